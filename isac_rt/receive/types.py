@@ -1,0 +1,116 @@
+"""What a receiver is given besides the samples, and what it hands on. Nothing here comes from the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """What tracking expects of the paths of one frame, in measurement space, at the middle of the frame.
+
+    One row per expected path; row 0 of a PT is its line of sight.
+
+    Attributes
+    ----------
+    range : (K,) [m]; one way for an echo at the AT, whole path length at a PT
+    velocity : (K,) [m/s] rate of `range`, positive is receding
+    direction : (K, 2) direction cosines (u_x, u_z) in the receiver's body frame
+    range_std, velocity_std : (K,) standard deviations of the predictions
+    weight : (K,) expected power relative to the strongest, in (0, 1]
+    """
+
+    range: np.ndarray
+    velocity: np.ndarray
+    direction: np.ndarray
+    range_std: np.ndarray
+    velocity_std: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detections:
+    """Points that a receiver found in one frame, at the middle of the frame. Read-only arrays of Q rows.
+
+    Attributes
+    ----------
+    range : (Q,) [m]; one way at the AT, whole path length at a PT
+    velocity : (Q,) [m/s], rate of `range`, positive is receding
+    direction : (Q, 2) direction cosines (u_x, u_z) of arrival in the receiver's body frame; NaN where it was not found
+    snr : (Q,) linear, of the range-Doppler cell after accumulation over antennas
+    std : (Q, 4) standard deviations of range, velocity, u_x, u_z
+    is_reference : (Q,) bool, the line of sight at a PT
+    """
+
+    range: np.ndarray
+    velocity: np.ndarray
+    direction: np.ndarray
+    snr: np.ndarray
+    std: np.ndarray
+    is_reference: np.ndarray
+
+    def __post_init__(self) -> None:
+        for a in (self.range, self.velocity, self.direction, self.snr, self.std, self.is_reference):
+            a.setflags(write=False)
+
+    def __len__(self) -> int:
+        return self.range.shape[0]
+
+
+def no_detections() -> Detections:
+    return Detections(
+        range=np.zeros(0),
+        velocity=np.zeros(0),
+        direction=np.zeros((0, 2)),
+        snr=np.zeros(0),
+        std=np.zeros((0, 4)),
+        is_reference=np.zeros(0, bool),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Maps:
+    """Pictures of one reception, made only when asked for.
+
+    Attributes
+    ----------
+    range_doppler : (rows, P) power, accumulated over antennas; rows from range 0, Doppler centred (velocity ascending)
+    range_axis [m], velocity_axis [m/s] : of the rows and columns
+    equivalent_range : (N, P) magnitude of the first group before data removal, over range cell and chirp
+    """
+
+    range_doppler: np.ndarray
+    range_axis: np.ndarray
+    velocity_axis: np.ndarray
+    equivalent_range: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reception:
+    """What one terminal made of one frame.
+
+    Attributes
+    ----------
+    detections : Detections
+    decoded : whether data symbols were decided (a PT in a data frame with its line of sight)
+    delay_symbols : (M, P) int, -1 where nothing was decided
+    transitions : (M, L_tx, P/L_tx - 1) int, -1 where nothing was decided
+    bits : (bits_per_frame,) uint8, empty when not decoded
+    delay_confidence : (M, P), transition_confidence : as `transitions`; larger is surer
+    edge_counts : (M*P,) raw delay decisions of the extended search, for slip detection; empty when not decoded
+    line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
+    maps : Maps or None
+    """
+
+    detections: Detections
+    decoded: bool
+    delay_symbols: np.ndarray
+    transitions: np.ndarray
+    bits: np.ndarray
+    delay_confidence: np.ndarray
+    transition_confidence: np.ndarray
+    edge_counts: np.ndarray
+    line_of_sight: bool
+    maps: Maps | None = None
