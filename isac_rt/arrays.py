@@ -11,6 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from isac_rt.scenario import Scenario
+from isac_rt.waveform import Waveform
+
 PatternModel = Literal["isotropic", "sector", "cosine"]
 
 
@@ -119,6 +122,29 @@ def is_latin(schedule: Schedule, num_tx: int) -> bool:
     """Whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups samples every
     antenna in every slot)."""
     return all(len(set(column)) == len(column) for column in schedule.T) and schedule.max() < num_tx
+
+
+def antennas_of(scenario: Scenario, waveform: Waveform) -> Antennas:
+    """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
+    a = scenario.array
+    return Antennas(
+        tx_x=a.tx_x,
+        tx_z=a.tx_z,
+        rx_x=a.rx_x,
+        rx_z=a.rx_z,
+        spacing=a.spacing_wavelengths * waveform.wavelength,
+        gain=10 ** (a.element_gain_dbi / 10),
+        pattern=a.element_pattern,
+        half_view=np.deg2rad(a.field_of_view_deg) / 2,
+    )
+
+
+def schedule_of(scenario: Scenario, waveform: Waveform, rng: np.random.Generator) -> Schedule:
+    """The antenna schedule that a scenario states."""
+    w = waveform
+    if scenario.array.schedule == "conventional":
+        return conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
+    return pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
 
 
 def _frozen(a: np.ndarray) -> np.ndarray:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
+
+from isac_rt.scenario import Scenario
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
@@ -109,8 +112,6 @@ class Waveform:
 
         With r = B/f_s: T- / (2 T_d) = (r - 2)/2 + 1 + L_tx.
         """
-        from fractions import Fraction
-
         ratio = Fraction(self.bandwidth).limit_denominator() / Fraction(self.sampling_rate).limit_denominator()
         return int((ratio - 2) / 2 + 1 + self.num_tx)
 
@@ -171,3 +172,17 @@ class Waveform:
         t = p * self.slot_duration + m * self.group_spacing
         t.setflags(write=False)
         return t
+
+
+def waveform_of(scenario: Scenario) -> Waveform:
+    """The waveform that a scenario states."""
+    r, a = scenario.radio, scenario.array
+    return Waveform(
+        carrier_frequency=r.carrier_hz,
+        bandwidth=r.bandwidth_hz,
+        sampling_rate=r.sampling_rate_hz,
+        num_samples=r.samples_per_chirp,
+        num_chirps=r.chirps_per_frame,
+        num_groups=r.groups,
+        num_tx=a.tx_x + a.tx_z - 1,
+    )

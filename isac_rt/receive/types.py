@@ -99,8 +99,10 @@ class Reception:
     transitions : (M, L_tx, P/L_tx - 1) int, -1 where nothing was decided
     bits : (bits_per_frame,) uint8, empty when not decoded
     delay_confidence : (M, P), transition_confidence : as `transitions`; larger is surer
-    edge_counts : (M*P,) raw delay decisions of the extended search, for slip detection; empty when not decoded
+    raw_delay_symbols : (M, P) int, decisions of a search that runs a few cells past the alphabet on both sides (so -3 and
+        N/2 + 2 can occur), for slip detection; empty when not decoded
     line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
+    reference_power : mean power of the reference path per sample and receive antenna [W], NaN where there is none
     maps : Maps or None
     """
 
@@ -111,6 +113,7 @@ class Reception:
     bits: np.ndarray
     delay_confidence: np.ndarray
     transition_confidence: np.ndarray
-    edge_counts: np.ndarray
+    raw_delay_symbols: np.ndarray
     line_of_sight: bool
+    reference_power: float
     maps: Maps | None = None
