@@ -1,23 +1,86 @@
-"""The whole input of a run: YAML <-> a frozen, typed tree. The only file that knows YAML.
+"""The whole input of a run as a frozen, typed tree, and what must hold between its values.
 
 Units stand in the key names. Unknown keys are refused. Everything inside the program is SI, radians and
-linear power; the conversions from decibels and degrees happen where a value leaves this tree.
+linear power; the conversions from decibels and degrees happen where a value leaves this tree. Files are read
+and written by `isac_rt.scenario_file`.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import itertools
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+Key = tuple[str | int, ...]
+
+NEAREST_M = 0.05
+"""Two bodies nearer than this are one to the ray tracer."""
+FASTEST_MPS = 200.0
+FARTHEST_M = 1e5
+CARRIERS_HZ = (1e9, 1e12)
+
+
+class Problem(NamedTuple):
+    """Something that cannot stand: the keys that take part in it, the one to name first, and what to say."""
+
+    keys: tuple[Key, ...]
+    text: str
+
+
+def dotted(key: Key) -> str:
+    """swarm.PT1.position_m.2 for ("swarm", "PT1", "position_m", 2)."""
+    return ".".join(map(str, key))
+
+
+def _three_numbers(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError("must be three numbers [x, y, z]")
+    return value
+
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Vector = tuple[Finite, Finite, Finite]
+Vector = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_three_numbers)]
+
+
+def _holds_bool(value: Any) -> bool:
+    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_holds_bool, value)))
 
 
 class Node(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    """One mapping of the tree."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, value: Any, info: Any) -> Any:
+        if cls.model_fields[info.field_name].annotation is not bool and _holds_bool(value):
+            raise ValueError("true and false do not belong here")
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Node:
+        problems = list(self.problems())
+        if problems:
+            text = "; ".join(f"{dotted(p.keys[0])}: {p.text}" for p in problems)
+            raise PydanticCustomError("inconsistent", "{text}", {"text": text, "problems": problems})
+        return self
+
+    def problems(self) -> Iterator[Problem]:
+        """What in this mapping contradicts itself; keys are relative to it."""
+        yield from ()
+
+    def applies(self, name: str) -> bool:
+        """Whether a field means anything beside the values of the others."""
+        return True
 
 
 class MaterialOverride(Node):
@@ -63,8 +126,39 @@ class City(Node):
     keep_radius_m: Positive | None = None
     materials: dict[str, MaterialOverride] = {}
 
+    def applies(self, name: str) -> bool:
+        return name in CITY_KEYS[self.source] or name in ("source", "keep_radius_m", "materials")
+
+    def problems(self) -> Iterator[Problem]:
+        for name in type(self).model_fields:
+            if name in self.model_fields_set and not self.applies(name):
+                sources = " or ".join(source for source, keys in CITY_KEYS.items() if name in keys)
+                yield Problem(
+                    ((name,), ("source",)),
+                    f"has no meaning with city.source {self.source}, only with {sources}; remove the key or change the source",
+                )
+        if self.source == "builtin" and not self.name:
+            yield Problem((("name",), ("source",)), "city.source builtin needs the name of a scene of Sionna RT, such as munich")
+        if self.source in ("mitsuba", "mesh", "footprints") and not self.file:
+            yield Problem((("file",), ("source",)), f"city.source {self.source} needs a file, relative to the scenario's folder")
+
+
+_BUILT = frozenset({"street_width_m", "building_height_m", "height_spread_m", "block_size_m"})
+_SURFACES = frozenset({"wall_material", "roof_material", "ground_material", "ground_margin_m"})
+CITY_KEYS: dict[str, frozenset[str]] = {
+    "builtin": frozenset({"name"}),
+    "mitsuba": frozenset({"file"}),
+    "mesh": frozenset({"file", "up_axis", "scale", "material", "material_map"}),
+    "footprints": frozenset({"file", "coordinates", "height_property", "default_height_m"}) | _SURFACES,
+    "canyon": _BUILT | _SURFACES | {"street_length_m"},
+    "blocks": _BUILT | _SURFACES | {"blocks_x", "blocks_y"},
+}
+"""Keys that each source of a city understands, beside source, keep_radius_m and materials."""
+
 
 class Radio(Node):
+    """The chirp and the frame."""
+
     carrier_hz: Positive = 77e9
     bandwidth_hz: Positive = 640e6
     sampling_rate_hz: Positive = 20e6
@@ -74,8 +168,19 @@ class Radio(Node):
     filter_transition_hz: Positive = 0.4e6
     """Width of the IF filter's skirts on each side of its passband [0, sampling rate)."""
 
+    def problems(self) -> Iterator[Problem]:
+        if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
+            yield Problem(
+                (("bandwidth_hz",), ("sampling_rate_hz",)),
+                f"must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; raise the bandwidth or lower the sampling rate",
+            )
+        if self.samples_per_chirp % 2:
+            yield Problem((("samples_per_chirp",),), "must be even: half of the range cells carry the data symbols")
+
 
 class Array(Node):
+    """L-shaped arrays: elements along X and Z that share the corner."""
+
     tx_x: Annotated[int, Field(ge=1, le=16)] = 2
     tx_z: Annotated[int, Field(ge=1, le=16)] = 2
     rx_x: Annotated[int, Field(ge=2, le=64)] = 8
@@ -88,6 +193,8 @@ class Array(Node):
 
 
 class Modulation(Node):
+    """What is on the chirps, and in which frames nothing is."""
+
     dpsk_order: Literal[2, 4, 8, 16] = 8
     acquisition_frames: Annotated[int, Field(ge=1)] = 3
     """Unmodulated frames at the start, from which every terminal acquires."""
@@ -111,6 +218,8 @@ class Rcs(Node):
 
 
 class Waypoint(Node):
+    """Where a UAV is at a time after the start of the run."""
+
     time_s: Finite
     position_m: Vector
 
@@ -125,6 +234,47 @@ class Uav(Node):
     boresight: Literal["velocity"] | Vector = "velocity"
     rcs: Rcs = Rcs()
 
+    @field_validator("boresight", mode="before")
+    @classmethod
+    def _velocity_or_direction(cls, value: Any) -> Any:
+        if value != "velocity" and not (isinstance(value, list | tuple) and len(value) == 3):
+            raise ValueError("must be velocity or a direction [x, y, z]")
+        if isinstance(value, list | tuple) and not any(value):
+            raise ValueError("a direction of length zero points nowhere; give a direction such as [0, 1, 0], or velocity")
+        return value
+
+    def applies(self, name: str) -> bool:
+        return name != "velocity_mps" or self.waypoints is None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.waypoints is None and self.position_m is None:
+            yield Problem((("position_m",),), "missing: a UAV needs either position_m or waypoints")
+        if self.waypoints is None:
+            return
+        if self.position_m is not None:
+            yield Problem((("position_m",), ("waypoints",)), "a UAV has either position_m or waypoints, not both; remove one of them")
+        if "velocity_mps" in self.model_fields_set:
+            yield Problem((("velocity_mps",), ("waypoints",)), "waypoints say how a UAV flies; remove velocity_mps or the waypoints")
+        if len(self.waypoints) < 2:
+            yield Problem((("waypoints",),), "needs two waypoints or more; for a UAV at rest or in straight flight use position_m")
+        for i, (before, after) in enumerate(itertools.pairwise(self.waypoints), start=1):
+            if after.time_s <= before.time_s:
+                yield Problem(
+                    (("waypoints", i, "time_s"), ("waypoints", i - 1, "time_s")),
+                    f"must be later than the waypoint before, at {before.time_s:g} s; put the waypoints in the order of their times",
+                )
+
+    def place(self, time: float) -> tuple[float, ...]:
+        """Position [m] with straight lines between waypoints: near enough to judge an input, not to fly by."""
+        if self.waypoints is None:
+            assert self.position_m is not None
+            return tuple(p + time * v for p, v in zip(self.position_m, self.velocity_mps, strict=True))
+        for a, b in itertools.pairwise(self.waypoints):
+            if time < b.time_s or b is self.waypoints[-1]:
+                share = (time - a.time_s) / (b.time_s - a.time_s)
+                return tuple(p + share * (q - p) for p, q in zip(a.position_m, b.position_m, strict=True))
+        raise AssertionError("two waypoints at least")
+
 
 class Leakage(Node):
     """The transmitter heard by the receiver on the same body."""
@@ -135,6 +285,8 @@ class Leakage(Node):
 
 
 class Propagation(Node):
+    """Which paths there are."""
+
     model: Literal["free_space", "ray_traced"] = "free_space"
     max_bounces: Annotated[int, Field(ge=0, le=6)] = 2
     """Specular bounces per leg (terminal to terminal, terminal to target)."""
@@ -147,6 +299,8 @@ class Propagation(Node):
 
 
 class Clutter(Node):
+    """What buildings and ground scatter diffusely."""
+
     model: Literal["none", "diffuse"] = "none"
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
 
@@ -163,6 +317,8 @@ class Noise(Node):
 
 
 class Receivers(Node):
+    """How terminals detect and demodulate."""
+
     velocity_method: Literal["auto", "omp", "latin_union"] = "auto"
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Of one cell of the range-Doppler map."""
@@ -177,11 +333,20 @@ class Receivers(Node):
 
 
 class Tracking(Node):
+    """The Kalman filters and the life of a track."""
+
     acceleration_std_mps2: Positive = 1.0
     gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
     confirm_hits: Annotated[int, Field(ge=1)] = 3
     confirm_window: Annotated[int, Field(ge=1)] = 5
     drop_misses: Annotated[int, Field(ge=1)] = 8
+
+    def problems(self) -> Iterator[Problem]:
+        if self.confirm_hits > self.confirm_window:
+            yield Problem(
+                (("confirm_hits",), ("confirm_window",)),
+                f"cannot be reached within confirm_window = {self.confirm_window}; lower it or widen the window",
+            )
 
 
 class Scenario(Node):
@@ -189,7 +354,7 @@ class Scenario(Node):
 
     name: str = "unnamed"
     seed: Annotated[int, Field(ge=0)] = 1
-    frames: Annotated[int, Field(ge=1)] = 100
+    frames: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     frame_interval_s: Positive | None = None
     """From the start of a frame to the next; null: contiguous frames."""
     radio: Radio = Radio()
@@ -202,3 +367,128 @@ class Scenario(Node):
     noise: Noise = Noise()
     receivers: Receivers = Receivers()
     tracking: Tracking = Tracking()
+
+    _folder: Path = PrivateAttr(default=Path())
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the scenario file, to which `city.file` is relative; the working folder for a tree made in Python."""
+        return self._folder
+
+    def in_folder(self, folder: Path) -> Scenario:
+        """The same scenario with its files looked for beside another place."""
+        scenario = self.model_copy()
+        scenario._folder = folder
+        return scenario
+
+    def city_path(self) -> Path:
+        """The city's file, found from the scenario's folder.
+
+        Raises
+        ------
+        ValueError
+            If the scenario has no city with a file.
+        """
+        if self.city is None or self.city.file is None:
+            raise ValueError("the scenario has no city.file")
+        return self.folder / self.city.file
+
+    @property
+    def num_tx(self) -> int:
+        """L_tx, elements of the transmitting L."""
+        return self.array.tx_x + self.array.tx_z - 1
+
+    @property
+    def frame_duration_s(self) -> float:
+        """P T-, as `Waveform` has it: T- = T + 2 (1 + L_tx) T_d with T_d = f_s T / (B - 2 f_s)."""
+        r = self.radio
+        sampled = r.samples_per_chirp / r.sampling_rate_hz
+        max_delay = r.samples_per_chirp / (r.bandwidth_hz - 2 * r.sampling_rate_hz)
+        return r.chirps_per_frame * (sampled + 2 * (1 + self.num_tx) * max_delay)
+
+    def problems(self) -> Iterator[Problem]:
+        yield from self._timing_problems()
+        yield from self._swarm_problems()
+        yield from self._model_problems()
+
+    def _timing_problems(self) -> Iterator[Problem]:
+        sizes = (("array", "tx_x"), ("array", "tx_z"))
+        antennas = f"the {self.num_tx} transmit antennas (array.tx_x + array.tx_z - 1)"
+        if self.radio.chirps_per_frame % self.num_tx:
+            yield Problem(
+                (("radio", "chirps_per_frame"), *sizes),
+                f"must be a multiple of {antennas}; every antenna needs the same number of slots",
+            )
+        if self.radio.groups > self.num_tx:
+            yield Problem(
+                (("radio", "groups"), *sizes), f"must not exceed {antennas}; use fewer groups or more transmit antennas"
+            )
+        if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (1 - 1e-12):
+            yield Problem(
+                (("frame_interval_s",), ("radio", "chirps_per_frame"), ("radio", "samples_per_chirp")),
+                f"is shorter than a frame, which lasts {self.frame_duration_s:.7g} s; lengthen it, or leave it out for contiguous frames",
+            )
+        if self.modulation.acquisition_frames >= self.frames:
+            yield Problem(
+                (("modulation", "acquisition_frames"), ("frames",)),
+                f"{self.modulation.acquisition_frames} acquisition frames leave none of the {self.frames} frames for data; "
+                "run more frames or set modulation.acquisition_frames lower",
+            )
+
+    def _swarm_problems(self) -> Iterator[Problem]:
+        for name in self.swarm:
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+                yield Problem((("swarm", name),), "a UAV's name may hold letters, digits, _ and - only; rename it")
+        active = [name for name, uav in self.swarm.items() if uav.role == "active"]
+        if not active:
+            yield Problem((("swarm",),), "no UAV has the role active; give it to the one that transmits")
+        for name in active[1:]:
+            said = f"{active[0]} is active already and only one may be for now; make it passive or target"
+            yield Problem((("swarm", name, "role"),), said)
+        for (a, first), (b, second) in itertools.combinations(self.swarm.items(), 2):
+            apart = math.dist(first.place(0.0), second.place(0.0))
+            if apart < NEAREST_M:
+                key = "position_m" if second.waypoints is None else "waypoints"
+                yield Problem(
+                    (("swarm", b, key), ("swarm", a)),
+                    f"{a} and {b} are {apart:.3g} m apart at the start, at least {NEAREST_M} m are needed; move one of them",
+                )
+
+    def _model_problems(self) -> Iterator[Problem]:
+        for name, uav in self.swarm.items():
+            if uav.rcs.model == "relative" and self.noise.model != "snr":
+                yield Problem(
+                    (("swarm", name, "rcs", "model"), ("noise", "model")),
+                    "relative goes with noise.model snr only: a link budget needs a radar cross-section; use constant or tr38901",
+                )
+        if self.clutter.model == "diffuse" and (self.propagation.model != "ray_traced" or self.city is None):
+            yield Problem(
+                (("clutter", "model"), ("propagation", "model"), ("city",)),
+                "diffuse needs propagation.model ray_traced and a city to scatter from; add them or set clutter.model to none",
+            )
+
+    def doubts(self) -> Iterator[Problem]:
+        """What may stand but looks like a value in the wrong unit."""
+        low, high = CARRIERS_HZ
+        if not low <= self.radio.carrier_hz <= high:
+            yield Problem((("radio", "carrier_hz"),), f"is outside {low:g} to {high:g} Hz; is it in hertz?")
+        for name, uav in self.swarm.items():
+            if uav.waypoints is None:
+                speeds: list[tuple[Key, float]] = [(("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))]
+                places: list[tuple[Key, tuple[float, ...]]] = [(("swarm", name, "position_m"), uav.place(0.0))]
+            else:
+                legs = enumerate(itertools.pairwise(uav.waypoints), start=1)
+                key = ("swarm", name, "waypoints")
+                speeds = [((*key, i), math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s)) for i, (a, b) in legs]
+                places = [((*key, i, "position_m"), w.position_m) for i, w in enumerate(uav.waypoints)]
+            for where, speed in speeds:
+                if speed > FASTEST_MPS:
+                    yield Problem((where,), f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}; is it in metres and seconds?")
+            for where, place in places:
+                if math.hypot(*place) > FARTHEST_M:
+                    yield Problem((where,), f"lies {math.hypot(*place):.4g} m from the origin, more than {FARTHEST_M:g}; is it in metres?")
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of a scenario file, for editors; docstrings become descriptions."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Scenario.model_json_schema()}
