@@ -1,0 +1,55 @@
+"""DCA-SPE: the active terminal takes its own data out of its echoes and senses."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+
+from isac_rt.arrays import Antennas
+from isac_rt.ifsignal import IFCube
+from isac_rt.payload import Payload
+from isac_rt.receive.common import make_maps, sense
+from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.types import Reception
+from isac_rt.scenario import Receivers
+
+
+def equivalent_range_map(cube: IFCube) -> np.ndarray:
+    """(N, P) magnitude over range cell and chirp of the first group before any data are removed, mean over receivers."""
+    total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
+    for rx in range(cube.samples.shape[1]):
+        total += np.abs(scipy.fft.fft(cube.samples[0, rx], axis=1, workers=1)).T
+    return total / cube.samples.shape[1]
+
+
+def receive_active(
+    cube: IFCube, payload: Payload, antennas: Antennas, settings: Receivers, *, maps: bool = False
+) -> Reception:
+    """Range, velocity and direction of what the transmitter's own echoes show.
+
+    Parameters
+    ----------
+    cube : IFCube, received by the terminal that sent `payload`
+    maps : also return pictures
+
+    Returns
+    -------
+    Reception with detections only: range one way, velocity receding positive, direction cosines from the virtual L
+    """
+    w = cube.waveform
+    spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
+    found = sense(spectra, w, cube.schedule, antennas, settings, passes=2)
+    groups, chirps = payload.delay_symbols.shape
+    return Reception(
+        detections=found.detections,
+        decoded=False,
+        delay_symbols=np.full((groups, chirps), -1),
+        transitions=np.full(payload.transitions.shape, -1),
+        bits=np.zeros(0, np.uint8),
+        delay_confidence=np.zeros((groups, chirps)),
+        transition_confidence=np.zeros(payload.transitions.shape),
+        raw_delay_symbols=np.zeros((0, chirps), int),
+        line_of_sight=False,
+        reference_power=float("nan"),
+        maps=make_maps(found.power, equivalent_range_map(cube), w, 2) if maps else None,
+    )

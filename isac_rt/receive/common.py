@@ -1,0 +1,117 @@
+"""From cleaned spectra to detections: what the active and the passive terminal do alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.arrays import Antennas, Schedule, is_latin
+from isac_rt.receive.cfar import detect, peaks, without_sidelobes
+from isac_rt.receive.doppler import accumulate, channel_maps, doppler_bins, omp_power
+from isac_rt.receive.estimate import (
+    Estimate,
+    LocalSpectra,
+    direction_cosine,
+    refine,
+    standard_deviations,
+    start_point,
+)
+from isac_rt.receive.types import Detections, Maps
+from isac_rt.scenario import Receivers
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+OMP_SPARSITY = 4
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """Detections of a frame with their estimates, strongest first, and the maps that they came from."""
+
+    estimates: list[Estimate]
+    detections: Detections
+    power: np.ndarray
+    noise: float
+
+
+def use_omp(settings: Receivers, schedule: Schedule, num_tx: int) -> bool:
+    """`auto`: the union where it samples every antenna in every slot, OMP elsewhere."""
+    if settings.velocity_method != "auto":
+        return settings.velocity_method == "omp"
+    return not (is_latin(schedule, num_tx) and len(schedule) == num_tx)
+
+
+def sense(
+    spectra: np.ndarray,
+    waveform: Waveform,
+    schedule: Schedule,
+    antennas: Antennas,
+    settings: Receivers,
+    passes: int,
+) -> Sensed:
+    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each."""
+    w = waveform
+    power = accumulate(channel_maps(spectra, w, schedule))
+    looks = antennas.num_tx * antennas.num_rx
+    above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+    above[: int(np.ceil(settings.min_range_m / w.range_cell(passes)))] = False
+    if use_omp(settings, schedule, w.num_tx):
+        above &= _confirmed_by_omp(spectra, above, level, w, schedule)
+    rows, bins = peaks(power, above, settings.cluster_cells)
+    keep = without_sidelobes(rows, bins, power, w.num_chirps)
+    rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
+    estimates = []
+    for row, column in zip(rows, bins, strict=True):
+        local = LocalSpectra(spectra, w, schedule, int(row))
+        estimates.append(refine(local, *start_point(power, int(row), int(column), w)))
+    snr = power[rows, bins] / level[rows, bins]
+    found = describe(estimates, snr, antennas, w, passes)
+    return Sensed(estimates, found, power, float(np.median(power)))
+
+
+def _confirmed_by_omp(
+    spectra: np.ndarray, above: np.ndarray, level: np.ndarray, waveform: Waveform, schedule: Schedule
+) -> np.ndarray:
+    """Cells of rows with a detection that OMP's support keeps: the sparse sampling's sidelobes fall away.
+
+    A cell stays if OMP's accumulated power there, compared with the correlation's, is above the background.
+    """
+    rows = np.flatnonzero(above.any(axis=1))
+    out = np.zeros_like(above)
+    if rows.size:
+        found = omp_power(spectra, rows, waveform, schedule, OMP_SPARSITY)
+        # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2, OMP one group's
+        gain = (len(schedule) / 2) ** 2
+        out[rows] = found * gain > level[rows]
+    return out
+
+
+def describe(
+    estimates: list[Estimate], snr: np.ndarray, antennas: Antennas, waveform: Waveform, passes: int
+) -> Detections:
+    """Detections in ranges, velocities and direction cosines; what lies outside the field of view has no direction."""
+    count, virtual = len(estimates), passes == 2
+    direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
+    limit = np.sin(antennas.half_view) if antennas.half_view < np.pi / 2 else 1.0
+    for i, e in enumerate(estimates):
+        u = [direction_cosine(e.channels, antennas, waveform, axis, virtual) for axis in (0, 2)]
+        direction[i] = [v if abs(v) <= limit else np.nan for v in u]
+        std[i] = standard_deviations(snr[i] * e.channels.size, antennas, waveform, passes, virtual)
+    return Detections(
+        range=np.array([e.delay for e in estimates]) * (SPEED_OF_LIGHT / passes),
+        velocity=np.array([e.delay_rate for e in estimates]) * (SPEED_OF_LIGHT / passes),
+        direction=direction,
+        snr=np.asarray(snr, float),
+        std=std,
+        is_reference=np.zeros(count, bool),
+    )
+
+
+def make_maps(power: np.ndarray, equivalent_range: np.ndarray, waveform: Waveform, passes: int) -> Maps:
+    """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
+    return Maps(
+        range_doppler=power.astype(np.float32),
+        range_axis=np.arange(power.shape[0]) * waveform.range_cell(passes),
+        velocity_axis=doppler_bins(waveform) * waveform.velocity_cell(passes),
+        equivalent_range=equivalent_range.astype(np.float32),
+    )

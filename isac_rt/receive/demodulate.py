@@ -1,0 +1,121 @@
+"""Delay symbols and DPSK symbols of a frame, given a prediction of the reference path.
+
+Every chirp is derotated by the predicted beat, fraction and migration included, so that the symbol is the number of the
+strongest cell. A prediction that is a whole cell off gives symbols that are all one off: the same signal. That is why
+the search runs a few cells past the alphabet (`raw`), where such a slip shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from scipy import stats
+
+from isac_rt.ifsignal import IFCube
+from isac_rt.payload import by_antenna, demodulate_bits, running_phases
+from isac_rt.receive.estimate import beat_cells, middle_phase
+from isac_rt.receive.spectrum import data_phase, window_length
+from isac_rt.receive.types import Prediction
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+EXTRA_CELLS = 4
+WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do not vote on the symbol
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """Decisions of a frame; shapes as in `Reception`.
+
+    `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a transition, the cosine-like share
+    |sum y conj(y')| / sum |y y'|, in [0, 1].
+    """
+
+    raw: np.ndarray
+    delay: np.ndarray
+    delay_confidence: np.ndarray
+    transitions: np.ndarray
+    transition_confidence: np.ndarray
+    phases: np.ndarray
+    bits: np.ndarray
+
+
+def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
+    """Median delay confidence over a frame that noise alone exceeds in fewer than one frame in a million.
+
+    In noise the confidence is the largest of `num_cells` Gamma(L_rx) means. Its median over the chirps exceeds the level
+    that one chirp exceeds with probability q in P[Binomial(num_chirps, q) >= num_chirps/2].
+    """
+    share = np.linspace(0.01, 0.5, 491)
+    tail = stats.binom.sf(num_chirps // 2 - 1, num_chirps, share)
+    q = float(share[np.flatnonzero(tail < 1e-6)[-1]])
+    return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
+
+
+def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int) -> Symbols:
+    """Decide all symbols of a frame.
+
+    Parameters
+    ----------
+    cube : IFCube of a modulated frame
+    prediction : row 0 is the reference path; further rows vote with their predicted power
+    dpsk_order : D
+    """
+    w = cube.waveform
+    delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
+    beats = beat_cells(w, delays[0], rates[0])
+    others = [
+        (float(prediction.weight[k]), np.round(beat_cells(w, delays[k], rates[k]) - beats).astype(int))
+        for k in range(1, delays.size)
+        if prediction.weight[k] >= WEAKEST_WEIGHT
+    ]
+    shape = cube.schedule.shape
+    raw, sure = np.empty(shape, np.int64), np.empty(shape)
+    picked = np.empty((shape[0], cube.samples.shape[1], shape[1]), np.complex128)
+    fast = np.arange(w.num_samples)
+    for m in range(shape[0]):
+        turn = np.exp(-2j * np.pi * ((beats[m][:, None] * fast / w.num_samples) % 1.0)).astype(np.complex64)
+        spectra = scipy.fft.fft(cube.samples[m] * turn, axis=-1, workers=1, overwrite_x=True)
+        power = np.zeros(spectra.shape[1:], np.float32)
+        for one in spectra:
+            power += one.real**2 + one.imag**2
+        raw[m], sure[m] = _decide(power, [(g, o[m]) for g, o in others], w)
+        picked[m] = np.take_along_axis(spectra, (raw[m] % w.num_samples)[None, :, None], axis=2)[..., 0]
+    delay = np.clip(raw, 0, w.num_delay_symbols - 1)
+    known = middle_phase(w, delays[0], rates[0]) - beats * (window_length(w) / 2 / w.num_samples)
+    known += data_phase(w, raw) - (w.slope * w.delay_step * raw) * delays[0]
+    picked *= np.exp(-2j * np.pi * known)[:, None, :]
+    transitions, share = _dpsk(picked, cube.schedule, w.num_tx, dpsk_order)
+    return Symbols(
+        raw=raw,
+        delay=delay,
+        delay_confidence=sure,
+        transitions=transitions,
+        transition_confidence=share,
+        phases=running_phases(transitions, cube.schedule, dpsk_order),
+        bits=demodulate_bits(delay, transitions, w, dpsk_order),
+    )
+
+
+def _decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+    """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from (P, N) power."""
+    cells = np.arange(-EXTRA_CELLS, waveform.num_delay_symbols + EXTRA_CELLS)
+    metric = power[:, cells % waveform.num_samples].astype(np.float64)
+    chirps = np.arange(power.shape[0])[:, None]
+    for weight, offset in others:
+        metric += weight * power[chirps, (cells[None, :] + offset[:, None]) % waveform.num_samples]
+    best = metric.argmax(axis=1)
+    peak = metric[chirps[:, 0], best]
+    rest = (metric.sum(axis=1) - peak) / (cells.size - 1)
+    return cells[best], peak / np.maximum(rest, 1e-300)
+
+
+def _dpsk(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of the earlier one."""
+    chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
+    product = chains[..., 1:] * chains[..., :-1].conj()
+    summed = product.sum(axis=2)
+    symbols = np.round(np.angle(summed) / (2 * np.pi / order)).astype(np.int64) % order
+    share = np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
+    return symbols, share

@@ -1,0 +1,210 @@
+"""Off-grid estimates of one detection: range and velocity by maximum likelihood on the cleaned spectra, then direction cosines.
+
+Around mid-frame, with tau(t) = tau_0 + tau_dot t and x the time from the middle of a chirp's window (at u_c),
+
+    Phi = [f_c tau_c + alpha tau_c u_c - alpha tau_c^2/2]  +  x [alpha tau_c + tau_dot (f_c + alpha u_c - alpha tau_c)],
+
+where tau_c is the delay at the chirp's middle. So the beat follows the migration and carries the range-Doppler coupling, and the
+slow-time phase follows tau_c. `Template` is this formula; nothing of it is linearised in the frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.arrays import Antennas, Schedule
+from isac_rt.receive.doppler import slow_window
+from isac_rt.receive.spectrum import window_length
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+HALF_WIDTH = 3  # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One detection off the grid.
+
+    Attributes
+    ----------
+    delay, delay_rate : at mid-frame [s, 1]
+    channels : (L_tx, L_rx) complex, response of every virtual channel at the estimate, normalised to the amplitude of a sample
+    """
+
+    delay: float
+    delay_rate: float
+    channels: np.ndarray
+
+
+def middle_times(waveform: Waveform) -> np.ndarray:
+    """(M, P) time of the middle of each chirp's window since mid-frame [s]."""
+    w = waveform
+    return w.chirp_time + window_middle(w) - w.frame_duration / 2
+
+
+def window_middle(waveform: Waveform) -> float:
+    """u_c [s], the middle of the Hann window since the start of the reference chirp."""
+    return waveform.window_start + window_length(waveform) / 2 * waveform.sample_interval
+
+
+def beat_cells(waveform: Waveform, delay: float, delay_rate: float) -> np.ndarray:
+    """(M, P) beat of a path in range cells, without data."""
+    w = waveform
+    tau = delay + delay_rate * middle_times(w)
+    carrier = w.carrier_frequency + w.slope * (window_middle(w) - tau)
+    return (w.slope * tau + delay_rate * carrier) * w.sampled_duration
+
+
+def middle_phase(waveform: Waveform, delay: float, delay_rate: float) -> np.ndarray:
+    """(M, P) phase of a path at the middle of each window [cycles mod 1], without data."""
+    w = waveform
+    tau = delay + delay_rate * middle_times(w)
+    return (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (window_middle(w) - tau / 2)) % 1.0
+
+
+def hann_response(waveform: Waveform, offset: np.ndarray) -> np.ndarray:
+    """Transform of the range window, about its middle, at `offset` cells from a tone; real, (samples)."""
+    length = window_length(waveform)
+    d = np.asarray(offset) * length / waveform.num_samples
+    near = np.abs(np.abs(d) - 1) < 1e-6
+    safe = np.where(near, 0.5, d)
+    return length / 2 * np.where(near, 0.5, np.sinc(safe) / (1 - safe**2))
+
+
+class LocalSpectra:
+    """The few range rows around a peak, weighted over the slots, ready for repeated evaluation of templates."""
+
+    def __init__(self, spectra: np.ndarray, waveform: Waveform, schedule: Schedule, row: int) -> None:
+        low = max(row - HALF_WIDTH, 0)
+        self.rows = np.arange(low, min(row + HALF_WIDTH + 1, spectra.shape[2]))
+        self.waveform = waveform
+        self._data = spectra[:, :, self.rows].transpose(1, 0, 3, 2)  # rx, group, chirp, row
+        weight = np.broadcast_to(slow_window(waveform), schedule.shape)
+        self._by_tx = np.stack([(weight * (schedule == tx)).ravel() for tx in range(waveform.num_tx)], axis=1)
+
+    def respond(self, delay: float, delay_rate: float) -> np.ndarray:
+        """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its amplitude."""
+        w = self.waveform
+        offset = beat_cells(w, delay, delay_rate)[..., None] - self.rows
+        shape = hann_response(w, offset)
+        phase = middle_phase(w, delay, delay_rate)[..., None] - self.rows * (window_length(w) / 2 / w.num_samples)
+        template = shape * np.exp(2j * np.pi * phase)
+        per_chirp = np.einsum("xmpk,mpk->xmp", self._data, template.conj(), optimize=True)
+        energy = (shape**2).sum(axis=-1).ravel() @ self._by_tx
+        return ((per_chirp.reshape(per_chirp.shape[0], -1) @ self._by_tx) / np.maximum(energy, 1e-30)).T
+
+    def power(self, delay: float, delay_rate: float) -> float:
+        """Power summed over the virtual channels: what the estimate maximises."""
+        return float((np.abs(self.respond(delay, delay_rate)) ** 2).sum())
+
+
+def start_point(
+    spectra_power: np.ndarray, row: int, column: int, waveform: Waveform
+) -> tuple[float, float]:
+    """Delay and delay rate of a peak of the centred map, by Hann's two-cell ratio on both axes.
+
+    Exact for a tone that does not migrate; within a tenth of a cell otherwise.
+    """
+    rows, num_bins = spectra_power.shape
+    line = np.sqrt(spectra_power[[max(row - 1, 0), row, min(row + 1, rows - 1)], column])
+    across = np.sqrt(spectra_power[row, [(column - 1) % num_bins, column, (column + 1) % num_bins]])
+    cell, doppler = row + _hann_ratio(line), column - num_bins // 2 + _hann_ratio(across)
+    return to_delay(cell, doppler, waveform)
+
+
+def to_delay(cell: float, doppler_bin: float, waveform: Waveform) -> tuple[float, float]:
+    """Delay and delay rate at mid-frame of a beat (cells) and a Doppler bin (receding is positive)."""
+    w = waveform
+    rate = doppler_bin / (w.frame_duration * w.effective_carrier)
+    return (cell / w.sampled_duration - rate * w.effective_carrier) / w.slope, rate
+
+
+def _hann_ratio(three: np.ndarray) -> float:
+    before, peak, after = three
+    if peak <= 0:
+        return 0.0
+    ratio = max(before, after) / peak
+    offset = np.clip((2 * ratio - 1) / (1 + ratio), -0.5, 0.5)
+    return float(offset if after >= before else -offset)
+
+
+def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int = 3) -> Estimate:
+    """Maximise the summed power by fitted paraboloids on shrinking stencils (cells and Doppler bins)."""
+    w = local.waveform
+    delay_unit, rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)
+    # coordinates: beat at mid-frame and Doppler, which decouple; the beat holds the coupling
+    beat = delay / delay_unit + delay_rate / rate_unit * (w.sampled_duration / w.frame_duration)
+    doppler = delay_rate / rate_unit
+
+    def split(b: float, d: float) -> tuple[float, float]:
+        return (b - d * (w.sampled_duration / w.frame_duration)) * delay_unit, d * rate_unit
+
+    for step in (0.2, 0.08, 0.03)[:iterations]:
+        at = np.array([-step, 0.0, step])
+        grid = np.log([[max(local.power(*split(beat + i, doppler + j)), 1e-300) for j in at] for i in at])
+        gx, gy = (grid[2, 1] - grid[0, 1]) / (2 * step), (grid[1, 2] - grid[1, 0]) / (2 * step)
+        hxx = (grid[2, 1] - 2 * grid[1, 1] + grid[0, 1]) / step**2
+        hyy = (grid[1, 2] - 2 * grid[1, 1] + grid[1, 0]) / step**2
+        hxy = (grid[2, 2] - grid[2, 0] - grid[0, 2] + grid[0, 0]) / (4 * step**2)
+        det = hxx * hyy - hxy**2
+        if hxx < 0 and det > 0:
+            move = np.array([hyy * gx - hxy * gy, hxx * gy - hxy * gx]) / -det
+        else:
+            move = step * np.sign([gx, gy])
+        beat, doppler = np.array([beat, doppler]) + np.clip(move, -3 * step, 3 * step)
+    delay, delay_rate = split(beat, doppler)
+    return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
+
+
+def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Channels (tx index, rx index) along X (axis 0) or Z (axis 2) of the L and their places along it [m].
+
+    `virtual`: transmit and receive elements of the axis together (an echo); else the receive arm with every transmit antenna.
+    """
+    rx = np.arange(antennas.rx_x) if axis == 0 else np.arange(antennas.rx_x - 1, antennas.num_rx)
+    along = np.arange(antennas.tx_x) if axis == 0 else np.arange(antennas.tx_x - 1, antennas.num_tx)
+    tx = along if virtual else np.arange(antennas.num_tx)
+    t, r = (a.ravel() for a in np.meshgrid(tx, rx, indexing="ij"))
+    place = antennas.rx_positions[r, axis] + (antennas.tx_positions[t, axis] if virtual else 0.0)
+    return t, r, place
+
+
+def direction_cosine(channels: np.ndarray, antennas: Antennas, waveform: Waveform, axis: int, virtual: bool) -> float:
+    """Direction cosine along one axis of the L from the channel responses, by maximising the beamformed power.
+
+    An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle. Echoes (`virtual`) are combined
+    coherently over both arrays; one-way paths coherently over the receivers and in power over the transmitters, whose
+    direction of departure is another and ambiguous.
+    """
+    tx, rx, place = arm(antennas, axis, virtual)
+    scale = 2 * np.pi * (waveform.carrier_frequency + waveform.slope * window_middle(waveform)) / SPEED_OF_LIGHT
+    limit = min(1.0, np.pi / (scale * antennas.spacing))
+    values = channels[tx, rx]
+    groups = [np.ones(tx.size, bool)] if virtual else [tx == t for t in np.unique(tx)]
+
+    def beam(u: np.ndarray) -> np.ndarray:
+        steer = np.exp(1j * scale * np.outer(u, place))
+        return sum(np.abs(steer[:, g] @ values[g]) ** 2 for g in groups)
+
+    u = np.linspace(-limit, limit, 8 * np.unique(rx).size * (2 if virtual else 1) + 1)
+    best = u[np.argmax(beam(u))]
+    for step in ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
+        low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))
+        curve = low - 2 * mid + high
+        best += np.clip(0.5 * (low - high) / curve * step if curve < 0 else step * np.sign(high - low), -2 * step, 2 * step)
+    return float(best) if abs(best) <= 1 else float("nan")
+
+
+def standard_deviations(snr: float, antennas: Antennas, waveform: Waveform, passes: int, virtual: bool) -> np.ndarray:
+    """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao of a tone, with Hann's loss of
+    2 on the two windowed axes), and never below the floors at which other paths' sidelobes usually end the gain."""
+    w, tone = waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
+    spread = [max(tone, 2e-3) * w.range_cell(passes), max(tone, 4e-3) * w.velocity_cell(passes)]
+    angles = []
+    for axis in (0, 2):
+        place = arm(antennas, axis, virtual)[2]
+        slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
+        share = place.size / (antennas.num_tx * antennas.num_rx)
+        angles.append(max(1 / (slope * np.sqrt(2 * max(snr, 1.0) * share)), 2e-4))
+    return np.array(spread + angles)

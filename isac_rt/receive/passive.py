@@ -1,0 +1,161 @@
+"""J-SPEDD: a passive terminal decodes the data and senses with the same frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from isac_rt.arrays import Antennas
+from isac_rt.ifsignal import IFCube
+from isac_rt.payload import unmodulated
+from isac_rt.receive.active import equivalent_range_map
+from isac_rt.receive.cfar import detect
+from isac_rt.receive.common import Sensed, describe, make_maps, sense
+from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate
+from isac_rt.receive.estimate import LocalSpectra, refine, start_point
+from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
+from isac_rt.scenario import Receivers
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+REFERENCE_SPAN_DB = 20.0  # the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
+GATE_CELLS = 1  # range rows searched on each side of the predicted one: the fraction is known, the whole cell is the prediction's
+GATE_BINS = 4
+
+
+def receive_passive(
+    cube: IFCube,
+    antennas: Antennas,
+    settings: Receivers,
+    dpsk_order: int,
+    prediction: Prediction | None,
+    modulated: bool,
+    *,
+    maps: bool = False,
+) -> Reception:
+    """Data symbols, bits and detections of one frame.
+
+    Parameters
+    ----------
+    cube : IFCube
+    prediction : row 0 is the line of sight; None when nothing is tracked. Unmodulated frames need none
+    modulated : whether the frame carries data (public)
+    maps : also return pictures
+
+    Returns
+    -------
+    Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the strongest. Without a prediction
+    a modulated frame cannot be read: nothing is detected. When the decisions look like noise, or nothing is found where the
+    reference is expected, `line_of_sight` is False and all symbols are erased.
+    """
+    w = cube.waveform
+    if not modulated:
+        pilot = unmodulated(w)
+        spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
+        found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
+        return _reception(cube, _earliest(found), found, None, maps)
+    if prediction is None:
+        return _reception(cube, no_detections(), None, None, maps)
+    symbols = demodulate(cube, prediction, dpsk_order)
+    cells = w.num_delay_symbols + 2 * EXTRA_CELLS
+    threshold = confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
+    if np.median(symbols.delay_confidence) < threshold:
+        return _reception(cube, no_detections(), None, None, maps)
+    spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
+    found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
+    detections = _at_prediction(spectra, found, prediction, cube, antennas, settings)
+    return _reception(cube, detections, found, symbols if detections.is_reference.any() else None, maps)
+
+
+def _earliest(found: Sensed) -> Detections:
+    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest."""
+    d = found.detections
+    if not len(d):
+        return d
+    strong = _amplitudes(found) ** 2 >= 10 ** (-REFERENCE_SPAN_DB / 10) * (_amplitudes(found) ** 2).max()
+    first = np.flatnonzero(strong)[np.argmin(d.range[strong])]
+    return replace(d, is_reference=np.arange(len(d)) == first)
+
+
+def _amplitudes(found: Sensed) -> np.ndarray:
+    return np.array([np.sqrt((np.abs(e.channels) ** 2).mean()) for e in found.estimates])
+
+
+def _at_prediction(
+    spectra: np.ndarray,
+    found: Sensed,
+    prediction: Prediction,
+    cube: IFCube,
+    antennas: Antennas,
+    settings: Receivers,
+) -> Detections:
+    """The reference within the gate, put first with its own estimate, and the other detections beside it."""
+    w = cube.waveform
+    row, column = _predicted_cell(prediction, w)
+    if not 0 <= row < found.power.shape[0]:
+        return no_detections()
+    rows = np.arange(max(row - GATE_CELLS, 0), min(row + GATE_CELLS + 1, found.power.shape[0]))
+    columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
+    gate = found.power[np.ix_(rows, columns)]
+    i, j = np.unravel_index(gate.argmax(), gate.shape)
+    looks = antennas.num_tx * antennas.num_rx
+    above, level = detect(found.power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+    if not above[rows[i], columns[j]]:
+        return no_detections()
+    local = LocalSpectra(spectra, w, cube.schedule, int(rows[i]))
+    estimate = refine(local, *start_point(found.power, int(rows[i]), int(columns[j]), w))
+    snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
+    reference = describe([estimate], np.array([snr]), antennas, w, 1)
+    d = found.detections
+    apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
+    apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
+    return Detections(
+        **{
+            name: np.concatenate([getattr(reference, name), getattr(d, name)[apart]])
+            for name in ("range", "velocity", "direction", "snr", "std")
+        },
+        is_reference=np.arange(1 + apart.sum()) == 0,
+    )
+
+
+def _predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
+    """Row and centred Doppler column where the reference is expected."""
+    w = waveform
+    doppler = prediction.velocity[0] / w.velocity_cell(1)
+    beat = prediction.range[0] / w.range_cell(1) + doppler * (w.sampled_duration / w.frame_duration)
+    return round(beat), (round(doppler) + w.num_chirps // 2) % w.num_chirps
+
+
+def _reception(
+    cube: IFCube, detections: Detections, found: Sensed | None, symbols: Symbols | None, maps: bool
+) -> Reception:
+    w = cube.waveform
+    shape, transitions = cube.schedule.shape, (w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1)
+    picture = None
+    if maps:
+        power = found.power if found else np.zeros((w.num_delay_symbols, w.num_chirps))
+        picture = make_maps(power, equivalent_range_map(cube), w, 1)
+    return Reception(
+        detections=detections,
+        decoded=symbols is not None,
+        delay_symbols=np.full(shape, -1) if symbols is None else symbols.delay,
+        transitions=np.full(transitions, -1) if symbols is None else symbols.transitions,
+        bits=np.zeros(0, np.uint8) if symbols is None else symbols.bits,
+        delay_confidence=np.zeros(shape) if symbols is None else symbols.delay_confidence,
+        transition_confidence=np.zeros(transitions) if symbols is None else symbols.transition_confidence,
+        raw_delay_symbols=np.zeros((0, shape[1]), int) if symbols is None else symbols.raw,
+        line_of_sight=bool(detections.is_reference.any()),
+        reference_power=_reference_power(detections, found),
+        maps=picture,
+    )
+
+
+def _reference_power(detections: Detections, found: Sensed | None) -> float:
+    """Mean power per sample and receive antenna of the reference, from the estimate nearest to it."""
+    if found is None or not detections.is_reference.any() or not found.estimates:
+        return float("nan")
+    reference = float(detections.range[detections.is_reference][0])
+    delays = np.array([e.delay for e in found.estimates]) * SPEED_OF_LIGHT
+    nearest = int(np.argmin(np.abs(delays - reference)))
+    return float(_amplitudes(found)[nearest] ** 2)
