@@ -1,7 +1,7 @@
 """Range-Doppler maps from cleaned spectra: the union of the groups, or each group's sparse sampling with OMP.
 
 By the Latin property every transmit antenna sends in every slot, in some group. The union of the groups is then a uniform sampling
-with the slot's full rate, up to the groups' offsets 2 m T_d, which a phase per Doppler bin takes out exactly.
+with the slot's full rate, up to the groups' offsets 2 m T_d, which `union_operator` takes out.
 Doppler bins are centred: bin 0 of the output is -P/2. Receding is positive.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.fft
 
-from isac_rt.arrays import Schedule
+from isac_rt.arrays import Schedule, is_latin
 from isac_rt.waveform import Waveform
 
 
@@ -34,7 +34,7 @@ def group_phase(waveform: Waveform) -> np.ndarray:
 
 
 def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
-    """Doppler DFT of every virtual channel over all its chirps, groups united.
+    """Doppler spectrum of every virtual channel over all its chirps, groups united.
 
     Parameters
     ----------
@@ -42,20 +42,45 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) ->
 
     Returns
     -------
-    maps : (L_tx, L_rx, rows, P) complex64. Where the union is not the full sampling (M < L_tx) these are the correlations with
-        the Doppler atoms, with the sampling's sidelobes in them.
+    maps : (L_tx, L_rx, rows, P) complex64, FFT order. Where the union is not the full sampling (M < L_tx) these are the
+        correlations with the Doppler atoms, with the sampling's sidelobes in them.
     """
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
-    out = np.zeros((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
-    window, turn = slow_window(waveform), group_phase(waveform)
+    out = np.empty((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
+    full = num_groups == waveform.num_tx and is_latin(schedule, waveform.num_tx)
     for tx in range(waveform.num_tx):
+        united = np.zeros((num_rx, num_rows, num_chirps), np.complex64)
         for m in range(num_groups):
-            mask = window * (schedule[m] == tx)
-            for rx in range(num_rx):
-                part = scipy.fft.fft(spectra[m, rx] * mask, axis=-1, workers=1, overwrite_x=True)
-                part *= turn[m]
-                out[tx, rx] += part
+            if full:
+                np.copyto(united, spectra[m], where=schedule[m] == tx)
+            else:
+                united = spectra[m] * (schedule[m] == tx)
+                _correlate(united, out[tx], slow_window(waveform), group_phase(waveform)[m], first=m == 0)
+        if full:
+            operator = union_operator(waveform, (schedule == tx).argmax(axis=0))
+            np.matmul(united.reshape(-1, num_chirps), operator.T, out=out[tx].reshape(-1, num_chirps))
     return out
+
+
+def _correlate(masked: np.ndarray, out: np.ndarray, window: np.ndarray, turn: np.ndarray, first: bool) -> None:
+    part = scipy.fft.fft(masked * window, axis=-1, workers=1, overwrite_x=True) * turn
+    out[...] = part if first else out + part
+
+
+def union_operator(waveform: Waveform, group: np.ndarray) -> np.ndarray:
+    """(P, P) complex64: from one antenna's samples, slot p heard in `group[p]`, to its windowed Doppler spectrum.
+
+    The samples lie at p + group[p] * 2 T_d / T-, not quite uniformly. Turning each bin by its own group phase would match that bin
+    and leave sidelobes of -31 dB of every other velocity; the plain DFT leaves them at high velocity. Solving for the
+    spectrum that takes these values at these times (the system is near the identity) leaves neither.
+    """
+    w, p = waveform, np.arange(waveform.num_chirps)
+    bins = np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
+    times = p + group * (w.group_spacing / w.slot_duration)
+    synthesis = np.exp(2j * np.pi * np.outer(times, bins) / w.num_chirps)
+    uniform = np.exp(2j * np.pi * np.outer(p, bins) / w.num_chirps)
+    resample = np.linalg.solve(synthesis.T, uniform.T).T
+    return (uniform.conj().T @ (slow_window(w)[:, None] * resample)).astype(np.complex64)
 
 
 def accumulate(maps: np.ndarray) -> np.ndarray:
