@@ -1,0 +1,544 @@
+"""One self-describing file per run: what is recorded of every frame, how it is summed up, saved and loaded.
+
+`Recorder` collects frames and makes one `xarray.Dataset` with named dimensions; what differs in number from frame to
+frame (detections, tracks, paths) is ragged: flat arrays beside their frame and observer. Nothing that depends on the
+clock of the machine is in the dataset, so two runs of one scenario give bit-identical variables.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.receive.types import Reception
+from isac_rt.scenario import Scenario
+from isac_rt.scenario_file import to_yaml
+from isac_rt.swarm import Pose
+from isac_rt.waveform import Waveform
+
+KINDS = tuple(kind.name.lower() for kind in PathKind)
+SYMBOLS = ("delay", "dpsk", "bit")
+MEASURES = {"range": ("m", "range_m"), "velocity": ("m s-1", "velocity_mps"), "azimuth": ("rad", "azimuth_deg"),
+            "elevation": ("rad", "elevation_deg")}  # fmt: skip
+"""What is estimated of a UAV: unit inside, key in the summary."""
+TIMINGS = ("setup", "trace", "synthesis", "receive", "track", "total")
+PACKAGES = ("isac_rt", "numpy", "scipy", "numba", "drjit", "mitsuba", "sionna-rt", "trimesh", "xarray", "h5netcdf", "pydantic")
+FILE = "results.nc"
+
+
+class ResultsError(Exception):
+    """Results cannot be written or read; the text says why and what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UavValues:
+    """One value per UAV of the scenario, in its order: truth, or estimates with NaN where a UAV was not matched.
+
+    Attributes
+    ----------
+    range, velocity : (U,) [m], [m/s, positive receding]; one way from the observer
+    azimuth, elevation : (U,) [rad] in the observer's body frame
+    """
+
+    range: np.ndarray
+    velocity: np.ndarray
+    azimuth: np.ndarray
+    elevation: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackTable:
+    """The tracks that an observer keeps after a frame, one row each: id, range [m], velocity [m/s], direction cosines,
+    whether confirmed, and the index of the UAV that the track follows in truth (-1: none)."""
+
+    id: np.ndarray
+    range: np.ndarray
+    velocity: np.ndarray
+    u_x: np.ndarray
+    u_z: np.ndarray
+    confirmed: np.ndarray
+    uav: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymbolCount:
+    """Symbols (or bits) sent to an observer in a frame. `errors` holds the undecided ones, `erased`, as well."""
+
+    errors: int = 0
+    erased: int = 0
+    total: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObserverRecord:
+    """What one receiving terminal had and made of one frame.
+
+    Attributes
+    ----------
+    transmitter : whose chirps it received
+    reception : what it found
+    paths : what it received
+    truth, detected, tracked : over all UAVs; estimates are NaN where none is associated
+    in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
+    tracks : after this frame
+    state : code of the terminal's state, an index into the recorder's `states`
+    detection_kind, detection_target : (Q,) what explains each detection: a `PathKind` or -1, a UAV index or -1
+    delay, dpsk, bit : symbol counts
+    num_false : detections that no path explains
+    slips : symbols decided outside their alphabet
+    reference_snr : per sample and antenna before processing (linear); NaN where there is no reference path
+    """
+
+    transmitter: str
+    reception: Reception
+    paths: PathSet
+    truth: UavValues
+    detected: UavValues
+    tracked: UavValues
+    in_view: np.ndarray
+    shadowed: np.ndarray
+    tracks: TrackTable
+    state: int
+    detection_kind: np.ndarray
+    detection_target: np.ndarray
+    delay: SymbolCount = SymbolCount()
+    dpsk: SymbolCount = SymbolCount()
+    bit: SymbolCount = SymbolCount()
+    num_false: int = 0
+    slips: int = 0
+    reference_snr: float = np.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecord:
+    """One frame: its index, the time of its middle [s], all poses then, and every observer that received in it.
+    Of a `snapshot` frame the whole path ledger and the maps are kept."""
+
+    frame: int
+    time: float
+    modulated: bool
+    poses: Mapping[str, Pose]
+    observers: Mapping[str, ObserverRecord]
+    snapshot: bool = False
+
+
+@dataclass(frozen=True)
+class Results:
+    """A run: labelled arrays, the summary of `summary.json`, and the scenario that made them."""
+
+    dataset: xr.Dataset
+    summary: dict[str, Any]
+    scenario: Scenario
+
+
+@dataclass
+class Recorder:
+    """Collects the frames of a run. `observers` are the receiving terminals, `states` the names of their state codes."""
+
+    scenario: Scenario
+    waveform: Waveform
+    observers: Sequence[str]
+    states: Sequence[str]
+    _frames: list[FrameRecord] = field(default_factory=list)
+
+    def add(self, record: FrameRecord) -> None:
+        """Append the next frame. Of frames that are no snapshots the paths are counted and let go."""
+        rows = {name: _slim(o, record.snapshot) for name, o in record.observers.items()}
+        self._frames.append(FrameRecord(**{**vars(record), "observers": rows}))
+
+    def finish(
+        self,
+        *,
+        timing: Mapping[str, float],
+        fidelity: Mapping[str, Any],
+        materials: Mapping[str, Any] | None = None,
+        link_budget: Sequence[Mapping[str, Any]] = (),
+    ) -> Results:
+        """The results of the frames so far. `timing` [s] goes into the summary only; `materials` and `link_budget`
+        (rows of a table) are kept as JSON attributes of the dataset."""
+        from isac_rt.summary import summarize
+
+        dataset = _Builder(self.scenario, self.waveform, tuple(self.observers), tuple(self.states), self._frames).dataset()
+        dataset.attrs |= {
+            **provenance(self.scenario),
+            "fidelity": json.dumps(dict(fidelity)),
+            "materials": json.dumps(dict(materials or {})),
+            "link_budget": json.dumps([dict(row) for row in link_budget]),
+        }
+        return Results(dataset, summarize(dataset, self.scenario, timing, fidelity), self.scenario)
+
+
+@dataclass(frozen=True)
+class _Slim:
+    """An `ObserverRecord` with its paths reduced to numbers and power by kind, and the ledger of a snapshot."""
+
+    record: ObserverRecord
+    counts: np.ndarray
+    power: np.ndarray
+    ledger: PathSet | None
+
+
+def _slim(o: ObserverRecord, snapshot: bool) -> Any:
+    kind, power = o.paths.kind, o.paths.power
+    counts = np.bincount(kind, minlength=len(KINDS))
+    total = np.bincount(kind, weights=power, minlength=len(KINDS))
+    return _Slim(ObserverRecord(**{**vars(o), "paths": o.paths.select(np.zeros(0, int))}), counts, total, o.paths if snapshot else None)
+
+
+def versions() -> dict[str, str]:
+    """Python's version and that of every package that a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def commit() -> str:
+    """Commit of the checkout that this package lies in, with ``+changes`` where it was edited; "" outside a checkout."""
+    folder = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # an installed copy may lie inside somebody else's checkout
+        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--", ".") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def provenance(scenario: Scenario) -> dict[str, str | int]:
+    """Attributes that say where a file comes from: scenario, seed, versions, commit, platform."""
+    return {
+        "title": f"isac_rt: {scenario.name}",
+        "scenario": to_yaml(scenario),
+        "seed": scenario.seed,
+        "versions": json.dumps(versions()),
+        "commit": commit(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "Conventions": "CF-1.11",
+    }
+
+
+_DIMENSIONLESS = "1"
+
+
+@dataclass
+class _Builder:
+    """Turns recorded frames into a dataset."""
+
+    scenario: Scenario
+    waveform: Waveform
+    observers: tuple[str, ...]
+    states: tuple[str, ...]
+    frames: list[FrameRecord]
+    out: dict[str, xr.Variable] = field(default_factory=dict)
+
+    def put(self, name: str, dims: Sequence[str], values: Any, units: str, long_name: str, **attrs: Any) -> None:
+        self.out[name] = xr.Variable(tuple(dims), np.asarray(values), {"units": units, "long_name": long_name, **attrs})
+
+    def over(self, value: Callable[[_Slim], Any], missing: Any, dtype: type) -> np.ndarray:
+        """(frame, observer, ...) of a value of each record; `missing` where an observer did not receive in a frame."""
+        rows = [[value(f.observers[o]) if o in f.observers else missing for o in self.observers] for f in self.frames]
+        return np.array(rows, dtype=dtype).reshape(len(self.frames), len(self.observers), *np.shape(missing))
+
+    def records(self) -> list[tuple[int, int, _Slim]]:
+        """(position of the frame, of the observer, record) in order."""
+        return [(i, j, f.observers[o]) for i, f in enumerate(self.frames) for j, o in enumerate(self.observers) if o in f.observers]
+
+    def dataset(self) -> xr.Dataset:
+        self.frame_values()
+        self.uav_values()
+        self.counts()
+        self.detections()
+        self.tracks()
+        self.ledger()
+        self.maps()
+        w = self.waveform
+        numbers = {
+            "carrier_hz": w.carrier_frequency, "effective_carrier_hz": w.effective_carrier, "frame_duration_s": w.frame_duration,
+            "frame_interval_s": self.scenario.frame_interval_s or w.frame_duration, "range_cell_m": w.range_cell(1),
+            "velocity_cell_mps": w.velocity_cell(1),
+        }  # fmt: skip
+        return xr.Dataset(self.out, attrs=numbers)
+
+    def frame_values(self) -> None:
+        names = list(self.scenario.swarm)
+        self.put("frame", ["frame"], np.array([f.frame for f in self.frames], np.int64), _DIMENSIONLESS, "index of the frame")
+        self.put("observer", ["observer"], np.array(self.observers, object), _DIMENSIONLESS, "receiving terminal")
+        self.put("uav", ["uav"], np.array(names, object), _DIMENSIONLESS, "unmanned aerial vehicle")
+        self.put("role", ["uav"], np.array([self.scenario.swarm[n].role for n in names], object), _DIMENSIONLESS, "role of the UAV")
+        self.put("kind", ["kind"], np.array(KINDS, object), _DIMENSIONLESS, "kind of path")
+        self.put("symbol", ["symbol"], np.array(SYMBOLS, object), _DIMENSIONLESS, "kind of symbol")
+        self.put("axis", ["axis"], np.array(list("xyz"), object), _DIMENSIONLESS, "world axis: east, north, up")
+        self.put("body_axis", ["body_axis"], np.array(["right", "boresight", "up"], object), _DIMENSIONLESS, "body axis")
+        self.put("time", ["frame"], np.array([f.time for f in self.frames], float), "s", "time of the middle of the frame")
+        self.put("modulated", ["frame"], np.array([f.modulated for f in self.frames], bool), _DIMENSIONLESS, "the frame carries data")
+        senders = {o: next((f.observers[o].record.transmitter for f in self.frames if o in f.observers), "") for o in self.observers}
+        self.put("transmitter", ["observer"], np.array(list(senders.values()), object), _DIMENSIONLESS, "terminal that is received")
+        for name, units in (("position", "m"), ("velocity", "m s-1"), ("acceleration", "m s-2")):
+            values = np.array([[getattr(f.poses[n], name) for n in names] for f in self.frames], float).reshape(-1, len(names), 3)
+            self.put(f"uav_{name}", ["frame", "uav", "axis"], values, units, f"{name} of the UAV in world axes")
+        turned = np.array([[f.poses[n].rotation for n in names] for f in self.frames], float).reshape(-1, len(names), 3, 3)
+        self.put("uav_attitude", ["frame", "uav", "axis", "body_axis"], turned, _DIMENSIONLESS, "body axes of the UAV in world axes")
+
+    def uav_values(self) -> None:
+        count = len(self.scenario.swarm)
+        none, no = np.full(count, np.nan), np.zeros(count, bool)
+        dims = ["frame", "observer", "uav"]
+        meaning = {"truth": "true", "detected": "detected", "tracked": "tracked"}
+        for group, word in meaning.items():
+            for name, (units, _) in MEASURES.items():
+                values = self.over(lambda s, g=group, n=name: getattr(getattr(s.record, g), n), none, float)
+                self.put(f"{group}_{name}", dims, values, units, f"{word} {name} of the UAV, seen by the observer")
+        self.put("in_view", dims, self.over(lambda s: s.record.in_view, no, bool), _DIMENSIONLESS, "UAV inside the field of view")
+        self.put("shadowed", dims, self.over(lambda s: s.record.shadowed, no, bool), _DIMENSIONLESS, "UAV hidden by the city")
+
+    def counts(self) -> None:
+        two, zero = ["frame", "observer"], np.zeros(len(KINDS))
+        self.put("processed", two, self.over(lambda s: True, False, bool), _DIMENSIONLESS, "the observer processed the frame")
+        self.put("state", two, self.over(lambda s: s.record.state, -1, np.int8), _DIMENSIONLESS, "state of the terminal, -1: not processed",
+                 flag_values=np.arange(len(self.states), dtype=np.int8), flag_meanings=" ".join(self.states))  # fmt: skip
+        for name, text, get in (
+            ("decoded", "data symbols were decided", lambda s: s.record.reception.decoded),
+            ("line_of_sight", "the receiver says that it sees its reference path", lambda s: s.record.reception.line_of_sight),
+        ):
+            self.put(name, two, self.over(get, False, bool), _DIMENSIONLESS, text)
+        power = self.over(lambda s: s.record.reception.reference_power, np.nan, float)
+        self.put("reference_power", two, power, "W", "mean power of the reference path per sample and antenna, as received")
+        self.put("reference_snr", two, self.over(lambda s: s.record.reference_snr, np.nan, float), _DIMENSIONLESS,
+                 "SNR of the reference path per sample and antenna before processing, linear")  # fmt: skip
+        self.put("num_false", two, self.over(lambda s: s.record.num_false, 0, np.int32), _DIMENSIONLESS, "detections that no path explains")
+        self.put("slips", two, self.over(lambda s: s.record.slips, 0, np.int32), _DIMENSIONLESS, "symbols decided outside their alphabet")
+        self.put("path_count", [*two, "kind"], self.over(lambda s: s.counts, zero, np.int32), _DIMENSIONLESS, "number of paths")
+        self.put("path_power", [*two, "kind"], self.over(lambda s: s.power, zero, float), _DIMENSIONLESS, "sum of |gain|^2 of the paths")
+        for name, text in (("errors", "wrong or undecided"), ("erased", "undecided"), ("total", "sent to the observer")):
+            values = self.over(lambda s, n=name: [getattr(getattr(s.record, k), n) for k in SYMBOLS], np.zeros(3), np.int64)
+            self.put(f"symbol_{name}", [*two, "symbol"], values, _DIMENSIONLESS, f"symbols, {text}")
+
+    def ragged(self, prefix: str, dim: str, rows: list[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]) -> None:
+        """Flat columns over `dim` with the frame and the observer of every row; a column is (dtype, unit, meaning)."""
+        count = [len(next(iter(r[2].values()))) for r in rows]
+        index = np.repeat(np.array([r[:2] for r in rows], np.int32).reshape(-1, 2), count, axis=0)
+        self.put(f"{prefix}_frame", [dim], index[:, 0], _DIMENSIONLESS, "position along the dimension frame")
+        self.put(f"{prefix}_observer", [dim], index[:, 1], _DIMENSIONLESS, "position along the dimension observer")
+        for name, (dtype, units, text) in columns.items():
+            parts = [np.asarray(r[2][name], dtype) for r in rows]
+            self.put(f"{prefix}_{name}", [dim], np.concatenate(parts) if parts else np.zeros(0, dtype), units, text)
+
+    def detections(self) -> None:
+        rows = []
+        for i, j, s in self.records():
+            d = s.record.reception.detections
+            rows.append((i, j, {
+                "range": d.range, "velocity": d.velocity, "u_x": d.direction[:, 0], "u_z": d.direction[:, 1], "snr": d.snr,
+                "range_std": d.std[:, 0], "velocity_std": d.std[:, 1], "u_x_std": d.std[:, 2], "u_z_std": d.std[:, 3],
+                "is_reference": d.is_reference, "kind": s.record.detection_kind, "target": s.record.detection_target,
+            }))  # fmt: skip
+        self.ragged("det", "detection", rows, {
+            "range": (float, "m", "range of the detection; one way at the AT, path length at a PT"),
+            "velocity": (float, "m s-1", "rate of the range, positive receding"),
+            "u_x": (float, _DIMENSIONLESS, "direction cosine along the body's X axis"),
+            "u_z": (float, _DIMENSIONLESS, "direction cosine along the body's Z axis"),
+            "snr": (float, _DIMENSIONLESS, "SNR of the range-Doppler cell, linear"),
+            "range_std": (float, "m", "standard deviation of the range"),
+            "velocity_std": (float, "m s-1", "standard deviation of the velocity"),
+            "u_x_std": (float, _DIMENSIONLESS, "standard deviation of u_x"), "u_z_std": (float, _DIMENSIONLESS, "standard deviation of u_z"),
+            "is_reference": (bool, _DIMENSIONLESS, "line of sight at a PT"),
+            "kind": (np.int8, _DIMENSIONLESS, "kind of the path that explains it, -1: none"),
+            "target": (np.int16, _DIMENSIONLESS, "index of the UAV that explains it, -1: none"),
+        })  # fmt: skip
+
+    def tracks(self) -> None:
+        rows = [(i, j, vars(s.record.tracks)) for i, j, s in self.records()]
+        self.ragged("track", "track", rows, {
+            "id": (np.int32, _DIMENSIONLESS, "number of the track, unique at its observer"), "range": (float, "m", "range of the track"),
+            "velocity": (float, "m s-1", "radial velocity of the track, positive receding"),
+            "u_x": (float, _DIMENSIONLESS, "direction cosine along the body's X axis"),
+            "u_z": (float, _DIMENSIONLESS, "direction cosine along the body's Z axis"),
+            "confirmed": (bool, _DIMENSIONLESS, "the track is confirmed"),
+            "uav": (np.int16, _DIMENSIONLESS, "index of the UAV that it follows, -1: none"),
+        })  # fmt: skip
+
+    def ledger(self) -> None:
+        kept = [(i, j, s.ledger) for i, j, s in self.records() if s.ledger is not None]
+        rows = [(i, j, {**_path_columns(p), "target": self._uav_index(p)}) for i, j, p in kept]
+        self.ragged("path", "path", rows, PATH_COLUMNS)
+
+    def _uav_index(self, paths: PathSet) -> np.ndarray:
+        """Targets of a path set as indices of the scenario's UAVs."""
+        order = list(self.scenario.swarm)
+        lookup = np.array([order.index(name) for name in paths.target_names] + [-1])
+        return lookup[paths.target]
+
+    def maps(self) -> None:
+        shots = [i for i, f in enumerate(self.frames) if any(s.record.reception.maps is not None for s in f.observers.values())]
+        found = [(k, j, s.record.reception.maps) for k, i in enumerate(shots)
+                 for j, o in enumerate(self.observers) if (s := self.frames[i].observers.get(o)) and s.record.reception.maps is not None]  # fmt: skip
+        rows, doppler = (max((m.range_doppler.shape[a] for _, _, m in found), default=0) for a in (0, 1))
+        cells, chirps = (max((m.equivalent_range.shape[a] for _, _, m in found), default=0) for a in (0, 1))
+        head = (len(shots), len(self.observers))
+        power, equivalent = np.full((*head, rows, doppler), np.nan, np.float32), np.full((*head, cells, chirps), np.nan, np.float32)
+        ranges, speeds = np.full((head[1], rows), np.nan), np.full((head[1], doppler), np.nan)
+        for k, j, m in found:
+            power[k, j, : m.range_doppler.shape[0], : m.range_doppler.shape[1]] = m.range_doppler
+            equivalent[k, j, : m.equivalent_range.shape[0], : m.equivalent_range.shape[1]] = m.equivalent_range
+            ranges[j, : m.range_axis.size], speeds[j, : m.velocity_axis.size] = m.range_axis, m.velocity_axis
+        self.put("snapshot_frame", ["snapshot"], np.array(shots, np.int32), _DIMENSIONLESS, "position along the dimension frame")
+        self.put("map_power", ["snapshot", "observer", "row", "doppler"], power, "W", "range-Doppler map, accumulated over antennas")
+        self.put("map_range", ["observer", "row"], ranges, "m", "range of the map's rows")
+        self.put("map_velocity", ["observer", "doppler"], speeds, "m s-1", "velocity of the map's columns")
+        self.put("map_equivalent_range", ["snapshot", "observer", "cell", "chirp"], equivalent, "W0.5",
+                 "magnitude over range cell and chirp before data removal")  # fmt: skip
+
+
+PATH_COLUMNS: dict[str, tuple] = {
+    "gain_re": (float, _DIMENSIONLESS, "real part of the complex gain without carrier phase"),
+    "gain_im": (float, _DIMENSIONLESS, "imaginary part of the complex gain without carrier phase"),
+    "power_db": (float, "dB", "|gain|^2"),
+    "delay": (float, "s", "delay at the middle of the frame"),
+    "delay_rate": (float, _DIMENSIONLESS, "rate of the delay"),
+    "delay_accel": (float, "s-1", "second derivative of the delay"),
+    **{f"departure_{a}": (float, _DIMENSIONLESS, f"{a} of the unit vector along the first segment, world axes") for a in "xyz"},
+    **{f"arrival_{a}": (float, _DIMENSIONLESS, f"{a} of the unit vector towards where the wave comes from, world axes") for a in "xyz"},
+    "kind": (np.int8, _DIMENSIONLESS, "kind of path, an index into the dimension kind"),
+    "target": (np.int16, _DIMENSIONLESS, "index of the UAV involved, -1: none"),
+    "bounces": (np.int16, _DIMENSIONLESS, "interactions with the city"),
+    "begin": (float, "s", "start of the path's life since the middle of the frame"),
+    "end": (float, "s", "end of the path's life since the middle of the frame"),
+}
+
+
+def _path_columns(p: PathSet) -> dict[str, np.ndarray]:
+    with np.errstate(divide="ignore"):
+        power_db = 10 * np.log10(p.power)
+    columns = {"gain_re": p.gain.real, "gain_im": p.gain.imag, "power_db": power_db}
+    columns |= {name: getattr(p, name) for name in ("delay", "delay_rate", "delay_accel", "kind", "target", "bounces", "begin", "end")}
+    columns |= {f"{end}_{a}": getattr(p, end)[:, i] for end in ("departure", "arrival") for i, a in enumerate("xyz")}
+    return columns
+
+
+def _atomically(file: Path, write: Callable[[Path], None]) -> None:
+    """Have `write` make a file under a temporary name beside `file`, then put it in place whole; or raise and leave nothing."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        os.replace(temporary, file)
+    except OSError as problem:
+        reason = problem.strerror or str(problem)
+        raise ResultsError(f"cannot write {file}: {reason}; choose another place with --out, or make room") from problem
+    finally:
+        try:
+            temporary.unlink(missing_ok=True)
+        except OSError:  # its folder is no folder: there is nothing to take away
+            pass
+
+
+def write_text(file: Path, text: str) -> None:
+    """A text file that appears whole or not at all."""
+    _atomically(Path(file), lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_bytes(file: Path, write: Callable[[Path], None]) -> None:
+    """A file made by `write(temporary path)` that appears whole or not at all."""
+    _atomically(Path(file), write)
+
+
+def _write_dataset(dataset: xr.Dataset, file: Path) -> None:
+    encoding = {
+        name: {"zlib": True, "complevel": 4, "shuffle": True} for name, v in dataset.variables.items() if v.dtype != object and v.ndim and v.size
+    }
+    _atomically(file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding))
+
+
+def save(results: Results, folder: str | Path) -> None:
+    """Write ``results.nc``, ``summary.json`` and ``scenario.yaml`` into `folder`; each appears whole or not at all.
+
+    Raises
+    ------
+    ResultsError  If the folder cannot be written.
+    """
+    folder = Path(folder)
+    _write_dataset(results.dataset, folder / FILE)
+    write_text(folder / "scenario.yaml", to_yaml(results.scenario))
+    write_text(folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n")
+
+
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder that cannot be made or written, before a long run rather than after it."""
+    probe = Path(folder) / ".writable"
+    write_text(probe, "")
+    probe.unlink(missing_ok=True)
+
+
+def load(folder: str | Path) -> Results:
+    """Results that `save` wrote into `folder`.
+
+    Raises
+    ------
+    ResultsError  If a file is missing or is not one of ours.
+    """
+    from isac_rt.scenario_file import load as load_scenario
+
+    folder = Path(folder)
+    try:
+        with xr.open_dataset(folder / FILE, engine="h5netcdf") as opened:
+            dataset = opened.load()
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise ResultsError(f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote") from problem
+    return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))
+
+
+def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario) -> None:
+    """Write the path ledger of one frame, all links, as NetCDF.
+
+    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront radii, the transmitter and
+    receiver of each, interaction points (path, bounce, axis) [m] and faces of the city mesh (path, bounce).
+
+    Raises
+    ------
+    ResultsError  If the file cannot be written.
+    """
+    depth = max((p.faces.shape[1] for p in paths.values()), default=0)
+    names = next((p.target_names for p in paths.values() if p.target_names), ())
+    out: dict[str, xr.Variable] = {}
+
+    def put(name: str, dims: Sequence[str], parts: list[np.ndarray], empty: np.ndarray, units: str, text: str) -> None:
+        out[name] = xr.Variable(dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text})
+
+    def column(name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str) -> None:
+        put(name, ["path"], [np.asarray(get(p), dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
+
+    column("transmitter", lambda p: np.full(len(p), p.tx, object), object, _DIMENSIONLESS, "transmitting terminal")
+    column("receiver", lambda p: np.full(len(p), p.rx, object), object, _DIMENSIONLESS, "receiving terminal")
+    for name, (dtype, units, text) in PATH_COLUMNS.items():
+        column(name, lambda p, n=name: _path_columns(p)[n], dtype, units, text)
+    carrier = scenario.radio.carrier_hz
+    column("doppler", lambda p: -carrier * p.delay_rate, float, "Hz", "Doppler shift at the carrier, positive closing")
+    column("tx_radius", lambda p: p.tx_radius, float, "m", "radius of curvature of the wavefront at the transmitter")
+    column("rx_radius", lambda p: p.rx_radius, float, "m", "radius of curvature of the wavefront at the receiver")
+    pad = lambda a, fill: np.pad(a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill)  # noqa: E731
+    put("points", ["path", "bounce", "axis"], [pad(p.points, np.nan) for p in paths.values()], np.zeros((0, depth, 3)), "m",
+        "interaction points in world axes, NaN where there is none")  # fmt: skip
+    put("faces", ["path", "bounce"], [pad(p.faces, -1) for p in paths.values()], np.zeros((0, depth), np.int32), _DIMENSIONLESS,
+        "face of the city mesh at each point, -1 where there is none")  # fmt: skip
+    out["kind_name"] = xr.Variable(["kind"], np.array(KINDS, object), {"units": _DIMENSIONLESS, "long_name": "name of each kind of path"})
+    out["target_name"] = xr.Variable(["uav"], np.array(names, object), {"units": _DIMENSIONLESS, "long_name": "name that target indexes"})
+    epoch = next((p.epoch for p in paths.values()), np.nan)
+    _write_dataset(xr.Dataset(out, attrs={**provenance(scenario), "epoch_s": epoch}), Path(file))

@@ -1,0 +1,120 @@
+"""A small made-up run, driven through the recorder: for the tests of results, figures, report and command line."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.types import Detections, Maps, Reception
+from isac_rt.results import FrameRecord, ObserverRecord, Recorder, Results, SymbolCount, TrackTable, UavValues
+from isac_rt.scenario import Scenario, Uav
+from isac_rt.swarm import Swarm
+from isac_rt.waveform import waveform_of
+
+STATES = ("acquiring", "tracking", "lost")
+TIMING = {"setup": 1.25, "trace": 2.5, "synthesis": 3.75, "receive": 4.5, "track": 0.125, "total": 12.125}
+
+
+def fake_scenario(frames: int = 7) -> Scenario:
+    uavs = {
+        "AT": Uav(role="active", position_m=(1.3, -20.7, 9.1), velocity_mps=(0.4, 6.1, 0.1)),
+        "PT1": Uav(role="passive", position_m=(4.2, 13.7, 11.4), velocity_mps=(-0.3, -3.1, 0.2)),
+        "U1": Uav(role="target", position_m=(-1.3, -4.9, 10.1), velocity_mps=(0.5, 9.7, 0.3)),
+    }
+    return Scenario(name="fake", seed=11, frames=frames, frame_interval_s=0.043, swarm=uavs)
+
+
+def _values(own, poses, error: float = 0.0, keep=None) -> UavValues:
+    columns = []
+    for k, pose in enumerate(poses.values()):
+        offset = pose.position - own.position
+        distance = np.linalg.norm(offset)
+        if distance == 0:
+            columns.append([0.0, 0.0, 0.0, 0.0])
+            continue
+        e = own.to_body(offset / distance)
+        rate = (offset / distance) @ (pose.velocity - own.velocity)
+        row = np.array([distance + error, rate - 2 * error, np.arctan2(e[0], e[1]) + error / 10, np.arcsin(e[2])])
+        columns.append(row if keep is None or keep[k] else row * np.nan)
+    r, v, a, e = np.array(columns).T
+    return UavValues(range=r, velocity=v, azimuth=a, elevation=e)
+
+
+def _paths(own, poses, tx, rx, rng, count=23):
+    kind = np.concatenate([[PathKind.LEAKAGE if tx == rx else PathKind.LINE_OF_SIGHT, PathKind.TARGET], rng.integers(2, 5, count - 2)])
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return make_paths(
+        gain=10 ** (-4 - 2 * rng.random(count)) * np.exp(2j * np.pi * rng.random(count)),
+        delay=rng.uniform(3e-8, 6e-7, count), delay_rate=rng.normal(0, 3e-8, count), departure=u, arrival=-u, kind=kind,
+        epoch=0.1, tx=tx, rx=rx, target=np.where(kind == PathKind.TARGET, 2, -1), bounces=np.where(kind == PathKind.SPECULAR, 1, 0),
+        target_names=tuple(poses), points=rng.normal(0, 9, (count, 2, 3)), faces=rng.integers(0, 40, (count, 2)),
+    )  # fmt: skip
+
+
+def _maps(w, rng, passes):
+    rows, doppler = 40, w.num_chirps
+    power = rng.exponential(1e-12, (rows, doppler))
+    power[17, 60] = 3e-9
+    speed = (np.arange(doppler) - doppler // 2) * w.velocity_cell(passes)
+    return Maps(range_doppler=power, range_axis=np.arange(rows) * w.range_cell(passes), velocity_axis=speed,
+                equivalent_range=rng.rayleigh(1e-6, (64, doppler)))  # fmt: skip
+
+
+def _reception(w, rng, truth, maps, decoded, detections):
+    found = Detections(
+        range=truth.range[2] + rng.normal(0, 0.05, detections), velocity=truth.velocity[2] + rng.normal(0, 0.1, detections),
+        direction=rng.uniform(-0.5, 0.5, (detections, 2)), snr=rng.uniform(20, 400, detections),
+        std=np.full((detections, 4), 0.07), is_reference=np.zeros(detections, bool),
+    )  # fmt: skip
+    none = np.full((1, 1), -1)
+    return Reception(detections=found, decoded=decoded, delay_symbols=none, transitions=none, bits=np.zeros(0, np.uint8),
+                     delay_confidence=none, transition_confidence=none, raw_delay_symbols=none, line_of_sight=decoded,
+                     reference_power=3.3e-13, maps=maps)  # fmt: skip
+
+
+def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord]:
+    """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3, and U1 is hidden in frame 4."""
+    w, swarm, out = waveform_of(scenario), Swarm.from_scenario(scenario), []
+    for f in range(scenario.frames):
+        rng = np.random.default_rng([5, f])
+        poses, snapshot, data = swarm.poses(f * 0.043 + 0.004), f == 2, f > 0
+        observers = {}
+        for name in ("AT", "PT1") if f % 2 == 0 else ("PT1",):
+            own = poses[name]
+            truth = _values(own, poses)
+            hidden = np.array([False, False, f == 4])
+            see = np.array([name == "PT1", False, True]) & ~hidden
+            lost = 90 if f == 3 else 0
+            sent = data and name == "PT1"
+            observers[name] = ObserverRecord(
+                transmitter="AT",
+                reception=_reception(w, rng, truth, _maps(w, rng, 2 if name == "AT" else 1) if snapshot else None, sent, detections),
+                paths=_paths(own, poses, "AT", name, rng),
+                truth=truth,
+                detected=_values(own, poses, 0.0637, see),
+                tracked=_values(own, poses, 0.0213, see),
+                in_view=np.array([name == "PT1", False, True]),
+                shadowed=hidden,
+                tracks=TrackTable(id=np.array([4]), range=truth.range[2:], velocity=truth.velocity[2:], u_x=np.array([0.1]),
+                                  u_z=np.array([0.02]), confirmed=np.array([True]), uav=np.array([2])),
+                state=int(f > 0),
+                detection_kind=np.array([1, 3, -1, 4][:detections]) if detections else np.zeros(0, int),
+                detection_target=np.array([2, -1, -1, -1][:detections]) if detections else np.zeros(0, int),
+                delay=SymbolCount(errors=lost // 3, erased=lost // 3, total=360) if sent else SymbolCount(),
+                dpsk=SymbolCount(errors=lost, erased=lost // 2, total=351) if sent else SymbolCount(),
+                bit=SymbolCount(errors=2 * lost, erased=lost, total=4293) if sent else SymbolCount(),
+                num_false=1,
+                reference_snr=7.7,
+            )  # fmt: skip
+        out.append(FrameRecord(frame=f, time=f * 0.043 + 0.004, modulated=data, poses=poses, observers=observers, snapshot=snapshot))
+    return out
+
+
+def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
+    scenario = scenario or fake_scenario()
+    recorder = Recorder(scenario, waveform_of(scenario), ("AT", "PT1"), STATES)
+    for record in fake_records(scenario, detections=detections):
+        recorder.add(record)
+    budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
+    return recorder.finish(timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)
