@@ -1,0 +1,78 @@
+"""Slow reference implementations, written from the equations and sharing no code with the package."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LIGHT = np.longdouble(299_792_458)
+
+
+def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition):
+    """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long double).
+
+    Times are counted from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are
+    placed as points: a path with a radius comes from (goes to) a point at this distance; a line of sight joins two elements.
+    """
+    ld = np.longdouble
+    period = ld(1) / ld(w.sampling_rate)
+    window = ld(w.num_samples) * period
+    longest = ld(w.sampling_rate) * window / (ld(w.bandwidth) - 2 * ld(w.sampling_rate))
+    chirp = window + 2 * longest
+    slope = ld(w.bandwidth) / chirp
+    slot = chirp + 2 * w.num_tx * longest
+    frame = w.num_chirps * slot
+    fast = np.arange(w.num_samples).astype(ld) * period + 2 * longest
+
+    def oscillator(since):  # phase of a chirp in cycles
+        return ld(w.carrier_frequency) * since + slope * since * since / 2
+
+    rx = (rx_pose.rotation @ rx_antennas.rx_positions.T).T.astype(ld)
+    out = np.zeros((w.num_groups, len(rx), w.num_chirps, w.num_samples), np.complex128)
+    for sender, paths in links:
+        tx = (sender.pose.rotation @ sender.antennas.tx_positions.T).T.astype(ld)
+        for m, source, p, k in np.ndindex(w.num_groups, w.num_groups, w.num_chirps, len(paths)):
+            a = sender.schedule[source, p]
+            begun = 2 * source * longest + ld(sender.payload.delay_symbols[source, p]) / (slope * window)
+            slot_time = 2 * m * longest + fast
+            t = slot_time + p * slot - frame / 2
+            tau = ld(paths.delay[k]) + ld(sender.clock_offset) + (ld(paths.delay_rate[k]) + ld(sender.clock_drift)) * t
+            tau = tau + ld(paths.delay_accel[k]) * t * t / 2
+            middle = begun + tau[w.num_samples // 2] - 2 * m * longest
+            beat = float(slope * middle)
+            if -transition < beat < 0:
+                gain = np.cos(np.pi * beat / transition / 2) ** 2
+            elif w.sampling_rate < beat < w.sampling_rate + transition:
+                gain = np.cos(np.pi * (beat - w.sampling_rate) / transition / 2) ** 2
+            else:
+                gain = float(0 <= beat <= w.sampling_rate)
+            lives = (paths.begin[k] <= t) & (t < paths.end[k])
+            on = 1.0 if sender.active is None else sender.active[source, p]
+            sent = sender.amplitude * np.conj(sender.payload.phases[source, p]) * on
+            for r in range(len(rx)):
+                extra = _element_path(paths, k, tx[a], rx[r]) / LIGHT
+                cycles = oscillator(slot_time - begun - tau - extra)
+                turn = oscillator(slot_time - 2 * m * longest) - cycles
+                turn = (turn - np.floor(turn)).astype(float)
+                received = paths.gain[k] * sent * gain * lives
+                out[m, r, p] += np.conj(received) * np.exp(2j * np.pi * turn)
+    return out
+
+
+def _element_path(paths, k, tx, rx):
+    """How much longer the path between two elements is than that between the centroids [m]."""
+    ld = np.longdouble
+    d, u = paths.departure[k].astype(ld), paths.arrival[k].astype(ld)
+    if paths.kind[k] == 0 and np.isfinite(paths.rx_radius[k]):
+        length = ld(paths.rx_radius[k])
+        return _norm(length * d + rx - tx) - length
+    total = ld(0)
+    for element, direction, radius in ((tx, d, paths.tx_radius[k]), (rx, u, paths.rx_radius[k])):
+        if np.isinf(radius):
+            total -= element @ direction
+        else:
+            total += _norm(ld(radius) * direction - element) - ld(radius)
+    return total
+
+
+def _norm(v):
+    return np.sqrt((v * v).sum())

@@ -1,0 +1,101 @@
+"""Noise: known answers of the generator, distribution, independence. False-failure rates are stated; seeds are fixed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from isac_rt.arrays import conventional_schedule
+from isac_rt.ifsignal import IFCube, add_noise
+from isac_rt.noise import _words, add_white_noise
+from isac_rt.randomness import seed_sequence
+from isac_rt.waveform import Waveform
+
+COUNT = 1 << 20
+SIGMAS = 5  # statistical: a false failure in 1.7 million
+
+
+def draw(*purpose, count=COUNT, power=1.0):
+    out = np.zeros(count, np.complex64)
+    add_white_noise(out, power, seed_sequence(7, "noise", *purpose).generate_state(2))
+    return out
+
+
+def test_known_answers_of_threefry():
+    """Published with the Random123 library for Threefry-2x32, 20 rounds. Planted bug: rotation 16 for 15."""
+    ones = 0xFFFFFFFF
+    counters = np.array([[0, 0], [ones, ones], [0x243F6A88, 0x85A308D3]], np.uint32)
+    keys = np.array([[0, 0], [ones, ones], [0x13198A2E, 0x03707344]], np.uint32)
+    answers = [[0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]]
+    np.testing.assert_array_equal(_words(counters, keys), np.array(answers, np.uint32))  # published, exact
+
+
+def test_moments():
+    """Planted bug: power/2 in both parts twice (variance halved)."""
+    power = 3.7e-11
+    z = draw("moments", power=power) / np.sqrt(power / 2)
+    for part in (z.real.astype(float), z.imag.astype(float)):
+        for order, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10170)):
+            assert abs((part**order).mean() - moment) < SIGMAS * np.sqrt(variance / COUNT)
+    assert abs((z.real * z.imag).mean()) < SIGMAS / np.sqrt(COUNT)
+
+
+def test_distribution_and_tails():
+    """Kolmogorov-Smirnov at 1e-6; counts beyond 3, 4, 4.5 and 5 sigma by the Poisson law at 1e-6 each."""
+    z = draw("tails", count=8 * COUNT, power=2.0)
+    parts = np.concatenate([z.real, z.imag])
+    assert stats.kstest(z.real[:COUNT].astype(float), "norm").pvalue > 1e-6
+    assert stats.kstest(np.angle(z[:COUNT]) / np.pi, stats.uniform(-1, 2).cdf).pvalue > 1e-6
+    for level in (3, 4, 4.5, 5):
+        expected = 2 * stats.norm.sf(level) * parts.size
+        low, high = stats.poisson.interval(1 - 1e-6, expected)
+        assert low <= (np.abs(parts) > level).sum() <= high
+    edges = stats.norm.ppf(np.linspace(0, 1, 101))
+    assert stats.chisquare(np.histogram(parts, edges)[0]).pvalue > 1e-6
+
+
+@pytest.mark.parametrize("shift", [1, 2, 1024, 122880])
+def test_white(shift):
+    z = draw("white")
+    product = z[shift:] * z[:-shift].conj()
+    for part in (product.real, product.imag):
+        assert abs(part.mean(dtype=float)) < SIGMAS / np.sqrt(2 * COUNT)
+    powers = np.abs(z) ** 2 - 1
+    assert abs((powers[shift:] * powers[:-shift]).mean(dtype=float)) < SIGMAS / np.sqrt(COUNT)
+
+
+def test_streams_are_independent():
+    a, b, again = draw("PT1", 4), draw("PT1", 5), draw("PT1", 4)
+    np.testing.assert_array_equal(a, again)
+    for other in (b, b.conj()):
+        assert abs((a * other).mean(dtype=complex)) < SIGMAS / np.sqrt(COUNT)
+
+
+def test_parts_make_the_whole():
+    """The counter is the index: planted bug: `first` ignored."""
+    key = seed_sequence(7, "parts").generate_state(2)
+    whole, split = np.zeros(5003, np.complex64), np.zeros(5003, np.complex64)
+    add_white_noise(whole, 0.3, key)
+    for start, stop in ((1234, 5003), (0, 7), (7, 1234)):
+        add_white_noise(split[start:stop], 0.3, key, start)
+    np.testing.assert_array_equal(split, whole)
+
+
+def test_counters_beyond_32_bits():
+    low, high = np.zeros(64, np.complex64), np.zeros(64, np.complex64)
+    key = np.array([1, 2], np.uint32)
+    add_white_noise(low, 1.0, key, 0)
+    add_white_noise(high, 1.0, key, 1 << 32)
+    assert not np.array_equal(low, high)
+
+
+def test_noise_is_added_to_the_samples_of_a_cube():
+    w = Waveform(num_samples=64, num_chirps=6)
+    samples = np.full((3, 2, 6, 64), 2 - 1j, np.complex64)
+    cube = IFCube(samples=samples, waveform=w, schedule=conventional_schedule(3, 6, 3), start_time=0.0)
+    words = seed_sequence(3, "noise", "PT2", 0).generate_state(2)
+    noise = np.zeros(samples.size, np.complex64)
+    add_white_noise(noise, 0.04, words)
+    found = add_noise(cube, 0.04, words).samples - (2 - 1j)
+    np.testing.assert_allclose(found.ravel(), noise, atol=5e-7)  # rounding of 2 + noise
