@@ -1,0 +1,88 @@
+"""Path geometry in float64: mirror images, and straight legs to a moving point.
+
+A chain of mirror reflections is unfolded: the transmitter's image behind the chain's planes sends straight to the receiver. Length,
+rate and acceleration follow from the relative motion of the image and the receiver, so curved flight is in them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.swarm import Pose
+
+
+@dataclass(frozen=True)
+class Legs:
+    """K straight (or unfolded) legs from one body to another. World axes, metres.
+
+    Attributes
+    ----------
+    length, rate, accel : (K,) of the leg's length [m, m/s, m/s^2]
+    departure : (K, 3) unit vectors along the first segment, at the start
+    arrival : (K, 3) unit vectors at the end, towards where the wave comes from
+    points : (K, B, 3) interaction points in order
+    """
+
+    length: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+    points: np.ndarray
+
+
+def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> Legs:
+    """Legs from `start` to `end` over chains of B mirrors at rest.
+
+    Parameters
+    ----------
+    normals : (K, B, 3) unit normals n in the order of the bounces
+    offsets : (K, B) plane offsets d, points x of the plane obey n.x = d
+    start, end : poses at one instant
+
+    Returns
+    -------
+    Legs; `points` lie on the planes (not checked against the faces' edges)
+    """
+    count, depth = offsets.shape
+    image = np.broadcast_to(start.position, (count, 3)).copy()
+    velocity = np.broadcast_to(start.velocity, (count, 3)).copy()
+    acceleration = np.broadcast_to(start.acceleration, (count, 3)).copy()
+    images = [image]
+    for b in range(depth):
+        n = normals[:, b]
+        image = image - 2 * ((n * image).sum(1) - offsets[:, b])[:, None] * n
+        velocity = velocity - 2 * (n * velocity).sum(1)[:, None] * n
+        acceleration = acceleration - 2 * (n * acceleration).sum(1)[:, None] * n
+        images.append(image)
+    span = end.position - image
+    length = np.linalg.norm(span, axis=1)
+    e = span / length[:, None]
+    w, a = end.velocity - velocity, end.acceleration - acceleration
+    rate = (e * w).sum(1)
+    accel = ((w * w).sum(1) - rate**2) / length + (e * a).sum(1)
+    points = np.empty((count, depth, 3))
+    target = np.broadcast_to(end.position, (count, 3))
+    for b in range(depth - 1, -1, -1):
+        n, source = normals[:, b], images[b + 1]
+        ray = target - source
+        share = (offsets[:, b] - (n * source).sum(1)) / (n * ray).sum(1)
+        target = source + share[:, None] * ray
+        points[:, b] = target
+    first = points[:, 0] if depth else np.broadcast_to(end.position, (count, 3))
+    departure = first - start.position
+    departure = departure / np.linalg.norm(departure, axis=1, keepdims=True)
+    return Legs(length, rate, accel, departure, -e, points)
+
+
+def straight(start: Pose, points: np.ndarray, velocity: np.ndarray | float = 0.0, acceleration: np.ndarray | float = 0.0) -> Legs:
+    """Legs from `start` to points (K, 3) that move with `velocity` and `acceleration` (K, 3 or one for all)."""
+    span = points - start.position
+    length = np.linalg.norm(span, axis=1)
+    e = span / length[:, None]
+    w, a = velocity - start.velocity, acceleration - start.acceleration
+    rate = (e * w).sum(1)
+    accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)
+    return Legs(length, rate, accel, e, -e, np.zeros((points.shape[0], 0, 3)))

@@ -1,0 +1,271 @@
+"""Ray-traced paths: Sionna RT discovers them, float64 geometry says where they are.
+
+One solve per frame, from the terminals to every UAV, gives the legs of all links: terminal to terminal, terminal back to itself, and
+terminal to target. Of each leg only the chain of faces, its visibility and its complex amplitude (which holds no carrier
+phase) come from Sionna; length, rate, acceleration, directions and points are unfolded in float64 from the planes of
+the mesh. Sionna's float32 delays are off by up to a radian and more at this carrier.
+
+Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point scatterer. Sionna's own
+RCS solver gives the same paths, but wants the bodies in the scene, where each shadows the terminal that carries it, and one
+solve per link; a test holds the two against each other.
+
+Points are world coordinates outside this module and local (recentred) coordinates inside. Import only after
+`isac_rt.runtime.activate()`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+import sionna.rt as rt
+
+from isac_rt.arrays import Antennas
+from isac_rt.city.mesh import City
+from isac_rt.city.scene import build_scene
+from isac_rt.propagation.diffuse import scatterer_phase
+from isac_rt.propagation.elements import element_amplitude
+from isac_rt.propagation.geometry import Legs, straight, unfold
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.rcs import CrossSection
+from isac_rt.scenario import Scenario
+from isac_rt.swarm import Pose
+from isac_rt.waveform import SPEED_OF_LIGHT
+
+VERTEX_TOLERANCE = 1e-2  # [m] a float64 point farther from Sionna's is another path; float32 explains 1e-4 within 1 km
+LENGTH_QUANTUM = 1e-6  # [m] chains over the same planes whose lengths agree to this are one path found twice
+MAX_PATHS = 1_000_000
+
+
+@dataclass(frozen=True)
+class LegSet:
+    """All legs between a terminal and a UAV, local coordinates."""
+
+    amplitude: np.ndarray
+    legs: Legs
+    faces: np.ndarray
+
+    @property
+    def bounces(self) -> np.ndarray:
+        return (self.faces >= 0).sum(axis=1)
+
+
+class RayTracer:
+    """Paths of all links of a frame in one city."""
+
+    def __init__(self, scenario: Scenario, city: City, antennas: Antennas, wavelength: float, carrier: float) -> None:
+        self._scenario, self._city, self._antennas, self._wavelength = scenario, city, antennas, wavelength
+        self._names = tuple(scenario.swarm)
+        self._terminals = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
+        self._sections = {name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()}
+        self._handle = build_scene(city, carrier)
+        self._solver = rt.PathSolver(deterministic=True)
+        self.dropped = 0
+        """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
+        scene = self._handle.scene
+        scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+
+    def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
+        """Paths of every link, in a fixed order.
+
+        Raises
+        ------
+        ValueError  If a pose is not finite, which Sionna would pass over in silence.
+        """
+        local = {name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()}
+        if not all(np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all() for pose in local.values()):
+            raise ValueError("a UAV's position or velocity is not finite")
+        legs = self._specular_legs(local)
+        hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
+        return {link: self._link(local, epoch, *link, legs, hits) for link in links}
+
+    def _solve(self, local: dict[str, Pose], sources: list[str], sinks: list[str], **options: object) -> rt.Paths:
+        scene = self._handle.scene
+        for name in [*scene.transmitters, *scene.receivers]:
+            scene.remove(name)
+        for name in sources:
+            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*local[name].position)))
+        for name in sinks:
+            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*local[name].position)))
+        found = self._solver(scene, refraction=False, synthetic_array=True, max_num_paths_per_src=MAX_PATHS, **options)
+        if found.tau.shape[-1] * len(sinks) >= MAX_PATHS:
+            raise ValueError(f"the ray tracer found its cap of {MAX_PATHS} paths; lower propagation.rays or clutter.rays")
+        return found
+
+    def _specular_legs(self, local: dict[str, Pose]) -> dict[tuple[str, str], LegSet]:
+        """Legs of every (terminal, UAV), by mirror reflections only."""
+        p = self._scenario.propagation
+        depth = p.max_bounces if p.specular and self._city.num_faces else 0
+        found = self._solve(
+            local, self._terminals, list(self._names), max_depth=depth, samples_per_src=p.rays, specular_reflection=depth > 0
+        )
+        amplitude, valid, faces, points = self._read(found, max(depth, 1))
+        out = {}
+        for j, start in enumerate(self._terminals):
+            for i, end in enumerate(self._names):
+                which = np.flatnonzero(valid[i, j])
+                out[start, end] = self._leg_set(local[start], local[end], amplitude[i, j, which], faces[i, j, which], points[i, j, which])
+        return out
+
+    def _read(self, found: rt.Paths, depth: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Amplitudes (rx, tx, path), validity, faces (rx, tx, path, depth) and points (..., depth, 3) of solved paths."""
+        real, imag = (np.asarray(part, np.float64) for part in found.a)
+        shape = real.shape[0], real.shape[2], real.shape[4]
+        amplitude = (real + 1j * imag).reshape(shape)
+        valid = np.asarray(found.valid).reshape(shape)
+        if not shape[2]:
+            return amplitude, valid, np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
+        faces = self._handle.face_index(np.asarray(found.objects), np.asarray(found.primitives))
+        hit = np.asarray(found.interactions) != 0
+        faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)
+        points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
+        return amplitude, valid, faces, points
+
+    def _leg_set(self, start: Pose, end: Pose, amplitude: np.ndarray, faces: np.ndarray, points: np.ndarray) -> LegSet:
+        """Unfold chains depth by depth, drop what contradicts Sionna's points, drop duplicates, sort."""
+        parts = []
+        for count in range(faces.shape[1] + 1):
+            which = np.flatnonzero((faces >= 0).sum(axis=1) == count)
+            chain = faces[which][:, :count]
+            if count == 0 and np.linalg.norm(end.position - start.position) < 1e-9:
+                continue  # a terminal's path to itself is its leakage, which is not the ray tracer's
+            legs = unfold(self._city.normals[chain], self._city.plane_offsets[chain], start, end)
+            good = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(axis=1, initial=0.0) < VERTEX_TOLERANCE
+            self.dropped += int((~good).sum())
+            keys = np.column_stack([np.round(legs.length / LENGTH_QUANTUM), self._city.plane_of_face[chain]])
+            _, first = np.unique(keys[good], axis=0, return_index=True)
+            keep = np.flatnonzero(good)[first]
+            parts.append((amplitude[which][keep], _pick(legs, keep), chain[keep]))
+        depth = faces.shape[1]
+        widths = [depth - chain.shape[1] for _, _, chain in parts]
+        return LegSet(
+            np.concatenate([a for a, _, _ in parts]) if parts else np.zeros(0, complex),
+            _join([legs for _, legs, _ in parts], depth),
+            np.concatenate([np.pad(c, ((0, 0), (0, w)), constant_values=-1) for (_, _, c), w in zip(parts, widths, strict=True)])
+            if parts
+            else np.zeros((0, depth), np.int64),
+        )
+
+    def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict) -> PathSet:
+        common = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
+        parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
+        for number, name in enumerate(self._names):
+            if name not in (tx, rx):
+                parts.append(self._by_way_of(local, tx, rx, name, number, legs, common))
+        if (tx, rx) in hits:
+            parts.append(self._scattered(local[tx], local[rx], *hits[tx, rx], common))
+        leakage = self._scenario.propagation.leakage
+        if tx == rx and leakage.enabled:
+            ahead = local[tx].rotation[:, 1][None]
+            gain = np.array([10 ** (-leakage.isolation_db / 20)])
+            delay = np.array([leakage.delay_s])
+            parts.append(make_paths(gain=gain, delay=delay, departure=ahead, arrival=ahead, kind=PathKind.LEAKAGE, **common))
+        every = merge(parts)
+        every = replace(every, points=every.points + self._city.origin)
+        return every.select(every.gain != 0)
+
+    def _between(self, start: Pose, end: Pose, found: LegSet, common: dict) -> PathSet:
+        """Line of sight and mirror reflections of the city."""
+        legs = found.legs
+        return make_paths(
+            gain=found.amplitude * element_amplitude(self._antennas, start, end, legs.departure, legs.arrival),
+            delay=legs.length / SPEED_OF_LIGHT,
+            delay_rate=legs.rate / SPEED_OF_LIGHT,
+            delay_accel=legs.accel / SPEED_OF_LIGHT,
+            departure=legs.departure,
+            arrival=legs.arrival,
+            tx_radius=legs.length,
+            rx_radius=legs.length,
+            kind=np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
+            bounces=found.bounces,
+            points=legs.points,
+            faces=found.faces,
+            **common,
+        )
+
+    def _by_way_of(self, local: dict, tx: str, rx: str, name: str, number: int, legs: dict, common: dict) -> PathSet:
+        """Echo and ghosts of one UAV: every leg to it with every leg from it, up to the bounces allowed."""
+        there, back = legs[tx, name], legs[rx, name]
+        i, j = (a.ravel() for a in np.indices((there.amplitude.size, back.amplitude.size)))
+        bounces = there.bounces[i] + back.bounces[j]
+        allowed = bounces <= (self._scenario.propagation.max_bounces if self._scenario.propagation.ghosts else 0)
+        i, j, bounces = i[allowed], j[allowed], bounces[allowed]
+        a, b, body = there.legs, back.legs, local[name]
+        section = self._sections[name].square_metres(body.to_body(a.arrival[i]), body.to_body(b.arrival[j]))
+        scatter = np.sqrt(4 * np.pi * section) / self._wavelength
+        elements = element_amplitude(self._antennas, local[tx], local[rx], a.departure[i], b.departure[j])
+        middle = np.broadcast_to(body.position, (i.size, 1, 3))
+        return make_paths(
+            gain=there.amplitude[i] * back.amplitude[j] * scatter * elements,
+            delay=(a.length[i] + b.length[j]) / SPEED_OF_LIGHT,
+            delay_rate=(a.rate[i] + b.rate[j]) / SPEED_OF_LIGHT,
+            delay_accel=(a.accel[i] + b.accel[j]) / SPEED_OF_LIGHT,
+            departure=a.departure[i],
+            arrival=b.departure[j],
+            tx_radius=a.length[i],
+            rx_radius=b.length[j],
+            kind=np.where(bounces > 0, PathKind.GHOST, PathKind.TARGET),
+            target=number,
+            bounces=bounces,
+            points=np.concatenate([a.points[i], middle, b.points[j][:, ::-1]], axis=1),
+            faces=np.concatenate([there.faces[i], np.full((i.size, 1), -1), back.faces[j][:, ::-1]], axis=1),
+            **common,
+        )
+
+    def _diffuse_hits(self, local: dict[str, Pose], links: list[tuple[str, str]]) -> dict:
+        """Hit points and scattered amplitudes of every link, from one solve; points on the float64 mesh, in a fixed order."""
+        sources, sinks = (list(dict.fromkeys(end)) for end in zip(*links, strict=True))
+        found = self._solve(
+            local,
+            sources,
+            sinks,
+            max_depth=1,
+            samples_per_src=self._scenario.clutter.rays,
+            los=False,
+            specular_reflection=False,
+            diffuse_reflection=True,
+        )
+        amplitude, valid, faces, points = self._read(found, 1)
+        out = {}
+        for tx, rx in links:
+            i, j = sinks.index(rx), sources.index(tx)
+            which = np.flatnonzero(valid[i, j] & (faces[i, j, :, 0] >= 0))
+            face, point = faces[i, j, which, 0], points[i, j, which, 0]
+            order = np.lexsort(point.T)
+            out[tx, rx] = np.abs(amplitude[i, j, which])[order], face[order], point[order]
+        return out
+
+    def _scattered(self, start: Pose, end: Pose, amplitude: np.ndarray, face: np.ndarray, point: np.ndarray, common: dict) -> PathSet:
+        """Scatterers at rest on the mesh, each with a phase of its own that belongs to its place."""
+        normal = self._city.normals[face]
+        on_plane = point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
+        there, back = straight(start, on_plane), straight(end, on_plane)
+        phase = scatterer_phase(point, self._scenario.seed)
+        return make_paths(
+            gain=amplitude * np.exp(1j * phase) * element_amplitude(self._antennas, start, end, there.departure, back.departure),
+            delay=(there.length + back.length) / SPEED_OF_LIGHT,
+            delay_rate=(there.rate + back.rate) / SPEED_OF_LIGHT,
+            delay_accel=(there.accel + back.accel) / SPEED_OF_LIGHT,
+            departure=there.departure,
+            arrival=back.departure,
+            tx_radius=there.length,
+            rx_radius=back.length,
+            kind=PathKind.DIFFUSE,
+            bounces=1,
+            points=on_plane[:, None],
+            faces=face[:, None],
+            **common,
+        )
+
+
+def _pick(legs: Legs, which: np.ndarray) -> Legs:
+    return Legs(*(getattr(legs, name)[which] for name in ("length", "rate", "accel", "departure", "arrival", "points")))
+
+
+def _join(parts: list[Legs], depth: int) -> Legs:
+    if not parts:
+        return Legs(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, depth, 3)))
+    points = [np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan) for p in parts]
+    names = ("length", "rate", "accel", "departure", "arrival")
+    return Legs(*(np.concatenate([getattr(p, name) for p in parts]) for name in names), np.concatenate(points))
