@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from isac_rt.metrics import SensingScore, SymbolCount, summary_block
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Scenario
@@ -72,15 +73,6 @@ class TrackTable:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SymbolCount:
-    """Symbols (or bits) sent to an observer in a frame. `errors` holds the undecided ones, `erased`, as well."""
-
-    errors: int = 0
-    erased: int = 0
-    total: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
 class ObserverRecord:
     """What one receiving terminal had and made of one frame.
 
@@ -94,7 +86,7 @@ class ObserverRecord:
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
     detection_kind, detection_target : (Q,) what explains each detection: a `PathKind` or -1, a UAV index or -1
-    delay, dpsk, bit : symbol counts
+    symbols : what was sent to it and became of it
     num_false : detections that no path explains
     slips : symbols decided outside their alphabet
     reference_snr : per sample and antenna before processing (linear); NaN where there is no reference path
@@ -112,9 +104,7 @@ class ObserverRecord:
     state: int
     detection_kind: np.ndarray
     detection_target: np.ndarray
-    delay: SymbolCount = SymbolCount()
-    dpsk: SymbolCount = SymbolCount()
-    bit: SymbolCount = SymbolCount()
+    symbols: SymbolCount = SymbolCount()
     num_false: int = 0
     slips: int = 0
     reference_snr: float = np.nan
@@ -160,15 +150,14 @@ class Recorder:
     def finish(
         self,
         *,
+        scores: Mapping[str, SensingScore],
         timing: Mapping[str, float],
         fidelity: Mapping[str, Any],
         materials: Mapping[str, Any] | None = None,
         link_budget: Sequence[Mapping[str, Any]] = (),
     ) -> Results:
-        """The results of the frames so far. `timing` [s] goes into the summary only; `materials` and `link_budget`
-        (rows of a table) are kept as JSON attributes of the dataset."""
-        from isac_rt.summary import summarize
-
+        """The results of the frames so far. `scores` holds every observer's sensing; `timing` [s] goes into the summary only;
+        `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the dataset."""
         dataset = _Builder(self.scenario, self.waveform, tuple(self.observers), tuple(self.states), self._frames).dataset()
         dataset.attrs |= {
             **provenance(self.scenario),
@@ -176,7 +165,36 @@ class Recorder:
             "materials": json.dumps(dict(materials or {})),
             "link_budget": json.dumps([dict(row) for row in link_budget]),
         }
-        return Results(dataset, summarize(dataset, self.scenario, timing, fidelity), self.scenario)
+        return Results(dataset, self._summary(dataset, scores, timing, fidelity), self.scenario)
+
+    def _summary(
+        self, dataset: xr.Dataset, scores: Mapping[str, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The fixed keys of `summary.json`; null stands for what does not apply. One transmitter is heard by each terminal,
+        so a terminal's figures are those of its link."""
+        frames = self._frames
+        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
+        duration = (frames[-1].frame - frames[0].frame) * interval + self.waveform.frame_duration if frames else 0.0
+        blocks: dict[str, dict[str, object]] = {}
+        links: dict[str, dict[str, object]] = {}
+        for name in self.observers:
+            heard = [f.observers[name].record for f in frames if name in f.observers]
+            decodes = any(r.transmitter != name for r in heard)
+            role = self.scenario.swarm[name].role
+            symbols = sum((r.symbols for r in heard), SymbolCount()) if decodes else None
+            blocks[name] = summary_block(role, scores[name], symbols, duration)
+            links |= {f"{sender}->{name}": blocks[name] for sender in {r.transmitter for r in heard}}
+        return {
+            "scenario": self.scenario.name,
+            "seed": self.scenario.seed,
+            "frames": len(frames),
+            "terminals": blocks,
+            "links": links,
+            "paths": {kind: int(n) for kind, n in zip(KINDS, dataset.path_count.sum(("frame", "observer")).values, strict=True)},
+            "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
+            "fidelity": dict(fidelity),
+            "versions": versions(),
+        }
 
 
 @dataclass(frozen=True)
@@ -194,6 +212,12 @@ def _slim(o: ObserverRecord, snapshot: bool) -> Any:
     counts = np.bincount(kind, minlength=len(KINDS))
     total = np.bincount(kind, weights=power, minlength=len(KINDS))
     return _Slim(ObserverRecord(**{**vars(o), "paths": o.paths.select(np.zeros(0, int))}), counts, total, o.paths if snapshot else None)
+
+
+def errors_of(dataset: xr.Dataset, group: str, name: str) -> np.ndarray:
+    """"detected" or "tracked" value less the truth (frame, observer, uav), NaN where none; angles [rad] wrapped to (-pi, pi]."""
+    e = (dataset[f"{group}_{name}"] - dataset[f"truth_{name}"]).values
+    return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 
 
 def versions() -> dict[str, str]:
@@ -327,7 +351,7 @@ class _Builder:
         self.put("path_count", [*two, "kind"], self.over(lambda s: s.counts, zero, np.int32), _DIMENSIONLESS, "number of paths")
         self.put("path_power", [*two, "kind"], self.over(lambda s: s.power, zero, float), _DIMENSIONLESS, "sum of |gain|^2 of the paths")
         for name, text in (("errors", "wrong or undecided"), ("erased", "undecided"), ("total", "sent to the observer")):
-            values = self.over(lambda s, n=name: [getattr(getattr(s.record, k), n) for k in SYMBOLS], np.zeros(3), np.int64)
+            values = self.over(lambda s, n=name: _by_symbol(s.record.symbols)[n], np.zeros(3), np.int64)
             self.put(f"symbol_{name}", [*two, "symbol"], values, _DIMENSIONLESS, f"symbols, {text}")
 
     def ragged(self, prefix: str, dim: str, rows: list[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]) -> None:
@@ -406,6 +430,15 @@ class _Builder:
                  "magnitude over range cell and chirp before data removal")  # fmt: skip
 
 
+def _by_symbol(c: SymbolCount) -> dict[str, tuple[int, int, int]]:
+    """Counts in the order of `SYMBOLS`."""
+    return {
+        "errors": (c.delay_errors, c.dpsk_errors, c.bit_errors),
+        "erased": (c.delay_erased, c.dpsk_erased, c.bits_total - c.bits_decoded),
+        "total": (c.delay_total, c.dpsk_total, c.bits_total),
+    }
+
+
 PATH_COLUMNS: dict[str, tuple] = {
     "gain_re": (float, _DIMENSIONLESS, "real part of the complex gain without carrier phase"),
     "gain_im": (float, _DIMENSIONLESS, "imaginary part of the complex gain without carrier phase"),
@@ -475,7 +508,7 @@ def save(results: Results, folder: str | Path) -> None:
     """
     folder = Path(folder)
     _write_dataset(results.dataset, folder / FILE)
-    write_text(folder / "scenario.yaml", to_yaml(results.scenario))
+    write_text(folder / "scenario.yaml", to_yaml(results.scenario, folder))
     write_text(folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n")
 
 
@@ -499,6 +532,9 @@ def load(folder: str | Path) -> Results:
     try:
         with xr.open_dataset(folder / FILE, engine="h5netcdf") as opened:
             dataset = opened.load()
+        for name, v in dataset.variables.items():
+            if v.dtype.kind in "UT":  # text comes back in another array type than it went in
+                dataset[name] = (v.dims, v.values.astype(object), v.attrs)
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         raise ResultsError(f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote") from problem

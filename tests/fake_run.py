@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from isac_rt.arrays import antennas_of
+from isac_rt.metrics import SensingScore, SymbolCount, Truth, resolutions
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
-from isac_rt.results import FrameRecord, ObserverRecord, Recorder, Results, SymbolCount, TrackTable, UavValues
+from isac_rt.results import FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
 from isac_rt.scenario import Scenario, Uav
 from isac_rt.swarm import Swarm
 from isac_rt.waveform import waveform_of
@@ -101,9 +103,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 state=int(f > 0),
                 detection_kind=np.array([1, 3, -1, 4][:detections]) if detections else np.zeros(0, int),
                 detection_target=np.array([2, -1, -1, -1][:detections]) if detections else np.zeros(0, int),
-                delay=SymbolCount(errors=lost // 3, erased=lost // 3, total=360) if sent else SymbolCount(),
-                dpsk=SymbolCount(errors=lost, erased=lost // 2, total=351) if sent else SymbolCount(),
-                bit=SymbolCount(errors=2 * lost, erased=lost, total=4293) if sent else SymbolCount(),
+                symbols=SymbolCount(360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1) if sent else SymbolCount(),
                 num_false=1,
                 reference_snr=7.7,
             )  # fmt: skip
@@ -114,7 +114,13 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
     recorder = Recorder(scenario, waveform_of(scenario), ("AT", "PT1"), STATES)
+    w = waveform_of(scenario)
+    scores = {name: SensingScore(resolutions(w, antennas_of(scenario, w), passes)) for name, passes in (("AT", 2), ("PT1", 1))}
     for record in fake_records(scenario, detections=detections):
         recorder.add(record)
+        for name, o in record.observers.items():
+            t = o.truth
+            truth = Truth(t.range[2], t.velocity[2], *o.reception.detections.direction[0], t.azimuth[2], t.elevation[2]) if detections else None
+            scores[name].add([truth] if truth else [], o.reception.detections, kinds=o.detection_kind)
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
-    return recorder.finish(timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)
+    return recorder.finish(scores=scores, timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)
