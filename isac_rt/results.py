@@ -532,9 +532,6 @@ def load(folder: str | Path) -> Results:
     try:
         with xr.open_dataset(folder / FILE, engine="h5netcdf") as opened:
             dataset = opened.load()
-        for name, v in dataset.variables.items():
-            if v.dtype.kind in "UT":  # text comes back in another array type than it went in
-                dataset[name] = (v.dims, v.values.astype(object), v.attrs)
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         raise ResultsError(f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote") from problem
