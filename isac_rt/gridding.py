@@ -12,7 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.fft
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
 from isac_rt.synthesis import FAST, Tones, chirp_terms, numbers, passed, sources
 from isac_rt.waveform import Waveform
@@ -67,45 +70,91 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _spread(grid, start, kernel, now, tilt, bow):
-    """Add the three strengths of a path, all receive elements at once, to WIDTH rows of the grid from `start`."""
-    for j in range(_WIDTH):
-        w, u, v = kernel[j], kernel[_WIDTH + j], kernel[2 * _WIDTH + j]
-        row = grid[start + j]
-        for lane in range(row.shape[0]):
-            row[lane] += w * now[lane] + u * tilt[lane] + v * bow[lane]
+def _horner(kernel, poly, r):
+    """All weights at `r`; the powers are the inner loop, of constant length, so that the outer one becomes vector code."""
+    for j in range(_LANES):
+        value = poly[0, j]
+        for d in range(1, _DEGREE + 1):
+            value = value * r + poly[d, j]
+        kernel[j] = value
+
+
+@intrinsic
+def _add_vector(typingctx, grid, index, strengths, start, lanes, w, u, v):
+    """grid[index : index + 16] += w a + u b + v c; a, b, c: 16 of strengths from start, start + lanes, start + 2 lanes.
+
+    LLVM does not turn the plain loop into vector code (it cannot know that the arrays do not overlap), so this says it.
+    """
+
+    def codegen(context, builder, signature, args):
+        vector = ir.VectorType(ir.FloatType(), 16)
+
+        def at(array, kind, position):
+            data = make_array(kind)(context, builder, array).data
+            return builder.bitcast(builder.gep(data, [position]), vector.as_pointer())
+
+        def every(scalar):
+            first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), 16), [0] * 16)
+            return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
+
+        target = at(args[0], signature.args[0], args[1])
+        total, position = builder.load(target, align=4), args[3]
+        for scalar in args[5:]:
+            strength = builder.load(at(args[2], signature.args[2], position), align=4)
+            product = builder.fmul(every(scalar), strength, flags=("contract",))
+            total = builder.fadd(total, product, flags=("contract",))
+            position = builder.add(position, args[4])
+        builder.store(total, target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(grid, types.intp, strengths, types.intp, types.intp, types.float32, types.float32, types.float32), codegen
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _strengths(now, tilt, bow, steer, slant, cr, ci, lag, curve):
-    """Strengths of 1, x, x^2 from the steering `steer`, the wideband slants and the chirp's factor cr + j ci."""
-    for r in range(slant.shape[0]):
-        sr, si, d = steer[2 * r], steer[2 * r + 1], slant[r]
-        tr, ti = cr * sr - ci * si, cr * si + ci * sr
+def _spread(grid, start, kernel, strengths):
+    """Add the three strengths (3 lanes,) of a path, all receive elements at once, to WIDTH rows of the flat grid from `start`."""
+    lanes = strengths.shape[0] // 3
+    for j in range(_WIDTH):
+        for lane in range(0, lanes, 16):
+            _add_vector(
+                grid, start + j * lanes + lane, strengths, lane, lanes, kernel[j], kernel[_WIDTH + j], kernel[2 * _WIDTH + j]
+            )
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _strengths(out, steer, lanes, cr, ci, lag, curve):
+    """Strengths (3 lanes,) of 1, x, x^2: the steering (its phasors z, j z, the slants d) times the chirp's factor cr + j ci.
+
+    Real and imaginary parts alternate; with z and j z both at hand no lane needs its neighbour.
+    """
+    for i in range(lanes):
+        z, jz, d = steer[i], steer[lanes + i], steer[2 * lanes + i]
+        plain, turned = cr * z + ci * jz, cr * jz - ci * z
         late = lag * d  # the array sees the frequency that was sent, tau before
-        re, im = tr + late * ti, ti - late * tr
-        now[2 * r], now[2 * r + 1] = re, im
-        tilt[2 * r], tilt[2 * r + 1] = d * re, d * im
-        square = np.float32(-0.5) * d * d
-        bow[2 * r] = square * re - curve * im
-        bow[2 * r + 1] = square * im + curve * re
+        value, quadrature = plain - late * turned, turned + late * plain
+        out[i] = value
+        out[lanes + i] = d * value
+        out[2 * lanes + i] = np.float32(-0.5) * d * d * value + curve * quadrature
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _fill(grids, w, m, first, half, poly, path, offset, steer, slant, link, factor, delay, rate, accel, begin, end, tx, symbol,
+def _fill(grids, w, m, first, half, poly, path, offset, steer, link, factor, delay, rate, accel, begin, end, tx, symbol,
           send, antenna):  # fmt: skip
     """Spread every path of chirps first, first + 1, ... of group m on their grids (B, G + WIDTH, 2 lanes) float32."""
     groups, lanes = send.shape[1], grids.shape[2]
     size = grids.shape[1] - _WIDTH
     kernel = np.empty(_LANES, np.float32)
-    now, tilt, bow = np.zeros(lanes, np.float32), np.zeros(lanes, np.float32), np.zeros(lanes, np.float32)
+    strengths = np.zeros(3 * lanes, np.float32)
     grids[:] = np.float32(0)
-    for b in range(grids.shape[0]):
-        p = first + b
-        time = w[6] + p * w[4] + m * w[5]
-        for i in range(path.shape[0]):
-            k, source = path[i], m - offset[i]
-            if source < 0 or source >= groups or time < begin[k] or time >= end[k]:
+    for i in range(path.shape[0]):  # chirps inside: a path's steering is read once, and its places on the grids are near
+        k, source = path[i], m - offset[i]
+        if source < 0 or source >= groups:
+            continue
+        for b in range(grids.shape[0]):
+            p = first + b
+            time = w[6] + p * w[4] + m * w[5]
+            if time < begin[k] or time >= end[k]:
                 continue
             q = link[k]
             tau = symbol[q, source, p] + delay[k] + (rate[k] + accel[k] * time / 2) * time - offset[i] * w[5]
@@ -121,15 +170,13 @@ def _fill(grids, w, m, first, half, poly, path, offset, steer, slant, link, fact
             cr, ci = np.float32(c.real) * co - np.float32(c.imag) * si, np.float32(c.real) * si + np.float32(c.imag) * co
             curve = np.float32(2 * np.pi * quadratic * half * half)
             lag = np.float32(tau / (w[2] * half))
-            _strengths(now, tilt, bow, steer[i], slant[i], cr, ci, lag, curve)
+            _strengths(strengths, steer[i], lanes, cr, ci, lag, curve)
             place = (frequency - np.floor(frequency)) * size
             cell = min(int(place), size - 1)
             r = np.float32(place - cell - 0.5)
-            kernel[:] = poly[0]
-            for d in range(1, poly.shape[0]):
-                for j in range(_LANES):
-                    kernel[j] = kernel[j] * r + poly[d, j]
-            _spread(grids[b], cell, kernel, now, tilt, bow)
+            _horner(kernel, poly, r)
+            _spread(grids[b].reshape(-1), cell * lanes, kernel, strengths)
+    for b in range(grids.shape[0]):
         _fold(grids[b], size)
 
 
@@ -158,16 +205,20 @@ def _emit(out, spectra, deconvolution, m, first):
                     out[m, r, first + b, n] += deconvolution[n] * spectra[b, mode if mode >= 0 else mode + grid, r]
 
 
-def _steering(waveform: Waveform, tones: Tones, path: np.ndarray, lanes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Phasors of the receive elements at mid-window (C, 2 lanes) and their slants alpha e T/2 [rad] (C, L_rx), float32."""
-    w = waveform
+def _steering(waveform: Waveform, tones: Tones, path: np.ndarray, lanes: int) -> np.ndarray:
+    """Per source the phasors z of the receive elements at mid-window, j z, and twice each slant pi alpha e T [rad].
+
+    Returns (C, 6 lanes) float32, real and imaginary parts alternating.
+    """
+    w, num_rx = waveform, tones.rx_delay.shape[1]
     delay = tones.rx_delay
     cycles = (w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]) * delay - w.slope * delay**2 / 2
-    steer = np.zeros((len(tones), lanes), np.complex64)
-    steer[:, : delay.shape[1]] = np.exp(2j * np.pi * (cycles % 1))
-    half = w.num_samples // 2
-    slant = (2 * np.pi * w.slope * w.sample_interval * half * delay).astype(np.float32)
-    return steer.view(np.float32)[path], slant[path]
+    out = np.zeros((len(tones), 3, lanes), np.complex64)
+    out[:, 0, :num_rx] = np.exp(2j * np.pi * (cycles % 1))
+    out[:, 1] = 1j * out[:, 0]
+    slant = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2) * delay
+    out[:, 2, :num_rx] = slant * (1 + 1j)
+    return out.reshape(len(tones), -1).view(np.float32)[path]
 
 
 def add_gridded(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float) -> None:
@@ -188,14 +239,14 @@ def add_gridded(samples: np.ndarray, waveform: Waveform, tones: Tones, transitio
     path, offset = path[order], offset[order]
     size, poly, deconvolution = weights(w.num_samples)
     lanes = -(-t.rx_delay.shape[1] // 8) * 8
-    steer, slant = _steering(w, t, path, lanes)
+    steer = _steering(w, t, path, lanes)
     values = numbers(w, transition)
     buffer = np.empty((_BATCH, size + _WIDTH, 2 * lanes), np.float32)
     low = _WIDTH // 2 - 1
     for m in range(w.num_groups):
         for first in range(0, w.num_chirps, _BATCH):
             grids = buffer[: min(_BATCH, w.num_chirps - first)]
-            _fill(grids, values, m, first, w.num_samples // 2, poly, path, offset, steer, slant, t.link, t.factor, t.delay,
+            _fill(grids, values, m, first, w.num_samples // 2, poly, path, offset, steer, t.link, t.factor, t.delay,
                   t.rate, t.accel, t.begin, t.end, t.tx_delay, t.symbol_delay, t.send, t.antenna)  # fmt: skip
             spectra = scipy.fft.ifft(grids.view(np.complex64)[:, low : low + size], axis=1, norm="forward")
             _emit(samples, spectra, deconvolution.astype(np.float32), m, first)

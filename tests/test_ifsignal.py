@@ -21,7 +21,7 @@ C = SPEED_OF_LIGHT
 START = 3.217
 SKIRT = 0.43e6
 COMPLEX64 = 2e-7  # rounding: two float32 roundings of the result
-FLOAT64 = 1e-8  # rounding: a delay of 5e-6 s summed of 8 terms, 8 half ulps of 4e-22 s at 77 GHz, is 1.6e-9 rad
+FLOAT64 = 1e-10  # rounding: a delay of 5e-6 s is summed of 8 terms, 8 half ulps of 4e-22 s at 77 GHz are 2e-10 cycles at worst, 3e-11 RMS
 SMALL = Waveform(bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3)
 
 
