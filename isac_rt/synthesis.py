@@ -181,37 +181,47 @@ def _rotation(step, bend, re, im):
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _tone(re, im, lane, turn, amplitude, phase, frequency, quadratic):
-    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to re + j im.
+def _tone(sums, lane, half, amplitude, phase, frequency, quadratic):
+    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`.
 
-    Each block starts from a phase reduced in float64; `lane` holds the phasors inside a block and `turn` how they
-    change from a block to the next.
+    `sums` holds _BLOCK real parts, then their imaginary parts, block after block. Each block starts from a phase reduced
+    in float64. `lane` is flat: the phasors inside a block (real, imaginary) and how they change from a block to the next.
+    Constant lengths and offsets let the compiler see that nothing overlaps.
     """
-    size, block = re.shape[0], lane.shape[1]
-    x = -float(size // 2)
-    _rotation(frequency + 2 * quadratic * x, quadratic, lane[0], lane[1])
-    for start in range(0, size, block):
+    x = -half
+    _rotation(frequency + 2 * quadratic * x, quadratic, lane[:_BLOCK], lane[_BLOCK : 2 * _BLOCK])
+    for start in range(0, sums.shape[0], 2 * _BLOCK):
         cycles = phase + (frequency + quadratic * x) * x
         angle = 2 * np.pi * (cycles - np.floor(cycles))
         c, s = np.cos(angle), np.sin(angle)
         pr = amplitude.real * c - amplitude.imag * s
         pi = amplitude.real * s + amplitude.imag * c
-        for i in range(min(block, size - start)):
-            lr, li = lane[0, i], lane[1, i]
-            re[start + i] += pr * lr - pi * li
-            im[start + i] += pr * li + pi * lr
-            lane[0, i] = lr * turn[0, i] - li * turn[1, i]
-            lane[1, i] = lr * turn[1, i] + li * turn[0, i]
-        x += block
+        for i in range(_BLOCK):
+            lr, li, tr, ti = lane[i], lane[_BLOCK + i], lane[2 * _BLOCK + i], lane[3 * _BLOCK + i]
+            sums[start + i] += pr * lr - pi * li
+            sums[start + _BLOCK + i] += pr * li + pi * lr
+            lane[i] = lr * tr - li * ti
+            lane[_BLOCK + i] = lr * ti + li * tr
+        x += _BLOCK
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _flush(row, sums):
+    """Add the sums of one chirp to its samples (2 N,) float32 and clear them."""
+    for n in range(row.shape[0] // 2):
+        place = 2 * _BLOCK * (n // _BLOCK) + n % _BLOCK
+        row[2 * n] += np.float32(sums[place])
+        row[2 * n + 1] += np.float32(sums[place + _BLOCK])
+    sums[:] = 0.0
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _direct(out, w, path, offset, link, factor, delay, rate, accel, begin, end, tx, rx, row, cross, symbol, send, antenna):
     """Add the listed (path, group offset) to out (M, L_rx, P, 2 N) float32."""
     groups, num_rx, chirps, width = out.shape
-    size, block = width // 2, _BLOCK
-    re, im = np.zeros((num_rx, size)), np.zeros((num_rx, size))
-    lane, turn = np.empty((2, block)), np.empty((2, block))
+    half = float(width // 2 // 2)
+    sums = np.zeros((num_rx, 2 * _BLOCK * ((width // 2 + _BLOCK - 1) // _BLOCK)))
+    lane = np.empty(4 * _BLOCK)
     for m in range(groups):
         for p in range(chirps):
             time = w[6] + p * w[4] + m * w[5]
@@ -229,18 +239,14 @@ def _direct(out, w, path, offset, link, factor, delay, rate, accel, begin, end, 
                 a = antenna[q, source, p]
                 speed = rate[k] + accel[k] * time
                 bend = chirp_terms(w, tau, speed, accel[k])[2]
-                _rotation(2 * bend * block, 0.0, turn[0], turn[1])
+                _rotation(2 * bend * _BLOCK, 0.0, lane[2 * _BLOCK : 3 * _BLOCK], lane[3 * _BLOCK :])
                 for r in range(num_rx):
                     element = tau + tx[k, a] + rx[k, r] + cross[row[k], a, r]
                     phase, frequency, quadratic = chirp_terms(w, element, speed, accel[k])
-                    _tone(re[r], im[r], lane, turn, amplitude, phase, frequency, quadratic)
+                    _tone(sums[r], lane, half, amplitude, phase, frequency, quadratic)
             if used:
                 for r in range(num_rx):
-                    for n in range(size):
-                        out[m, r, p, 2 * n] += np.float32(re[r, n])
-                        out[m, r, p, 2 * n + 1] += np.float32(im[r, n])
-                re[:] = 0.0
-                im[:] = 0.0
+                    _flush(out[m, r, p], sums[r])
 
 
 def add_direct(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float) -> None:

@@ -111,7 +111,7 @@ def test_direct_is_exact(shape, data):
 @pytest.mark.parametrize("speed", [0.0, 3.3, 30.0])
 @pytest.mark.parametrize(("samples", "count"), [(1024, 9), (1000, 40), (255, 130)])
 def test_gridded_against_exact(samples, count, speed):
-    """At 30 m/s and for the full L. Planted bugs: no second order of motion; no `lag`; margins not wrapped."""
+    """At 30 m/s and for the full L. Planted bugs: no second order of motion; no `lag`; modes not taken modulo the grid."""
     w = replace(Waveform(), num_samples=samples, num_chirps=6)
     rng = np.random.default_rng(samples + count)
     array = antennas(w, rx_x=8, rx_z=8)
@@ -121,7 +121,7 @@ def test_gridded_against_exact(samples, count, speed):
 
 
 def test_paths_at_the_ends_of_the_passband():
-    """Frequencies 0 and 1 wrap around the grid; planted bug: a half-integer centre flips their sign."""
+    """Frequencies 0 and 1 wrap around the grid; planted bug: margins not wrapped."""
     w = replace(Waveform(), num_chirps=3)
     ends = np.array([-0.011, 0.0, 1e-7, 0.9999999, 1.0, 1.013]) * w.max_delay
     links = [(sender(w, np.random.default_rng(3), data=False), paths(w, np.random.default_rng(4), 6, delay=ends))]
