@@ -18,6 +18,9 @@ __all__ = ["FreeSpace", "PathKind", "PathSet", "Propagation", "make_paths", "mak
 class Propagation(Protocol):
     """What simulate needs of a propagation model."""
 
+    dropped: int
+    """Paths left out because float64 geometry contradicts the ray tracer."""
+
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
         """Paths of every link at the middle of a frame."""
         ...

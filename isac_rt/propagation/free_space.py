@@ -33,6 +33,7 @@ class FreeSpace:
         self._uavs, self._antennas, self._wavelength = uavs, antennas, wavelength
         self._names = tuple(uavs)
         self._sections = {name: CrossSection(uav.rcs, name, seed) for name, uav in uavs.items()}
+        self.dropped = 0
 
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
         """Paths of every link; those that no element sends or hears are left out."""
@@ -125,11 +126,19 @@ class FreeSpace:
         if tx != rx:
             distance = np.linalg.norm(poses[rx].position - poses[tx].position)
             return float(friis_amplitude(self._wavelength, distance) * self._antennas.gain)
-        strongest = 0.0
+        return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self._antennas.gain
+
+    def strongest_target(self, poses: dict[str, Pose], tx: str) -> str:
+        """The UAV whose echo is the reference of a terminal's own link."""
+        echoes = self._own_echoes(poses, tx)
+        if not echoes:
+            raise ValueError(f"no UAV with a cross-section of its own to which {tx}'s SNR could refer; give one in swarm.*.rcs")
+        return max(echoes, key=echoes.__getitem__)
+
+    def _own_echoes(self, poses: dict[str, Pose], tx: str) -> dict[str, float]:
+        out = {}
         for name, uav in self._uavs.items():
             if name != tx and uav.rcs.model != "relative":
                 leg = self._leg(poses, tx, name)
-                strongest = max(strongest, self.echo_amplitude(poses, tx, rx, name, leg, leg))
-        if strongest == 0.0:
-            raise ValueError(f"no UAV with a cross-section of its own to which {tx}'s SNR could refer; give one in swarm.*.rcs")
-        return strongest * self._antennas.gain
+                out[name] = self.echo_amplitude(poses, tx, tx, name, leg, leg)
+        return out

@@ -85,9 +85,9 @@ class RayTracer:
         for name in [*scene.transmitters, *scene.receivers]:
             scene.remove(name)
         for name in sources:
-            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*local[name].position)))
+            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*local[name].position.tolist())))
         for name in sinks:
-            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*local[name].position)))
+            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*local[name].position.tolist())))
         found = self._solver(scene, refraction=False, synthetic_array=True, max_num_paths_per_src=MAX_PATHS, **options)
         if found.tau.shape[-1] * len(sinks) >= MAX_PATHS:
             raise ValueError(f"the ray tracer found its cap of {MAX_PATHS} paths; lower propagation.rays or clutter.rays")

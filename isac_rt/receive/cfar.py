@@ -105,15 +105,21 @@ def hann_envelope(distance: np.ndarray) -> np.ndarray:
 
 
 def without_sidelobes(
-    rows: np.ndarray, bins: np.ndarray, power: np.ndarray, num_bins: int, margin: float = 4.0
+    rows: np.ndarray, bins: np.ndarray, power: np.ndarray, num_bins: int, floor: float, margin: float = 4.0
 ) -> np.ndarray:
-    """Which peaks (strongest first) are more than the window sidelobes of a stronger one; `margin` is a power factor."""
+    """Which peaks (strongest first) are more than what a stronger one leaves around it.
+
+    Parameters
+    ----------
+    floor : share of a path's power that modulation and motion spread over all Doppler bins of its range row
+    margin : power factor above the bound
+    """
     keep = np.zeros(rows.size, bool)
     values = power[rows, bins]
     for i in range(rows.size):
         stronger = np.flatnonzero(keep[:i])
         across = np.abs(bins[i] - bins[stronger])
         across = np.minimum(across, num_bins - across)
-        bound = margin * values[stronger] * hann_envelope(rows[i] - rows[stronger]) * hann_envelope(across)
+        bound = margin * values[stronger] * hann_envelope(rows[i] - rows[stronger]) * (hann_envelope(across) + floor)
         keep[i] = not np.any(values[i] <= bound)
     return keep

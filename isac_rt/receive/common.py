@@ -12,11 +12,12 @@ from isac_rt.receive.doppler import accumulate, channel_maps, doppler_bins, omp_
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
-    direction_cosine,
+    direction_cosines,
     refine,
     standard_deviations,
     start_point,
 )
+from isac_rt.receive.spectrum import motion_floor
 from isac_rt.receive.types import Detections, Maps
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -58,7 +59,7 @@ def sense(
     if use_omp(settings, schedule, w.num_tx):
         above &= _confirmed_by_omp(spectra, above, level, w, schedule)
     rows, bins = peaks(power, above, settings.cluster_cells)
-    keep = without_sidelobes(rows, bins, power, w.num_chirps)
+    keep = without_sidelobes(rows, bins, power, w.num_chirps, motion_floor(w))
     rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
     estimates = []
     for row, column in zip(rows, bins, strict=True):
@@ -90,13 +91,13 @@ def describe(
     estimates: list[Estimate], snr: np.ndarray, antennas: Antennas, waveform: Waveform, passes: int
 ) -> Detections:
     """Detections in ranges, velocities and direction cosines; what lies outside the field of view has no direction."""
-    count, virtual = len(estimates), passes == 2
+    count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
     limit = np.sin(antennas.half_view) if antennas.half_view < np.pi / 2 else 1.0
     for i, e in enumerate(estimates):
-        u = [direction_cosine(e.channels, antennas, waveform, axis, virtual) for axis in (0, 2)]
+        u = direction_cosines(e, antennas, waveform, passes)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]
-        std[i] = standard_deviations(snr[i] * e.channels.size, antennas, waveform, passes, virtual)
+        std[i] = standard_deviations(snr[i] * e.channels.size, antennas, waveform, passes)
     return Detections(
         range=np.array([e.delay for e in estimates]) * (SPEED_OF_LIGHT / passes),
         velocity=np.array([e.delay_rate for e in estimates]) * (SPEED_OF_LIGHT / passes),

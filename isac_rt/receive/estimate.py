@@ -196,14 +196,33 @@ def direction_cosine(channels: np.ndarray, antennas: Antennas, waveform: Wavefor
     return float(best) if abs(best) <= 1 else float("nan")
 
 
-def standard_deviations(snr: float, antennas: Antennas, waveform: Waveform, passes: int, virtual: bool) -> np.ndarray:
+def direction_cosines(estimate: Estimate, antennas: Antennas, waveform: Waveform, passes: int) -> list[float]:
+    """u_x and u_z of a detection.
+
+    A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an element at r and a source at R, which
+    would turn the estimate by 0.02 degrees at 11 m. R is the estimated range; behind a reflector on the way to a PT the true
+    radius is shorter.
+    """
+    virtual, channels = passes == 2, estimate.channels
+    u = [direction_cosine(channels, antennas, waveform, axis, virtual) for axis in (0, 2)]
+    radius = estimate.delay * SPEED_OF_LIGHT / passes
+    if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
+        return u
+    towards = np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
+    scale = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
+    tx, rx = (scale * ((r**2).sum(1) - (r @ towards) ** 2) for r in (antennas.tx_positions, antennas.rx_positions))
+    flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
+    return [direction_cosine(flat, antennas, waveform, axis, virtual) for axis in (0, 2)]
+
+
+def standard_deviations(snr: float, antennas: Antennas, waveform: Waveform, passes: int) -> np.ndarray:
     """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao of a tone, with Hann's loss of
     2 on the two windowed axes), and never below the floors at which other paths' sidelobes usually end the gain."""
     w, tone = waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
     spread = [max(tone, 2e-3) * w.range_cell(passes), max(tone, 4e-3) * w.velocity_cell(passes)]
     angles = []
     for axis in (0, 2):
-        place = arm(antennas, axis, virtual)[2]
+        place = arm(antennas, axis, passes == 2)[2]
         slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
         share = place.size / (antennas.num_tx * antennas.num_rx)
         angles.append(max(1 / (slope * np.sqrt(2 * max(snr, 1.0) * share)), 2e-4))

@@ -84,3 +84,15 @@ def _gather(spectrum, symbols, factor, step, out):  # pragma: no cover - compile
         for k in range(num_rows):
             out[k, p] = np.complex64(spectrum[p, (k + symbols[p]) % num_samples] * turn)
             turn *= step[p]
+
+
+def motion_floor(waveform: Waveform) -> float:
+    """Largest share of a path's power in one Doppler bin that motion during the data's time shift leaves (module docstring).
+
+    The phase error is uniform over 2 pi f_c (dtau/dt) s_D/f_s at the fastest unambiguous path; its variance spreads over P bins,
+    with Hann's 3/2, and a bin exceeds ten times the mean of its few independent antennas once in thousands.
+    """
+    w = waveform
+    fastest = 0.5 / (w.slot_duration * w.effective_carrier)
+    span = 2 * np.pi * w.carrier_frequency * fastest * w.num_delay_symbols * w.delay_step
+    return float(10 * 1.5 / w.num_chirps * span**2 / 12)

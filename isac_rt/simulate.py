@@ -1,0 +1,407 @@
+"""run(scenario) -> Results: the one place where the stages meet. No physics here."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
+from isac_rt.city import City, load_city
+from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
+from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, thermal_noise_power, transmit_amplitude
+from isac_rt.metrics import (
+    SensingScore,
+    SymbolCount,
+    Truth,
+    associate,
+    count_symbols,
+    explain,
+    resolutions,
+    truth_of,
+)
+from isac_rt.payload import Payload, random_payload, unmodulated
+from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
+from isac_rt.propagation.pathset import drop_weak
+from isac_rt.randomness import generator, seed_sequence
+from isac_rt.receive import Reception
+from isac_rt.results import TIMINGS, FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
+from isac_rt.scenario import Scenario
+from isac_rt.swarm import Pose, Swarm
+from isac_rt.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.tracking import TrackSet
+from isac_rt.waveform import Waveform, waveform_of
+
+Progress = Callable[[int, int], None]
+Link = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What stays the same over a run."""
+
+    scenario: Scenario
+    waveform: Waveform
+    antennas: Antennas
+    schedule: Schedule
+    swarm: Swarm
+    city: City
+    propagation: Propagation
+    reference: FreeSpace
+    """Closed forms of the reference paths, as they would be unshadowed and in view."""
+
+    @property
+    def active(self) -> str:
+        return self.swarm.with_role("active")[0]
+
+    def start_time(self, frame: int) -> float:
+        """Of a frame's first reference chirp [s]."""
+        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
+        return frame * interval
+
+    def epoch(self, frame: int) -> float:
+        """Middle of a frame [s]."""
+        return self.start_time(frame) + self.waveform.frame_duration / 2
+
+    def modulated(self, frame: int) -> bool:
+        """Whether a frame carries data: all but the acquisition frames and the periodic pilots. Public."""
+        m = self.scenario.modulation
+        pilot = m.pilot_every_frames is not None and frame % m.pilot_every_frames == 0
+        return frame >= m.acquisition_frames and not pilot
+
+    def links(self, frame: int) -> list[Link]:
+        """Links that are received in a frame: the AT's own (when it processes it) and one for every PT."""
+        own = frame % self.scenario.receivers.active_every_frames == 0
+        return [(self.active, self.active)] * own + [(self.active, pt) for pt in self.swarm.with_role("passive")]
+
+    def payload(self, frame: int) -> Payload:
+        if not self.modulated(frame):
+            return unmodulated(self.waveform)
+        rng = generator(self.scenario.seed, "payload", self.active, frame)
+        return random_payload(self.waveform, self.schedule, self.scenario.modulation.dpsk_order, rng)
+
+
+    def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
+        """E|n|^2 of a sample at the link's receiver [W]."""
+        if self.scenario.noise.model == "link_budget":
+            return thermal_noise_power(self.scenario.noise, self.waveform)
+        return noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
+
+    def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
+        """Poses and paths of a frame; what is too weak to matter is left out."""
+        poses, s = self.swarm.poses(self.epoch(frame)), self.scenario
+        found = self.propagation.paths(poses, self.epoch(frame), self.links(frame))
+        cells = self.waveform.num_samples * self.waveform.num_chirps
+        share = 10 ** (-s.propagation.weakest_path_db / 10) / (transmit_amplitude(s.noise) ** 2 * cells)
+        return poses, {link: drop_weak(p, share * self.noise_power(poses, link)) for link, p in found.items()}
+
+    def transmission(self, frame: int, pose: Pose) -> Transmission:
+        """What the active terminal sends in a frame."""
+        return Transmission(
+            name=self.active,
+            pose=pose,
+            antennas=self.antennas,
+            schedule=self.schedule,
+            payload=self.payload(frame),
+            amplitude=transmit_amplitude(self.scenario.noise),
+        )
+
+    def receive_samples(self, frame: int, sent: Transmission, paths: PathSet, poses: dict[str, Pose]) -> IFCube:
+        """IF samples of one receiver, with its noise. They depend on nothing but the frame and the receiver."""
+        level = self.noise_power(poses, (paths.tx, paths.rx))
+        cube = if_signal(
+            self.waveform,
+            [(sent, paths)],
+            poses[paths.rx],
+            self.antennas,
+            start_time=self.start_time(frame),
+            filter_transition=self.scenario.radio.filter_transition_hz,
+            noise_power=level,
+        )
+        words = seed_sequence(self.scenario.seed, "noise", paths.rx, frame).generate_state(2)
+        return add_noise(cube, level, words)
+
+    def budget(self) -> list[LinkBudget]:
+        """The link budget at the first frame."""
+        poses = self.swarm.poses(self.epoch(0))
+        rows = []
+        for tx, rx in self.links(0):
+            amplitude = self.reference.reference_amplitude(poses, tx, rx)
+            name = rx if tx != rx else self.reference.strongest_target(poses, tx)
+            distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
+            what = "line of sight" if tx != rx else f"echo of {name}"
+            rows.append(link_budget((tx, rx), what, distance, amplitude, self.scenario.noise, self.waveform, self.antennas))
+        return rows
+
+
+def prepare(scenario: Scenario) -> Setup:
+    """Load and build everything that frames share."""
+    waveform = waveform_of(scenario)
+    antennas = antennas_of(scenario, waveform)
+    swarm = Swarm.from_scenario(scenario)
+    interval = scenario.frame_interval_s or waveform.frame_duration
+    times = np.linspace(0, scenario.frames * interval, 9)
+    centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
+    city = load_city(scenario, waveform.carrier_frequency, centre)
+    return Setup(
+        scenario,
+        waveform,
+        antennas,
+        schedule_of(scenario, waveform, generator(scenario.seed, "schedule")),
+        swarm,
+        city,
+        make_propagation(scenario, waveform, antennas, city),
+        FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
+    )
+
+
+def trace(scenario: Scenario, frame: int) -> dict[Link, PathSet]:
+    """The paths of all links of one frame."""
+    return prepare(scenario).trace(frame)[1]
+
+
+@dataclass
+class _Clock:
+    """Seconds per stage, summed over the threads that work in it."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMINGS, 0.0))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class _Heard:
+    """What one observer got and made of one frame."""
+
+    reception: Reception
+    tracks: TrackSet
+    state: int
+    slips: int
+
+
+class _Observer:
+    """One receiving terminal with its score."""
+
+    def __init__(self, setup: Setup, name: str) -> None:
+        s = setup.scenario
+        self.name, self.setup, self.passes = name, setup, 2 if name == setup.active else 1
+        self.terminal: ActiveTerminal | PassiveTerminal
+        if self.passes == 2:
+            self.terminal = ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
+        else:
+            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, s.modulation.dpsk_order)
+        self.score = SensingScore(resolutions(setup.waveform, setup.antennas, self.passes))
+
+    def hear(self, frame: int, sent: Transmission, paths: PathSet, poses: dict[str, Pose], maps: bool, clock: _Clock) -> _Heard:
+        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
+        with clock.stage("synthesis"):
+            cube = self.setup.receive_samples(frame, sent, paths, poses)
+        with clock.stage("receive"):
+            own, when = poses[self.name], self.setup.epoch(frame)
+            if isinstance(self.terminal, ActiveTerminal):
+                reception, tracks = self.terminal.step(cube, sent.payload, own, when, maps=maps)
+                return _Heard(reception, tracks, int(TerminalState.TRACKING), 0)
+            reception, tracks = self.terminal.step(cube, own, when, self.setup.modulated(frame), maps=maps)
+            return _Heard(reception, tracks, int(self.terminal.state), self.terminal.slips_repaired)
+
+
+def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None) -> Results:
+    """Simulate every frame of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    progress : called with the frames done and the frames in all
+    setup : from `prepare`, if it is there already
+
+    Returns
+    -------
+    Results; the same for one scenario and set of versions whatever the number of threads
+    """
+    clock, begin = _Clock(), time.perf_counter()
+    with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
+        with clock.stage("setup"):
+            setup = setup or prepare(scenario)
+            names = [setup.active, *setup.swarm.with_role("passive")]
+            observers = {name: _Observer(setup, name) for name in names}
+            recorder = Recorder(scenario, setup.waveform, names, [state.name.lower() for state in TerminalState])
+        snapshots = _snapshot_frames(scenario)
+        waiting: tuple[_Frame, dict[str, Future[_Heard]]] | None = None
+        for frame in range(scenario.frames):
+            with clock.stage("trace"):
+                poses, paths = setup.trace(frame)
+            if waiting is not None:
+                _collect(recorder, observers, *waiting, clock)
+                if progress:
+                    progress(frame, scenario.frames)
+            sent = setup.transmission(frame, poses[setup.active])
+            snap = frame in snapshots
+            jobs = {p.rx: pool.submit(observers[p.rx].hear, frame, sent, p, poses, snap, clock) for p in paths.values()}
+            waiting = _Frame(frame, poses, {p.rx: p for p in paths.values()}, sent, snap), jobs
+        if waiting is not None:
+            _collect(recorder, observers, *waiting, clock)
+        if progress:
+            progress(scenario.frames, scenario.frames)
+    clock.seconds["total"] = time.perf_counter() - begin
+    return recorder.finish(
+        scores={name: o.score for name, o in observers.items()},
+        timing=clock.seconds,
+        fidelity=_fidelity(setup),
+        materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in setup.city.materials},
+        link_budget=[vars(row) for row in setup.budget()],
+    )
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame as it was sent and travelled."""
+
+    number: int
+    poses: dict[str, Pose]
+    paths: dict[str, PathSet]
+    sent: Transmission
+    snapshot: bool
+
+
+def _snapshot_frames(scenario: Scenario) -> set[int]:
+    """Frames of which maps and ledger are kept: three of those that the active terminal processes, the first in data mode."""
+    step = scenario.receivers.active_every_frames
+    heard = [f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames] or [0]
+    return {heard[0], heard[len(heard) // 2], heard[-1]}
+
+
+def _collect(recorder: Recorder, observers: dict[str, _Observer], frame: _Frame, jobs: dict[str, Future], clock: _Clock) -> None:
+    """Wait for a frame's receivers, score and record it."""
+    heard = {name: job.result() for name, job in jobs.items()}
+    with clock.stage("track"):
+        recorder.add(
+            FrameRecord(
+                frame=frame.number,
+                time=observers[next(iter(observers))].setup.epoch(frame.number),
+                modulated=frame.sent.payload.modulated,
+                poses=frame.poses,
+                observers={name: _record(observers[name], frame, h) for name, h in heard.items()},
+                snapshot=frame.snapshot,
+            )
+        )
+
+
+def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord:
+    """Hold one observer's reception against the truth."""
+    setup, paths, reception = observer.setup, frame.paths[observer.name], heard.reception
+    names, own, active = list(setup.swarm.uavs), frame.poses[observer.name], frame.poses[setup.active]
+    truth: list[Truth | None] = []
+    for name in names:
+        by_way = active if observer.passes == 1 and name != setup.active else None
+        truth.append(None if name == observer.name else truth_of(own, frame.poses[name], by_way))
+    in_view = np.array([name != observer.name and _in_view(setup, own, active, frame.poses[name]) for name in names])
+    direct = _direct_targets(paths, names, setup.active)
+    seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
+    targets = [t for i in seen if (t := truth[i]) is not None]
+    kind, target = explain(reception.detections, paths, setup.waveform, observer.passes)
+    observer.score.add(targets, reception.detections, heard.tracks, kind)
+    d, t = reception.detections, heard.tracks
+    detected = np.column_stack([d.range, d.velocity, d.direction])
+    tracked = np.column_stack([t.range, t.velocity, t.direction])
+    sure = np.flatnonzero(t.confirmed | t.is_reference)
+    to_detection = associate(targets, detected, observer.score.resolution)
+    to_track = [(i, int(sure[j])) for i, j in associate(targets, tracked[sure], observer.score.resolution)]
+    followed = np.full(len(t), -1)
+    followed[[j for _, j in to_track]] = [seen[i] for i, _ in to_track]
+    stray = np.ones(len(d), bool)
+    stray[[j for _, j in to_detection]] = False
+    raw = reception.raw_delay_symbols
+    return ObserverRecord(
+        transmitter=setup.active,
+        reception=reception,
+        paths=paths,
+        truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in truth]),
+        detected=_estimates(len(names), detected, to_detection, seen),
+        tracked=_estimates(len(names), tracked, to_track, seen),
+        in_view=in_view,
+        shadowed=in_view & ~direct,
+        tracks=TrackTable(
+            id=t.ids, range=t.range, velocity=t.velocity, u_x=t.direction[:, 0], u_z=t.direction[:, 1], confirmed=t.confirmed, uav=followed
+        ),
+        state=heard.state,
+        detection_kind=kind,
+        detection_target=target,
+        symbols=count_symbols(frame.sent.payload, reception) if observer.passes == 1 else SymbolCount(),
+        num_false=int((stray & (kind < 0)).sum()),
+        slips=int(((raw < 0) | (raw >= setup.waveform.num_delay_symbols)).sum()),
+        reference_snr=_reference_snr(setup, frame, paths),
+    )
+
+
+def _in_view(setup: Setup, own: Pose, active: Pose, body: Pose) -> bool:
+    """Whether a body is in the field of view of the receiver and, unless it is the transmitter itself, of the transmitter."""
+    ends = [(own, body)]
+    if body is active:
+        ends.append((active, own))
+    elif own is not active:
+        ends.append((active, body))
+    return all(bool(setup.antennas.in_view(a.to_body(_unit(b.position - a.position)))) for a, b in ends)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def _direct_targets(paths: PathSet, names: list[str], active: str) -> np.ndarray:
+    """Whether each UAV is reached without the city: the transmitter by the line of sight, the others by their echo."""
+    echo = {paths.target_names[i] for i in paths.target[paths.kind == PathKind.TARGET]}
+    sight = bool((paths.kind == PathKind.LINE_OF_SIGHT).any())
+    return np.array([sight if name == active and paths.rx != active else name in echo for name in names])
+
+
+def _reference_snr(setup: Setup, frame: _Frame, paths: PathSet) -> float:
+    """Per-sample SNR of the line of sight, or of the strongest echo on the terminal's own link; NaN where there is none."""
+    kind = PathKind.TARGET if paths.tx == paths.rx else PathKind.LINE_OF_SIGHT
+    power = paths.power[paths.kind == kind]
+    level = setup.noise_power(frame.poses, (paths.tx, paths.rx))
+    return float(frame.sent.amplitude**2 * power.max() / level) if power.size else float("nan")
+
+
+def _values(rows: list[np.ndarray | None]) -> UavValues:
+    table = np.array([np.full(4, np.nan) if r is None else r for r in rows])
+    return UavValues(range=table[:, 0], velocity=table[:, 1], azimuth=table[:, 2], elevation=table[:, 3])
+
+
+def _estimates(count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen: list[int]) -> UavValues:
+    """Estimates by UAV; direction cosines become azimuth and elevation of the front half-space."""
+    rows: list[np.ndarray | None] = [None] * count
+    for i, j in pairs:
+        r, v, u_x, u_z = found[j]
+        forward = 1 - u_x**2 - u_z**2
+        angles = (np.arctan2(u_x, np.sqrt(forward)), np.arcsin(u_z)) if forward >= 0 else (np.nan, np.nan)
+        rows[seen[i]] = np.array([r, v, *angles])
+    return _values(rows)
+
+
+def _fidelity(setup: Setup) -> dict[str, object]:
+    """What was modelled, for the summary."""
+    p, c = setup.scenario.propagation, setup.scenario.clutter
+    traced = p.model == "ray_traced"
+    return {
+        "propagation": p.model,
+        "max_bounces": p.max_bounces if traced and p.specular else 0,
+        "ghosts": traced and p.ghosts,
+        "leakage": traced and p.leakage.enabled,
+        "clutter": c.model,
+        "rays": p.rays if traced else None,
+        "clutter_rays": c.rays if c.model == "diffuse" else None,
+        "weakest_path_db": p.weakest_path_db,
+        "synthesis": "auto",
+        "paths_contradicted": setup.propagation.dropped,
+        "city_faces": setup.city.num_faces,
+    }
