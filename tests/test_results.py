@@ -14,6 +14,7 @@ from isac_rt import results as module
 from isac_rt.arrays import antennas_of
 from isac_rt.metrics import SensingScore, resolutions
 from isac_rt.results import KINDS, Recorder, ResultsError, check_folder, errors_of, load, save, write_ledger
+from isac_rt.scenario_file import to_yaml
 from isac_rt.waveform import waveform_of
 
 TERMINAL_KEYS = {"role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased", "matched",
@@ -45,7 +46,7 @@ def test_round_trip_is_bit_exact(tmp_path, detections):
     save(made, tmp_path / "a" / "b")
     back = load(tmp_path / "a" / "b")
     _same(made.dataset, back.dataset)
-    assert back.summary == json.loads(json.dumps(made.summary)) and back.scenario == made.scenario
+    assert back.summary == json.loads(json.dumps(made.summary)) and to_yaml(back.scenario) == to_yaml(made.scenario)
     assert back.dataset.attrs["scenario"] == made.dataset.attrs["scenario"]
 
 

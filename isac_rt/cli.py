@@ -1,0 +1,284 @@
+"""The command line. Commands import what they need when they run, so that ``isac-rt --help`` is quick.
+
+Exit 0: done; 2: the input or the machine will not do, in one message; 130: interrupted; 1: anything else.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from isac_rt.results import Results
+    from isac_rt.scenario import Scenario
+
+DEBUG = "ISAC_RT_DEBUG"
+_GRACE = 1.2
+"""After Ctrl-C a run may tidy up for so long [s]; then the process ends whatever it is doing."""
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich",
+                  help="Integrated sensing and communication of a UAV swarm over a ray-traced city.")  # fmt: skip
+
+ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="The scenario, a YAML file.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a key, as in radio.groups=2.")]
+FrameNumber = Annotated[int, typer.Option("--frame", min=0, help="Number of the frame.")]
+
+
+class InputProblem(Exception):
+    """A command's arguments do not fit the scenario."""
+
+
+def _out() -> Console:
+    return Console(highlight=False)
+
+
+def _err() -> Console:
+    return Console(stderr=True, highlight=False)
+
+
+def _load(file: Path, overrides: Sequence[str] | None = None, frames: int | None = None, seed: int | None = None) -> Scenario:
+    from isac_rt.scenario_file import load
+
+    return load(file, overrides or (), frames, seed)
+
+
+@app.command()
+def run(
+    scenario: ScenarioFile,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where the results go; default runs/NAME.")] = None,
+    frames: Annotated[int | None, typer.Option("--frames", help="Simulate so many frames.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Replace the scenario's seed.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Simulate a scenario: results, summary, figures and a report."""
+    loaded = _load(scenario, overrides, frames, seed)
+    folder = out if out is not None else Path("runs") / loaded.name
+    with _ending_soon_after_interrupt(folder):
+        _run(loaded, folder)
+    _out().print(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/", soft_wrap=True)
+
+
+def _run(loaded: Scenario, folder: Path) -> None:
+    from isac_rt.results import check_folder, save
+
+    check_folder(folder)
+    from isac_rt import simulate
+
+    with _err().status("setting up"):
+        setup = simulate.prepare(loaded)
+        budget = simulate.link_budgets(setup)
+    _print_budget(budget)
+    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report), loaded.frames)
+    save(results, folder)
+    with _err().status("figures and report"):
+        from isac_rt.figures import make_figures
+        from isac_rt.report import write_report
+
+        write_report(results, folder, make_figures(results, folder, setup.city))
+    _print_summary(results)
+
+
+@app.command()
+def paths(
+    scenario: ScenarioFile,
+    frame: FrameNumber,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.nc", help="Where the ledger goes.")],
+    overrides: Overrides = None,
+) -> None:
+    """Write the path ledger of a frame, all links."""
+    loaded = _load(scenario, overrides)
+    _check_frame(loaded, frame)
+    with _ending_soon_after_interrupt(out.parent), _err().status("tracing"):
+        from isac_rt import simulate
+        from isac_rt.results import write_ledger
+
+        found = simulate.trace(loaded, frame)
+        write_ledger(found, out, loaded)
+    table = _table("link", *(k.replace("_", " ") for k in next(iter(found.values())).counts()) if found else ())
+    for (tx, rx), p in found.items():
+        table.add_row(f"{tx} to {rx}", *map(str, p.counts().values()))
+    _out().print(table)
+
+
+@app.command()
+def view(
+    scenario: ScenarioFile,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.png", help="Where the picture goes.")],
+    frame: FrameNumber = 0,
+    overrides: Overrides = None,
+) -> None:
+    """Render the city, the swarm and the paths of a frame."""
+    loaded = _load(scenario, overrides)
+    _check_frame(loaded, frame)
+    with _ending_soon_after_interrupt(out.parent), _err().status("tracing and drawing"):
+        import numpy as np
+
+        from isac_rt import simulate
+        from isac_rt.render import view_scene, write_view
+
+        setup = simulate.prepare(loaded)
+        found = simulate.trace(loaded, frame, setup=setup)
+        times = np.linspace(setup.epoch(0), setup.epoch(loaded.frames - 1), 60)
+        picture = view_scene(setup.city, setup.swarm, times, setup.epoch(frame), found)
+        write_view(picture, out)
+    _out().print(f"{out}", soft_wrap=True)
+
+
+@app.command()
+def doctor() -> None:
+    """Back end, LLVM, memory, threads, and what to install."""
+    from isac_rt.runtime import doctor as look
+
+    checks = look()
+    table = _table("", "found", "to do", justify="left")
+    for check in checks:
+        table.add_row(f"[green]ok[/] {check.name}" if check.ok else f"[red]no[/] {check.name}", check.found, "" if check.ok else check.remedy)
+    _out().print(table)
+    if not all(check.ok for check in checks):
+        raise typer.Exit(2)
+
+
+@app.command()
+def schema() -> None:
+    """JSON Schema of the scenario, for editors."""
+    import json
+
+    from isac_rt.scenario import json_schema
+
+    typer.echo(json.dumps(json_schema(), indent=1))
+
+
+def _check_frame(scenario: Scenario, frame: int) -> None:
+    if frame >= scenario.frames:
+        raise InputProblem(f"--frame {frame}: {scenario.name} has frames 0 to {scenario.frames - 1}; choose one of these or set frames higher")
+
+
+def _with_progress(work: Any, frames: int) -> Results:
+    """Do `work(report)` with a bar on stderr; `report(done, total)` moves it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, console=_err()) as bar:
+        task = bar.add_task("frames", total=frames)
+        return work(lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def _table(*titles: str, justify: Any = "right") -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for i, title in enumerate(titles):
+        table.add_column(title, justify="left" if i == 0 else justify)
+    return table
+
+
+def _print_budget(rows: Sequence[Any]) -> None:
+    """The link budget as `isac_rt.linkbudget.LinkBudget` rows."""
+    table = _table("link budget", "reference", "distance [m]", "received [dBm]", "noise [dBm]", "SNR [dB]", "gain [dB]", "processed [dB]")
+    for b in rows:
+        values = (b.distance_m, b.received_dbm, b.noise_dbm, b.snr_db, b.processing_gain_db, b.processed_snr_db)
+        table.add_row(b.link.replace("->", " to "), b.reference, *(f"{v:.1f}" for v in values))
+    _out().print(table)
+
+
+def _print_summary(results: Results) -> None:
+    from isac_rt.report import number, per_terminal, rmse_table
+
+    for part in (per_terminal(results.summary), rmse_table(results.summary)):
+        keep = [i for i, title in enumerate(part.columns) if title not in ("Role", "Matched", "Matched, tracked")]
+        table = _table(*(part.columns[i] for i in keep))
+        for row in part.rows:
+            table.add_row(*(row[i] for i in keep))
+        _out().print(table)
+    found = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n)
+    _out().print(f"paths: {found}; {number(results.summary['timing_s']['total'])} s")
+
+
+@contextmanager
+def _ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
+    """Make Ctrl-C end the process within `_GRACE` even inside a long native call, leaving no half-written file in `folder`.
+
+    Python runs its own handler only between byte codes; the wake-up pipe is written by the C handler at once, and a thread
+    waits for it.
+    """
+    receive, send = os.pipe()
+    os.set_blocking(send, False)
+
+    def wait() -> None:
+        while (heard := os.read(receive, 1)) and heard[0] != signal.SIGINT:
+            pass
+        os.close(receive)
+        if not heard:
+            return
+        time.sleep(_GRACE)
+        for unfinished in folder.rglob(f".*.{os.getpid()}.tmp"):
+            unfinished.unlink(missing_ok=True)
+        _say_interrupted()
+        os._exit(130)
+
+    before = signal.set_wakeup_fd(send, warn_on_full_buffer=False)
+    threading.Thread(target=wait, daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(send)
+
+
+def _say_interrupted() -> None:
+    sys.stderr.write("\ninterrupted\n")
+    sys.stderr.flush()
+
+
+def _user_problems() -> tuple[type[BaseException], ...]:
+    """What the user can mend. Imported only once something was raised: a module that is not loaded raised nothing."""
+    names = {"scenario_file": "ScenarioError", "city.materials": "CityError", "runtime": "RuntimeProblem", "results": "ResultsError"}
+    loaded = {name: sys.modules.get(f"isac_rt.{name}") for name in names}
+    return (InputProblem, *(getattr(module, names[name]) for name, module in loaded.items() if module is not None))
+
+
+def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:
+    if category.__module__.startswith("isac_rt"):
+        _err().print(f"[yellow]warning[/] {message}", soft_wrap=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    warnings.showwarning = _say_warning
+    try:
+        status = app(args=None if arguments is None else list(arguments), prog_name="isac-rt", standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except KeyboardInterrupt:
+        _say_interrupted()
+        return 130
+    except Exception as problem:
+        if os.environ.get(DEBUG):
+            traceback.print_exc()
+        if hasattr(problem, "exit_code"):  # typer's own: usage errors, exits and aborts
+            text = problem.format_message() if hasattr(problem, "format_message") else ""
+            if text:
+                sys.stderr.write(f"{text} (see isac-rt --help)\n")
+            return int(problem.exit_code)
+        if type(problem).__name__ == "Abort":  # what typer makes of Ctrl-C
+            _say_interrupted()
+            return 130
+        if isinstance(problem, _user_problems()):
+            sys.stderr.write(f"{problem}\n")
+            return 2
+        sys.stderr.write(f"{type(problem).__name__}: {problem} (this is a fault of isac_rt; {DEBUG}=1 shows where)\n")
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
