@@ -128,14 +128,16 @@ def _strengths(out, steer, lanes, cr, ci, lag, curve):
 
     Real and imaginary parts alternate; with z and j z both at hand no lane needs its neighbour.
     """
+    phasor, ahead, slant = steer[:lanes], steer[lanes : 2 * lanes], steer[2 * lanes :]
+    level, slope, bow = out[:lanes], out[lanes : 2 * lanes], out[2 * lanes :]
     for i in range(lanes):
-        z, jz, d = steer[i], steer[lanes + i], steer[2 * lanes + i]
+        z, jz, d = phasor[i], ahead[i], slant[i]
         plain, turned = cr * z + ci * jz, cr * jz - ci * z
         late = lag * d  # the array sees the frequency that was sent, tau before
         value, quadrature = plain - late * turned, turned + late * plain
-        out[i] = value
-        out[lanes + i] = d * value
-        out[2 * lanes + i] = np.float32(-0.5) * d * d * value + curve * quadrature
+        level[i] = value
+        slope[i] = d * value
+        bow[i] = np.float32(-0.5) * d * d * value + curve * quadrature
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -18,7 +18,7 @@ from isac_rt.synthesis import Tones, add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 Method = Literal["auto", "exact", "direct", "gridded"]
-FEW_PATHS = 4
+FEW_PATHS = 10
 """Up to so many paths the direct method costs about as much as the transforms of the gridded one."""
 
 

@@ -186,7 +186,7 @@ def _tone(sums, lane, half, amplitude, phase, frequency, quadratic):
 
     `sums` holds _BLOCK real parts, then their imaginary parts, block after block. Each block starts from a phase reduced
     in float64. `lane` is flat: the phasors inside a block (real, imaginary) and how they change from a block to the next.
-    Constant lengths and offsets let the compiler see that nothing overlaps.
+    Constant lengths and offsets, and slices instead of sums of indices (which may be negative), let the compiler vectorise.
     """
     x = -half
     _rotation(frequency + 2 * quadratic * x, quadratic, lane[:_BLOCK], lane[_BLOCK : 2 * _BLOCK])
@@ -196,10 +196,11 @@ def _tone(sums, lane, half, amplitude, phase, frequency, quadratic):
         c, s = np.cos(angle), np.sin(angle)
         pr = amplitude.real * c - amplitude.imag * s
         pi = amplitude.real * s + amplitude.imag * c
+        part = sums[start : start + 2 * _BLOCK]
         for i in range(_BLOCK):
             lr, li, tr, ti = lane[i], lane[_BLOCK + i], lane[2 * _BLOCK + i], lane[3 * _BLOCK + i]
-            sums[start + i] += pr * lr - pi * li
-            sums[start + _BLOCK + i] += pr * li + pi * lr
+            part[i] += pr * lr - pi * li
+            part[_BLOCK + i] += pr * li + pi * lr
             lane[i] = lr * tr - li * ti
             lane[_BLOCK + i] = lr * ti + li * tr
         x += _BLOCK
@@ -208,10 +209,11 @@ def _tone(sums, lane, half, amplitude, phase, frequency, quadratic):
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
 def _flush(row, sums):
     """Add the sums of one chirp to its samples (2 N,) float32 and clear them."""
-    for n in range(row.shape[0] // 2):
-        place = 2 * _BLOCK * (n // _BLOCK) + n % _BLOCK
-        row[2 * n] += np.float32(sums[place])
-        row[2 * n + 1] += np.float32(sums[place + _BLOCK])
+    for start in range(0, row.shape[0], 2 * _BLOCK):
+        samples, part = row[start : start + 2 * _BLOCK], sums[start : start + 2 * _BLOCK]
+        for i in range(samples.shape[0] // 2):
+            samples[2 * i] += np.float32(part[i])
+            samples[2 * i + 1] += np.float32(part[_BLOCK + i])
     sums[:] = 0.0
 
 
