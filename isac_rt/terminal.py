@@ -1,0 +1,294 @@
+"""One terminal from frame to frame: receive, track, predict. Samples and public knowledge in, never the truth.
+
+A terminal knows its own pose, the waveform, the antenna schedule, which frames carry data, and, at the active terminal, its own
+payload. `python -m isac_rt.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, replace
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from isac_rt.arrays import Antennas
+from isac_rt.ifsignal import IFCube
+from isac_rt.payload import Payload
+from isac_rt.receive import Detections, Prediction, Reception, receive_active, receive_passive
+from isac_rt.receive.demodulate import EXTRA_CELLS
+from isac_rt.scenario import Receivers, Tracking
+from isac_rt.swarm import Pose
+from isac_rt.tracking import (
+    Gaussian,
+    Track,
+    Tracker,
+    TrackSet,
+    birth,
+    expected,
+    mahalanobis,
+    measurement_covariance,
+    predict,
+    update,
+    wrapped,
+)
+from isac_rt.waveform import Waveform
+
+LEVEL_DROP = 10.0
+"""A reference this factor in power under the remembered, range-scaled level is not the line of sight."""
+COAST_CELLS = 0.2
+"""A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
+SLIP_FALSE_RATE = 1e-6
+"""Chance that noise alone makes one chirp's decision confident enough to count as evidence of a slip."""
+REFERENCE_GATE = 1e-6
+"""A pilot's reference that the track would show this rarely starts the track anew."""
+
+
+class TerminalState(IntEnum):
+    """What a terminal says of its link."""
+
+    ACQUIRING = 0  # nothing known yet
+    TRACKING = 1  # its reference path is in sight
+    LOST = 2  # it had a reference and does not see it now
+
+
+class ActiveTerminal:
+    """The AT: senses with its own echoes and tracks what it finds."""
+
+    def __init__(self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking) -> None:
+        self._antennas, self._receivers = antennas, receivers
+        self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
+
+    def step(
+        self, cube: IFCube, payload: Payload, own_pose: Pose, time: float, *, maps: bool = False
+    ) -> tuple[Reception, TrackSet]:
+        """Receive and track one frame; `time` is its middle [s]."""
+        reception = receive_active(cube, payload, self._antennas, self._receivers, maps=maps)
+        self.tracker.predict(time)
+        self.tracker.update(reception.detections, own_pose)
+        return reception, self.tracker.snapshot(own_pose)
+
+
+class PassiveTerminal:
+    """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of sight, and comes back.
+
+    Attributes
+    ----------
+    state : TerminalState
+    reference : the track of the active terminal, None before acquisition
+    slips_repaired : times that the range of the reference was moved by whole cells while data flowed
+    """
+
+    def __init__(
+        self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking, dpsk_order: int
+    ) -> None:
+        self._waveform, self._antennas, self._receivers, self._order = waveform, antennas, receivers, dpsk_order
+        self._acceleration = tracking.acceleration_std_mps2
+        self._period = 2 * waveform.max_velocity(1)
+        self._time, self._level = -np.inf, float("nan")
+        self.tracker = Tracker(tracking, self._period)
+        self.state = TerminalState.ACQUIRING
+        self.reference: Track | None = None
+        self.slips_repaired = 0
+
+    def step(
+        self, cube: IFCube, own_pose: Pose, time: float, modulated: bool, *, maps: bool = False
+    ) -> tuple[Reception, TrackSet]:
+        """Receive and track one frame; `time` is its middle [s], `modulated` is public."""
+        if self.reference is not None:
+            self.reference.state = predict(self.reference.state, time - self._time, self._acceleration)
+            self.reference.age += 1
+        self._time = time
+        self.tracker.predict(time)
+        reception = self._receive(cube, self._expect(own_pose) if modulated else None, modulated, maps)
+        if reception.decoded:
+            reception = self._repair_slip(cube, reception, own_pose, maps)
+        if reception.line_of_sight and not self._plausible(reception):
+            reception = _without_reference(reception)
+        self._follow(reception, own_pose, modulated)
+        if self.reference is not None and reception.line_of_sight:
+            self.tracker.update(reception.detections, own_pose, self.reference.state)
+        return reception, self.tracker.snapshot(own_pose, self.reference)
+
+    def _receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
+        return receive_passive(cube, self._antennas, self._receivers, self._order, prediction, modulated, maps=maps)
+
+    def _expect(self, own: Pose) -> Prediction | None:
+        """Prediction for a data frame; None when the range is no longer known well enough to read a fraction of a cell."""
+        if self.reference is None:
+            return None
+        prediction = self.tracker.to_prediction(own, self.reference)
+        return prediction if prediction.range_std[0] < COAST_CELLS * self._waveform.range_cell(1) else None
+
+    def _plausible(self, reception: Reception) -> bool:
+        """Whether the reference's level, scaled with its range squared, is that of the line of sight as remembered."""
+        return not _scaled_level(reception) < self._level / LEVEL_DROP
+
+    def _follow(self, reception: Reception, own: Pose, modulated: bool) -> None:
+        """Update or restart the reference track, and say where the terminal stands."""
+        if not reception.line_of_sight:
+            if self.reference is not None:
+                self.reference.missed += 1
+                self.state = TerminalState.LOST
+            return
+        d = reception.detections
+        q = int(np.flatnonzero(d.is_reference)[0])
+        z = np.array([d.range[q], d.velocity[q], *d.direction[q]])
+        if self.reference is None or (not modulated and not self._expected(z, d.std[q], own)):
+            state = birth(z, d.std[q], own)
+            if state is None:
+                return
+            self.reference = Track(self.tracker.new_id(), state, float(d.snr[q]), confirmed=True)
+            self._level = _scaled_level(reception)
+            self.tracker.clear()  # their bistatic positions rested on the old reference
+        else:
+            R = measurement_covariance(d.std[q], self.reference.state.mean)
+            self.reference.state = update(self.reference.state, z, R, own, velocity_period=self._period)
+            self.reference.snr, self.reference.missed = float(d.snr[q]), 0
+            self._level += 0.2 * (_scaled_level(reception) - self._level)
+        self.state = TerminalState.TRACKING
+
+    def _expected(self, z: np.ndarray, std: np.ndarray, own: Pose) -> bool:
+        """Whether a pilot's reference lies where the track would have it."""
+        assert self.reference is not None
+        state = self.reference.state
+        mean, S = expected(state.mean, state.covariance, own)
+        residual = wrapped(z - mean, self._period)
+        d2, _ = mahalanobis(residual, S + measurement_covariance(std, state.mean))
+        return bool(d2 < stats.chi2.isf(REFERENCE_GATE, np.isfinite(residual).sum()))
+
+    def _repair_slip(self, cube: IFCube, reception: Reception, own: Pose, maps: bool) -> Reception:
+        """Move the reference by whole cells when confident symbols lie outside the alphabet, and read the frame again.
+
+        With the range k cells too long every symbol is read k too low, so that the symbols 0..k-1 fall below the alphabet: a frame
+        of M P chirps shows a slip of one cell with probability 1 - (1 - 2/N)^(M P), one half for the paper's numbers. The
+        repair stands only if the frame, read again, has no confident symbol outside.
+        """
+        cells = slip_cells(reception, self._antennas.num_rx, self._waveform)
+        if cells == 0 or self.reference is None:
+            return reception
+        before = self.reference.state
+        self.reference.state = _moved(before, own, cells * self._waveform.range_cell(1))
+        prediction = self._expect(own)
+        again = self._receive(cube, prediction, True, maps) if prediction else reception
+        if not again.decoded or slip_cells(again, self._antennas.num_rx, self._waveform) != 0:
+            self.reference.state = before
+            return reception
+        self.slips_repaired += 1
+        return again
+
+
+def slip_cells(reception: Reception, num_rx: int, waveform: Waveform) -> int:
+    """Whole cells by which the true range exceeds the predicted one, as far as confident symbols outside the alphabet show it;
+    0 where none does, or where both ends contradict each other."""
+    raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
+    searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
+    sure = reception.delay_confidence > stats.gamma(num_rx, scale=1 / num_rx).isf(SLIP_FALSE_RATE / searched)
+    if not sure.any():
+        return 0
+    low, high = min(int(raw[sure].min()), 0), max(int(raw[sure].max()) - last, 0)
+    return low + high if low == 0 or high == 0 else 0
+
+
+def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
+    """A state pushed along the line of sight."""
+    span = state.mean[:3] - own.position
+    mean = state.mean.copy()
+    mean[:3] += span / np.linalg.norm(span) * distance
+    return Gaussian(mean, state.covariance)
+
+
+def _scaled_level(reception: Reception) -> float:
+    d = reception.detections
+    return float(reception.reference_power * d.range[d.is_reference][0] ** 2)
+
+
+def _without_reference(reception: Reception) -> Reception:
+    """The same frame with its reference taken for something else: nothing decoded, no line of sight."""
+    d = reception.detections
+    return replace(
+        reception,
+        detections=Detections(**{**vars(d), "is_reference": np.zeros(len(d), bool)}),
+        decoded=False,
+        delay_symbols=np.full_like(reception.delay_symbols, -1),
+        transitions=np.full_like(reception.transitions, -1),
+        bits=np.zeros(0, np.uint8),
+        raw_delay_symbols=np.zeros((0, reception.raw_delay_symbols.shape[1]), int),
+        line_of_sight=False,
+    )
+
+
+def save_capture(
+    path: Path | str,
+    cubes: list[IFCube],
+    own_poses: list[Pose],
+    times: list[float],
+    modulated: list[bool],
+    antennas: Antennas,
+    receivers: Receivers,
+    tracking: Tracking,
+    dpsk_order: int,
+    payloads: list[Payload] | None = None,
+) -> None:
+    """Samples and public parameters of successive frames of one terminal in one .npz file.
+
+    `payloads` are the terminal's own, at the active terminal; a passive terminal's file has none.
+    """
+    public = {
+        "waveform": asdict(cubes[0].waveform),
+        "antennas": asdict(antennas),
+        "receivers": receivers.model_dump(mode="json"),
+        "tracking": tracking.model_dump(mode="json"),
+        "dpsk_order": dpsk_order,
+        "active": payloads is not None,
+    }
+    arrays = {"samples": np.stack([c.samples for c in cubes]), "schedule": cubes[0].schedule}
+    arrays |= {"start": np.array([c.start_time for c in cubes]), "time": np.array(times), "modulated": np.array(modulated)}
+    for name in ("position", "velocity", "acceleration", "rotation"):
+        arrays[f"own_{name}"] = np.stack([getattr(p, name) for p in own_poses])
+    for i, p in enumerate(payloads or []):
+        arrays |= {f"payload{i}_{name}": value for name, value in vars(p).items()}
+    np.savez(path, public=np.array(json.dumps(public)), **arrays)
+
+
+def replay(path: Path | str) -> dict[str, np.ndarray]:
+    """Run a terminal on a capture alone: detections, symbols, bits and tracks of every frame, as flat named arrays."""
+    with np.load(path) as file:
+        data = {name: file[name] for name in file.files}
+    public = json.loads(str(data["public"]))
+    w, antennas = Waveform(**public["waveform"]), Antennas(**public["antennas"])
+    receivers, tracking = Receivers.model_validate(public["receivers"]), Tracking.model_validate(public["tracking"])
+    active = ActiveTerminal(w, antennas, receivers, tracking)
+    passive = PassiveTerminal(w, antennas, receivers, tracking, public["dpsk_order"])
+    out: dict[str, np.ndarray] = {}
+    for i, time in enumerate(data["time"].tolist()):
+        cube = IFCube(samples=data["samples"][i], waveform=w, schedule=data["schedule"], start_time=float(data["start"][i]))
+        own = Pose(*(data[f"own_{name}"][i] for name in ("position", "velocity", "acceleration", "rotation")))
+        if public["active"]:
+            names = ("bits", "delay_symbols", "transitions", "phases")
+            payload = Payload(*(data[f"payload{i}_{name}"] for name in names))
+            reception, tracks = active.step(cube, payload, own, time)
+        else:
+            reception, tracks = passive.step(cube, own, time, bool(data["modulated"][i]))
+        out |= flat(i, reception, tracks)
+    return out
+
+
+def flat(frame: int, reception: Reception, tracks: TrackSet) -> dict[str, np.ndarray]:
+    """One frame's outcome as named arrays, for comparing runs bit by bit."""
+    d, names = reception.detections, ("delay_symbols", "transitions", "bits", "delay_confidence")
+    out = {f"{frame}/{name}": np.asarray(getattr(reception, name)) for name in names}
+    out |= {f"{frame}/det_{name}": np.asarray(value) for name, value in vars(d).items()}
+    return out | {f"{frame}/track_{name}": np.asarray(value) for name, value in vars(tracks).items()}
+
+
+def main() -> None:
+    capture, target = sys.argv[1:]
+    np.savez(target, **replay(capture))
+
+
+if __name__ == "__main__":
+    main()
