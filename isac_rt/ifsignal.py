@@ -18,6 +18,10 @@ from isac_rt.synthesis import Tones, add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 Method = Literal["auto", "exact", "direct", "gridded"]
+"""exact: float64 per sample. direct: error 1e-6, cost ~ paths. gridded: error `GRIDDED_ERROR`, for many paths. auto: the
+paths whose gridding error, integrated coherently over the whole cube, could exceed the noise of a cell (amplitude^2 |gain|^2
+GRIDDED_ERROR^2 size > noise_power) go direct, the `max_direct` strongest of them at the most, and so does every line of
+sight; the rest are gridded. At most FEW_PATHS paths all go direct."""
 FEW_PATHS = 10
 """Up to so many paths the direct method costs about as much as the transforms of the gridded one."""
 
@@ -94,10 +98,7 @@ def if_signal(
     start_time : of the frame's first reference chirp [s]; the paths' epoch is half a frame later
     filter_transition : width of the filter's skirts [Hz]
     schedule : of the cube; by default that of the first transmission
-    method : "exact" float64 per sample; "direct" error 1e-6, cost ~ paths; "gridded" error `GRIDDED_ERROR`, for many paths;
-        "auto": the paths whose gridding error, integrated coherently over the whole cube, could exceed the noise of a cell
-        (amplitude^2 |gain|^2 GRIDDED_ERROR^2 size > noise_power) go direct, the `max_direct` strongest of them at the most,
-        and so does every line of sight; the rest are gridded. At most FEW_PATHS paths all go direct.
+    method : see `Method`
     noise_power : per complex sample [W], for "auto"; with 0 the `max_direct` strongest go direct
 
     Returns
@@ -112,34 +113,25 @@ def if_signal(
     Notes
     -----
     Not modelled: motion during the flight of light; the turning of directions within a frame (element phases err by
-    2 pi v r t / (R lambda), 0.05 rad at an outer element for 10 m/s across at 30 m). Spherical wavefronts enter at both ends
+    2 pi v r t / (R lambda), 0.03 rad at an outer element for 10 m/s across at 30 m). Spherical wavefronts enter at both ends
     by their radii, jointly for lines of sight; for folded paths the joint term r_tx.r_rx/L of the perpendicular offsets is
-    left out (1e-5 m, 0.02 rad at 30 m), as it is for lines of sight in "gridded".
+    left out (5e-6 m, 0.01 rad at 30 m), as it is for lines of sight in "gridded".
     """
     if schedule is None:
         if not links:
             raise ValueError("if_signal got neither a link nor a schedule; pass the schedule of the cube")
         schedule = links[0][0].schedule
-    epoch = start_time + waveform.frame_duration / 2
-    for transmission, paths in links:
-        if abs(paths.epoch - epoch) > 1e-9:
-            raise ValueError(
-                f"paths {transmission.name}->{paths.rx} have epoch {paths.epoch!r} s, the middle of the frame is {epoch!r} s; "
-                "compute the paths at start_time + frame_duration/2"
-            )
+    _check_epochs(links, start_time + waveform.frame_duration / 2)
     tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas)
     shape = (waveform.num_groups, rx_antennas.num_rx, waveform.num_chirps, waveform.num_samples)
     if method == "exact":
         samples = exact(waveform, tones, filter_transition).astype(np.complex64)
-        return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
-    samples = np.zeros(shape, np.complex64)
-    if method == "auto":
-        alone = _direct_paths(power, sight, int(np.prod(shape)), noise_power, max_direct)
     else:
+        samples = np.zeros(shape, np.complex64)
         alone = np.full(len(tones), method == "direct")
-    if not alone.all():
+        if method == "auto":
+            alone = _direct_paths(power, sight, samples.size, noise_power, max_direct)
         add_gridded(samples, waveform, tones.select(~alone), filter_transition)
-    if alone.any():
         add_direct(samples, waveform, tones.select(alone), filter_transition)
     return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
 
@@ -154,6 +146,15 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     """
     add_white_noise(cube.samples, power, seed_words)
     return cube
+
+
+def _check_epochs(links: Sequence[tuple[Transmission, PathSet]], epoch: float) -> None:
+    for transmission, paths in links:
+        if abs(paths.epoch - epoch) > 1e-9:
+            raise ValueError(
+                f"paths {transmission.name}->{paths.rx} have epoch {paths.epoch!r} s, the middle of the frame is {epoch!r} s; "
+                "compute the paths at start_time + frame_duration/2"
+            )
 
 
 def _direct_paths(power: np.ndarray, sight: np.ndarray, size: int, noise_power: float, limit: int) -> np.ndarray:

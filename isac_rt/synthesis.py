@@ -262,6 +262,8 @@ def add_direct(samples: np.ndarray, waveform: Waveform, tones: Tones, transition
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     """
     path, offset = sources(waveform, tones, transition)
+    if path.size == 0:
+        return
     t = tones
     _direct(
         samples.view(np.float32),
