@@ -101,11 +101,6 @@ def if_signal(
     method : see `Method`
     noise_power : per complex sample [W], for "auto"; with 0 the `max_direct` strongest go direct
 
-    Returns
-    -------
-    IFCube
-        Paths of length 0 give zeros.
-
     Raises
     ------
     ValueError  If a path set belongs to another instant, or there is no link and no schedule.
