@@ -127,17 +127,18 @@ class Setup:
         words = seed_sequence(self.scenario.seed, "noise", paths.rx, frame).generate_state(2)
         return add_noise(cube, level, words)
 
-    def budget(self) -> list[LinkBudget]:
-        """The link budget at the first frame."""
-        poses = self.swarm.poses(self.epoch(0))
-        rows = []
-        for tx, rx in self.links(0):
-            amplitude = self.reference.reference_amplitude(poses, tx, rx)
-            name = rx if tx != rx else self.reference.strongest_target(poses, tx)
-            distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
-            what = "line of sight" if tx != rx else f"echo of {name}"
-            rows.append(link_budget((tx, rx), what, distance, amplitude, self.scenario.noise, self.waveform, self.antennas))
-        return rows
+
+def link_budgets(setup: Setup) -> list[LinkBudget]:
+    """The link budget of every link at the first frame."""
+    poses = setup.swarm.poses(setup.epoch(0))
+    rows = []
+    for tx, rx in setup.links(0):
+        amplitude = setup.reference.reference_amplitude(poses, tx, rx)
+        name = rx if tx != rx else setup.reference.strongest_target(poses, tx)
+        distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
+        what = "line of sight" if tx != rx else f"echo of {name}"
+        rows.append(link_budget((tx, rx), what, distance, amplitude, setup.scenario.noise, setup.waveform, setup.antennas))
+    return rows
 
 
 def prepare(scenario: Scenario) -> Setup:
@@ -148,7 +149,7 @@ def prepare(scenario: Scenario) -> Setup:
     interval = scenario.frame_interval_s or waveform.frame_duration
     times = np.linspace(0, scenario.frames * interval, 9)
     centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
-    city = load_city(scenario, waveform.carrier_frequency, centre)
+    city = load_city(scenario.city, scenario.folder, waveform.carrier_frequency, centre)
     return Setup(
         scenario,
         waveform,
@@ -161,9 +162,9 @@ def prepare(scenario: Scenario) -> Setup:
     )
 
 
-def trace(scenario: Scenario, frame: int) -> dict[Link, PathSet]:
+def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
     """The paths of all links of one frame."""
-    return prepare(scenario).trace(frame)[1]
+    return (setup or prepare(scenario)).trace(frame)[1]
 
 
 @dataclass
@@ -258,7 +259,7 @@ def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | 
         timing=clock.seconds,
         fidelity=_fidelity(setup),
         materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in setup.city.materials},
-        link_budget=[vars(row) for row in setup.budget()],
+        link_budget=[vars(row) for row in link_budgets(setup)],
     )
 
 

@@ -82,10 +82,14 @@ def detect(
     level : (rows, P) background
     """
     level = background(power, guard, training)
+    return power > threshold(looks, false_alarm_rate, guard, training) * level, level
+
+
+def threshold(looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> float:
+    """Factor on the background of a Hann-windowed map: neighbouring training cells count for less than one each."""
     width = 2 * (guard[1] + training[1]) + 1
     independent = training[0] * width / HANN_CORRELATION**2
-    factor = greatest_of_factor(false_alarm_rate, float(looks), max(independent, 1.0))
-    return power > factor * level, level
+    return greatest_of_factor(false_alarm_rate, float(looks), max(independent, 1.0))
 
 
 def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive.active import equivalent_range_map
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import detect, threshold
 from isac_rt.receive.common import Sensed, describe, make_maps, sense
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate
 from isac_rt.receive.estimate import LocalSpectra, refine, start_point
@@ -54,13 +54,12 @@ def receive_passive(
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
-        return _reception(cube, _earliest(found), found, None, maps)
+        return _reception(cube, _earliest(found, antennas, settings), found, None, maps)
     if prediction is None:
         return _reception(cube, no_detections(), None, None, maps)
     symbols = demodulate(cube, prediction, dpsk_order)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
-    threshold = confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
-    if np.median(symbols.delay_confidence) < threshold:
+    if np.median(symbols.delay_confidence) < confidence_threshold(antennas.num_rx, cells, symbols.raw.size):
         return _reception(cube, no_detections(), None, None, maps)
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
     found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
@@ -68,13 +67,18 @@ def receive_passive(
     return _reception(cube, detections, found, symbols if detections.is_reference.any() else None, maps)
 
 
-def _earliest(found: Sensed) -> Detections:
-    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest."""
+def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> Detections:
+    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the false-alarm rate is asked of the
+    whole map here and not of one cell, or an empty pilot would now and then be acquired."""
     d = found.detections
-    if not len(d):
+    looks = antennas.num_tx * antennas.num_rx
+    rate = settings.false_alarm_rate / found.power.size
+    sure = d.snr > threshold(looks, rate, settings.guard_cells, settings.training_cells)
+    if not sure.any():
         return d
-    strong = _amplitudes(found) ** 2 >= 10 ** (-REFERENCE_SPAN_DB / 10) * (_amplitudes(found) ** 2).max()
-    first = np.flatnonzero(strong)[np.argmin(d.range[strong])]
+    power = _amplitudes(found) ** 2
+    sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
+    first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
     return replace(d, is_reference=np.arange(len(d)) == first)
 
 
