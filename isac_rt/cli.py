@@ -258,6 +258,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = _say_warning
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="isac-rt", standalone_mode=False)
+        if status == 130:  # what typer makes of Ctrl-C
+            _say_interrupted()
         return status if isinstance(status, int) else 0
     except KeyboardInterrupt:
         _say_interrupted()
@@ -270,9 +272,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if text:
                 sys.stderr.write(f"{text} (see isac-rt --help)\n")
             return int(problem.exit_code)
-        if type(problem).__name__ == "Abort":  # what typer makes of Ctrl-C
-            _say_interrupted()
-            return 130
         if isinstance(problem, _user_problems()):
             sys.stderr.write(f"{problem}\n")
             return 2

@@ -116,20 +116,14 @@ def _range_label(dataset: xr.Dataset, observer: int) -> str:
 
 
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and range at which the map shows the UAVs in view and unshadowed: bistatic at a PT, the transmitter one way."""
+    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded into the map's span."""
     here = {"frame": frame, "observer": observer}
-    names = [str(n) for n in dataset.uav.values]
     seen = dataset.in_view[here].values & ~dataset.shadowed[here].values
-    r, v = dataset.truth_range[here].values.copy(), dataset.truth_velocity[here].values.copy()
-    sender = names.index(str(dataset.transmitter.values[observer]))
-    if names[sender] != str(dataset.observer.values[observer]):
-        offset = dataset.uav_position.values[frame] - dataset.uav_position.values[frame, sender]
-        speed = dataset.uav_velocity.values[frame] - dataset.uav_velocity.values[frame, sender]
-        leg = np.linalg.norm(offset, axis=1)
-        far = leg > 0
-        r[far] += leg[far]
-        v[far] += np.sum(offset * speed, axis=1)[far] / leg[far]
-    return v[seen], r[seen]
+    r, v = dataset.truth_range[here].values[seen], dataset.truth_velocity[here].values[seen]
+    axis = dataset.map_velocity.values[observer]
+    axis = axis[np.isfinite(axis)]
+    span = (axis[1] - axis[0]) * len(axis)
+    return v - span * np.floor((v - axis[0]) / span + 0.5 / len(axis)), r
 
 
 def _map(ax: Axes, x: np.ndarray, y: np.ndarray, level_db: np.ndarray, label: str) -> None:
@@ -172,7 +166,7 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
     ax.set(xlabel="time [s]", ylabel=f"{name} [{unit}]")
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(ncols=4, loc="upper left", bbox_to_anchor=(0, 1.0))
+        ax.legend(ncols=4, loc="best")
     return ax
 
 

@@ -133,7 +133,7 @@ def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, 
     floor = float(np.quantile(corners[..., 2], 0.02)) + 1.0
     level = normal[..., 2:] > 0.9
     base = np.where(level & (points[..., 2:] < floor), _GROUND, np.where(normal[..., 2:] > 0.25, _ROOF, _WALL))
-    light = 0.60 + 0.40 * np.clip(normal @ SUN, 0, 1) * lit
+    light = 0.66 + 0.06 * normal[..., 2] + 0.07 * (normal @ view.axes[0]) + 0.28 * np.clip(normal @ SUN, 0, 1) * lit
     step = np.abs(np.diff(np.where(seen, depth, 1e4), axis=1, prepend=1e4)) + np.abs(np.diff(np.where(seen, depth, 1e4), axis=0, prepend=1e4))
     turn = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(np.diff(normal, axis=0, prepend=0), axis=-1)
     edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (turn > 0.5), 0.72, 1.0)
@@ -145,7 +145,7 @@ def best_view(city: City, tracks: np.ndarray, aspect: float) -> View:
     """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3) [m]."""
     low, high = tracks.reshape(-1, 3).min(axis=0), tracks.reshape(-1, 3).max(axis=0)
     centre = (low + high) / 2
-    half = 0.62 * max(float(np.linalg.norm(high - low)), 50.0)
+    half = 0.78 * max(float(np.linalg.norm(high - low)), 50.0)
     corners = city.corners + city.origin
     views = [view_from(a, ELEVATION, centre, (half, half / aspect)) for a in np.arange(16) * np.pi / 8 + 0.2]
     return min(views, key=lambda v: is_hidden(tracks, v, depth_buffer(corners, v, 320, int(320 / aspect))[0]).mean())

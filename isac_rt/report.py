@@ -95,7 +95,16 @@ def row_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Rows of one shape as a table, keys as titles."""
     if not rows:
         return Table((), ())
-    return Table([k.replace("_", " ") for k in rows[0]], [[number(v) for v in row.values()] for row in rows])
+    return Table([_title(k) for k in rows[0]], [[number(v) for v in row.values()] for row in rows])
+
+
+_UNITS = {"_dbm": " [dBm]", "_db": " [dB]", "_m": " [m]", "_s_per_m": " [S/m]"}
+
+
+def _title(key: str) -> str:
+    """A key as a column title, its unit in brackets."""
+    ending = next((e for e in sorted(_UNITS, key=len, reverse=True) if key.endswith(e)), "")
+    return key.removesuffix(ending).replace("_", " ").replace("snr", "SNR") + _UNITS.get(ending, "")
 
 
 def _html(table: Table) -> Markup:

@@ -48,7 +48,8 @@ class UavValues:
 
     Attributes
     ----------
-    range, velocity : (U,) [m], [m/s, positive receding]; one way from the observer
+    range, velocity : (U,) as in `Detections` [m], [m/s, positive receding]: one way at the AT and of the transmitter itself,
+        path length and its rate for what reflects to a PT
     azimuth, elevation : (U,) [rad] in the observer's body frame
     """
 

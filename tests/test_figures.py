@@ -55,15 +55,15 @@ def test_range_doppler_marks_detections_and_truth_where_they_are(run):
     assert {"target (1)", "specular (1)", "unexplained (1)"} <= set(lines)
 
 
-def test_bistatic_truth_at_a_passive_terminal(run):
-    """Path length AT - U1 - PT1 and its rate by a difference quotient of positions. Seen to fail with one leg only."""
-    ax = range_doppler(Figure().subplots(), run.dataset, 0, 1)
+def test_truth_beyond_the_unambiguous_velocity_is_drawn_where_it_folds_to(run):
+    """U1 made faster by 1.25 spans shows a quarter of a span farther on. Seen to fail without the folding."""
+    fast = run.dataset.copy(deep=True)
+    axis = fast.map_velocity.values[0]
+    span = 120 * (axis[1] - axis[0])
+    fast.truth_velocity.values[2, 0, 2] = 1.25 * span + 0.1234
+    ax = range_doppler(Figure().subplots(), fast, 0, 0)
     truth = next(line for line in ax.get_lines() if line.get_label() == "UAV in view (truth)")
-    at, pt, u1 = run.dataset.uav_position.values[2]
-    va, vp, vu = run.dataset.uav_velocity.values[2]
-    length = lambda t: np.linalg.norm(u1 - at + t * (vu - va)) + np.linalg.norm(u1 - pt + t * (vu - vp))  # noqa: E731
-    assert abs(truth.get_ydata()[1] - length(0)) < 1e-9
-    assert abs(truth.get_xdata()[1] - (length(1e-4) - length(-1e-4)) / 2e-4) < 1e-6
+    assert abs(truth.get_xdata()[0] - (0.25 * span + 0.1234)) < 1e-9
 
 
 def test_tracks_are_drawn_in_people_units_and_shadow_is_shaded(run):
