@@ -200,7 +200,9 @@ class _Observer:
         if self.passes == 2:
             self.terminal = ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
         else:
-            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, s.modulation.dpsk_order)
+            amplitude = transmit_amplitude(s.noise)
+            order = s.modulation.dpsk_order
+            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude)
         self.score = SensingScore(resolutions(setup.waveform, setup.antennas, self.passes))
 
     def hear(self, frame: int, sent: Transmission, paths: PathSet, poses: dict[str, Pose], maps: bool, clock: _Clock) -> _Heard:

@@ -1,7 +1,7 @@
 """One terminal from frame to frame: receive, track, predict. Samples and public knowledge in, never the truth.
 
-A terminal knows its own pose, the waveform, the antenna schedule, which frames carry data, and, at the active terminal, its own
-payload. `python -m isac_rt.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
+A terminal knows its own pose, the waveform, the antennas and their schedule, the transmit power, which frames carry data, and, at the
+active terminal, its own payload. `python -m isac_rt.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ from isac_rt.tracking import (
 from isac_rt.waveform import Waveform
 
 LEVEL_DROP = 10.0
-"""A reference this factor in power under the remembered, range-scaled level is not the line of sight."""
+"""A reference this factor in power under what free space gives at its range is a reflection. Off boresight both ends lose
+some 4 dB at most inside the field of view; a mirror reflection off a wall loses more than the rest, scattering far more."""
 COAST_CELLS = 0.2
 """A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
 SLIP_FALSE_RATE = 1e-6
@@ -83,12 +84,19 @@ class PassiveTerminal:
     """
 
     def __init__(
-        self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking, dpsk_order: int
+        self,
+        waveform: Waveform,
+        antennas: Antennas,
+        receivers: Receivers,
+        tracking: Tracking,
+        dpsk_order: int,
+        transmit_amplitude: float,
     ) -> None:
         self._waveform, self._antennas, self._receivers, self._order = waveform, antennas, receivers, dpsk_order
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
-        self._time, self._level = -np.inf, float("nan")
+        self._time = -np.inf
+        self._level = (transmit_amplitude * antennas.gain * waveform.wavelength / (4 * np.pi)) ** 2
         self.tracker = Tracker(tracking, self._period)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
@@ -124,8 +132,10 @@ class PassiveTerminal:
         return prediction if prediction.range_std[0] < COAST_CELLS * self._waveform.range_cell(1) else None
 
     def _plausible(self, reception: Reception) -> bool:
-        """Whether the reference's level, scaled with its range squared, is that of the line of sight as remembered."""
-        return not _scaled_level(reception) < self._level / LEVEL_DROP
+        """Whether the reference is as strong as a line of sight of its length: transmit power and antennas are public."""
+        d = reception.detections
+        scaled = reception.reference_power * d.range[d.is_reference][0] ** 2
+        return bool(scaled >= self._level / LEVEL_DROP)
 
     def _follow(self, reception: Reception, own: Pose, modulated: bool) -> None:
         """Update or restart the reference track, and say where the terminal stands."""
@@ -142,13 +152,11 @@ class PassiveTerminal:
             if state is None:
                 return
             self.reference = Track(self.tracker.new_id(), state, float(d.snr[q]), confirmed=True)
-            self._level = _scaled_level(reception)
             self.tracker.clear()  # their bistatic positions rested on the old reference
         else:
             R = measurement_covariance(d.std[q], self.reference.state.mean)
             self.reference.state = update(self.reference.state, z, R, own, velocity_period=self._period)
             self.reference.snr, self.reference.missed = float(d.snr[q]), 0
-            self._level += 0.2 * (_scaled_level(reception) - self._level)
         self.state = TerminalState.TRACKING
 
     def _expected(self, z: np.ndarray, std: np.ndarray, own: Pose) -> bool:
@@ -201,11 +209,6 @@ def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
     return Gaussian(mean, state.covariance)
 
 
-def _scaled_level(reception: Reception) -> float:
-    d = reception.detections
-    return float(reception.reference_power * d.range[d.is_reference][0] ** 2)
-
-
 def _without_reference(reception: Reception) -> Reception:
     """The same frame with its reference taken for something else: nothing decoded, no line of sight."""
     d = reception.detections
@@ -231,6 +234,7 @@ def save_capture(
     receivers: Receivers,
     tracking: Tracking,
     dpsk_order: int,
+    transmit_amplitude: float,
     payloads: list[Payload] | None = None,
 ) -> None:
     """Samples and public parameters of successive frames of one terminal in one .npz file.
@@ -243,6 +247,7 @@ def save_capture(
         "receivers": receivers.model_dump(mode="json"),
         "tracking": tracking.model_dump(mode="json"),
         "dpsk_order": dpsk_order,
+        "transmit_amplitude": transmit_amplitude,
         "active": payloads is not None,
     }
     arrays = {"samples": np.stack([c.samples for c in cubes]), "schedule": cubes[0].schedule}
@@ -262,7 +267,7 @@ def replay(path: Path | str) -> dict[str, np.ndarray]:
     w, antennas = Waveform(**public["waveform"]), Antennas(**public["antennas"])
     receivers, tracking = Receivers.model_validate(public["receivers"]), Tracking.model_validate(public["tracking"])
     active = ActiveTerminal(w, antennas, receivers, tracking)
-    passive = PassiveTerminal(w, antennas, receivers, tracking, public["dpsk_order"])
+    passive = PassiveTerminal(w, antennas, receivers, tracking, public["dpsk_order"], public["transmit_amplitude"])
     out: dict[str, np.ndarray] = {}
     for i, time in enumerate(data["time"].tolist()):
         cube = IFCube(samples=data["samples"][i], waveform=w, schedule=data["schedule"], start_time=float(data["start"][i]))
