@@ -1,0 +1,27 @@
+"""Shared by all tests: those that trace rays are skipped, with the reason, on a machine that cannot."""
+
+from __future__ import annotations
+
+import pytest
+
+from isac_rt.runtime import RuntimeProblem, choose_backend
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    traced = [item for item in items if item.get_closest_marker("sionna")]
+    if not traced:
+        return
+    try:
+        choose_backend()
+    except RuntimeProblem as problem:
+        for item in traced:
+            item.add_marker(pytest.mark.skip(reason=str(problem)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _backend(request: pytest.FixtureRequest) -> None:
+    """Dr.Jit is told its back end before the first test that traces."""
+    if any(item.get_closest_marker("sionna") and not item.get_closest_marker("skip") for item in request.session.items):
+        from isac_rt.runtime import activate
+
+        activate()
