@@ -42,7 +42,10 @@ class InputProblem(Exception):
 
 
 def _out() -> Console:
-    return Console(highlight=False)
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = 140  # in a file or a pipe there is no edge to wrap at
+    return console
 
 
 def _err() -> Console:
@@ -179,7 +182,7 @@ def _with_progress(work: Any, frames: int) -> Results:
 def _table(*titles: str, justify: Any = "right") -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for i, title in enumerate(titles):
-        table.add_column(title, justify="left" if i == 0 else justify)
+        table.add_column(title, justify="left" if i == 0 else justify, no_wrap=i == 0)
     return table
 
 
