@@ -66,7 +66,8 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
     assert "Traceback" not in said.err
 
 
-def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path):
+def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypatch):
+    monkeypatch.setattr("isac_rt.figures.make_figures", lambda *_: [])
     assert main(["run", str(scenario_file), "--out", str(tmp_path / "o"), "--set", "modulation.dpsk_order=4"]) == 0
     assert "dpsk_order: 4" in (tmp_path / "o" / "scenario.yaml").read_text()
 
