@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from isac_rt.city.materials import CityError, MaterialUse
 from isac_rt.city.mesh import Surface
 
-COLLINEAR = 1e-9
-"""A corner this close to the line through its neighbours is dropped: the triangulation would skip it, the walls would not. [m]"""
-
 
 def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
     """The valid polygons of a geometry, with repair where that keeps an area.
@@ -32,22 +29,28 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
     polygons = [q for p in parts for q in shapely.get_parts(p) if q.area > 0]
     if not polygons:
         raise CityError(f"{what}: the polygon has no area; redraw or remove it")
-    return [shapely.geometry.polygon.orient(shapely.force_2d(p)) for p in polygons]
+    return [shapely.remove_repeated_points(shapely.force_2d(p)) for p in polygons]
 
 
-def _corners(ring: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The ring without its closing point and without points on straight edges."""
-    points = ring[:-1]
-    while len(points) > 3:
-        before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
-        along, to = after - before, points - before
-        length = np.hypot(along[:, 0], along[:, 1])
-        off = np.abs(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0]) / np.maximum(length, COLLINEAR)
-        straight = np.flatnonzero(off <= COLLINEAR)
-        if not len(straight):
-            break
-        points = np.delete(points, straight[0], axis=0)  # one at a time: neighbours change
-    return points
+def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Counter-clockwise triangles of a polygon over the corners `plan` of its rings, using every one of them.
+
+    Constrained Delaunay: ear clipping may pass over a corner on a straight edge, and the roof would not meet the wall there.
+    """
+    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    corners = np.array([shapely.get_coordinates(t)[:3] for t in pieces])
+    known, first = np.unique(plan, axis=0, return_index=True)
+    place = {point: int(i) for point, i in zip(map(tuple, known.tolist()), first, strict=True)}
+    triangles = np.array([[place[tuple(p)] for p in t] for t in corners.tolist()], dtype=np.int64)
+    flipped = _turn(corners) < 0
+    triangles[flipped] = triangles[flipped][:, ::-1]
+    return triangles
+
+
+def _turn(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Twice the signed area of plane triangles (T, 3, 2). [m^2]"""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
 def triangulate(rings: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
@@ -67,16 +70,9 @@ def triangulate(rings: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
     ends = np.cumsum([len(r) for r in rings]).astype(np.uint32)
     centred = np.ascontiguousarray(points - points.mean(axis=0))
     triangles = np.asarray(mapbox_earcut.triangulate_float64(centred, ends), dtype=np.int64).reshape(-1, 3)
-    a, b, c = (centred[triangles[:, k]] for k in range(3))
-    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    triangles[turn < 0] = triangles[turn < 0][:, ::-1]
+    flipped = _turn(centred[triangles]) < 0
+    triangles[flipped] = triangles[flipped][:, ::-1]
     return triangles
-
-
-def ring_area(ring: NDArray[np.float64]) -> float:
-    """Signed area of an open ring, positive counter-clockwise. [m^2]"""
-    x, y = (ring - ring[0]).T
-    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
 
 
 def building(
@@ -95,14 +91,12 @@ def building(
         For messages.
     """
     polygon = shapely.geometry.polygon.orient(polygon)  # outer ring counter-clockwise, holes clockwise
-    rings = [_corners(shapely.get_coordinates(r)) for r in (polygon.exterior, *polygon.interiors)]
-    rings = [rings[0], *(r for r in rings[1:] if abs(ring_area(r)) > 0)]
+    rings = [shapely.get_coordinates(r)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     plan = np.concatenate(rings)
     num = len(plan)
     vertices = np.concatenate([np.column_stack([plan, np.full(num, z)]) for z in (base, top)])
-    cap = triangulate(rings)
-    a, b, c = (plan[cap[:, k]] for k in range(3))
-    covered = np.sum((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])) / 2
+    cap = _cap(polygon, plan)
+    covered = _turn(plan[cap]).sum() / 2
     if abs(covered - polygon.area) > 1e-6 * polygon.area:
         raise CityError(f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 covered); simplify the outline")
     start = np.cumsum([0] + [len(r) for r in rings[:-1]])
