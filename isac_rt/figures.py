@@ -31,7 +31,7 @@ STYLE = {
     "axes.titlelocation": "left", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.4,
 }  # fmt: skip
 _SHOWN_DB = 60.0
-"""Depth of a map's colour scale below its peak [dB]."""
+"""Depth of a map's colour scale [dB]."""
 _UNITS = {"range": (1.0, "m"), "velocity": (1.0, "m/s"), "azimuth": (180 / np.pi, "deg"), "elevation": (180 / np.pi, "deg")}
 
 
@@ -79,7 +79,7 @@ def _footprints(ax: Axes, city: City) -> None:
     top = max(float(np.quantile(height, 0.98) - height.min()), 1.0)
     shade = 0.96 - 0.42 * np.clip((height - height.min()) / top, 0, 1)
     colours = np.repeat(shade[:, None], 3, axis=1)
-    patches = PolyCollection(triangles[order][:, :, :2], facecolors=colours[order], edgecolors="face", linewidths=0.2, zorder=0)
+    patches = PolyCollection(triangles[order][:, :, :2], facecolors=colours[order], edgecolors="face", linewidths=0.6, zorder=0)
     patches.set_rasterized(True)
     ax.add_collection(patches)
 
@@ -89,7 +89,9 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     power = dataset.map_power.values[snapshot, observer]
     r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
     rows, columns = np.isfinite(r), np.isfinite(v)
-    _map(ax, v[columns], r[rows], 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], 1e-300)), "power [dB below the peak]")
+    level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], 1e-300))
+    level = level - np.median(level)  # most cells hold noise alone; the peak may be the transmitter's own leakage
+    _map(ax, v[columns], r[rows], level, (-5.0, min(level.max(), _SHOWN_DB)), "power above the median cell [dB]")
     frame = int(dataset.snapshot_frame.values[snapshot])
     mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
     kind = dataset.det_kind.values
@@ -126,9 +128,8 @@ def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarra
     return v - span * np.floor((v - axis[0]) / span + 0.5 / len(axis)), r
 
 
-def _map(ax: Axes, x: np.ndarray, y: np.ndarray, level_db: np.ndarray, label: str) -> None:
-    peak = level_db.max() if level_db.size else 0.0
-    image = ax.imshow(level_db - peak, origin="lower", aspect="auto", cmap="magma", vmin=-_SHOWN_DB, vmax=0, interpolation="nearest",
+def _map(ax: Axes, x: np.ndarray, y: np.ndarray, level_db: np.ndarray, shown: tuple[float, float], label: str) -> None:
+    image = ax.imshow(level_db, origin="lower", aspect="auto", cmap="magma", vmin=shown[0], vmax=shown[1], interpolation="nearest",
                       extent=_extent(x, y))  # fmt: skip
     ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.05)
     ax.grid(False)
@@ -144,7 +145,8 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
     magnitude = dataset.map_equivalent_range.values[snapshot, observer]
     magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
     level = 20 * np.log10(np.maximum(magnitude, 1e-300))
-    _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, "magnitude [dB below the peak]")
+    level = level - level.max()
+    _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, (-_SHOWN_DB, 0.0), "magnitude [dB below the peak]")
     frame = int(dataset.snapshot_frame.values[snapshot])
     ax.set(xlabel="chirp", ylabel="range cell")
     ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, equivalent range before data removal")
@@ -190,7 +192,7 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
                         label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})")  # fmt: skip
     ax.set(xscale="log", ylim=(0, 1.02), xlabel=f"|{name} error| [{unit}]", ylabel="share of errors below")
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="lower right")
+        ax.legend(loc="best")
     return ax
 
 
@@ -207,7 +209,8 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
     ax.set(xlabel="path length [m]" if against == "delay" else "Doppler shift [kHz] (closing is positive)", ylabel="path gain [dB]")
     ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.observer.values[observer]}")
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="upper right", ncols=2)
+        for handle in ax.legend(loc="best", ncols=2).legend_handles:
+            handle.set(markersize=5, alpha=1)
     return ax
 
 

@@ -145,7 +145,7 @@ def best_view(city: City, tracks: np.ndarray, aspect: float) -> View:
     """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3) [m]."""
     low, high = tracks.reshape(-1, 3).min(axis=0), tracks.reshape(-1, 3).max(axis=0)
     centre = (low + high) / 2
-    half = 0.78 * max(float(np.linalg.norm(high - low)), 50.0)
+    half = 0.78 * max(float(np.linalg.norm(high - low)), 65.0)
     corners = city.corners + city.origin
     views = [view_from(a, ELEVATION, centre, (half, half / aspect)) for a in np.arange(16) * np.pi / 8 + 0.2]
     return min(views, key=lambda v: is_hidden(tracks, v, depth_buffer(corners, v, 320, int(320 / aspect))[0]).mean())
@@ -174,7 +174,7 @@ def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mappi
                 points = points[np.isfinite(points).all(axis=1)]
                 points = points[~is_hidden(points, view, depth)]
                 flat = view.project(points)
-                ax.plot(flat[:, 0], flat[:, 1], ".", color=colour, ms=1.6, alpha=0.6, mew=0)
+                ax.plot(flat[:, 0], flat[:, 1], ".", color=colour, ms=2.6, alpha=0.8, mew=0)
             elif kind != PathKind.LEAKAGE:
                 for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
                     _line(ax, _polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, 1.0, 0.85)

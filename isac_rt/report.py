@@ -21,7 +21,7 @@ _CAPTIONS = {
     "scene": ("The scene", "The swarm from above. The darker a face of the city, the higher it lies."),
     "range_doppler": (
         "Range and Doppler",
-        "Power after accumulation over the antennas. Marks are detections, by the kind of the strongest ray-traced path within one cell; "
+        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. Marks are detections, by the kind of the strongest ray-traced path within one cell; "
         "white circles are where the truth puts the UAVs in view, detected or not. A passive terminal measures path lengths: "
         "reflectors stand at transmitter to UAV to receiver.",
     ),
