@@ -124,10 +124,10 @@ def test_recentring_far_from_the_origin_is_exact(tmp_path):
     """Seen failing with the vertices cast to float32 on reading."""
     shift = np.array([412_345.125, 5_332_100.75])
     write(tmp_path, feature((np.array(COURT) + shift).tolist(), height=9.1))
-    centre = np.array([*(shift + [11.1, 7.7]), 31.3])
+    write(tmp_path, feature(COURT, height=9.1), name="near.geojson")
+    centre = np.array([shift[0] + 11.1, shift[1] + 7.7, 31.3])
     city = load_city(node(source="footprints", file="town.geojson"), tmp_path, F_C, centre)
-    near = load_city(node(source="footprints", file=write(tmp_path, feature(COURT, height=9.1), name="n.geojson") and "n.geojson"),
-                     tmp_path, F_C, [11.1, 7.7, 31.3])  # fmt: skip
+    near = load_city(node(source="footprints", file="near.geojson"), tmp_path, F_C, [11.1, 7.7, 31.3])
     rounding = 4e-9  # float64 spacing at 5e6 m is 9e-10
     found, expected = np.sort(city.corners.reshape(-1, 3), axis=0), np.sort(near.corners.reshape(-1, 3), axis=0)
     assert np.abs(found - expected).max() < rounding
@@ -192,7 +192,7 @@ def test_faces_of_one_wall_share_a_plane_whichever_way_they_face():
         return t[::-1] if flip else t
     triangles = [tri(17.3), tri(17.3, flip=True), tri(17.3), tri(17.3 + 1e-3), tri(-17.3)]
     surface = Surface(np.concatenate(triangles), np.arange(15).reshape(5, 3), MaterialUse("concrete"))
-    vertices, faces, owner, _, tolerance = clean([surface], "walls", np.zeros(3), None)
+    vertices, faces, _, _, tolerance = clean([surface], "walls", np.zeros(3), None)
     city = City("walls", vertices, faces, np.zeros(5, np.int16), (), np.zeros(3), (), tolerance)
     planes = city.plane_of_face
     assert planes[0] == planes[1] == planes[2]
@@ -214,7 +214,7 @@ def test_float32_files_get_their_own_plane_tolerance():
 def test_bad_faces_are_removed_and_counted():
     vertices = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [2, 0, 0], [9, 9, 9]])
     faces = np.array([[0, 1, 2], [2, 1, 0], [0, 3, 1], [1, 1, 2], [0, 1, 4]])
-    out, kept, owner, notes, _ = clean([Surface(vertices, faces, MaterialUse("metal"))], "x", np.zeros(3), None)
+    _, kept, _, notes, _ = clean([Surface(vertices, faces, MaterialUse("metal"))], "x", np.zeros(3), None)
     assert len(kept) == 2
     assert "2 faces without area removed" in notes
     assert "1 repeated faces removed" in notes
@@ -303,7 +303,8 @@ def test_overrides_new_materials_and_unknown_names():
 
 @pytest.mark.parametrize(
     ("name", "faces"),
-    [("floor_wall", 4), ("simple_reflector", 2), ("double_reflector", 4), ("triple_reflector", 6), ("box", 12), ("simple_street_canyon", 74)],
+    [("floor_wall", 4), ("simple_reflector", 2), ("double_reflector", 4), ("triple_reflector", 6), ("box", 12),
+     ("simple_street_canyon", 74)],
 )  # fmt: skip
 def test_builtin_scenes(name, faces):
     centre = np.array([1.3, -0.7, 2.1])
@@ -322,7 +323,7 @@ def test_munich():
 
 
 def test_unknown_builtin_lists_those_there_are():
-    with pytest.raises(CityError, match="munich.*simple_street_canyon"):
+    with pytest.raises(CityError, match=r"munich.*simple_street_canyon"):
         load_city(node(source="builtin", name="muenchen"), ".", F_C, ORIGIN)
 
 
@@ -338,6 +339,16 @@ def test_mitsuba_transforms_defaults_and_own_materials(tmp_path):
     assert np.allclose(city.vertices, expected, rtol=0, atol=1e-14)  # rounding
     (material,) = city.materials
     assert (material.relative_permittivity, material.conductivity, material.thickness) == (2.9, 0.4, 0.03)
+
+
+def test_mitsuba_cube_faces_outward(tmp_path):
+    """Seen failing with one of the cube's triangles reversed."""
+    (tmp_path / "c.xml").write_text('<scene version="2.1.0"><shape type="cube"><bsdf type="diffuse" id="mat-itu_wood"/></shape></scene>')
+    city = load_city(node(source="mitsuba", file="c.xml"), tmp_path, F_C, ORIGIN)
+    body = solid(city, np.arange(12))
+    assert body.is_watertight
+    assert body.volume == pytest.approx(8.0, rel=1e-14)  # rounding
+    assert [m.name for m in city.materials] == ["wood"]
 
 
 def test_glb_up_axis_transform_scale_and_materials(tmp_path):

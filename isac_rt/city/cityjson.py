@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -39,6 +40,26 @@ class CityModel:
     bases: list[float] = field(default_factory=list)
     surfaces: list[Surface] = field(default_factory=list)
     terrain: bool = False
+
+
+def parse_height(value: Any, what: str) -> float | None:
+    """A height property as metres: a number, or text such as ``12.5`` or ``12.5 m``; None if there is none.
+
+    Raises
+    ------
+    CityError  If it is anything else, not positive or not finite.
+    """
+    if value is None or (isinstance(value, str) and not value.strip()):
+        return None
+    number = value
+    if isinstance(value, str):
+        try:
+            number = float(value.strip().removesuffix("m").strip())
+        except ValueError:
+            raise CityError(f"{what}: height {value!r} is not a number of metres; correct it") from None
+    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or number <= 0:
+        raise CityError(f"{what}: height {value!r} is not a positive number of metres; correct it")
+    return float(number)
 
 
 def _vertices(document: dict[str, Any], name: str) -> NDArray[np.float64]:
@@ -138,8 +159,6 @@ def read_cityjson(document: dict[str, Any], city: scenario.City, name: str, note
     notes : list of str
         Grows.
     """
-    from isac_rt.city.footprints import parse_height
-
     vertices, model, skipped = _vertices(document, name), CityModel(), 0
     objects = document.get("CityObjects", {})
     detailed = {key for key, item in objects.items() if any(_level(g) >= 1 for g in item.get("geometry", []))}

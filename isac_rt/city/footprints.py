@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from isac_rt import scenario
-from isac_rt.city.cityjson import read_cityjson
+from isac_rt.city.cityjson import parse_height, read_cityjson
 from isac_rt.city.extrude import building, ground, polygons_of
 from isac_rt.city.materials import CityError, MaterialUse
 from isac_rt.city.mesh import Surface
@@ -66,26 +65,6 @@ def _placed(
     lon, lat = (boxes[:, [0, 1]].min(axis=0) + boxes[:, [2, 3]].max(axis=0)) / 2
     notes.append(f"world origin at longitude {lon:.7f}, latitude {lat:.7f} degrees (azimuthal equidistant, WGS 84)")
     return projection(float(lon), float(lat))
-
-
-def parse_height(value: Any, what: str) -> float | None:
-    """A height property as metres: a number, or text such as ``12.5`` or ``12.5 m``; None if there is none.
-
-    Raises
-    ------
-    CityError  If it is anything else, not positive or not finite.
-    """
-    if value is None or (isinstance(value, str) and not value.strip()):
-        return None
-    number = value
-    if isinstance(value, str):
-        try:
-            number = float(value.strip().removesuffix("m").strip())
-        except ValueError:
-            raise CityError(f"{what}: height {value!r} is not a number of metres; correct it") from None
-    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or number <= 0:
-        raise CityError(f"{what}: height {value!r} is not a positive number of metres; correct it")
-    return float(number)
 
 
 def _geojson(document: dict[str, Any], key: str, name: str, notes: list[str]) -> list[tuple[shapely.Geometry, float | None, str]]:

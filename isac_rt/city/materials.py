@@ -24,6 +24,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -228,7 +229,7 @@ def itu_constants(name: str, frequency: float) -> tuple[float, float, str]:
         eps, sigma = _constants(soil_permittivity(frequency, SOIL_MOISTURE[name]), frequency)
         moisture = SOIL_MOISTURE[name]
         return eps, sigma, f"Dobson 1985 soil model (ITU-R P.527), sandy loam, {100 * moisture:g} % water; P.2040 ends at 10 GHz"
-    for below, above in zip(fits[:-1], fits[1:], strict=True):
+    for below, above in itertools.pairwise(fits):
         if below.high < f < above.low:
             (eps_0, sigma_0), (eps_1, sigma_1) = below.at(below.high), above.at(above.low)
             w = np.log(f / below.high) / np.log(above.low / below.high)

@@ -131,6 +131,7 @@ def _group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, toleranc
     count = len(corners)
     plane = np.full(count, -1, dtype=np.int64)
     left = np.arange(count)
+    x, y, z = corners[:, 0, 0].copy(), corners[:, 0, 1].copy(), corners[:, 0, 2].copy()  # of what is left: one corner decides most
     num_left, num_planes = count, 0
     while num_left > 0:
         seed = left[0]
@@ -139,18 +140,15 @@ def _group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, toleranc
         kept = 0
         for i in range(num_left):
             face = left[i]
-            inside = face == seed
-            if not inside:
-                inside = True
-                for k in range(3):
-                    distance = nx * corners[face, k, 0] + ny * corners[face, k, 1] + nz * corners[face, k, 2] - d
-                    if abs(distance) > tolerance:
-                        inside = False
-                        break
+            inside = abs(nx * x[i] + ny * y[i] + nz * z[i] - d) <= tolerance
             if inside:
+                for k in range(1, 3):
+                    distance = nx * corners[face, k, 0] + ny * corners[face, k, 1] + nz * corners[face, k, 2] - d
+                    inside = inside and abs(distance) <= tolerance
+            if inside or face == seed:
                 plane[face] = num_planes
             else:
-                left[kept] = face
+                left[kept], x[kept], y[kept], z[kept] = face, x[i], y[i], z[i]
                 kept += 1
         num_left = kept
         num_planes += 1

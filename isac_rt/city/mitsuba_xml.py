@@ -20,13 +20,14 @@ from isac_rt.city.materials import (
     MaterialUse,
     canonical_name,
 )
-from isac_rt.city.meshfiles import read_triangles
 from isac_rt.city.mesh import Surface
+from isac_rt.city.meshfiles import read_triangles
 
 _RECTANGLE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
 _CUBE = (
     np.array([[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)]),
-    np.array([[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5]]),
+    np.array([[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4],
+              [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5]]),
 )  # fmt: skip
 
 
@@ -92,7 +93,7 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
             step[:3, :3] = _rotation(_vector(reader, part, 0.0), angle)
         elif part.tag == "matrix":
             values = reader.numbers(part)
-            size = int(round(values.size**0.5))
+            size = round(values.size**0.5)
             step[:size, :size] = values.reshape(size, size)
         else:
             raise CityError(f"{reader.path.name}: <{part.tag}> in a transform is not read here; write it as <matrix>")

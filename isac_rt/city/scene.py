@@ -32,7 +32,10 @@ class SceneHandle:
     faces_of_object: dict[int, NDArray[np.int64]]
 
     def face_index(self, objects: NDArray, primitives: NDArray) -> NDArray[np.int64]:
-        """Faces of the mesh for Sionna's object and primitive numbers (any shape); -1 where there was no hit."""
+        """Faces of the mesh for Sionna's object and primitive numbers (any shape); -1 where there was no hit.
+
+        Of surfaces only: at a SENSING interaction Sionna stores a target's index in place of an object number.
+        """
         out = np.full(objects.shape, NO_FACE, np.int64)
         for number, faces in self.faces_of_object.items():
             here = objects == number
