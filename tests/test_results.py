@@ -41,7 +41,7 @@ def _same(a: xr.Dataset, b: xr.Dataset) -> None:
 
 @pytest.mark.parametrize("detections", [3, 0])
 def test_round_trip_is_bit_exact(tmp_path, detections):
-    """Exact. Seen to fail with a float32 cast of det_range in the writer; 0 detections is the empty ragged dimension."""
+    """Exact. Seen to fail with a float32 encoding in `_write_dataset`; 0 detections is the empty ragged dimension."""
     made = fake_run(detections=detections)
     save(made, tmp_path / "a" / "b")
     back = load(tmp_path / "a" / "b")
@@ -74,6 +74,7 @@ def test_what_was_recorded_is_found_by_name(run):
     assert np.array_equal(d.uav_position.sel(uav="U1").values, [r.poses["U1"].position for r in records])
     of = (d.det_frame.values == 4) & (d.det_observer.values == here["observer"])
     assert np.array_equal(d.det_velocity.values[of], o.reception.detections.velocity)
+    assert np.array_equal(d.det_range.values[of], o.reception.detections.range)
     assert d.det_kind.values[of].tolist() == [1, 3, -1]
     for k, kind in enumerate(KINDS):
         assert d.path_count.sel(kind=kind).values[4, here["observer"]] == (o.paths.kind == k).sum()
