@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 
 import numpy as np
@@ -29,7 +30,7 @@ def written(run, tmp_path_factory):
 
 
 def test_all_figures_are_there_and_hold_ink(written):
-    """Seen to fail with a `_map` that draws nothing (variance of the map's figure)."""
+    """Seen to fail with figures saved before anything was drawn on them."""
     folder, files = written
     assert {f.stem for f in files} == {"scene", "range_doppler_0002", "equivalent_range_0002", "tracks_AT", "tracks_PT1", "errors", "paths",
                                        "decoding", "link"}  # fmt: skip
@@ -47,12 +48,15 @@ def test_a_run_without_detections_maps_or_paths_still_makes_figures(tmp_path):
 
 
 def test_range_doppler_marks_detections_and_truth_where_they_are(run):
-    """Circle of U1 at the AT at its true range and velocity; the detections by kind. Seen to fail with axes exchanged."""
+    """Circle of U1 at the AT at its true range and velocity; the detections by kind. Seen to fail with axes exchanged
+    and with an empty map."""
     ax = range_doppler(Figure().subplots(), run.dataset, 0, 0)
     lines = {line.get_label(): line for line in ax.get_lines()}
     truth = lines["UAV in view (truth)"]
     assert truth.get_ydata()[0] == run.dataset.truth_range.values[2, 0, 2] and truth.get_xdata()[0] == run.dataset.truth_velocity.values[2, 0, 2]
     assert {"target (1)", "specular (1)", "unexplained (1)"} <= set(lines)
+    shown = ax.images[0].get_array()
+    assert np.unravel_index(shown.argmax(), shown.shape) == (17, 60) and shown.max() > 30 and abs(np.median(shown)) < 1e-4
 
 
 def test_truth_beyond_the_unambiguous_velocity_is_drawn_where_it_folds_to(run):
@@ -89,7 +93,7 @@ def test_scene_shows_every_uav(run):
 
 
 def test_report_is_one_self_contained_page(run, written):
-    """No address of any kind is followed. Seen to fail with figures linked by file name."""
+    """No address of any kind is followed. Seen to fail with names in place of the pictures' data."""
     from isac_rt.report import write_report
 
     folder, files = written
@@ -97,7 +101,8 @@ def test_report_is_one_self_contained_page(run, written):
     for reference in re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?([^\"')>\s]+)", page):
         assert reference.startswith(("data:", "#")), reference[:60]
     assert "<link" not in page and "@import" not in page
-    assert page.count("data:image/png;base64,") == len(files)
+    embedded = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", page)]
+    assert embedded == [file.read_bytes() for file in files]
     for text in ("AT to PT1", "passive", "25,758", "line of sight", "prefers-color-scheme", "viewport", "\u2013"):
         assert text in page
     text = re.sub(r"base64,[^\"]+", "", page)

@@ -75,6 +75,7 @@ def test_what_was_recorded_is_found_by_name(run):
     of = (d.det_frame.values == 4) & (d.det_observer.values == here["observer"])
     assert np.array_equal(d.det_velocity.values[of], o.reception.detections.velocity)
     assert np.array_equal(d.det_range.values[of], o.reception.detections.range)
+    assert d.symbol_errors.values[3, here["observer"]].tolist() == [30, 90, 180] and d.symbol_erased.values[3, here["observer"], 1] == 45
     assert d.det_kind.values[of].tolist() == [1, 3, -1]
     for k, kind in enumerate(KINDS):
         assert d.path_count.sel(kind=kind).values[4, here["observer"]] == (o.paths.kind == k).sum()
