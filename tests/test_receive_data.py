@@ -144,7 +144,7 @@ def test_weaker_reference_is_read_with_the_stronger_path_predicted():
 def test_symbol_errors_in_noise(link, snr_db: float, delay_ser: float, dpsk_ser: float):
     """Against an independent simulation's rates (1200 and 1170 symbols). Planted bugs: one receiver left out of the sum, a Hann
     window before the decision."""
-    w, payload, clean = link
+    _, payload, clean = link
     frames, wrong_delay, wrong_dpsk = 3, 0, 0
     for seed in range(frames):
         found = demodulate(with_noise(clean, 10 ** (-snr_db / 10), 100 + seed), predict(LENGTH + 0.05, RATE - 0.1), 8)
@@ -173,7 +173,7 @@ def test_confidence_threshold_in_noise():
 
 def test_a_blocked_line_of_sight_is_said_and_nothing_invented(link):
     """Noise alone, and noise with a path far from the prediction in velocity. Planted bug: decoded set when a prediction is given."""
-    w, _, clean = link
+    _, _, clean = link
     silent = replace(clean, samples=np.zeros_like(clean.samples))
     for seed in range(2):
         r = receive_passive(with_noise(silent, 1.0, seed), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True)

@@ -38,7 +38,7 @@ def receive_active(
     """
     w = cube.waveform
     spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-    found = sense(spectra, w, cube.schedule, antennas, settings, passes=2)
+    found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
     groups, chirps = payload.delay_symbols.shape
     return Reception(
         detections=found.detections,

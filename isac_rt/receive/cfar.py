@@ -16,6 +16,10 @@ HANN_CORRELATION = 1.0 + 2 * ((2 / 3) ** 2 + (1 / 6) ** 2)
 """Cells per independent cell along one Hann-windowed axis: the sum of the squared correlations of neighbouring cells."""
 
 
+ROUNDING = 1e-16
+"""The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a quarter and half the range away."""
+
+
 @lru_cache(maxsize=64)
 def greatest_of_factor(false_alarm_rate: float, looks: float, cells_per_side: float) -> float:
     """Factor on the greater of two training means that gives the false-alarm rate.
@@ -81,7 +85,7 @@ def detect(
     above : (rows, P) bool
     level : (rows, P) background
     """
-    level = background(power, guard, training)
+    level = np.maximum(background(power, guard, training), ROUNDING * power.max())
     return power > threshold(looks, false_alarm_rate, guard, training) * level, level
 
 
@@ -115,7 +119,7 @@ def without_sidelobes(
 
     Parameters
     ----------
-    floor : share of a path's power that modulation and motion spread over all Doppler bins of its range row
+    floor : share of a path's power that may lie in any Doppler bin of its range row
     margin : power factor above the bound
     """
     keep = np.zeros(rows.size, bool)

@@ -8,7 +8,7 @@ import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule, is_latin
 from isac_rt.receive.cfar import detect, peaks, without_sidelobes
-from isac_rt.receive.doppler import accumulate, channel_maps, doppler_bins, omp_power
+from isac_rt.receive.doppler import UNION_FLOOR, accumulate, channel_maps, doppler_bins, omp_power
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -17,7 +17,6 @@ from isac_rt.receive.estimate import (
     standard_deviations,
     start_point,
 )
-from isac_rt.receive.spectrum import motion_floor
 from isac_rt.receive.types import Detections, Maps
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -46,24 +45,25 @@ def sense(
     spectra: np.ndarray,
     waveform: Waveform,
     schedule: Schedule,
+    delay_symbols: np.ndarray,
     antennas: Antennas,
     settings: Receivers,
     passes: int,
 ) -> Sensed:
-    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each."""
+    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose `delay_symbols` were removed."""
     w = waveform
-    power = accumulate(channel_maps(spectra, w, schedule))
+    power = accumulate(channel_maps(spectra, w, schedule, delay_symbols))
     looks = antennas.num_tx * antennas.num_rx
     above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     above[: int(np.ceil(settings.min_range_m / w.range_cell(passes)))] = False
     if use_omp(settings, schedule, w.num_tx):
         above &= _confirmed_by_omp(spectra, above, level, w, schedule)
     rows, bins = peaks(power, above, settings.cluster_cells)
-    keep = without_sidelobes(rows, bins, power, w.num_chirps, motion_floor(w))
+    keep = without_sidelobes(rows, bins, power, w.num_chirps, UNION_FLOOR)
     rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
     estimates = []
     for row, column in zip(rows, bins, strict=True):
-        local = LocalSpectra(spectra, w, schedule, int(row))
+        local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row))
         estimates.append(refine(local, *start_point(power, int(row), int(column), w)))
     snr = power[rows, bins] / level[rows, bins]
     found = describe(estimates, snr, antennas, w, passes)

@@ -1,17 +1,20 @@
 """Range-Doppler maps from cleaned spectra: the union of the groups, or each group's sparse sampling with OMP.
 
 By the Latin property every transmit antenna sends in every slot, in some group. The union of the groups is then a uniform sampling
-with the slot's full rate, up to the groups' offsets 2 m T_d, which `union_operator` takes out.
+with the slot's full rate, up to the offsets of the groups and of the data (2 m T_d and tau_D), which `union_operator` takes out.
 Doppler bins are centred: bin 0 of the output is -P/2. Receding is positive.
 """
 
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 
 from isac_rt.arrays import Schedule, is_latin
 from isac_rt.waveform import Waveform
+
+UNION_FLOOR = 1e-5
+"""Share of a path's power that the resampling of the united groups may leave in any other Doppler bin; reached within 2 % of the
+unambiguous velocity."""
 
 
 def slow_window(waveform: Waveform) -> np.ndarray:
@@ -25,20 +28,19 @@ def doppler_bins(waveform: Waveform) -> np.ndarray:
     return np.fft.fftshift(np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps))
 
 
-def group_phase(waveform: Waveform) -> np.ndarray:
-    """(M, P) exp(-j 2 pi f_D 2 m T_d) per Doppler bin, in FFT order."""
+def slow_times(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
+    """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a chirp with data lies tau_D later."""
     w = waveform
-    frequency = np.fft.fftfreq(w.num_chirps, w.slot_duration)
-    offsets = np.arange(w.num_groups) * w.group_spacing
-    return np.exp(-2j * np.pi * offsets[:, None] * frequency[None, :]).astype(np.complex64)
+    return (w.chirp_time + delay_symbols * w.delay_step) / w.slot_duration
 
 
-def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
+def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray) -> np.ndarray:
     """Doppler spectrum of every virtual channel over all its chirps, groups united.
 
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) complex64 from `clean_spectrum`
+    delay_symbols : (M, P) int, those that were removed
 
     Returns
     -------
@@ -48,39 +50,36 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) ->
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
     out = np.empty((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
     full = num_groups == waveform.num_tx and is_latin(schedule, waveform.num_tx)
+    times = slow_times(waveform, delay_symbols)
     for tx in range(waveform.num_tx):
-        united = np.zeros((num_rx, num_rows, num_chirps), np.complex64)
-        for m in range(num_groups):
-            if full:
-                np.copyto(united, spectra[m], where=schedule[m] == tx)
-            else:
-                united = spectra[m] * (schedule[m] == tx)
-                _correlate(united, out[tx], slow_window(waveform), group_phase(waveform)[m], first=m == 0)
-        if full:
-            operator = union_operator(waveform, (schedule == tx).argmax(axis=0))
-            np.matmul(united.reshape(-1, num_chirps), operator.T, out=out[tx].reshape(-1, num_chirps))
+        sent = schedule == tx
+        united = np.concatenate([spectra[m][..., sent[m]] for m in range(num_groups)], axis=-1)
+        operator = union_operator(waveform, times[sent]) if full else correlation_operator(waveform, times[sent])
+        np.matmul(united.reshape(-1, united.shape[-1]), operator.T, out=out[tx].reshape(-1, num_chirps))
     return out
 
 
-def _correlate(masked: np.ndarray, out: np.ndarray, window: np.ndarray, turn: np.ndarray, first: bool) -> None:
-    part = scipy.fft.fft(masked * window, axis=-1, workers=1, overwrite_x=True) * turn
-    out[...] = part if first else out + part
+def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
+    """(P, S) complex64: from S samples at `times` [slots] to their windowed correlations with the Doppler atoms."""
+    bins = np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps)
+    atoms = np.exp(-2j * np.pi * np.outer(bins, times) / waveform.num_chirps)
+    return (atoms * slow_window(waveform)[np.floor(times).astype(int)]).astype(np.complex64)
 
 
-def union_operator(waveform: Waveform, group: np.ndarray) -> np.ndarray:
-    """(P, P) complex64: from one antenna's samples, slot p heard in `group[p]`, to its windowed Doppler spectrum.
+def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
+    """(P, P) complex64: from one antenna's samples at `times` [slots], one in each slot, to its windowed Doppler spectrum.
 
-    The samples lie at p + group[p] * 2 T_d / T-, not quite uniformly. Turning each bin by its own group phase would match that bin
-    and leave sidelobes of -31 dB of every other velocity; the plain DFT leaves them at high velocity. Solving for the
-    spectrum that takes these values at these times (the system is near the identity) leaves neither.
+    The times are not quite uniform. The plain DFT, or turning each bin by its own group phase, would leave sidelobes of -25 to -35 dB
+    at all other velocities. Here the samples are resampled to the uniform grid (about the mean offset) by the least-squares fit
+    of all tones up to the unambiguous velocity: the normal equations of that band have the entries sinc(t - t'). What
+    remains is below -60 dB, and below -50 dB within 2 % of the unambiguous velocity.
     """
-    w, p = waveform, np.arange(waveform.num_chirps)
-    bins = np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
-    times = p + group * (w.group_spacing / w.slot_duration)
-    synthesis = np.exp(2j * np.pi * np.outer(times, bins) / w.num_chirps)
-    uniform = np.exp(2j * np.pi * np.outer(p, bins) / w.num_chirps)
-    resample = np.linalg.solve(synthesis.T, uniform.T).T
-    return (uniform.conj().T @ (slow_window(w)[:, None] * resample)).astype(np.complex64)
+    p = np.arange(waveform.num_chirps)
+    bins = np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps)
+    grid = p + (times - np.floor(times)).mean()
+    resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - grid)).T
+    analyse = np.exp(-2j * np.pi * np.outer(bins, p) / waveform.num_chirps)
+    return (analyse @ (slow_window(waveform)[:, None] * resample)).astype(np.complex64)
 
 
 def accumulate(maps: np.ndarray) -> np.ndarray:

@@ -76,14 +76,16 @@ def hann_response(waveform: Waveform, offset: np.ndarray) -> np.ndarray:
 class LocalSpectra:
     """The few range rows around a peak, ready for repeated evaluation of templates over the slow-time window."""
 
-    def __init__(self, spectra: np.ndarray, waveform: Waveform, schedule: Schedule, row: int) -> None:
+    def __init__(
+        self, spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray, row: int
+    ) -> None:
         w, low = waveform, max(row - HALF_WIDTH, 0)
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
         self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1)).reshape(schedule.size, rows.shape[2], -1)
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         self._tx = np.ascontiguousarray(schedule.ravel())
-        self._time = middle_times(w).ravel()
+        self._time = (middle_times(w) + delay_symbols * w.delay_step).ravel()
         self._numbers = np.array(
             [w.carrier_frequency, w.slope, window_middle(w), w.sampled_duration, window_length(w), w.num_samples]
         )

@@ -53,7 +53,7 @@ def receive_passive(
     if not modulated:
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
-        found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
+        found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
         return _reception(cube, _earliest(found, antennas, settings), found, None, maps)
     if prediction is None:
         return _reception(cube, no_detections(), None, None, maps)
@@ -62,8 +62,8 @@ def receive_passive(
     if np.median(symbols.delay_confidence) < confidence_threshold(antennas.num_rx, cells, symbols.raw.size):
         return _reception(cube, no_detections(), None, None, maps)
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
-    found = sense(spectra, w, cube.schedule, antennas, settings, passes=1)
-    detections = _at_prediction(spectra, found, prediction, cube, antennas, settings)
+    found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
+    detections = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
     return _reception(cube, detections, found, symbols if detections.is_reference.any() else None, maps)
 
 
@@ -88,6 +88,7 @@ def _amplitudes(found: Sensed) -> np.ndarray:
 
 def _at_prediction(
     spectra: np.ndarray,
+    delay_symbols: np.ndarray,
     found: Sensed,
     prediction: Prediction,
     cube: IFCube,
@@ -107,7 +108,7 @@ def _at_prediction(
     above, level = detect(found.power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     if not above[rows[i], columns[j]]:
         return no_detections()
-    local = LocalSpectra(spectra, w, cube.schedule, int(rows[i]))
+    local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]))
     estimate = refine(local, *start_point(found.power, int(rows[i]), int(columns[j]), w))
     snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
     reference = describe([estimate], np.array([snr]), antennas, w, 1)

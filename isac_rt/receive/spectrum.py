@@ -7,9 +7,8 @@ With a data delay tau_D = D / (alpha T) the tone of a path at cell f becomes (cy
 The bracket and the ramp D n/N do not depend on the path. The cross term does: it shifts the tone's time origin
 by s_D samples (17 for the largest symbol of the paper's settings). So the window is laid s_D samples later, over the same
 stretch of the shifted time for every symbol, and the spectrum's cell k is turned by exp(+j 2 pi k s_D/N) after
-it is read at k + D. What remains is the unmodulated frame, at fractional cells too; the only error is the motion
-during s_D samples: 2 pi f_c (dtau/dt) s_D / f_s, at most 0.04 rad at 15 m/s for an echo, different from chirp to chirp, which
-spreads -60 dB of a path's power over the Doppler axis.
+it is read at k + D. What remains is, at fractional cells too, an unmodulated chirp that was sent tau_D later: the path's motion during
+tau_D is in it, and whoever follows the phase from chirp to chirp has to count tau_D to the chirp's time.
 """
 
 from __future__ import annotations
@@ -84,15 +83,3 @@ def _gather(spectrum, symbols, factor, step, out):  # pragma: no cover - compile
         for k in range(num_rows):
             out[k, p] = np.complex64(spectrum[p, (k + symbols[p]) % num_samples] * turn)
             turn *= step[p]
-
-
-def motion_floor(waveform: Waveform) -> float:
-    """Largest share of a path's power in one Doppler bin that motion during the data's time shift leaves (module docstring).
-
-    The phase error is uniform over 2 pi f_c (dtau/dt) s_D/f_s at the fastest unambiguous path; its variance spreads over P bins,
-    with Hann's 3/2, and a bin exceeds ten times the mean of its few independent antennas once in thousands.
-    """
-    w = waveform
-    fastest = 0.5 / (w.slot_duration * w.effective_carrier)
-    span = 2 * np.pi * w.carrier_frequency * fastest * w.num_delay_symbols * w.delay_step
-    return float(10 * 1.5 / w.num_chirps * span**2 / 12)
