@@ -10,55 +10,58 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy import integrate, ndimage, optimize, stats
+from scipy import ndimage, optimize, stats
 
 HANN_CORRELATION = 1.0 + 2 * ((2 / 3) ** 2 + (1 / 6) ** 2)
 """Cells per independent cell along one Hann-windowed axis: the sum of the squared correlations of neighbouring cells."""
 
+QUADRATURE_POINTS = 4001
 
 ROUNDING = 1e-16
 """The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a quarter and half the range away."""
 
 
-@lru_cache(maxsize=64)
-def greatest_of_factor(false_alarm_rate: float, looks: float, cells_per_side: float) -> float:
+@lru_cache(maxsize=256)
+def greatest_of_factor(false_alarm_rate: float, looks: float, before: float, behind: float) -> float:
     """Factor on the greater of two training means that gives the false-alarm rate.
 
     Parameters
     ----------
     false_alarm_rate : of one cell
     looks : L, independent exponentials in a cell's mean
-    cells_per_side : independent training cells on each side (may be a fraction)
+    before, behind : independent training cells on each side (may be fractions); 0 where a side is missing
     """
-    side = stats.gamma(looks * cells_per_side, scale=1 / (looks * cells_per_side))
     cell = stats.gamma(looks, scale=1 / looks)
+    sides = [stats.gamma(looks * n, scale=1 / (looks * n)) for n in (before, behind) if n > 0]
+    z = np.linspace(min(s.ppf(1e-12) for s in sides), max(s.isf(1e-14) for s in sides), QUADRATURE_POINTS)
+    cumulative = np.prod([s.cdf(z) for s in sides], axis=0)
 
-    def rate(factor: float) -> float:
-        low, high = side.ppf(1e-12), side.isf(1e-14)
-        value, _ = integrate.quad(
-            lambda z: cell.sf(factor * z) * 2 * side.pdf(z) * side.cdf(z), low, high, limit=400, epsabs=0, epsrel=1e-8
-        )
-        return np.log(max(value, 1e-300)) - np.log(false_alarm_rate)
+    def excess(factor: float) -> float:
+        # by parts: the density of the greater mean against the cell's tail
+        rate = np.trapezoid(factor * cell.pdf(factor * z) * cumulative, z) + cell.sf(factor * z[-1])
+        return float(np.log(max(rate, 1e-300)) - np.log(false_alarm_rate))
 
-    return float(optimize.brentq(rate, 0.5, 200.0, xtol=1e-6))
+    return float(optimize.brentq(excess, 0.5, 1000.0, xtol=1e-6))
+
+
+def side_rows(rows: int, guard: int, training: int) -> np.ndarray:
+    """(rows, 2) training rows before and behind each row; a side with less than half of them is not used."""
+    index = np.arange(rows)
+    count = np.clip(np.stack([index - guard, rows - 1 - guard - index], axis=1), 0, training)
+    return np.where(count >= max(training // 2, 1), count, 0)
 
 
 def _side_mean(power: np.ndarray, guard: tuple[int, int], training: tuple[int, int], side: int) -> np.ndarray:
-    """Mean over the training block before (-1) or behind (+1) each cell in range; Doppler wraps. NaN where no cell is."""
+    """Mean over the training block before (-1) or behind (+1) each cell in range; Doppler wraps. NaN where none is used."""
     rows, _ = power.shape
     width = 2 * (guard[1] + training[1]) + 1
     across = ndimage.uniform_filter1d(power.astype(np.float64), width, axis=1, mode="wrap")
     total = np.concatenate([np.zeros((1, power.shape[1])), np.cumsum(across, axis=0)])
     index = np.arange(rows)
-    if side < 0:
-        stop = np.clip(index - guard[0], 0, rows)
-        start = np.clip(index - guard[0] - training[0], 0, rows)
-    else:
-        start = np.clip(index + guard[0] + 1, 0, rows)
-        stop = np.clip(index + guard[0] + 1 + training[0], 0, rows)
-    count = stop - start
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count[:, None] >= max(training[0] // 2, 1), (total[stop] - total[start]) / count[:, None], np.nan)
+    count = side_rows(rows, guard[0], training[0])[:, 0 if side < 0 else 1]
+    start = np.where(count == 0, 0, index - guard[0] - count if side < 0 else index + guard[0] + 1)
+    with np.errstate(invalid="ignore"):
+        return (total[start + count] - total[start]) / count[:, None]
 
 
 def background(power: np.ndarray, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
@@ -86,14 +89,25 @@ def detect(
     level : (rows, P) background
     """
     level = np.maximum(background(power, guard, training), ROUNDING * power.max())
-    return power > threshold(looks, false_alarm_rate, guard, training) * level, level
+    rows = side_rows(len(power), guard[0], training[0])
+    factor = np.array([_factor(looks, false_alarm_rate, guard, training, *count) for count in rows.tolist()])
+    return power > factor[:, None] * level, level
 
 
 def threshold(looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> float:
-    """Factor on the background of a Hann-windowed map: neighbouring training cells count for less than one each."""
-    width = 2 * (guard[1] + training[1]) + 1
-    independent = training[0] * width / HANN_CORRELATION**2
-    return greatest_of_factor(false_alarm_rate, float(looks), max(independent, 1.0))
+    """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
+    return _factor(looks, false_alarm_rate, guard, training, training[0], training[0])
+
+
+def _factor(
+    looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int], before: int, behind: int
+) -> float:
+    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less than one each. Infinite
+    where there is no training row."""
+    if before == behind == 0:
+        return np.inf
+    share = (2 * (guard[1] + training[1]) + 1) / HANN_CORRELATION**2
+    return greatest_of_factor(false_alarm_rate, float(looks), before * share, behind * share)
 
 
 def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
