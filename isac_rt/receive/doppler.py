@@ -122,7 +122,7 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
         support = np.concatenate([support, best.argmax(axis=1)[:, None]], axis=1)
         inner = gram[support[:, :, None], support[:, None, :]]
         solution = np.linalg.solve(inner, first[rows[:, None], support][..., None])[..., 0]
-        correlation = first - np.einsum("vk,vkp->vp", solution, gram[support])
+        correlation = first - np.einsum("vk,vkp->vp", solution, gram[support].conj())
     out = np.zeros((count, num_chirps), np.complex64)
     out[rows[:, None], support] = solution * size
     return out

@@ -1,0 +1,342 @@
+"""Maps, CFAR, off-grid estimates and angles at the receivers, on cubes written from the signal's equation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from receiver_cubes import ANTENNAS, Path, cube, frame
+from scipy import stats
+
+from isac_rt.ifsignal import IFCube
+from isac_rt.payload import unmodulated
+from isac_rt.receive import receive_active
+from isac_rt.receive.cfar import (
+    background,
+    detect,
+    greatest_of_factor,
+    hann_envelope,
+    peaks,
+    side_rows,
+    threshold,
+    without_sidelobes,
+)
+from isac_rt.receive.common import sense, use_omp
+from isac_rt.receive.doppler import accumulate, channel_maps, correlation_operator, omp, slow_times, slow_window, union_operator
+from isac_rt.receive.estimate import (
+    LocalSpectra,
+    beat_cells,
+    direction_cosine,
+    hann_response,
+    middle_phase,
+    refine,
+    start_point,
+)
+from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
+from isac_rt.scenario import Receivers
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
+SETTINGS = Receivers()
+GUARD, TRAINING = SETTINGS.guard_cells, SETTINGS.training_cells
+FALSE_FAILURE = 1e-6  # statistical
+
+
+def white(w: Waveform, schedule: np.ndarray, num_rx: int, seed: int) -> IFCube:
+    shape = (w.num_groups, num_rx, w.num_chirps, w.num_samples, 2)
+    samples = np.random.default_rng(seed).standard_normal(shape, np.float32).view(np.complex64)[..., 0]
+    return IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0)
+
+
+# --- Doppler
+
+
+@pytest.mark.parametrize(("tone", "bound_db"), [(0.0, -60), (10.3, -60), (-30.5, -60), (50.5, -60), (58.2, -48)])
+def test_union_of_groups_is_the_uniform_sampling(tone: float, bound_db: float):
+    """One antenna's samples at their true times against the windowed DFT of uniform samples, over all bins. Planted bugs: offsets of
+    the groups left out (-25 dB), offsets of the data left out (-45 dB), times not about their mean."""
+    w, schedule, payload = frame()
+    sent = schedule == 1
+    times = slow_times(w, payload.delay_symbols)[sent]
+    middle = (times - np.floor(times)).mean()
+    p, bins = np.arange(w.num_chirps), np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
+    expected = np.exp(-2j * np.pi * np.outer(bins, p) / w.num_chirps) @ (
+        slow_window(w) * np.exp(2j * np.pi * tone * (p + middle) / w.num_chirps)
+    )
+    operator = union_operator(w, times)
+    got = operator @ np.exp(2j * np.pi * tone * times / w.num_chirps)
+    assert np.abs(expected).max() > 40
+    assert 20 * np.log10(np.abs(got - expected).max() / slow_window(w).sum()) < bound_db
+    noise_gain = (np.abs(operator) ** 2).sum(axis=1) / (slow_window(w) ** 2).sum()
+    assert noise_gain.max() < 1.05  # resampling by a tenth of a slot hardly raises the noise
+
+
+def test_sparse_correlation_is_the_sum_over_the_samples():
+    """Planted bug: group offsets left out."""
+    w = Waveform(num_groups=2)
+    schedule, payload = frame(waveform=w)[1:]
+    times = slow_times(w, payload.delay_symbols)[schedule == 2]
+    values = np.random.default_rng(3).standard_normal(times.size)
+    got = correlation_operator(w, times) @ values
+    for k in (0, 7, 59, 60, 113):
+        number = k if k < 60 else k - 120
+        slow = sum(
+            v * np.sin(np.pi * (int(t) + 0.5) / 120) ** 2 * np.exp(-2j * np.pi * number * t / 120)
+            for v, t in zip(values, times, strict=True)
+        )
+        assert abs(got[k] - slow) < 1e-5 * np.abs(values).sum()  # rounding of complex64
+
+
+def test_omp_against_a_plain_loop():
+    """Batch-OMP against least squares on a growing support. Planted bugs: correlation updated with the transposed Gram matrix,
+    first atom chosen twice."""
+    rng = np.random.default_rng(6)
+    chosen = np.sort(rng.choice(120, 40, replace=False))
+    vectors = rng.standard_normal((12, 40)) + 1j * rng.standard_normal((12, 40))
+    got = omp(vectors, chosen, 120, 3)
+    atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(120)) / 120)
+    for v, row in zip(vectors, got, strict=True):
+        support, residual = [], v
+        for _ in range(3):
+            support.append(int(np.abs(atoms.conj().T @ residual).argmax()))
+            x = np.linalg.lstsq(atoms[:, support], v, rcond=None)[0]
+            residual = v - atoms[:, support] @ x
+        assert sorted(np.flatnonzero(row)) == sorted(support)
+        assert np.abs(row[support] - 40 * x).max() < 1e-5 * np.abs(40 * x).max()  # complex64
+
+
+def test_omp_recovers_three_tones_beyond_the_unambiguous_velocity_of_one_antenna():
+    tones, chosen = np.array([7, 51, 88]), np.flatnonzero(frame()[1][0] == 0)
+    vector = np.exp(2j * np.pi * np.outer(tones, chosen) / 120).T @ np.array([1.0, 0.6j, -0.4])
+    found = omp(vector[None], chosen, 120, 3)[0] / chosen.size
+    assert np.flatnonzero(found).tolist() == tones.tolist()
+    assert np.abs(found[tones] - [1.0, 0.6j, -0.4]).max() < 1e-5
+
+
+def test_method_follows_the_schedule():
+    _, schedule, _ = frame()
+    assert not use_omp(SETTINGS, schedule, 3)
+    assert use_omp(SETTINGS, schedule[:2], 3)
+    assert use_omp(Receivers(velocity_method="omp"), schedule, 3)
+    assert not use_omp(Receivers(velocity_method="latin_union"), schedule, 3)
+
+
+# --- CFAR
+
+
+@pytest.mark.parametrize(("rate", "looks", "cells"), [(1e-6, 45, 30.0), (1e-3, 9, 4.7), (1e-2, 1, 11.0)])
+def test_factor_of_one_side_is_the_f_distribution(rate: float, looks: int, cells: float):
+    """A cell over a mean of n cells is F(2 L, 2 L n). Planted bug: looks of the cell used for the training mean."""
+    quadrature = 1e-4
+    assert greatest_of_factor(rate, looks, cells, 0.0) == pytest.approx(stats.f.isf(rate, 2 * looks, 2 * looks * cells), rel=quadrature)
+    many = greatest_of_factor(rate, looks, 1e6, 1e6)
+    assert many == pytest.approx(stats.gamma(looks, scale=1 / looks).isf(rate), rel=1e-3)
+
+
+def test_factor_of_the_greater_side_by_drawing():
+    """Planted bug: the smaller side."""
+    rng, n = np.random.default_rng(9), 400_000
+    cell = rng.gamma(5, 1 / 5, n)
+    sides = np.maximum(rng.gamma(5 * 3.5, 1 / (5 * 3.5), n), rng.gamma(5 * 6, 1 / (5 * 6), n))
+    false = int((cell > greatest_of_factor(1e-3, 5, 3.5, 6.0) * sides).sum())
+    low, high = stats.binom.ppf([FALSE_FAILURE / 2, 1 - FALSE_FAILURE / 2], n, 1e-3)
+    assert low <= false <= high
+
+
+def test_false_alarm_rate_of_the_whole_chain():
+    """White noise through data removal, union and accumulation. Neighbouring cells of the map are alike, so false alarms come in
+    groups: the bounds are for a third as many independent trials. Planted bugs: training cells taken for independent,
+    one look too many."""
+    w, schedule, payload = frame()
+    rate, false, trials = 1e-3, 0, 0
+    for seed in range(4):
+        spectra = clean_spectrum(white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512)
+        power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
+        above, _ = detect(power, 9, rate, GUARD, TRAINING)
+        false, trials = false + int(above.sum()), trials + above.size
+    low, high = stats.binom.ppf([FALSE_FAILURE / 2, 1 - FALSE_FAILURE / 2], trials // 3, rate)
+    assert 3 * low <= false <= 3 * high
+
+
+def test_training_at_the_ends_and_across_the_doppler_wrap():
+    power = np.ones((40, 20))
+    power[:, 0] = 5.0
+    level = background(power, (1, 1), (4, 2))
+    assert np.isfinite(level).all()
+    share = (6 * 1.0 + 5.0) / 7  # width 2 (1 + 2) + 1 = 7 columns, one of them the bright one
+    assert level[20, 19] == pytest.approx(share) and level[0, 2] == pytest.approx(share) and level[39, 10] == pytest.approx(1.0)
+    counts = side_rows(40, 1, 4)
+    assert counts[0].tolist() == [0, 4] and counts[2].tolist() == [0, 4] and counts[3].tolist() == [2, 4] and counts[39].tolist() == [4, 0]
+
+
+def test_a_clutter_edge_raises_no_alarms():
+    """A step of 20 dB in range. Planted bug: the mean of both sides, which gives thousands of alarms before the edge's far side."""
+    rng = np.random.default_rng(4)
+    power = rng.gamma(45, 1 / 45, (200, 120))
+    power[100:] *= 100
+    above, _ = detect(power, 45, 1e-4, GUARD, TRAINING)
+    # the four rows behind the edge see it in their guard cells only: their own side holds the rate to a few times the design
+    assert above.sum() <= stats.binom.isf(FALSE_FAILURE, power.size, 3e-4)
+
+
+def test_peaks_are_local_maxima_and_wrap():
+    power = np.ones((30, 16))
+    power[10, 0], power[10, 15], power[11, 0], power[20, 8] = 9.0, 8.0, 7.0, 5.0
+    rows, bins = peaks(power, power > 2, (1, 1))
+    assert rows.tolist() == [10, 20] and bins.tolist() == [0, 8]
+
+
+def test_hann_envelope_bounds_the_window_spectrum():
+    """Against the transform of the window itself. Planted bug: exponent of the sidelobes."""
+    n = np.arange(4096)
+    spectrum = np.abs(np.fft.fft(np.sin(np.pi * n / 4096) ** 2, 16 * 4096)[: 16 * 40]) ** 2
+    relative, distance = spectrum / spectrum[0], np.arange(16 * 40) / 16
+    bound = hann_envelope(distance)
+    assert (relative <= bound * 1.01).all()
+    peak = [relative[(distance >= k) & (distance < k + 1)].max() / bound[16 * k + 8] for k in range(3, 30)]
+    assert min(peak) > 0.7  # not loose either
+
+
+def test_sidelobes_are_told_from_targets():
+    power = np.full((60, 120), 1e-9)
+    rows, bins = np.array([30, 30, 35, 30]), np.array([60, 65, 61, 90])
+    power[rows, bins] = 1.0, 2e-5, 2e-3, 2e-3
+    keep = without_sidelobes(rows, bins, power, 120, 1e-5)
+    assert keep.tolist() == [True, False, True, True]
+
+
+# --- estimates
+
+
+def test_compiled_match_is_the_template():
+    """Planted bugs: Doppler without the data delay, phase at the first sample, window's transform about its start."""
+    w, schedule, _ = frame()
+    spectra = np.random.default_rng(2).standard_normal((3, 2, 30, 120, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    tau, rate, row = 14.37 * w.delay_step, 3.1e-8, 14
+    got = LocalSpectra(spectra, w, schedule, np.zeros_like(schedule), row).respond(tau, rate)
+    rows = np.arange(row - 3, row + 4)
+    shape = hann_response(w, beat_cells(w, tau, rate)[..., None] - rows)
+    turn = middle_phase(w, tau, rate)[..., None] - rows * (window_length(w) / 2 / w.num_samples)
+    template = shape * np.exp(2j * np.pi * turn)
+    for tx in range(3):
+        weight = (schedule == tx) * slow_window(w)
+        expected = np.einsum("mxkp,mpk,mp->x", spectra[:, :, rows], template.conj(), weight) / (shape**2 * weight[..., None]).sum()
+        assert np.abs(got[tx] - expected).max() < 1e-9 * np.abs(expected).max()  # rounding
+
+
+def test_window_transform_is_closed_form():
+    """Planted bug: the transform about the first sample."""
+    w = Waveform()
+    n, length = np.arange(w.num_samples), window_length(w)
+    for offset in (0.0, 0.37, -1.2, 2.6):
+        slow = (hann(n, length) * np.exp(2j * np.pi * offset * (n - length / 2) / w.num_samples)).sum()
+        assert abs(slow - hann_response(w, np.array(offset))) < 1e-4 * length / 2
+
+
+CASES = [(10.123, -3.266, 0.43, -0.31), (46.3217, 13.277, -0.52, 0.17), (97.618, 14.62, 0.05, 0.61), (3.417, -14.5, -0.2, -0.2)]
+
+
+@pytest.mark.parametrize(("distance", "speed", "x", "z"), CASES)
+def test_an_echo_is_estimated_without_bias(distance: float, speed: float, x: float, z: float):
+    """One noise-free modulated path at the AT, off the grid: nothing else is seen. Planted bugs: coupling with the wrong sign,
+    range not referred to mid-frame, carrier at the start of the chirp, X and Z arm exchanged, steering with the other sign."""
+    w, schedule, payload = frame()
+    signal = cube(w, schedule, payload, [Path(2 * distance, 2 * speed, 1.0, (x, z), (x, z))])
+    d = receive_active(signal, payload, ANTENNAS, SETTINGS).detections
+    assert len(d) == 1
+    rounding_range, rounding_velocity = 2e-4, 1e-5  # element delays of opposite sign do not cancel exactly in the summed power
+    assert abs(d.range[0] - distance) < rounding_range
+    assert abs(d.velocity[0] - speed) < rounding_velocity
+    # the cube has plane waves, the receiver expects spheres: |r|^2/(2 R) over the array, falling with the distance
+    assert np.abs(d.direction[0] - [x, z]).max() < 1e-4 + 4e-3 / distance
+
+
+def test_one_way_angles_use_the_receive_arm_only():
+    """Arrival and departure differ. Planted bug: the virtual array at a PT."""
+    w, schedule, _ = frame()
+    pilot = unmodulated(w)
+    signal = cube(w, schedule, pilot, [Path(83.71, 6.6, 1.0, (0.37, -0.21), (-0.55, 0.42))])
+    spectra = clean_spectrum(signal, pilot.delay_symbols, pilot.phases, 512)
+    d = sense(spectra, w, schedule, pilot.delay_symbols, ANTENNAS, SETTINGS, 1).detections
+    assert len(d) == 1 and abs(d.range[0] - 83.71) < 2e-4 and abs(d.velocity[0] - 6.6) < 1e-5
+    assert np.abs(d.direction[0] - [0.37, -0.21]).max() < 2e-4
+
+
+@pytest.mark.parametrize("virtual", [True, False])
+def test_beamformer_against_its_signal(virtual: bool):
+    """Channels straight from the positions, all over the field of view. Planted bug: spacing of half a wavelength."""
+    w, middle = Waveform(), 2 * np.pi * Waveform().effective_carrier / SPEED_OF_LIGHT
+    for axis, u in ((0, -0.83), (0, 0.271), (2, 0.64), (2, -0.07)):
+        tx, rx = ANTENNAS.tx_positions[:, axis] * (u if virtual else -0.3), ANTENNAS.rx_positions[:, axis] * u
+        channels = np.exp(-1j * middle * (tx[:, None] + rx[None, :]))
+        assert direction_cosine(channels, ANTENNAS, w, axis, virtual) == pytest.approx(u, abs=1e-4)  # window's middle is 9 samples off
+
+
+def test_outside_the_field_of_view_there_is_no_direction():
+    w, schedule, payload = frame()
+    narrow = replace(ANTENNAS, half_view=np.deg2rad(30.0))
+    signal = cube(w, schedule, payload, [Path(61.4, 2.2, 1.0, (0.7, 0.1), (0.7, 0.1))])
+    d = receive_active(signal, payload, narrow, SETTINGS).detections
+    assert np.isnan(d.direction[0, 0]) and abs(d.direction[0, 1] - 0.1) < 1e-3
+
+
+def test_standard_deviations_match_the_scatter():
+    """Noise at -24 dB per sample, 10 frames of one path: each estimate's scatter is what `std` says, within the chi-square spread and
+    the factor 2 to which the bound is meant. Planted bug: variance for deviation."""
+    w, schedule, _ = frame()
+    pilot = unmodulated(w)
+    clean = cube(w, schedule, pilot, [Path(71.3, -4.6, 1.0, (0.2, -0.3), (0.1, 0.2))], FEW)
+    errors, std = [], np.zeros(4)
+    for seed in range(10):
+        noisy = white(w, schedule, 3, 50 + seed)
+        noisy = replace(noisy, samples=clean.samples + noisy.samples * np.float32(np.sqrt(10**2.4 / 2)))
+        spectra = clean_spectrum(noisy, pilot.delay_symbols, pilot.phases, 512)
+        d = sense(spectra, w, schedule, pilot.delay_symbols, FEW, SETTINGS, 1).detections
+        errors.append([d.range[0] - 71.3, d.velocity[0] + 4.6, *(d.direction[0] - [0.2, -0.3])])
+        std = d.std[0]
+    scatter = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (scatter / std > 0.35).all() and (scatter / std < 2.2).all()
+
+
+@pytest.mark.parametrize(
+    ("groups", "method", "strongest"), [(3, "latin_union", 1.0), (3, "omp", 0.07), (2, "auto", 0.07), (1, "auto", 0.05)]
+)
+def test_three_targets_in_noise(groups: int, method: str, strongest: float):
+    """Two of them in one range cell, one stronger (26 dB with the union; with sparse sampling nearly alike, for off the grid the
+    stronger one uses up OMP's atoms). Sparse sampling's sidelobes are not reported. Planted bugs: sidelobes of the strong one kept; OMP's
+    correlation updated with the transposed Gram matrix."""
+    w, schedule, payload = frame(waveform=Waveform(num_groups=groups), seed=7)
+    targets = [(33.371, 3.3, strongest), (33.47, -5.1, 0.05), (51.12, -7.9, 0.05)]
+    signal = cube(w, schedule, payload, [Path(2 * r, 2 * v, a, (0.2, 0.1), (0.2, 0.1)) for r, v, a in targets], noise=0.1)
+    d = receive_active(signal, payload, ANTENNAS, Receivers(velocity_method=method)).detections
+    assert len(d) == 3
+    for r, v, _ in targets:
+        i = int(np.argmin(np.abs(d.range - r) + np.abs(d.velocity - v)))
+        assert abs(d.range[i] - r) < 0.01 and abs(d.velocity[i] - v) < 0.02
+
+
+def test_leakage_is_passed_over_and_hides_nothing():
+    """60 dB over an echo at 12 m that stands still as well. Planted bug: min_range_m ignored."""
+    w, schedule, payload = frame()
+    paths = [Path(0.3, 0.0, 30.0), Path(2 * 12.34, 0.0, 0.03, (0.1, 0.0), (0.1, 0.0)), Path(2 * 30.1, 2 * 4.0, 0.03)]
+    d = receive_active(cube(w, schedule, payload, paths, FEW, noise=0.1), payload, FEW, SETTINGS).detections
+    assert sorted(np.round(d.range, 2).tolist()) == [12.34, 30.1]
+
+
+def test_start_point_is_near_and_refinement_moves_to_the_truth():
+    w, schedule, payload = frame()
+    signal = cube(w, schedule, payload, [Path(57.77, 9.21)], FEW)
+    spectra = clean_spectrum(signal, payload.delay_symbols, payload.phases, 512)
+    power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
+    row, column = (int(i) for i in np.unravel_index(power.argmax(), power.shape))
+    delay, rate = start_point(power, row, column, w)
+    assert abs(delay * SPEED_OF_LIGHT - 57.77) < 0.2 * w.range_cell(1)
+    assert abs(rate * SPEED_OF_LIGHT - 9.21) < 0.1 * w.velocity_cell(1)
+    found = refine(LocalSpectra(spectra, w, schedule, payload.delay_symbols, row), delay, rate)
+    assert abs(found.delay * SPEED_OF_LIGHT - 57.77) < 2e-4 and abs(found.delay_rate * SPEED_OF_LIGHT - 9.21) < 1e-5
+    assert np.abs(np.abs(found.channels) - 1).max() < 2e-3  # the amplitude of a sample
+
+
+def test_threshold_grows_with_fewer_training_cells():
+    assert threshold(45, 1e-6, (3, 3), (2, 1)) > threshold(45, 1e-6, (3, 3), (8, 6)) > stats.gamma(45, scale=1 / 45).isf(1e-6) * 0.9
