@@ -33,9 +33,11 @@ from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose
 from isac_rt.waveform import SPEED_OF_LIGHT
 
-VERTEX_TOLERANCE = 1e-2  # [m] a float64 point farther from Sionna's is another path; float32 explains 1e-4 within 1 km
-LENGTH_QUANTUM = 1e-6  # [m] chains over the same planes whose lengths agree to this are one path found twice
-MAX_PATHS = 1_000_000
+POINT_TOLERANCE = 1e-3
+"""Share of a path's length by which its points may differ from Sionna's; beyond, it is another path. Sionna's mirrors are float32
+triangles whose normals err by up to 3e-4 rad in Munich, which moves points by centimetres and lengths by micrometres."""
+MOST_PATHS = 4_000_000
+"""Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so fewer rays get less room."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class RayTracer:
         self._sections = {name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()}
         self._handle = build_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
+        self._normals, self._offsets = plane_of_each_face(city)
         self.dropped = 0
         """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
         scene = self._handle.scene
@@ -80,7 +83,15 @@ class RayTracer:
         hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
         return {link: self._link(local, epoch, *link, legs, hits) for link in links}
 
-    def _solve(self, local: dict[str, Pose], sources: list[str], sinks: list[str], **options: object) -> rt.Paths:
+    def _solve(
+        self, local: dict[str, Pose], sources: list[str], sinks: list[str], max_depth: int, samples_per_src: int, **options: bool
+    ) -> rt.Paths:
+        """Solve between isotropic single elements.
+
+        Raises
+        ------
+        ValueError  If there are so many paths that some may be missing.
+        """
         scene = self._handle.scene
         for name in [*scene.transmitters, *scene.receivers]:
             scene.remove(name)
@@ -88,9 +99,20 @@ class RayTracer:
             scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*local[name].position.tolist())))
         for name in sinks:
             scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*local[name].position.tolist())))
-        found = self._solver(scene, refraction=False, synthetic_array=True, max_num_paths_per_src=MAX_PATHS, **options)
-        if found.tau.shape[-1] * len(sinks) >= MAX_PATHS:
-            raise ValueError(f"the ray tracer found its cap of {MAX_PATHS} paths; lower propagation.rays or clutter.rays")
+        room = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
+        found = self._solver(
+            scene,
+            max_depth=max_depth,
+            samples_per_src=samples_per_src,
+            max_num_paths_per_src=room,
+            refraction=False,
+            synthetic_array=True,
+            **options,
+        )
+        valid = np.asarray(found.valid)  # (rx, tx, path): the array is synthetic
+        most = valid.sum(axis=(0, 2)).max()
+        if most >= MOST_PATHS:
+            raise ValueError(f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays or clutter.rays")
         return found
 
     def _specular_legs(self, local: dict[str, Pose]) -> dict[tuple[str, str], LegSet]:
@@ -130,12 +152,12 @@ class RayTracer:
             chain = faces[which][:, :count]
             if count == 0 and np.linalg.norm(end.position - start.position) < 1e-9:
                 continue  # a terminal's path to itself is its leakage, which is not the ray tracer's
-            legs = unfold(self._city.normals[chain], self._city.plane_offsets[chain], start, end)
-            good = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(axis=1, initial=0.0) < VERTEX_TOLERANCE
+            legs = unfold(self._normals[chain], self._offsets[chain], start, end)
+            apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(axis=1, initial=0.0)
+            good = apart < POINT_TOLERANCE * legs.length
             self.dropped += int((~good).sum())
-            keys = np.column_stack([np.round(legs.length / LENGTH_QUANTUM), self._city.plane_of_face[chain]])
-            _, first = np.unique(keys[good], axis=0, return_index=True)
-            keep = np.flatnonzero(good)[first]
+            keep = one_of_each_chain(self._city.plane_of_face[chain], chain, good)
+            keep = keep[np.argsort(legs.length[keep], kind="stable")]
             parts.append((amplitude[which][keep], _pick(legs, keep), chain[keep]))
         depth = faces.shape[1]
         widths = [depth - chain.shape[1] for _, _, chain in parts]
@@ -215,7 +237,7 @@ class RayTracer:
 
     def _diffuse_hits(self, local: dict[str, Pose], links: list[tuple[str, str]]) -> dict:
         """Hit points and scattered amplitudes of every link, from one solve; points on the float64 mesh, in a fixed order."""
-        sources, sinks = (list(dict.fromkeys(end)) for end in zip(*links, strict=True))
+        sources, sinks = list(dict.fromkeys(tx for tx, _ in links)), self._terminals  # as many each frame: a new number compiles anew
         found = self._solve(
             local,
             sources,
@@ -257,6 +279,34 @@ class RayTracer:
             faces=face[:, None],
             **common,
         )
+
+
+def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest face.
+
+    All triangles of a wall are then one mirror, to the last bit: a path that slides from one to the next does not jump, and
+    one that was found on both is recognised.
+    """
+    by_area = np.argsort(-city.areas, kind="stable")
+    _, first, plane = np.unique(city.plane_of_face[by_area], return_index=True, return_inverse=True)
+    largest = np.empty(city.num_faces, np.int64)
+    largest[by_area] = by_area[first[plane]]
+    return city.normals[largest], city.plane_offsets[largest]
+
+
+def one_of_each_chain(planes: np.ndarray, faces: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with the lowest faces (K, B).
+
+    Mirrors leave two points one path over a chain of planes, so what shares the chain was found twice: on both triangles of a
+    seam, or by Sionna's hash of planes, which coordinates far from the origin defeat.
+    """
+    which = np.flatnonzero(good)
+    if planes.shape[1] == 0:
+        return which[:1]
+    keys = np.column_stack([planes, faces])[which]
+    which = which[np.lexsort(keys.T[::-1])]
+    _, first = np.unique(planes[which], axis=0, return_index=True)
+    return which[first]
 
 
 def _pick(legs: Legs, which: np.ndarray) -> Legs:
