@@ -172,14 +172,17 @@ def test_confidence_threshold_in_noise():
 
 
 def test_a_blocked_line_of_sight_is_said_and_nothing_invented(link):
-    """Noise alone, and noise with a path far from the prediction in velocity. Planted bug: decoded set when a prediction is given."""
-    _, _, clean = link
+    """Noise alone, and a reflection that moves otherwise than predicted. Planted bug: decoded set when a prediction is given."""
+    w, payload, clean = link
     silent = replace(clean, samples=np.zeros_like(clean.samples))
     for seed in range(2):
         r = receive_passive(with_noise(silent, 1.0, seed), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True)
         assert not r.line_of_sight and not r.decoded and len(r.detections) == 0
         assert (r.delay_symbols == -1).all() and (r.transitions == -1).all()
         assert r.bits.size == 0 and r.raw_delay_symbols.size == 0 and np.isnan(r.reference_power)
+    reflection = cube(w, clean.schedule, payload, [Path(LENGTH + 9.31, RATE + 11.7, 0.3)])
+    r = receive_passive(with_noise(reflection, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True)
+    assert not r.line_of_sight and not r.decoded and r.bits.size == 0 and np.isnan(r.reference_power)
 
 
 def test_a_modulated_frame_without_prediction_is_not_read(link):

@@ -29,7 +29,7 @@ class Symbols:
     """Decisions of a frame; shapes as in `Reception`.
 
     `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a transition, the cosine-like share
-    |sum y conj(y')| / sum |y y'|, in [0, 1].
+    |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions from their symbols [rad].
     """
 
     raw: np.ndarray
@@ -37,6 +37,7 @@ class Symbols:
     delay_confidence: np.ndarray
     transitions: np.ndarray
     transition_confidence: np.ndarray
+    phase_spread: float
     phases: np.ndarray
     bits: np.ndarray
 
@@ -86,13 +87,14 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int) -> Symbols
     known = middle_phase(w, delays[0], rates[0]) - beats * (window_length(w) / 2 / w.num_samples)
     known += data_phase(w, raw) - (w.slope * w.delay_step * raw) * delays[0]
     picked *= np.exp(-2j * np.pi * known)[:, None, :]
-    transitions, share = _dpsk(picked, cube.schedule, w.num_tx, dpsk_order)
+    transitions, share, spread = _dpsk(picked, cube.schedule, w.num_tx, dpsk_order)
     return Symbols(
         raw=raw,
         delay=delay,
         delay_confidence=sure,
         transitions=transitions,
         transition_confidence=share,
+        phase_spread=spread,
         phases=running_phases(transitions, cube.schedule, dpsk_order),
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
     )
@@ -111,11 +113,26 @@ def _decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform:
     return cells[best], peak / np.maximum(rest, 1e-300)
 
 
-def _dpsk(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+def _dpsk(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of the earlier one."""
     chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
     product = chains[..., 1:] * chains[..., :-1].conj()
     summed = product.sum(axis=2)
-    symbols = np.round(np.angle(summed) / (2 * np.pi / order)).astype(np.int64) % order
+    steps = np.angle(summed) / (2 * np.pi / order)
+    symbols = np.round(steps).astype(np.int64) % order
+    spread = float(np.sqrt(np.mean((steps - np.round(steps)) ** 2)) * 2 * np.pi / order)
     share = np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
-    return symbols, share
+    return symbols, share, spread
+
+
+def moves_as_predicted(symbols: Symbols, num_rx: int, order: int) -> bool:
+    """Whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
+
+    The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole symbols of its Doppler, so that
+    a reflection always ends up near the predicted cell. But unless it moves as predicted its phases lie anywhere between the symbols:
+    a spread of pi/D/sqrt(3). The spread from noise is sqrt((1 + 1/(2 g)) / (L_rx g)) with g the SNR of a cell.
+    """
+    anywhere = np.pi / order / np.sqrt(3)
+    g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)
+    from_noise = np.sqrt((1 + 1 / (2 * g)) / (num_rx * g))
+    return bool(from_noise > 0.6 * anywhere or symbols.phase_spread < 0.8 * anywhere)

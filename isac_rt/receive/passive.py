@@ -12,12 +12,12 @@ from isac_rt.payload import unmodulated
 from isac_rt.receive.active import equivalent_range_map
 from isac_rt.receive.cfar import detect, threshold
 from isac_rt.receive.common import Sensed, describe, make_maps, sense
-from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate
-from isac_rt.receive.estimate import LocalSpectra, refine, start_point
+from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
+from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.waveform import Waveform
 
 REFERENCE_SPAN_DB = 20.0  # the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
 GATE_CELLS = 1  # range rows searched on each side of the predicted one: the fraction is known, the whole cell is the prediction's
@@ -46,28 +46,29 @@ def receive_passive(
     Returns
     -------
     Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the strongest. Without a prediction
-    a modulated frame cannot be read: nothing is detected. When the decisions look like noise, or nothing is found where the
-    reference is expected, `line_of_sight` is False and all symbols are erased.
+    a modulated frame cannot be read: nothing is detected. When the decisions look like noise or like a path that moves
+    otherwise, or nothing is found where the reference is expected, `line_of_sight` is False and all symbols are erased.
     """
     w = cube.waveform
     if not modulated:
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        return _reception(cube, _earliest(found, antennas, settings), found, None, maps)
+        return _reception(cube, *_earliest(found, antennas, settings), found, None, maps)
     if prediction is None:
-        return _reception(cube, no_detections(), None, None, maps)
+        return _reception(cube, no_detections(), None, None, None, maps)
     symbols = demodulate(cube, prediction, dpsk_order)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
-    if np.median(symbols.delay_confidence) < confidence_threshold(antennas.num_rx, cells, symbols.raw.size):
-        return _reception(cube, no_detections(), None, None, maps)
+    confident = np.median(symbols.delay_confidence) >= confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
+    if not confident or not moves_as_predicted(symbols, antennas.num_rx, dpsk_order):
+        return _reception(cube, no_detections(), None, None, None, maps)
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
     found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
-    detections = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
-    return _reception(cube, detections, found, symbols if detections.is_reference.any() else None, maps)
+    detections, reference = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
+    return _reception(cube, detections, reference, found, symbols if reference else None, maps)
 
 
-def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> Detections:
+def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:
     """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the false-alarm rate is asked of the
     whole map here and not of one cell, or an empty pilot would now and then be acquired."""
     d = found.detections
@@ -75,15 +76,16 @@ def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> Detecti
     rate = settings.false_alarm_rate / found.power.size
     sure = d.snr > threshold(looks, rate, settings.guard_cells, settings.training_cells)
     if not sure.any():
-        return d
-    power = _amplitudes(found) ** 2
+        return d, None
+    power = np.array([_power(e) for e in found.estimates])
     sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
     first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
-    return replace(d, is_reference=np.arange(len(d)) == first)
+    return replace(d, is_reference=np.arange(len(d)) == first), found.estimates[first]
 
 
-def _amplitudes(found: Sensed) -> np.ndarray:
-    return np.array([np.sqrt((np.abs(e.channels) ** 2).mean()) for e in found.estimates])
+def _power(estimate: Estimate) -> float:
+    """Mean power of a path per sample and receive antenna [W]."""
+    return float((np.abs(estimate.channels) ** 2).mean())
 
 
 def _at_prediction(
@@ -94,12 +96,12 @@ def _at_prediction(
     cube: IFCube,
     antennas: Antennas,
     settings: Receivers,
-) -> Detections:
+) -> tuple[Detections, Estimate | None]:
     """The reference within the gate, put first with its own estimate, and the other detections beside it."""
     w = cube.waveform
     row, column = _predicted_cell(prediction, w)
     if not 0 <= row < found.power.shape[0]:
-        return no_detections()
+        return no_detections(), None
     rows = np.arange(max(row - GATE_CELLS, 0), min(row + GATE_CELLS + 1, found.power.shape[0]))
     columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
     gate = found.power[np.ix_(rows, columns)]
@@ -107,7 +109,7 @@ def _at_prediction(
     looks = antennas.num_tx * antennas.num_rx
     above, level = detect(found.power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     if not above[rows[i], columns[j]]:
-        return no_detections()
+        return no_detections(), None
     local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]))
     estimate = refine(local, *start_point(found.power, int(rows[i]), int(columns[j]), w))
     snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
@@ -115,13 +117,14 @@ def _at_prediction(
     d = found.detections
     apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
     apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
-    return Detections(
+    everything = Detections(
         **{
             name: np.concatenate([getattr(reference, name), getattr(d, name)[apart]])
             for name in ("range", "velocity", "direction", "snr", "std")
         },
         is_reference=np.arange(1 + apart.sum()) == 0,
     )
+    return everything, estimate
 
 
 def _predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
@@ -133,7 +136,12 @@ def _predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, in
 
 
 def _reception(
-    cube: IFCube, detections: Detections, found: Sensed | None, symbols: Symbols | None, maps: bool
+    cube: IFCube,
+    detections: Detections,
+    reference: Estimate | None,
+    found: Sensed | None,
+    symbols: Symbols | None,
+    maps: bool,
 ) -> Reception:
     w = cube.waveform
     shape, transitions = cube.schedule.shape, (w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1)
@@ -150,17 +158,7 @@ def _reception(
         delay_confidence=np.zeros(shape) if symbols is None else symbols.delay_confidence,
         transition_confidence=np.zeros(transitions) if symbols is None else symbols.transition_confidence,
         raw_delay_symbols=np.zeros((0, shape[1]), int) if symbols is None else symbols.raw,
-        line_of_sight=bool(detections.is_reference.any()),
-        reference_power=_reference_power(detections, found),
+        line_of_sight=reference is not None,
+        reference_power=float("nan") if reference is None else _power(reference),
         maps=picture,
     )
-
-
-def _reference_power(detections: Detections, found: Sensed | None) -> float:
-    """Mean power per sample and receive antenna of the reference, from the estimate nearest to it."""
-    if found is None or not detections.is_reference.any() or not found.estimates:
-        return float("nan")
-    reference = float(detections.range[detections.is_reference][0])
-    delays = np.array([e.delay for e in found.estimates]) * SPEED_OF_LIGHT
-    nearest = int(np.argmin(np.abs(delays - reference)))
-    return float(_amplitudes(found)[nearest] ** 2)
