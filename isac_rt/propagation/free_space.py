@@ -76,9 +76,7 @@ class FreeSpace:
 
         dep, arr = stack(there, "departure"), stack(on, "departure")
         d1, d2 = (np.array([leg.length[0] for leg in legs]) for legs in (there, on))
-        amplitude = np.array(
-            [self.echo_amplitude(poses, tx, rx, name, a, b) for name, a, b in zip(others, there, on, strict=True)]
-        )
+        amplitude = np.array([self.echo_amplitude(poses, tx, rx, name, a, b) for name, a, b in zip(others, there, on, strict=True)])
         elements = element_amplitude(self._antennas, poses[tx], poses[rx], dep, arr)
         relative = np.array([self._uavs[name].rcs.model == "relative" for name in others], bool)
         return make_paths(

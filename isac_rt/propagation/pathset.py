@@ -87,11 +87,7 @@ class PathSet:
         """The paths that a mask or an index array chooses."""
         return replace(
             self,
-            **{
-                f.name: getattr(self, f.name)[which]
-                for f in fields(self)
-                if isinstance(getattr(self, f.name), np.ndarray)
-            },
+            **{f.name: getattr(self, f.name)[which] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)},
         )
 
     def counts(self) -> dict[str, int]:
