@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import deque
 from dataclasses import asdict, replace
 from enum import IntEnum
 from pathlib import Path
@@ -29,7 +30,6 @@ from isac_rt.tracking import (
     TrackSet,
     birth,
     expected,
-    mahalanobis,
     measurement_covariance,
     predict,
     update,
@@ -42,10 +42,19 @@ LEVEL_DROP = 10.0
 some 4 dB at most inside the field of view; a mirror reflection off a wall loses more than the rest, scattering far more."""
 COAST_CELLS = 0.2
 """A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
+EVIDENCE_FRAMES = 12
+"""How long a symbol outside the alphabet is remembered."""
 SLIP_FALSE_RATE = 1e-6
 """Chance that noise alone makes one chirp's decision confident enough to count as evidence of a slip."""
-REFERENCE_GATE = 1e-6
-"""A pilot's reference that the track would show this rarely starts the track anew."""
+BELIEVED_CELLS = (0.15, 0.3)
+"""A reference off its prediction by more cells of range or of velocity than these, and four deviations, is not believed: a second path in
+the same cell pulls the estimate, and the track, if it followed, would soon misread the symbols. It coasts instead."""
+ANCHOR_CELLS = 0.75
+"""A pilot off by more than this has found another cell: the track starts anew from it."""
+PATIENCE = 25
+"""So many frames of disbelief in a row, and the next pilot is right and the track wrong."""
+REFERENCE_STD_CELLS = 0.02
+"""Floor of the reference's range and velocity deviations in cells, for what other paths beside it leave."""
 
 
 class TerminalState(IntEnum):
@@ -95,12 +104,14 @@ class PassiveTerminal:
         self._waveform, self._antennas, self._receivers, self._order = waveform, antennas, receivers, dpsk_order
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
+        self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
         self._time = -np.inf
         self._level = (transmit_amplitude * antennas.gain * waveform.wavelength / (4 * np.pi)) ** 2
         self.tracker = Tracker(tracking, self._period)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
         self.slips_repaired = 0
+        self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
 
     def step(
         self, cube: IFCube, own_pose: Pose, time: float, modulated: bool, *, maps: bool = False
@@ -129,7 +140,7 @@ class PassiveTerminal:
         if self.reference is None:
             return None
         prediction = self.tracker.to_prediction(own, self.reference)
-        return prediction if prediction.range_std[0] < COAST_CELLS * self._waveform.range_cell(1) else None
+        return prediction if prediction.range_std[0] < COAST_CELLS * self._cells[0] else None
 
     def _plausible(self, reception: Reception) -> bool:
         """Whether the reference is as strong as a line of sight of its length: transmit power and antennas are public."""
@@ -147,58 +158,80 @@ class PassiveTerminal:
         d = reception.detections
         q = int(np.flatnonzero(d.is_reference)[0])
         z = np.array([d.range[q], d.velocity[q], *d.direction[q]])
-        if self.reference is None or (not modulated and not self._expected(z, d.std[q], own)):
-            state = birth(z, d.std[q], own)
-            if state is None:
-                return
-            self.reference = Track(self.tracker.new_id(), state, float(d.snr[q]), confirmed=True)
-            self.tracker.clear()  # their bistatic positions rested on the old reference
+        std = np.maximum(d.std[q], REFERENCE_STD_CELLS * np.array([*self._cells, 0.0, 0.0]))
+        off = self._disbelief(z, own)
+        if self.reference is None or (not modulated and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)):
+            self._restart(z, std, float(d.snr[q]), own)
+        elif off > 0:
+            self.reference.missed += 1
         else:
-            R = measurement_covariance(d.std[q], self.reference.state.mean)
+            R = measurement_covariance(std, self.reference.state.mean)
             self.reference.state = update(self.reference.state, z, R, own, velocity_period=self._period)
             self.reference.snr, self.reference.missed = float(d.snr[q]), 0
-        self.state = TerminalState.TRACKING
+        if self.reference is not None:
+            self.state = TerminalState.TRACKING
 
-    def _expected(self, z: np.ndarray, std: np.ndarray, own: Pose) -> bool:
-        """Whether a pilot's reference lies where the track would have it."""
-        assert self.reference is not None
-        state = self.reference.state
-        mean, S = expected(state.mean, state.covariance, own)
-        residual = wrapped(z - mean, self._period)
-        d2, _ = mahalanobis(residual, S + measurement_covariance(std, state.mean))
-        return bool(d2 < stats.chi2.isf(REFERENCE_GATE, np.isfinite(residual).sum()))
+    def _restart(self, z: np.ndarray, std: np.ndarray, snr: float, own: Pose) -> None:
+        """A reference track from one detection; the other tracks rested on the old one."""
+        state = birth(z, std, own)
+        if state is not None:
+            self.reference = Track(self.tracker.new_id(), state, snr, confirmed=True)
+            self.tracker.clear()
+            self._ends.clear()
+
+    def _disbelief(self, z: np.ndarray, own: Pose) -> float:
+        """0 where a reference lies where the track has it; else how many cells of range it is off."""
+        if self.reference is None:
+            return 0.0
+        mean, S = expected(*self.reference.state, own)
+        residual = np.abs(wrapped(z - mean, self._period))[:2]
+        allowed = np.array(BELIEVED_CELLS) * self._cells + 4 * np.sqrt(np.diag(S)[:2])
+        return float(residual[0] / self._cells[0]) if (residual > allowed).any() else 0.0
 
     def _repair_slip(self, cube: IFCube, reception: Reception, own: Pose, maps: bool) -> Reception:
-        """Move the reference by whole cells when confident symbols lie outside the alphabet, and read the frame again.
+        """Move the reference by whole cells when symbols outside the alphabet show a slip, and read the frame again.
 
-        With the range k cells too long every symbol is read k too low, so that the symbols 0..k-1 fall below the alphabet: a frame
-        of M P chirps shows a slip of one cell with probability 1 - (1 - 2/N)^(M P), one half for the paper's numbers. The
-        repair stands only if the frame, read again, has no confident symbol outside.
+        With the range k cells too long every symbol is read k too low: the symbols 0..k-1 fall below the alphabet, and none is read
+        in its last k places. A frame of M P chirps holds k M P / (N/2) of the former on average (0.7 k for the paper's
+        numbers); two are asked for, over at most `EVIDENCE_FRAMES` frames, and none of the latter, which a second
+        path in the cell would leave there.
         """
-        cells = slip_cells(reception, self._antennas.num_rx, self._waveform)
+        self._ends.append(_end_symbols(reception, self._antennas.num_rx, self._waveform))
+        cells = slip_cells(np.concatenate(self._ends), self._waveform.num_delay_symbols)
         if cells == 0 or self.reference is None:
             return reception
         before = self.reference.state
-        self.reference.state = _moved(before, own, cells * self._waveform.range_cell(1))
+        self.reference.state = _moved(before, own, cells * self._cells[0])
         prediction = self._expect(own)
         again = self._receive(cube, prediction, True, maps) if prediction else reception
-        if not again.decoded or slip_cells(again, self._antennas.num_rx, self._waveform) != 0:
+        self._ends.clear()
+        if not again.decoded:
             self.reference.state = before
             return reception
         self.slips_repaired += 1
         return again
 
 
-def slip_cells(reception: Reception, num_rx: int, waveform: Waveform) -> int:
-    """Whole cells by which the true range exceeds the predicted one, as far as confident symbols outside the alphabet show it;
-    0 where none does, or where both ends contradict each other."""
+def _end_symbols(reception: Reception, num_rx: int, waveform: Waveform) -> np.ndarray:
+    """Confident raw symbols of a frame near and beyond either end of the alphabet."""
     raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
     sure = reception.delay_confidence > stats.gamma(num_rx, scale=1 / num_rx).isf(SLIP_FALSE_RATE / searched)
-    if not sure.any():
-        return 0
-    low, high = min(int(raw[sure].min()), 0), max(int(raw[sure].max()) - last, 0)
-    return low + high if low == 0 or high == 0 else 0
+    return raw[sure & ((raw < EXTRA_CELLS) | (raw > last - EXTRA_CELLS))]
+
+
+def slip_cells(ends: np.ndarray, num_symbols: int) -> int:
+    """Whole cells by which the true range exceeds the predicted one, from confident raw symbols at the alphabet's ends.
+
+    0 without two symbols outside at one end, or with one where such a slip leaves none.
+    """
+    last = num_symbols - 1
+    low, high = int((ends < 0).sum()), int((ends > last).sum())
+    if low >= 2 and not (ends > last + ends.min()).any():
+        return int(ends.min())
+    if high >= 2 and not (ends < ends.max() - last).any():
+        return int(ends.max()) - last
+    return 0
 
 
 def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
