@@ -156,8 +156,8 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
 def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed intervals shaded in its colour."""
     scale, unit = _UNITS[name]
-    here = dataset.isel(observer=observer)
-    t = dataset.time.values
+    here = _processed(dataset, observer)
+    t = here.time.values
     for u, uav in enumerate(dataset.uav.values):
         if uav == dataset.observer.values[observer] or not here.in_view.values[:, u].any():
             continue
@@ -170,6 +170,12 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     if ax.get_legend_handles_labels()[0]:
         ax.legend(ncols=4, loc="best")
     return ax
+
+
+def _processed(dataset: xr.Dataset, observer: int) -> xr.Dataset:
+    """One observer, and only the frames that it processed: an active terminal may skip most."""
+    here = dataset.isel(observer=observer)
+    return here.isel(frame=np.flatnonzero(here.processed.values))
 
 
 def _shade(ax: Axes, t: np.ndarray, active: np.ndarray, colour: str) -> None:
@@ -235,9 +241,10 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
 def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
     """SNR of the reference path of every terminal, per sample and antenna before processing."""
     for o, name in enumerate(dataset.observer.values):
+        here = _processed(dataset, o)
         with np.errstate(divide="ignore", invalid="ignore"):
-            snr = 10 * np.log10(dataset.reference_snr.values[:, o])
-        ax.plot(dataset.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name)
+            snr = 10 * np.log10(here.reference_snr.values)
+        ax.plot(here.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name)
     ax.set(xlabel="time [s]", ylabel="SNR of the reference path [dB]")
     ax.legend(loc="best")
     return ax
@@ -245,12 +252,13 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
 
 def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     """Power received by kind of path over time (all paths of a kind added)."""
-    power, count = dataset.path_power.values[:, observer], dataset.path_count.values[:, observer]
+    here = _processed(dataset, observer)
+    power, count = here.path_power.values, here.path_count.values
     for k, name in enumerate(KINDS):
         shown = count[:, k] > 0
         if shown.any():
             level = np.where(shown, 10 * np.log10(np.maximum(power[:, k], 1e-300)), np.nan)
-            ax.plot(dataset.time.values, level, ".-", ms=3, lw=1, color=KIND_COLOURS[name], label=f"{words(name)} ({count[:, k].sum()})")
+            ax.plot(here.time.values, level, ".-", ms=3, lw=1, color=KIND_COLOURS[name], label=f"{words(name)} ({count[:, k].sum()})")
     ax.set(xlabel="time [s]", ylabel="path gain of the kind [dB]")
     ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.observer.values[observer]} (paths over all frames)")
     if ax.get_legend_handles_labels()[0]:
