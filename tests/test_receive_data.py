@@ -142,8 +142,8 @@ def test_weaker_reference_is_read_with_the_stronger_path_predicted():
     [(-28, 0.1421, 0.3427), (-25, 0.0008, 0.0265)],
 )
 def test_symbol_errors_in_noise(link, snr_db: float, delay_ser: float, dpsk_ser: float):
-    """Against an independent simulation's rates (1200 and 1170 symbols). Planted bugs: one receiver left out of the sum, a Hann
-    window before the decision."""
+    """Against an independent simulation's rates (1200 and 1170 symbols). Planted bugs: every second receiver left out of
+    the sum, a Hann window before the decision."""
     _, payload, clean = link
     frames, wrong_delay, wrong_dpsk = 3, 0, 0
     for seed in range(frames):

@@ -17,6 +17,7 @@ from isac_rt.receive.cfar import (
     detect,
     greatest_of_factor,
     hann_envelope,
+    independent_cells,
     peaks,
     side_rows,
     threshold,
@@ -58,7 +59,10 @@ def test_union_of_groups_is_the_uniform_sampling(tone: float, bound_db: float):
     the groups left out (-25 dB), offsets of the data left out (-45 dB), times not about their mean."""
     w, schedule, payload = frame()
     sent = schedule == 1
-    times = slow_times(w, payload.delay_symbols)[sent]
+    groups, slots = np.nonzero(sent)
+    late = groups * 2 * w.max_delay + payload.delay_symbols[sent] / (w.slope * w.sampled_duration)
+    times = slots + late / w.slot_duration
+    assert np.abs(slow_times(w, payload.delay_symbols)[sent] - times).max() < 1e-12  # rounding
     middle = (times - np.floor(times)).mean()
     p, bins = np.arange(w.num_chirps), np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
     expected = np.exp(-2j * np.pi * np.outer(bins, p) / w.num_chirps) @ (
@@ -146,17 +150,26 @@ def test_factor_of_the_greater_side_by_drawing():
 
 def test_false_alarm_rate_of_the_whole_chain():
     """White noise through data removal, union and accumulation. Neighbouring cells of the map are alike, so false alarms come in
-    groups: the bounds are for a third as many independent trials. Planted bugs: training cells taken for independent,
+    groups: the bounds are for a third as many independent trials; few training cells, so that they matter. Planted bug:
     one look too many."""
     w, schedule, payload = frame()
-    rate, false, trials = 1e-3, 0, 0
+    rate, false, trials = 1e-2, 0, 0
     for seed in range(4):
         spectra = clean_spectrum(white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512)
         power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
-        above, _ = detect(power, 9, rate, GUARD, TRAINING)
+        above, _ = detect(power, 9, rate, GUARD, (1, 1))
         false, trials = false + int(above.sum()), trials + above.size
     low, high = stats.binom.ppf([FALSE_FAILURE / 2, 1 - FALSE_FAILURE / 2], trials // 3, rate)
     assert 3 * low <= false <= 3 * high
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 19])
+def test_independent_cells_of_a_windowed_axis(count: int):
+    """From the transform of the squared window. Planted bug: neighbours taken for independent."""
+    squared = np.fft.fft(np.sin(np.pi * (np.arange(120) + 0.5) / 120) ** 4)
+    alike = np.abs(squared / squared[0]) ** 2
+    pairs = sum(alike[abs(i - j)] for i in range(count) for j in range(count))
+    assert independent_cells(count) == pytest.approx(count**2 / pairs, rel=1e-9)  # rounding
 
 
 def test_training_at_the_ends_and_across_the_doppler_wrap():
@@ -300,10 +313,10 @@ def test_standard_deviations_match_the_scatter():
 
 
 @pytest.mark.parametrize(
-    ("groups", "method", "strongest"), [(3, "latin_union", 1.0), (3, "omp", 0.07), (2, "auto", 0.07), (1, "auto", 0.05)]
+    ("groups", "method", "strongest"), [(3, "latin_union", 5.0), (3, "omp", 0.07), (2, "auto", 0.07), (1, "auto", 0.05)]
 )
 def test_three_targets_in_noise(groups: int, method: str, strongest: float):
-    """Two of them in one range cell, one stronger (26 dB with the union; with sparse sampling nearly alike, for off the grid the
+    """Two of them in one range cell, one stronger (40 dB with the union; with sparse sampling nearly alike, for off the grid the
     stronger one uses up OMP's atoms). Sparse sampling's sidelobes are not reported. Planted bugs: sidelobes of the strong one kept; OMP's
     correlation updated with the transposed Gram matrix."""
     w, schedule, payload = frame(waveform=Waveform(num_groups=groups), seed=7)
@@ -313,7 +326,7 @@ def test_three_targets_in_noise(groups: int, method: str, strongest: float):
     assert len(d) == 3
     for r, v, _ in targets:
         i = int(np.argmin(np.abs(d.range - r) + np.abs(d.velocity - v)))
-        assert abs(d.range[i] - r) < 0.01 and abs(d.velocity[i] - v) < 0.02
+        assert abs(d.range[i] - r) < 0.05 and abs(d.velocity[i] - v) < 0.08  # a fifth, a third of a cell beside the strong one
 
 
 def test_leakage_is_passed_over_and_hides_nothing():

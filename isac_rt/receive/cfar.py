@@ -12,8 +12,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage, optimize, stats
 
-HANN_CORRELATION = 1.0 + 2 * ((2 / 3) ** 2 + (1 / 6) ** 2)
-"""Cells per independent cell along one Hann-windowed axis: the sum of the squared correlations of neighbouring cells."""
+HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
+"""Correlation of the powers of cells one and two apart along a Hann-windowed axis."""
 
 QUADRATURE_POINTS = 4001
 
@@ -106,8 +106,15 @@ def _factor(
     where there is no training row."""
     if before == behind == 0:
         return np.inf
-    share = (2 * (guard[1] + training[1]) + 1) / HANN_CORRELATION**2
-    return greatest_of_factor(false_alarm_rate, float(looks), before * share, behind * share)
+    across = independent_cells(2 * (guard[1] + training[1]) + 1)
+    sides = (independent_cells(rows) * across for rows in (before, behind))
+    return greatest_of_factor(false_alarm_rate, float(looks), *sides)
+
+
+def independent_cells(count: int) -> float:
+    """Independent cells whose mean scatters like that of `count` neighbours along a Hann-windowed axis."""
+    pairs = sum(max(count - d, 0) * c for d, c in enumerate(HANN_CORRELATION, start=1))
+    return count**2 / (count + 2 * pairs) if count else 0.0
 
 
 def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
