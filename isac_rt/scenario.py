@@ -172,7 +172,7 @@ class Radio(Node):
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
             yield Problem(
                 (("bandwidth_hz",), ("sampling_rate_hz",)),
-                f"must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; raise the bandwidth or lower the sampling rate",
+                f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; raise the bandwidth or lower the sampling rate",
             )
         if self.samples_per_chirp % 2:
             yield Problem((("samples_per_chirp",),), "must be even: half of the range cells carry the data symbols")
@@ -345,7 +345,7 @@ class Tracking(Node):
         if self.confirm_hits > self.confirm_window:
             yield Problem(
                 (("confirm_hits",), ("confirm_window",)),
-                f"cannot be reached within confirm_window = {self.confirm_window}; lower it or widen the window",
+                f"{self.confirm_hits} hits cannot be reached within confirm_window = {self.confirm_window}; lower it or widen the window",
             )
 
 
@@ -417,11 +417,11 @@ class Scenario(Node):
         if self.radio.chirps_per_frame % self.num_tx:
             yield Problem(
                 (("radio", "chirps_per_frame"), *sizes),
-                f"must be a multiple of {antennas}; every antenna needs the same number of slots",
+                f"{self.radio.chirps_per_frame} chirps are not a multiple of {antennas}; every antenna needs the same number of slots",
             )
         if self.radio.groups > self.num_tx:
             yield Problem(
-                (("radio", "groups"), *sizes), f"must not exceed {antennas}; use fewer groups or more transmit antennas"
+                (("radio", "groups"), *sizes), f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more transmit antennas"
             )
         if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (1 - 1e-12):
             yield Problem(
@@ -471,7 +471,7 @@ class Scenario(Node):
         """What may stand but looks like a value in the wrong unit."""
         low, high = CARRIERS_HZ
         if not low <= self.radio.carrier_hz <= high:
-            yield Problem((("radio", "carrier_hz"),), f"is outside {low:g} to {high:g} Hz; is it in hertz?")
+            yield Problem((("radio", "carrier_hz"),), f"{self.radio.carrier_hz:g} Hz is outside {low:g} to {high:g} Hz; is it in hertz?")
         for name, uav in self.swarm.items():
             if uav.waypoints is None:
                 speeds: list[tuple[Key, float]] = [(("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))]

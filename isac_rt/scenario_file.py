@@ -270,11 +270,13 @@ class _Complaints:
         self._path, self._data, self._places = path, data, places
 
     def line(self, keys: Sequence[Key], text: str) -> str:
-        """One complaint. The first key is named; the place is that of an option if one set any of the keys."""
+        """One complaint. The first key is named; the place is that of an option if one set any of the keys, else of the
+        first key that the file holds."""
+        named = keys[0]
         options = [key for key in keys if isinstance(self._places.get(key), str)]
-        named = (options or [key for key in keys if _at(self._data, key) is not _NOWHERE] or list(keys))[0]
+        anchor = (options or [key for key in keys if _at(self._data, key) is not _NOWHERE] or [named])[0]
         value = _at(self._data, named)
-        place = next(self._places[named[:n]] for n in range(len(named), -1, -1) if named[:n] in self._places)
+        place = next(self._places[anchor[:n]] for n in range(len(anchor), -1, -1) if anchor[:n] in self._places)
         shown = "" if value is _NOWHERE or isinstance(value, dict) else f" = {_shown(value)}"
         if isinstance(place, str):  # an option
             named_already = place.startswith((f"--set {dotted(named)}=", f"--{dotted(named)} "))
