@@ -71,8 +71,9 @@ def chain_length(planes, start: np.ndarray, end: np.ndarray) -> np.longdouble:
     return np.sqrt(((end - image) ** 2).sum())
 
 
-def derivatives(length, h=np.longdouble("1e-3")) -> tuple[float, float]:
+def derivatives(length) -> tuple[float, float]:
     """First and second derivative of length(t) at 0 by central differences of fourth order in long double."""
+    h = np.longdouble("1e-3")
     f = {k: length(k * h) for k in (-2, -1, 0, 1, 2)}
     first = (8 * (f[1] - f[-1]) - (f[2] - f[-2])) / (12 * h)
     second = (16 * (f[1] + f[-1]) - (f[2] + f[-2]) - 30 * f[0]) / (12 * h * h)
