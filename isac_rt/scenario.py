@@ -456,6 +456,11 @@ class Scenario(Node):
 
     def _model_problems(self) -> Iterator[Problem]:
         for name, uav in self.swarm.items():
+            if uav.rcs.model == "relative" and self.propagation.model != "free_space":
+                yield Problem(
+                    (("swarm", name, "rcs", "model"), ("propagation", "model")),
+                    "relative goes with propagation.model free_space only: a traced echo needs a radar cross-section; use constant or tr38901",
+                )
             if uav.rcs.model == "relative" and self.noise.model != "snr":
                 yield Problem(
                     (("swarm", name, "rcs", "model"), ("noise", "model")),
