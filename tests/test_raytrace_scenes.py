@@ -358,8 +358,7 @@ def test_a_wall_shadows():
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (3.7, -2.9)], ids=["on the seam", "beside it"])
 def test_a_wall_returns_once_to_its_radar(place):
-    """Monostatic, at right angles, twice the distance; found once, also where both triangles of the wall meet. Seen failing with the
-    planes of a chain replaced by its faces when duplicates are dropped."""
+    """Monostatic, at right angles, twice the distance; found once, also where both triangles of the wall meet."""
     y, z = place
     wall = rectangle((31.7, -20, -20), (0, 40, 0), (0, 0, 40), slab(conductivity=1e7))
     model, _ = tracer(wall)
@@ -385,6 +384,18 @@ def test_points_and_lengths_do_not_depend_on_the_origin():
     assert len(near) == len(other) > 3
     assert C * other.delay == pytest.approx(C * near.delay, abs=1e-8)
     assert np.nan_to_num(other.points - far) == pytest.approx(np.nan_to_num(near.points), abs=1e-8)
+
+
+def test_a_wall_far_from_the_origin_reflects_once():
+    """Ten kilometres off, Sionna's float32 finds one reflection several times over, each at full amplitude. Seen failing
+    with the faces of a chain in place of its planes where duplicates are dropped, and with none dropped."""
+    far = np.array([7100.3, -6900.7, 310.1])
+    city = rectangle(far + np.array([31.3, -60, -60]), (5.0, 120, 0), (0, 0, 120), slab())
+    model, _ = tracer(city, 1)
+    poses = swarm_of(far + np.array([0.3, 1.1, 9.3]), far + np.array([1.7, 17.4, 8.1]), far + np.array([-3.3, -2.2, 7.9]))
+    paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
+    assert paths.counts()["specular"] == 1
+    assert model.duplicates > 0
 
 
 def test_leakage():

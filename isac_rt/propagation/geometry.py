@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.city.mesh import City
 from isac_rt.swarm import Pose
 
 
@@ -86,3 +87,31 @@ def straight(start: Pose, points: np.ndarray, velocity: np.ndarray | float = 0.0
     rate = (e * w).sum(1)
     accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)
     return Legs(length, rate, accel, e, -e, np.zeros((points.shape[0], 0, 3)))
+
+
+def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest face.
+
+    All triangles of a wall are then one mirror, to the last bit: a path that slides from one to the next does not jump, and
+    one that was found on both is recognised.
+    """
+    by_area = np.argsort(-city.areas, kind="stable")
+    _, first, plane = np.unique(city.plane_of_face[by_area], return_index=True, return_inverse=True)
+    largest = np.empty(city.num_faces, np.int64)
+    largest[by_area] = by_area[first[plane]]
+    return city.normals[largest], city.plane_offsets[largest]
+
+
+def one_of_each_chain(planes: np.ndarray, faces: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with the lowest faces (K, B).
+
+    Mirrors leave two points one path over a chain of planes, so what shares the chain was found twice: on both triangles of a
+    seam, or by Sionna's hash of planes, which coordinates far from the origin defeat.
+    """
+    which = np.flatnonzero(good)
+    if planes.shape[1] == 0:
+        return which[:1]
+    keys = np.column_stack([planes, faces])[which]
+    which = which[np.lexsort(keys.T[::-1])]
+    _, first = np.unique(planes[which], axis=0, return_index=True)
+    return which[first]

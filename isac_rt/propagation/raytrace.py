@@ -31,7 +31,7 @@ from isac_rt.city.mesh import City
 from isac_rt.city.scene import build_scene
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.geometry import Legs, straight, unfold
+from isac_rt.propagation.geometry import Legs, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario import Scenario
@@ -71,6 +71,8 @@ class RayTracer:
         self._normals, self._offsets = plane_of_each_face(city)
         self.dropped = 0
         """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
+        self.duplicates = 0
+        """Paths left out so far because Sionna found them more than once."""
         scene = self._handle.scene
         scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
 
@@ -162,6 +164,7 @@ class RayTracer:
             good = apart < POINT_TOLERANCE * legs.length
             self.dropped += int((~good).sum())
             keep = one_of_each_chain(self._city.plane_of_face[chain], chain, good)
+            self.duplicates += int(good.sum()) - keep.size
             keep = keep[np.argsort(legs.length[keep], kind="stable")]
             parts.append((amplitude[which][keep], _pick(legs, keep), chain[keep]))
         depth = faces.shape[1]
@@ -284,34 +287,6 @@ class RayTracer:
             faces=face[:, None],
             **common,
         )
-
-
-def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest face.
-
-    All triangles of a wall are then one mirror, to the last bit: a path that slides from one to the next does not jump, and
-    one that was found on both is recognised.
-    """
-    by_area = np.argsort(-city.areas, kind="stable")
-    _, first, plane = np.unique(city.plane_of_face[by_area], return_index=True, return_inverse=True)
-    largest = np.empty(city.num_faces, np.int64)
-    largest[by_area] = by_area[first[plane]]
-    return city.normals[largest], city.plane_offsets[largest]
-
-
-def one_of_each_chain(planes: np.ndarray, faces: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with the lowest faces (K, B).
-
-    Mirrors leave two points one path over a chain of planes, so what shares the chain was found twice: on both triangles of a
-    seam, or by Sionna's hash of planes, which coordinates far from the origin defeat.
-    """
-    which = np.flatnonzero(good)
-    if planes.shape[1] == 0:
-        return which[:1]
-    keys = np.column_stack([planes, faces])[which]
-    which = which[np.lexsort(keys.T[::-1])]
-    _, first = np.unique(planes[which], axis=0, return_index=True)
-    return which[first]
 
 
 def _pick(legs: Legs, which: np.ndarray) -> Legs:
