@@ -147,8 +147,10 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
     level = 20 * np.log10(np.maximum(magnitude, 1e-300))
     level = level - level.max()
     _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, (-_SHOWN_DB, 0.0), "magnitude [dB below the peak]")
+    cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])
+    ax.plot(chirps, cells, "o", ms=2.5, mfc="none", mec="white", mew=0.4)
     frame = int(dataset.snapshot_frame.values[snapshot])
-    ax.set(xlabel="chirp", ylabel="range cell")
+    ax.set(xlabel="chirp", ylabel="range cell (circles: one-dimensional CFAR)")
     ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, equivalent range before data removal")
     return ax
 

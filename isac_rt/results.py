@@ -418,10 +418,12 @@ class _Builder:
         cells, chirps = (max((m.equivalent_range.shape[a] for _, _, m in found), default=0) for a in (0, 1))
         head = (len(shots), len(self.observers))
         power, equivalent = np.full((*head, rows, doppler), np.nan, np.float32), np.full((*head, cells, chirps), np.nan, np.float32)
+        marked = np.zeros((*head, cells, chirps), bool)
         ranges, speeds = np.full((head[1], rows), np.nan), np.full((head[1], doppler), np.nan)
         for k, j, m in found:
             power[k, j, : m.range_doppler.shape[0], : m.range_doppler.shape[1]] = m.range_doppler
             equivalent[k, j, : m.equivalent_range.shape[0], : m.equivalent_range.shape[1]] = m.equivalent_range
+            marked[k, j, : m.equivalent_range.shape[0], : m.equivalent_range.shape[1]] = m.equivalent_detections
             ranges[j, : m.range_axis.size], speeds[j, : m.velocity_axis.size] = m.range_axis, m.velocity_axis
         self.put("snapshot_frame", ["snapshot"], np.array(shots, np.int32), _DIMENSIONLESS, "position along the dimension frame")
         self.put("map_power", ["snapshot", "observer", "row", "doppler"], power, "W", "range-Doppler map, accumulated over antennas")
@@ -429,6 +431,8 @@ class _Builder:
         self.put("map_velocity", ["observer", "doppler"], speeds, "m s-1", "velocity of the map's columns")
         self.put("map_equivalent_range", ["snapshot", "observer", "cell", "chirp"], equivalent, "W0.5",
                  "magnitude over range cell and chirp before data removal")  # fmt: skip
+        self.put("map_equivalent_detections", ["snapshot", "observer", "cell", "chirp"], marked, _DIMENSIONLESS,
+                 "cells that the one-dimensional CFAR finds, chirp by chirp")  # fmt: skip
 
 
 def _by_symbol(c: SymbolCount) -> dict[str, tuple[int, int, int]]:

@@ -60,7 +60,7 @@ def _maps(w, rng, passes):
     power[17, 60] = 3e-9
     speed = (np.arange(doppler) - doppler // 2) * w.velocity_cell(passes)
     return Maps(range_doppler=power, range_axis=np.arange(rows) * w.range_cell(passes), velocity_axis=speed,
-                equivalent_range=rng.rayleigh(1e-6, (64, doppler)))  # fmt: skip
+                equivalent_range=rng.rayleigh(1e-6, (64, doppler)), equivalent_detections=rng.random((64, doppler)) < 0.01)  # fmt: skip
 
 
 def _reception(w, rng, truth, maps, decoded, detections):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 
 from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
@@ -12,14 +11,6 @@ from isac_rt.receive.common import make_maps, sense
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Receivers
-
-
-def equivalent_range_map(cube: IFCube) -> np.ndarray:
-    """(N, P) magnitude over range cell and chirp of the first group before any data are removed, mean over receivers."""
-    total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
-    for rx in range(cube.samples.shape[1]):
-        total += np.abs(scipy.fft.fft(cube.samples[0, rx], axis=1, workers=1)).T
-    return total / cube.samples.shape[1]
 
 
 def receive_active(
@@ -51,5 +42,5 @@ def receive_active(
         raw_delay_symbols=np.zeros((0, chirps), int),
         line_of_sight=False,
         reference_power=float("nan"),
-        maps=make_maps(found.power, equivalent_range_map(cube), w, 2) if maps else None,
+        maps=make_maps(found.power, cube, settings, 2) if maps else None,
     )

@@ -94,6 +94,27 @@ def detect(
     return power > factor[:, None] * level, level
 
 
+def detect_chirps(power: np.ndarray, looks: int, false_alarm_rate: float, guard: int, training: int) -> np.ndarray:
+    """One-dimensional CFAR along the range cells of every chirp (the paper's first stage).
+
+    Parameters
+    ----------
+    power : (N, P) mean power over `looks` receivers of spectra without a window, so that their noise is independent
+    guard, training : range cells on each side
+
+    Returns
+    -------
+    above : (N, P) bool
+    """
+    level = np.maximum(background(power, (guard, 0), (training, 0)), ROUNDING * power.max())
+    factor = np.array([_chirp_factor(looks, false_alarm_rate, *count) for count in side_rows(len(power), guard, training).tolist()])
+    return power > factor[:, None] * level
+
+
+def _chirp_factor(looks: int, false_alarm_rate: float, before: int, behind: int) -> float:
+    return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, float(looks), before, behind)
+
+
 def threshold(looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> float:
     """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
     return _factor(looks, false_alarm_rate, guard, training, training[0], training[0])

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 
 from isac_rt.arrays import Antennas, Schedule, is_latin
-from isac_rt.receive.cfar import detect, peaks, without_sidelobes
+from isac_rt.ifsignal import IFCube
+from isac_rt.receive.cfar import detect, detect_chirps, peaks, without_sidelobes
 from isac_rt.receive.doppler import UNION_FLOOR, accumulate, channel_maps, doppler_bins, omp_power
 from isac_rt.receive.estimate import (
     Estimate,
@@ -109,11 +111,23 @@ def describe(
     )
 
 
-def make_maps(power: np.ndarray, equivalent_range: np.ndarray, waveform: Waveform, passes: int) -> Maps:
+def equivalent_range_power(cube: IFCube) -> np.ndarray:
+    """(N, P) mean power over the receivers, over range cell and chirp of the first group, before any data are removed."""
+    total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
+    for one in cube.samples[0]:
+        spectrum = scipy.fft.fft(one, axis=1, workers=1)
+        total += (spectrum.real**2 + spectrum.imag**2).T
+    return total / cube.samples.shape[1]
+
+
+def make_maps(power: np.ndarray, cube: IFCube, settings: Receivers, passes: int) -> Maps:
     """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
+    w, before = cube.waveform, equivalent_range_power(cube)
+    looks, guard, training = cube.samples.shape[1], settings.guard_cells[0], settings.training_cells[0]
     return Maps(
         range_doppler=power.astype(np.float32),
-        range_axis=np.arange(power.shape[0]) * waveform.range_cell(passes),
-        velocity_axis=doppler_bins(waveform) * waveform.velocity_cell(passes),
-        equivalent_range=equivalent_range.astype(np.float32),
+        range_axis=np.arange(power.shape[0]) * w.range_cell(passes),
+        velocity_axis=doppler_bins(w) * w.velocity_cell(passes),
+        equivalent_range=np.sqrt(before),
+        equivalent_detections=detect_chirps(before, looks, settings.false_alarm_rate, guard, training),
     )

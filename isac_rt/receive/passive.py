@@ -9,7 +9,6 @@ import numpy as np
 from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
-from isac_rt.receive.active import equivalent_range_map
 from isac_rt.receive.cfar import detect, threshold
 from isac_rt.receive.common import Sensed, describe, make_maps, sense
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
@@ -54,18 +53,18 @@ def receive_passive(
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        return _reception(cube, *_earliest(found, antennas, settings), found, None, maps)
+        return _reception(cube, settings, *_earliest(found, antennas, settings), found, None, maps)
     if prediction is None:
-        return _reception(cube, no_detections(), None, None, None, maps)
+        return _reception(cube, settings, no_detections(), None, None, None, maps)
     symbols = demodulate(cube, prediction, dpsk_order)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
     confident = np.median(symbols.delay_confidence) >= confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
     if not confident or not moves_as_predicted(symbols, antennas.num_rx, dpsk_order):
-        return _reception(cube, no_detections(), None, None, None, maps)
+        return _reception(cube, settings, no_detections(), None, None, None, maps)
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
     found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
     detections, reference = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
-    return _reception(cube, detections, reference, found, symbols if reference else None, maps)
+    return _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
 
 
 def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:
@@ -137,6 +136,7 @@ def _predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, in
 
 def _reception(
     cube: IFCube,
+    settings: Receivers,
     detections: Detections,
     reference: Estimate | None,
     found: Sensed | None,
@@ -148,7 +148,7 @@ def _reception(
     picture = None
     if maps:
         power = found.power if found else np.zeros((w.num_delay_symbols, w.num_chirps))
-        picture = make_maps(power, equivalent_range_map(cube), w, 1)
+        picture = make_maps(power, cube, settings, 1)
     return Reception(
         detections=detections,
         decoded=symbols is not None,

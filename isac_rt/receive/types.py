@@ -78,13 +78,15 @@ class Maps:
     ----------
     range_doppler : (rows, P) power, accumulated over antennas; rows from range 0, Doppler centred (velocity ascending)
     range_axis [m], velocity_axis [m/s] : of the rows and columns
-    equivalent_range : (N, P) magnitude of the first group before data removal, over range cell and chirp
+    equivalent_range : (N, P) rms magnitude over the receivers of the first group before data removal, over range cell and chirp
+    equivalent_detections : (N, P) bool, what the one-dimensional CFAR finds in it, chirp by chirp
     """
 
     range_doppler: np.ndarray
     range_axis: np.ndarray
     velocity_axis: np.ndarray
     equivalent_range: np.ndarray
+    equivalent_detections: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
