@@ -172,7 +172,8 @@ class Radio(Node):
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
             yield Problem(
                 (("bandwidth_hz",), ("sampling_rate_hz",)),
-                f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; raise the bandwidth or lower the sampling rate",
+                f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; "
+                "raise the bandwidth or lower the sampling rate",
             )
         if self.samples_per_chirp % 2:
             yield Problem((("samples_per_chirp",),), "must be even: half of the range cells carry the data symbols")
@@ -420,9 +421,8 @@ class Scenario(Node):
                 f"{self.radio.chirps_per_frame} chirps are not a multiple of {antennas}; every antenna needs the same number of slots",
             )
         if self.radio.groups > self.num_tx:
-            yield Problem(
-                (("radio", "groups"), *sizes), f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more transmit antennas"
-            )
+            said = f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more transmit antennas"
+            yield Problem((("radio", "groups"), *sizes), said)
         if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (1 - 1e-12):
             yield Problem(
                 (("frame_interval_s",), ("radio", "chirps_per_frame"), ("radio", "samples_per_chirp")),

@@ -61,7 +61,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         (BASE + "radio: {groups: 5}\n", "s.yaml:4: radio.groups = 5: 5 groups are more than the 3 transmit antennas"),
         (BASE + "radio: {chirps_per_frame: 121}\n", "radio.chirps_per_frame = 121: 121 chirps are not a multiple of the 3 transmit"),
         (BASE + "radio: {samples_per_chirp: 1023}\n", "radio.samples_per_chirp = 1023: must be even"),
-        (BASE + "radio: {bandwidth_hz: 40e6}\n", "radio.bandwidth_hz = 40000000.0: 4e+07 Hz must exceed twice the sampling rate of 2e+07 Hz"),
+        (BASE + "radio: {bandwidth_hz: 40e6}\n", "radio.bandwidth_hz = 40000000.0: 4e+07 Hz must exceed twice the sampling rate of 2e+07"),
         (BASE + "frame_interval_s: 0.0077\n", "s.yaml:4: frame_interval_s = 0.0077: is shorter than a frame, which lasts 0.0077824 s"),
         (BASE + "frames: 3\n", "modulation.acquisition_frames lower"),
         (BASE + "seed: 1\nseed: 2\n", "s.yaml:5: the key seed stands here a second time (first in line 4)"),
