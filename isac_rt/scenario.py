@@ -459,7 +459,8 @@ class Scenario(Node):
             if uav.rcs.model == "relative" and self.propagation.model != "free_space":
                 yield Problem(
                     (("swarm", name, "rcs", "model"), ("propagation", "model")),
-                    "relative goes with propagation.model free_space only: a traced echo needs a radar cross-section; use constant or tr38901",
+                    "relative goes with propagation.model free_space only: a traced echo needs a radar cross-section; "
+                    "use constant or tr38901",
                 )
             if uav.rcs.model == "relative" and self.noise.model != "snr":
                 yield Problem(

@@ -13,8 +13,9 @@ PACKAGE = Path(__file__).parent.parent / "isac_rt"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # a module may import those before it
 ORDER = (
-    "scenario scenario_file runtime randomness waveform arrays payload city swarm linkbudget propagation synthesis gridding noise ifsignal "
-    "receive tracking terminal baselines access metrics fidelity summary results simulate sweep experiments validation bench figures render report cli"
+    "scenario scenario_file runtime randomness waveform arrays payload city swarm linkbudget propagation synthesis gridding "
+    "noise ifsignal receive tracking terminal baselines access metrics fidelity results simulate sweep experiments validation "
+    "bench figures render report cli"
 ).split()
 ALONE = {"runtime", "randomness"}
 MAX_MODULE_LINES = 600
