@@ -176,7 +176,7 @@ def test_independent_cells_of_a_windowed_axis(count: int):
 def test_training_at_the_ends_and_across_the_doppler_wrap():
     power = np.ones((40, 20))
     power[:, 0] = 5.0
-    level = background(power, (1, 1), (4, 2))
+    level = background(power, np.ones(power.shape, bool), (1, 1), (4, 2))
     assert np.isfinite(level).all()
     share = (6 * 1.0 + 5.0) / 7  # width 2 (1 + 2) + 1 = 7 columns, one of them the bright one
     assert level[20, 19] == pytest.approx(share) and level[0, 2] == pytest.approx(share) and level[39, 10] == pytest.approx(1.0)
@@ -365,3 +365,16 @@ def test_one_dimensional_cfar_keeps_its_rate_and_finds_a_tone():
     assert abs(above.sum() - 200) < 4.5 * np.sqrt(200)
     power[417] += 10**1.2
     assert detect_chirps(power, 15, 1e-6, 3, 8)[417].all()
+
+
+def test_a_strong_path_does_not_hide_a_target_beside_it():
+    """A target 20 dB over the noise, 10 rows and 5 bins from a path at 60 dB, whose lobes fill part of the target's training block. Planted
+    bug: all cells train."""
+    rng = np.random.default_rng(4)
+    power = rng.gamma(45, 1 / 45, (200, 120))
+    rows, bins = np.abs(np.arange(200) - 90), np.abs(np.arange(120) - 50)
+    power += 1e6 * np.outer(hann_envelope(rows), hann_envelope(bins)) * (np.maximum.outer(rows, bins) < 40)
+    power[100, 55] += 100
+    above, _ = detect(power, 45, 1e-6, (3, 3), (8, 6))
+    assert above[100, 55]
+    assert above[90, 50]

@@ -20,6 +20,13 @@ QUADRATURE_POINTS = 4001
 ROUNDING = 1e-16
 """The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a quarter and half the range away."""
 
+STRONG, MAX_STRONG = 1e3, 8
+"""Peaks this far over the median cell, and at most so many, are kept out of the training of the cells around them."""
+DEEPEST_LOBE = 1e-8
+"""Lobes are followed down to this share of their peak, 15 cells out; without noise they would fill the map."""
+LEAST_KEPT = 0.25
+"""Share of a training block that must be left for its mean to count."""
+
 
 @lru_cache(maxsize=256)
 def greatest_of_factor(false_alarm_rate: float, looks: float, before: float, behind: float) -> float:
@@ -51,22 +58,46 @@ def side_rows(rows: int, guard: int, training: int) -> np.ndarray:
     return np.where(count >= max(training // 2, 1), count, 0)
 
 
-def _side_mean(power: np.ndarray, guard: tuple[int, int], training: tuple[int, int], side: int) -> np.ndarray:
-    """Mean over the training block before (-1) or behind (+1) each cell in range; Doppler wraps. NaN where none is used."""
+def _side_mean(power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int], side: int) -> np.ndarray:
+    """Mean over the kept cells of the training block before (-1) or behind (+1) each cell in range; Doppler wraps. NaN where
+    too few are."""
     rows, _ = power.shape
     width = 2 * (guard[1] + training[1]) + 1
-    across = ndimage.uniform_filter1d(power.astype(np.float64), width, axis=1, mode="wrap")
-    total = np.concatenate([np.zeros((1, power.shape[1])), np.cumsum(across, axis=0)])
-    index = np.arange(rows)
     count = side_rows(rows, guard[0], training[0])[:, 0 if side < 0 else 1]
+    index = np.arange(rows)
     start = np.where(count == 0, 0, index - guard[0] - count if side < 0 else index + guard[0] + 1)
-    with np.errstate(invalid="ignore"):
-        return (total[start + count] - total[start]) / count[:, None]
+
+    def block(values: np.ndarray) -> np.ndarray:
+        across = ndimage.uniform_filter1d(values, width, axis=1, mode="wrap") * width
+        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(across, axis=0)])
+        return total[start + count] - total[start]
+
+    held = np.round(block(keep.astype(np.float64)))
+    enough = (count[:, None] > 0) & (held >= LEAST_KEPT * count[:, None] * width)
+    return np.where(enough, block(np.where(keep, power, 0.0).astype(np.float64)) / np.maximum(held, 1), np.nan)
 
 
-def background(power: np.ndarray, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
-    """The greater of the two training means; at the ends of the range axis the one there is."""
-    return np.fmax(_side_mean(power, guard, training, -1), _side_mean(power, guard, training, +1))
+def background(power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
+    """The greater of the two training means over the kept cells; where one is missing the other, infinite where both are."""
+    level = np.fmax(_side_mean(power, keep, guard, training, -1), _side_mean(power, keep, guard, training, +1))
+    return np.where(np.isnan(level), np.inf, level)
+
+
+def strong_lobes(power: np.ndarray) -> np.ndarray:
+    """Cells that the lobes of the strongest peaks of a Hann-windowed map reach, (rows, P) bool.
+
+    A line of sight 60 dB over the noise would otherwise raise the background of every target within the training block. A row is
+    allowed for migration.
+    """
+    noise = float(np.median(power))
+    rows, bins = peaks(power, power > STRONG * noise, (8, 8))
+    reached = np.zeros(power.shape, bool)
+    for row, column in zip(rows[:MAX_STRONG], bins[:MAX_STRONG], strict=True):
+        along = np.maximum(np.abs(np.arange(power.shape[0]) - row) - 1, 0)
+        across = np.abs(np.arange(power.shape[1]) - column)
+        across = np.minimum(across, power.shape[1] - across)
+        reached |= np.outer(hann_envelope(along), hann_envelope(across)) > max(noise / power[row, column], DEEPEST_LOBE)
+    return reached
 
 
 def detect(
@@ -88,7 +119,7 @@ def detect(
     above : (rows, P) bool
     level : (rows, P) background
     """
-    level = np.maximum(background(power, guard, training), ROUNDING * power.max())
+    level = np.maximum(background(power, ~strong_lobes(power), guard, training), ROUNDING * power.max())
     rows = side_rows(len(power), guard[0], training[0])
     factor = np.array([_factor(looks, false_alarm_rate, guard, training, *count) for count in rows.tolist()])
     return power > factor[:, None] * level, level
@@ -106,7 +137,8 @@ def detect_chirps(power: np.ndarray, looks: int, false_alarm_rate: float, guard:
     -------
     above : (N, P) bool
     """
-    level = np.maximum(background(power, (guard, 0), (training, 0)), ROUNDING * power.max())
+    every = np.ones(power.shape, bool)
+    level = np.maximum(background(power, every, (guard, 0), (training, 0)), ROUNDING * power.max())
     factor = np.array([_chirp_factor(looks, false_alarm_rate, *count) for count in side_rows(len(power), guard, training).tolist()])
     return power > factor[:, None] * level
 
