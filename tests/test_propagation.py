@@ -8,7 +8,7 @@ import pytest
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.geometry import one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, drop_weak, make_paths
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario import Rcs, Uav
@@ -204,6 +204,15 @@ def test_one_path_of_each_chain_of_planes():
     assert again.tolist() == [2, 3]
     none = np.zeros((3, 0), int)
     assert one_of_each_chain(none, none, np.array([False, True, True])).tolist() == [1]
+
+
+def test_walls_that_meet_in_a_point_have_no_order():
+    """Sorted where the points coincide, and nowhere else. Seen failing with all planes sorted, and with one pass only."""
+    here, there = [1.0, 2.0, 3.0], [1.0, 2.0, 3.5]
+    points = np.array([[here, here, here], [there, here, here], [here, here, there], [here, there, here]])
+    planes = np.array([[9, 7, 4]] * 4)
+    assert edges_in_any_order(planes, points).tolist() == [[4, 7, 9], [9, 4, 7], [7, 9, 4], [9, 7, 4]]
+    assert planes[0].tolist() == [9, 7, 4]
 
 
 # ---- cross-sections

@@ -102,6 +102,24 @@ def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
     return city.normals[largest], city.plane_offsets[largest]
 
 
+EDGE = 1e-3
+"""Two points of a path this close together [m] are one point in the edge of two walls."""
+
+
+def edges_in_any_order(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Planes (K, B) of chains with those that are met at one point (K, B, 3) in rising order.
+
+    A wave that meets two walls in their edge meets them in either order: the same path, the same image.
+    """
+    out = planes.copy()
+    for b in range(1, planes.shape[1]):  # bubble sort of short rows, over the neighbours that share a point
+        for a in range(planes.shape[1] - b):
+            together = np.linalg.norm(points[:, a + 1] - points[:, a], axis=1) < EDGE
+            swap = together & (out[:, a] > out[:, a + 1])
+            out[swap, a], out[swap, a + 1] = out[swap, a + 1], out[swap, a]
+    return out
+
+
 def one_of_each_chain(planes: np.ndarray, faces: np.ndarray, good: np.ndarray) -> np.ndarray:
     """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with the lowest faces (K, B).
 

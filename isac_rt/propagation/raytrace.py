@@ -11,8 +11,10 @@ solve per link; a test holds the two against each other. What is left out: a wav
 horizontal polarisation and the other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of
 two bounces in a street canyon).
 
-Where two walls meet at right angles, the mirror path of a terminal to itself by way of both runs through their edge, in either
-order at once: there the ray tracer may find none, one or both.
+Where walls meet at right angles (or a wall the ground), the mirror path of a terminal to itself runs through their edge, in every
+order of the walls at once: each order holds a part of the wavefront, and together they make one image. Sionna finds none of
+them from a terminal to itself, and one of them to a point that is not the terminal, so chains of two and more bounces are also
+sought to points beside each terminal, and unfolded to the terminal itself.
 
 Points are world coordinates outside this module and local (recentred) coordinates inside. Import only after
 `isac_rt.runtime.activate()`.
@@ -31,7 +33,7 @@ from isac_rt.city.mesh import City
 from isac_rt.city.scene import build_scene
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.geometry import Legs, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.geometry import Legs, edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario import Scenario
@@ -41,6 +43,10 @@ from isac_rt.waveform import SPEED_OF_LIGHT
 POINT_TOLERANCE = 1e-3
 """Share of a path's length by which its points may differ from Sionna's; beyond, it is another path. Sionna's mirrors are float32
 triangles whose normals err by up to 3e-4 rad in Munich, which moves points by centimetres and lengths by micrometres."""
+ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
+"""From a terminal to the points beside it to which corners are sought, local coordinates [m]. A tenth of a metre is what
+Sionna's ray offsets need (3 cm: half of the corners, 1 cm: none) and less than a Fresnel zone; two points, because one that
+lies towards the corner does not help."""
 MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so fewer rays get less room."""
 
@@ -91,9 +97,9 @@ class RayTracer:
         return {link: self._link(local, epoch, *link, legs, hits) for link in links}
 
     def _solve(
-        self, local: dict[str, Pose], sources: list[str], sinks: list[str], max_depth: int, samples_per_src: int, **options: bool
+        self, sources: dict[str, np.ndarray], sinks: dict[str, np.ndarray], max_depth: int, samples_per_src: int, **options: bool
     ) -> rt.Paths:
-        """Solve between isotropic single elements.
+        """Solve between isotropic single elements at places by name.
 
         Raises
         ------
@@ -102,10 +108,10 @@ class RayTracer:
         scene = self._handle.scene
         for name in [*scene.transmitters, *scene.receivers]:
             scene.remove(name)
-        for name in sources:
-            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*local[name].position.tolist())))
-        for name in sinks:
-            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*local[name].position.tolist())))
+        for name, place in sources.items():
+            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*place.tolist())))
+        for name, place in sinks.items():
+            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*place.tolist())))
         room = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
         found = self._solver(
             scene,
@@ -126,15 +132,25 @@ class RayTracer:
         """Legs of every (terminal, UAV), by mirror reflections only."""
         p = self._scenario.propagation
         depth = p.max_bounces if p.specular and self._city.num_faces else 0
-        found = self._solve(
-            local, self._terminals, list(self._names), max_depth=depth, samples_per_src=p.rays, specular_reflection=depth > 0
-        )
+        sources = {name: local[name].position for name in self._terminals}
+        sinks = {name: local[name].position for name in self._names}
+        beside = {f"{name}-{k}": place + step for name, place in sources.items() for k, step in enumerate(ASIDE)} if depth > 1 else {}
+        found = self._solve(sources, sinks | beside, max_depth=depth, samples_per_src=p.rays, specular_reflection=depth > 0)
         amplitude, valid, faces, points = self._read(found, max(depth, 1))
+        corner = valid & ((faces >= 0).sum(axis=-1) > 1)
+        slack = 4 * np.linalg.norm(ASIDE, axis=1).max()
         out = {}
-        for j, start in enumerate(self._terminals):
-            for i, end in enumerate(self._names):
+        for j, start in enumerate(sources):
+            for i, end in enumerate(sinks):
                 which = np.flatnonzero(valid[i, j])
-                out[start, end] = self._leg_set(local[start], local[end], amplitude[i, j, which], faces[i, j, which], points[i, j, which])
+                rows, loose = np.full(which.size, i), np.zeros(which.size)
+                if start == end and beside:
+                    first = len(sinks) + len(ASIDE) * j
+                    steps, found_beside = np.nonzero(corner[first : first + len(ASIDE), j])
+                    rows, which = np.append(rows, first + steps), np.append(which, found_beside)
+                    loose = np.append(loose, np.full(steps.size, slack))
+                at = rows, j, which
+                out[start, end] = self._leg_set(local[start], local[end], amplitude[at], faces[at], points[at], loose)
         return out
 
     def _read(self, found: rt.Paths, depth: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -151,8 +167,8 @@ class RayTracer:
         points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
         return amplitude, valid, faces, points
 
-    def _leg_set(self, start: Pose, end: Pose, amplitude: np.ndarray, faces: np.ndarray, points: np.ndarray) -> LegSet:
-        """Unfold chains depth by depth, drop what contradicts Sionna's points, drop duplicates, sort."""
+    def _leg_set(self, start: Pose, end: Pose, amplitude: np.ndarray, faces: np.ndarray, points: np.ndarray, slack: np.ndarray) -> LegSet:
+        """Unfold chains depth by depth, drop what contradicts Sionna's points by more than `slack`, drop duplicates, sort."""
         parts = []
         for count in range(faces.shape[1] + 1):
             which = np.flatnonzero((faces >= 0).sum(axis=1) == count)
@@ -161,9 +177,10 @@ class RayTracer:
                 continue  # a terminal's path to itself is its leakage, which is not the ray tracer's
             legs = unfold(self._normals[chain], self._offsets[chain], start, end)
             apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(axis=1, initial=0.0)
-            good = apart < POINT_TOLERANCE * legs.length
-            self.dropped += int((~good).sum())
-            keep = one_of_each_chain(self._city.plane_of_face[chain], chain, good)
+            good = apart < POINT_TOLERANCE * legs.length + slack[which]
+            self.dropped += int((~good & (slack[which] == 0)).sum())  # what stands beside may well go astray at grazing angles
+            planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)
+            keep = one_of_each_chain(planes, chain, good)
             self.duplicates += int(good.sum()) - keep.size
             keep = keep[np.argsort(legs.length[keep], kind="stable")]
             parts.append((amplitude[which][keep], _pick(legs, keep), chain[keep]))
@@ -247,9 +264,8 @@ class RayTracer:
         """Hit points and scattered amplitudes of every link, from one solve; points on the float64 mesh, in a fixed order."""
         sources, sinks = list(dict.fromkeys(tx for tx, _ in links)), self._terminals  # as many each frame: a new number compiles anew
         found = self._solve(
-            local,
-            sources,
-            sinks,
+            {name: local[name].position for name in sources},
+            {name: local[name].position for name in sinks},
             max_depth=1,
             samples_per_src=self._scenario.clutter.rays,
             los=False,
