@@ -50,7 +50,7 @@ BELIEVED_CELLS = (0.15, 0.3)
 """A reference off its prediction by more cells of range or of velocity than these, and four deviations, is not believed: a second path in
 the same cell pulls the estimate, and the track, if it followed, would soon misread the symbols. It coasts instead."""
 MOST_CELLS = 0.4
-"""However uncertain the prediction, a reference farther off is not believed: two equal paths a cell apart are found in their middle."""
+"""However uncertain the prediction, a reference farther off in range is not believed: two equal paths a cell apart are found in their middle."""
 ANCHOR_CELLS = 0.75
 """A pilot off by more than this has found another cell: the track starts anew from it."""
 PATIENCE = 25
@@ -187,7 +187,8 @@ class PassiveTerminal:
             return 0.0
         mean, S = expected(*self.reference.state, own)
         residual = np.abs(wrapped(z - mean, self._period))[:2]
-        allowed = np.minimum(np.array(BELIEVED_CELLS) * self._cells + 4 * np.sqrt(np.diag(S)[:2]), MOST_CELLS * self._cells)
+        allowed = np.array(BELIEVED_CELLS) * self._cells + 4 * np.sqrt(np.diag(S)[:2])
+        allowed[0] = min(allowed[0], MOST_CELLS * self._cells[0])
         return float(residual[0] / self._cells[0]) if (residual > allowed).any() else 0.0
 
     def _repair_slip(self, cube: IFCube, reception: Reception, own: Pose, maps: bool) -> Reception:
