@@ -114,7 +114,7 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
 
 
 def _range_label(dataset: xr.Dataset, observer: int) -> str:
-    return "range [m]" if dataset.transmitter.values[observer] == dataset.observer.values[observer] else "path length [m]"
+    return "range [m]" if dataset.transmitter.values[observer] == dataset.receiver.values[observer] else "path length [m]"
 
 
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
@@ -161,7 +161,7 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     here = _processed(dataset, observer)
     t = here.time.values
     for u, uav in enumerate(dataset.uav.values):
-        if uav == dataset.observer.values[observer] or not here.in_view.values[:, u].any():
+        if uav == dataset.receiver.values[observer] or not here.in_view.values[:, u].any():
             continue
         colour, seen = uav_colour(dataset, u), here.in_view.values[:, u]
         ax.plot(t, np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan), color=colour, lw=0.9, label=str(uav))
@@ -215,7 +215,7 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
             ax.plot(x[at], dataset.path_power_db.values[at], KIND_MARKERS[name], ms=2.5 if name == "diffuse" else 5, ls="none",
                     color=KIND_COLOURS[name], alpha=0.5 if name == "diffuse" else 0.9, mew=0, label=f"{words(name)} ({at.sum()})")  # fmt: skip
     ax.set(xlabel="path length [m]" if against == "delay" else "Doppler shift [kHz] (closing is positive)", ylabel="path gain [dB]")
-    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.observer.values[observer]}")
+    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
     if ax.get_legend_handles_labels()[0]:
         for handle in ax.legend(loc="best", ncols=2).legend_handles:
             handle.set(markersize=5, alpha=1)
@@ -262,7 +262,7 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
             level = np.where(shown, 10 * np.log10(np.maximum(power[:, k], 1e-300)), np.nan)
             ax.plot(here.time.values, level, ".-", ms=3, lw=1, color=KIND_COLOURS[name], label=f"{words(name)} ({count[:, k].sum()})")
     ax.set(xlabel="time [s]", ylabel="path gain of the kind [dB]")
-    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.observer.values[observer]} (paths over all frames)")
+    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]} (paths over all frames)")
     if ax.get_legend_handles_labels()[0]:
         ax.legend(ncols=3)
     return ax
@@ -295,7 +295,7 @@ def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
         for ax, name in zip(axes[:, 0], ("range", "velocity", "azimuth"), strict=True):
             over_time(ax, d, o, name)
         axes[0, 0].set_title(f"{d.observer.values[o]}: truth (line), detections (dots), tracks (broad); shaded where hidden")
-        yield f"tracks_{d.observer.values[o]}", figure
+        yield f"tracks_{str(d.observer.values[o]).replace('->', '_to_')}", figure
     figure, axes = _figure(2, 2, 6.0)
     for ax, name in zip(axes.flat, MEASURES, strict=True):
         error_cdf(ax, d, name)

@@ -140,22 +140,24 @@ class SymbolCount:
         return SymbolCount(*(getattr(self, f) + getattr(other, f) for f in self.__dataclass_fields__))
 
 
-def count_symbols(payload: Payload, reception: Reception) -> SymbolCount:
-    """One frame: what was sent against what was decided. An unmodulated frame counts nothing."""
+def count_symbols(payload: Payload, reception: Reception, groups: Sequence[int] | None = None) -> SymbolCount:
+    """One frame: what was sent in `groups` (None: in all) against what was decided. An unmodulated frame counts nothing."""
     if not payload.modulated:
         return SymbolCount()
+    mine = list(range(len(payload.delay_symbols)) if groups is None else groups)
 
     def compare(sent: np.ndarray, decided: np.ndarray) -> tuple[int, int, int]:
         if not reception.decoded:
             return sent.size, sent.size, sent.size
         return sent.size, int((sent != decided).sum()), int((decided < 0).sum())
 
-    decoded = payload.bits.size if reception.decoded else 0
-    wrong = int((payload.bits != reception.bits).sum()) if decoded else payload.bits.size
+    bits = payload.bits_of(mine)
+    decoded = bits.size if reception.decoded else 0
+    wrong = int((bits != reception.bits).sum()) if decoded else bits.size
     return SymbolCount(
-        *compare(payload.delay_symbols, reception.delay_symbols),
-        *compare(payload.transitions, reception.transitions),
-        payload.bits.size,
+        *compare(payload.delay_symbols[mine], reception.delay_symbols[mine]),
+        *compare(payload.transitions[mine], reception.transitions[mine]),
+        bits.size,
         wrong,
         decoded,
         1,
@@ -252,7 +254,15 @@ class SensingScore:
         self.track_errors.merge(other.track_errors)
 
 
-def summary_block(role: str, sensing: SensingScore, symbols: SymbolCount | None, duration: float) -> dict[str, object]:
+def pool(scores: Sequence[SensingScore]) -> SensingScore:
+    """Several links' scores in one; the resolution is the first's."""
+    out = SensingScore(scores[0].resolution)
+    for score in scores:
+        out.merge(score)
+    return out
+
+
+def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolCount | None, duration: float) -> dict[str, object]:
     """One terminal's (or link's) figures under the fixed keys of `summary.json`; null where one does not apply.
 
     `bits` are the payload bits that were decoded, right or wrong; `bit_rate_bps` is these over `duration` [s], the time from

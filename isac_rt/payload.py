@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +24,14 @@ class Payload:
     delay_symbols : (M, P) int in [0, N/2)
     transitions : (M, L_tx, P/L_tx - 1) int in [0, D): the independent DPSK symbols
     phases : (M, P) complex128, beta^(D) of every chirp: the running product of its antenna's transitions
+    num_delay_bits : how many of the bits are on the delay symbols
     """
 
     bits: np.ndarray
     delay_symbols: np.ndarray
     transitions: np.ndarray
     phases: np.ndarray
+    num_delay_bits: int = 0
 
     def __post_init__(self) -> None:
         for a in (self.bits, self.delay_symbols, self.transitions, self.phases):
@@ -37,6 +40,13 @@ class Payload:
     @property
     def modulated(self) -> bool:
         return self.bits.size > 0
+
+    def bits_of(self, groups: Sequence[int]) -> np.ndarray:
+        """The bits that some groups carry, in the order of `bits` with the other groups left out."""
+        if not self.modulated:
+            return self.bits
+        parts = np.split(self.bits, [self.num_delay_bits])
+        return np.concatenate([part.reshape(len(self.delay_symbols), -1)[list(groups)].ravel() for part in parts])
 
 
 def unmodulated(waveform: Waveform) -> Payload:
@@ -71,7 +81,7 @@ def modulate(bits: np.ndarray, waveform: Waveform, schedule: Schedule, dpsk_orde
     transitions = _gray_decode(_pack(bits[split:], dpsk_order.bit_length() - 1)).reshape(
         w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1
     )
-    return Payload(bits.copy(), delay, transitions, running_phases(transitions, schedule, dpsk_order))
+    return Payload(bits.copy(), delay, transitions, running_phases(transitions, schedule, dpsk_order), split)
 
 
 def demodulate_bits(delay_symbols: np.ndarray, transitions: np.ndarray, waveform: Waveform, dpsk_order: int) -> np.ndarray:

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from isac_rt.metrics import SensingScore, SymbolCount, summary_block
+from isac_rt.metrics import SensingScore, SymbolCount, pool, summary_block
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_file import to_yaml
 from isac_rt.swarm import Pose
+from isac_rt.timetable import Link, Timetable
 from isac_rt.waveform import Waveform
 
 KINDS = tuple(kind.name.lower() for kind in PathKind)
@@ -75,7 +76,7 @@ class TrackTable:
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverRecord:
-    """What one receiving terminal had and made of one frame.
+    """What one link's receiving terminal had and made of one frame.
 
     Attributes
     ----------
@@ -113,7 +114,7 @@ class ObserverRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
-    """One frame: its index, the time of its middle [s], all poses then, and every observer that received in it.
+    """One frame: its index, the time of its middle [s], all poses then, and by its label every observer that received in it.
     Of a `snapshot` frame the whole path ledger and the maps are kept."""
 
     frame: int
@@ -135,11 +136,11 @@ class Results:
 
 @dataclass
 class Recorder:
-    """Collects the frames of a run. `observers` are the receiving terminals, `states` the names of their state codes."""
+    """Collects the frames of a run. An observer is a link's receiver; `states` are the names of the terminals' state codes."""
 
     scenario: Scenario
     waveform: Waveform
-    observers: Sequence[str]
+    timetable: Timetable
     states: Sequence[str]
     _frames: list[FrameRecord] = field(default_factory=list)
 
@@ -151,15 +152,15 @@ class Recorder:
     def finish(
         self,
         *,
-        scores: Mapping[str, SensingScore],
+        scores: Mapping[Link, SensingScore],
         timing: Mapping[str, float],
         fidelity: Mapping[str, Any],
         materials: Mapping[str, Any] | None = None,
         link_budget: Sequence[Mapping[str, Any]] = (),
     ) -> Results:
-        """The results of the frames so far. `scores` holds every observer's sensing; `timing` [s] goes into the summary only;
+        """The results of the frames so far. `scores` holds every link's sensing; `timing` [s] goes into the summary only;
         `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the dataset."""
-        dataset = _Builder(self.scenario, self.waveform, tuple(self.observers), tuple(self.states), self._frames).dataset()
+        dataset = _Builder(self.scenario, self.waveform, self.timetable, tuple(self.states), self._frames).dataset()
         dataset.attrs |= {
             **provenance(self.scenario),
             "fidelity": json.dumps(dict(fidelity)),
@@ -169,33 +170,43 @@ class Recorder:
         return Results(dataset, self._summary(dataset, scores, timing, fidelity), self.scenario)
 
     def _summary(
-        self, dataset: xr.Dataset, scores: Mapping[str, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]
+        self, dataset: xr.Dataset, scores: Mapping[Link, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """The fixed keys of `summary.json`; null stands for what does not apply. One transmitter is heard by each terminal,
-        so a terminal's figures are those of its link."""
+        """The fixed keys of `summary.json`; null stands for what does not apply."""
         frames = self._frames
         interval = self.scenario.frame_interval_s or self.waveform.frame_duration
         duration = (frames[-1].frame - frames[0].frame) * interval + self.waveform.frame_duration if frames else 0.0
-        blocks: dict[str, dict[str, object]] = {}
-        links: dict[str, dict[str, object]] = {}
-        for name in self.observers:
-            heard = [f.observers[name].record for f in frames if name in f.observers]
-            decodes = any(r.transmitter != name for r in heard)
-            role = self.scenario.swarm[name].role
-            symbols = sum((r.symbols for r in heard), SymbolCount()) if decodes else None
-            blocks[name] = summary_block(role, scores[name], symbols, duration)
-            links |= {f"{sender}->{name}": blocks[name] for sender in {r.transmitter for r in heard}}
+        symbols = {link: self._symbols(link) for link in self.timetable.all_links}
+        links = {}
+        for (tx, rx), counted in symbols.items():
+            role = "active" if tx == rx else "passive"
+            links[f"{tx}->{rx}"] = summary_block(role, scores[tx, rx], counted, duration)
+        terminals = {}
+        for name in dict.fromkeys(rx for _, rx in self.timetable.all_links):
+            mine = [link for link in self.timetable.all_links if link[1] == name]
+            received = [c for link in mine if (c := symbols[link]) is not None]
+            roles = self.timetable.roles_taken(name)
+            role = roles[0] if len(roles) == 1 else roles
+            pooled = sum(received, SymbolCount()) if received else None
+            terminals[name] = summary_block(role, pool([scores[link] for link in mine]), pooled, duration)
         return {
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "frames": len(frames),
-            "terminals": blocks,
+            "terminals": terminals,
             "links": links,
             "paths": {kind: int(n) for kind, n in zip(KINDS, dataset.path_count.sum(("frame", "observer")).values, strict=True)},
             "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
             "fidelity": dict(fidelity),
             "versions": versions(),
         }
+
+    def _symbols(self, link: Link) -> SymbolCount | None:
+        """What was sent over a link and became of it; None for a terminal's own echoes."""
+        if link[0] == link[1]:
+            return None
+        label = self.timetable.labels[link]
+        return sum((f.observers[label].record.symbols for f in self._frames if label in f.observers), SymbolCount())
 
 
 @dataclass(frozen=True)
@@ -268,10 +279,14 @@ class _Builder:
 
     scenario: Scenario
     waveform: Waveform
-    observers: tuple[str, ...]
+    timetable: Timetable
     states: tuple[str, ...]
     frames: list[FrameRecord]
     out: dict[str, xr.Variable] = field(default_factory=dict)
+
+    @property
+    def observers(self) -> list[str]:
+        return list(self.timetable.labels.values())
 
     def put(self, name: str, dims: Sequence[str], values: Any, units: str, long_name: str, **attrs: Any) -> None:
         self.out[name] = xr.Variable(tuple(dims), np.asarray(values), {"units": units, "long_name": long_name, **attrs})
@@ -304,17 +319,18 @@ class _Builder:
     def frame_values(self) -> None:
         names = list(self.scenario.swarm)
         self.put("frame", ["frame"], np.array([f.frame for f in self.frames], np.int64), _DIMENSIONLESS, "index of the frame")
-        self.put("observer", ["observer"], np.array(self.observers, object), _DIMENSIONLESS, "receiving terminal")
+        self.put("observer", ["observer"], np.array(self.observers, object), _DIMENSIONLESS, "link, by its receiver where that is enough")
         self.put("uav", ["uav"], np.array(names, object), _DIMENSIONLESS, "unmanned aerial vehicle")
-        self.put("role", ["uav"], np.array([self.scenario.swarm[n].role for n in names], object), _DIMENSIONLESS, "role of the UAV")
+        self.put("role", ["uav"], np.array([self.scenario.swarm[n].role for n in names], object), _DIMENSIONLESS, "role of the UAV at the start")
         self.put("kind", ["kind"], np.array(KINDS, object), _DIMENSIONLESS, "kind of path")
         self.put("symbol", ["symbol"], np.array(SYMBOLS, object), _DIMENSIONLESS, "kind of symbol")
         self.put("axis", ["axis"], np.array(list("xyz"), object), _DIMENSIONLESS, "world axis: east, north, up")
         self.put("body_axis", ["body_axis"], np.array(["right", "boresight", "up"], object), _DIMENSIONLESS, "body axis")
         self.put("time", ["frame"], np.array([f.time for f in self.frames], float), "s", "time of the middle of the frame")
         self.put("modulated", ["frame"], np.array([f.modulated for f in self.frames], bool), _DIMENSIONLESS, "the frame carries data")
-        senders = {o: next((f.observers[o].record.transmitter for f in self.frames if o in f.observers), "") for o in self.observers}
-        self.put("transmitter", ["observer"], np.array(list(senders.values()), object), _DIMENSIONLESS, "terminal that is received")
+        for i, end in enumerate(("transmitter", "receiver")):
+            ends = np.array([link[i] for link in self.timetable.labels], object)
+            self.put(end, ["observer"], ends, _DIMENSIONLESS, f"{end} of the observer's link")
         for name, units in (("position", "m"), ("velocity", "m s-1"), ("acceleration", "m s-2")):
             values = np.array([[getattr(f.poses[n], name) for n in names] for f in self.frames], float).reshape(-1, len(names), 3)
             self.put(f"uav_{name}", ["frame", "uav", "axis"], values, units, f"{name} of the UAV in world axes")

@@ -11,6 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator
+from fractions import Fraction as Rational
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -18,6 +19,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr,
 from pydantic_core import PydanticCustomError
 
 Key = tuple[str | int, ...]
+
+
+def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> int:
+    """floor(T- / (2 T_d)) in rational arithmetic; with r = B/f_s it is (r - 2)/2 + 1 + L_tx (19 for the paper's numbers)."""
+    ratio = Rational(bandwidth).limit_denominator() / Rational(sampling_rate).limit_denominator()
+    return int((ratio - 2) / 2 + 1 + num_tx)
+
 
 NEAREST_M = 0.05
 """Two bodies nearer than this are one to the ray tracer."""
@@ -201,6 +209,8 @@ class Modulation(Node):
     """Unmodulated frames at the start, from which every terminal acquires."""
     pilot_every_frames: Annotated[int, Field(ge=2)] | None = 25
     """One unmodulated frame in so many, for late and lost terminals; null: none after the start."""
+    streams: dict[str, tuple[Annotated[int, Field(ge=0)], ...]] = {}
+    """Groups that carry data for a passive terminal, by its name; a terminal that is not named reads them all."""
 
 
 class Rcs(Node):
@@ -234,6 +244,9 @@ class Uav(Node):
     waypoints: tuple[Waypoint, ...] | None = None
     boresight: Literal["velocity"] | Vector = "velocity"
     rcs: Rcs = Rcs()
+    resource_block: Annotated[int, Field(ge=0)] | None = None
+    """First of the consecutive resource blocks, one per group, in which the UAV sends while it is active; null: the lowest that
+    the active UAVs before it leave free."""
 
     @field_validator("boresight", mode="before")
     @classmethod
@@ -245,9 +258,14 @@ class Uav(Node):
         return value
 
     def applies(self, name: str) -> bool:
+        if name == "resource_block":
+            return self.role == "active"
         return name != "velocity_mps" or self.waypoints is None
 
     def problems(self) -> Iterator[Problem]:
+        if self.resource_block is not None and self.role != "active":
+            said = f"has no meaning for a UAV that is {self.role} at the start: one that takes over the active role takes over its blocks too; remove it"
+            yield Problem((("resource_block",), ("role",)), said)
         if self.waypoints is None and self.position_m is None:
             yield Problem((("position_m",),), "missing: a UAV needs either position_m or waypoints")
         if self.waypoints is None:
@@ -350,6 +368,17 @@ class Tracking(Node):
             )
 
 
+class RoleChange(Node):
+    """An active terminal and a passive one change places."""
+
+    frame: Annotated[int, Field(ge=1)]
+    """First frame in the new roles; acquisition frames follow, as at the start."""
+    from_uav: str
+    """Active until then, passive from then on."""
+    to_uav: str
+    """Passive until then; takes over the role and the resource blocks."""
+
+
 class Scenario(Node):
     """Everything that a run depends on."""
 
@@ -362,6 +391,7 @@ class Scenario(Node):
     array: Array = Array()
     modulation: Modulation = Modulation()
     swarm: dict[str, Uav]
+    role_changes: tuple[RoleChange, ...] = ()
     city: City | None = None
     propagation: Propagation = Propagation()
     clutter: Clutter = Clutter()
@@ -410,6 +440,8 @@ class Scenario(Node):
     def problems(self) -> Iterator[Problem]:
         yield from self._timing_problems()
         yield from self._swarm_problems()
+        yield from self._role_problems()
+        yield from self._block_problems()
         yield from self._model_problems()
 
     def _timing_problems(self) -> Iterator[Problem]:
@@ -442,9 +474,6 @@ class Scenario(Node):
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
         if not active:
             yield Problem((("swarm",),), "no UAV has the role active; give it to the one that transmits")
-        for name in active[1:]:
-            said = f"{active[0]} is active already and only one may be for now; make it passive or target"
-            yield Problem((("swarm", name, "role"),), said)
         for (a, first), (b, second) in itertools.combinations(self.swarm.items(), 2):
             apart = math.dist(first.place(0.0), second.place(0.0))
             if apart < NEAREST_M:
@@ -453,6 +482,54 @@ class Scenario(Node):
                     (("swarm", b, key), ("swarm", a)),
                     f"{a} and {b} are {apart:.3g} m apart at the start, at least {NEAREST_M} m are needed; move one of them",
                 )
+
+    def _role_problems(self) -> Iterator[Problem]:
+        roles, last = {name: uav.role for name, uav in self.swarm.items()}, 0
+        ever_passive = {name for name, role in roles.items() if role == "passive"}
+        for i, change in enumerate(self.role_changes):
+            key = ("role_changes", i)
+            if change.frame <= last or change.frame >= self.frames:
+                said = f"must be after {last} (the change before it) and below the number of frames, {self.frames}"
+                yield Problem(((*key, "frame"), ("frames",)), said)
+            last = max(last, change.frame)
+            for end, name, role in (("from_uav", change.from_uav, "active"), ("to_uav", change.to_uav, "passive")):
+                if roles.get(name) != role:
+                    now = f"is {roles[name]}" if name in roles else "is not in the swarm"
+                    yield Problem(((*key, end), ("swarm",)), f"{name} {now}; name a UAV that is {role} then")
+            roles |= {change.from_uav: "passive", change.to_uav: "active"}
+            ever_passive.add(change.from_uav)
+        for name, groups in self.modulation.streams.items():
+            stream: Key = ("modulation", "streams", name)
+            if name not in ever_passive:
+                yield Problem((stream, ("swarm",)), "is never a passive terminal of the swarm; name one that receives")
+            if not groups or len(set(groups)) < len(groups) or max(groups, default=0) >= self.radio.groups:
+                said = f"needs one group or more of 0 to {self.radio.groups - 1} (radio.groups = {self.radio.groups}), each once"
+                yield Problem((stream, ("radio", "groups")), said)
+
+    def _block_problems(self) -> Iterator[Problem]:
+        r = self.radio
+        limit = num_resource_blocks(r.bandwidth_hz, r.sampling_rate_hz, self.num_tx)
+        for name, first in self.first_blocks().items():
+            if first + r.groups > limit:
+                yield Problem(
+                    (("swarm", name, "resource_block"), ("radio", "groups"), ("radio", "bandwidth_hz")),
+                    f"{name} would need the resource blocks {first} to {first + r.groups - 1}; a slot has {limit} (0 to {limit - 1}); "
+                    "choose a lower block, fewer groups or fewer active UAVs",
+                )
+
+    def first_blocks(self) -> dict[str, int]:
+        """First resource block of every UAV that is active at the start; a successor takes over its predecessor's."""
+        active = {name: uav for name, uav in self.swarm.items() if uav.role == "active"}
+        out = {name: uav.resource_block for name, uav in active.items() if uav.resource_block is not None}
+        taken = {block + i for block in out.values() for i in range(self.radio.groups)}
+        for name in active:
+            if name not in out:
+                block = 0
+                while taken & set(range(block, block + self.radio.groups)):
+                    block += 1
+                out[name] = block
+                taken |= set(range(block, block + self.radio.groups))
+        return {name: out[name] for name in active}
 
     def _model_problems(self) -> Iterator[Problem]:
         for name, uav in self.swarm.items():
@@ -474,7 +551,10 @@ class Scenario(Node):
             )
 
     def doubts(self) -> Iterator[Problem]:
-        """What may stand but looks like a value in the wrong unit."""
+        """What may stand but is probably not meant: values in the wrong unit, active UAVs that talk over each other."""
+        for (a, first), (b, second) in itertools.combinations(self.first_blocks().items(), 2):
+            if abs(first - second) < self.radio.groups:
+                yield Problem((("swarm", b, "resource_block"),), f"{b} and {a} send in the same resource blocks; are they meant to collide?")
         low, high = CARRIERS_HZ
         if not low <= self.radio.carrier_hz <= high:
             yield Problem((("radio", "carrier_hz"),), f"{self.radio.carrier_hz:g} Hz is outside {low:g} to {high:g} Hz; is it in hertz?")

@@ -26,7 +26,6 @@ from isac_rt.metrics import (
     resolutions,
     truth_of,
 )
-from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.pathset import drop_weak
 from isac_rt.randomness import generator, seed_sequence
@@ -35,11 +34,11 @@ from isac_rt.results import TIMINGS, FrameRecord, ObserverRecord, Recorder, Resu
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose, Swarm
 from isac_rt.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.timetable import Link, Timetable
 from isac_rt.tracking import TrackSet
 from isac_rt.waveform import Waveform, waveform_of
 
 Progress = Callable[[int, int], None]
-Link = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -55,37 +54,7 @@ class Setup:
     propagation: Propagation
     reference: FreeSpace
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
-
-    @property
-    def active(self) -> str:
-        return self.swarm.with_role("active")[0]
-
-    def start_time(self, frame: int) -> float:
-        """Of a frame's first reference chirp [s]."""
-        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
-        return frame * interval
-
-    def epoch(self, frame: int) -> float:
-        """Middle of a frame [s]."""
-        return self.start_time(frame) + self.waveform.frame_duration / 2
-
-    def modulated(self, frame: int) -> bool:
-        """Whether a frame carries data: all but the acquisition frames and the periodic pilots. Public."""
-        m = self.scenario.modulation
-        pilot = m.pilot_every_frames is not None and frame % m.pilot_every_frames == 0
-        return frame >= m.acquisition_frames and not pilot
-
-    def links(self, frame: int) -> list[Link]:
-        """Links that are received in a frame: the AT's own (when it processes it) and one for every PT."""
-        own = frame % self.scenario.receivers.active_every_frames == 0
-        return [(self.active, self.active)] * own + [(self.active, pt) for pt in self.swarm.with_role("passive")]
-
-    def payload(self, frame: int) -> Payload:
-        if not self.modulated(frame):
-            return unmodulated(self.waveform)
-        rng = generator(self.scenario.seed, "payload", self.active, frame)
-        return random_payload(self.waveform, self.schedule, self.scenario.modulation.dpsk_order, rng)
-
+    timetable: Timetable
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W]."""
@@ -94,45 +63,57 @@ class Setup:
         return noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
 
     def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """Poses and paths of a frame; what is too weak to matter is left out."""
-        poses, s = self.swarm.poses(self.epoch(frame)), self.scenario
-        found = self.propagation.paths(poses, self.epoch(frame), self.links(frame))
+        """Poses and paths of a frame, interference between active terminals included; what is too weak to matter is left out."""
+        s, epoch = self.scenario, self.timetable.epoch(frame)
+        poses = self.swarm.poses(epoch)
+        heard = self.timetable.links(frame)
+        active, receivers = self.timetable.with_role("active", frame), dict.fromkeys(rx for _, rx in heard)
+        found = self.propagation.paths(poses, epoch, [(tx, rx) for tx in active for rx in receivers])
         cells = self.waveform.num_samples * self.waveform.num_chirps
         share = 10 ** (-s.propagation.weakest_path_db / 10) / (transmit_amplitude(s.noise) ** 2 * cells)
         return poses, {link: drop_weak(p, share * self.noise_power(poses, link)) for link, p in found.items()}
 
-    def transmission(self, frame: int, pose: Pose) -> Transmission:
-        """What the active terminal sends in a frame."""
+    def transmission(self, active: str, frame: int, pose: Pose) -> Transmission:
+        """What an active terminal sends in a frame."""
         return Transmission(
-            name=self.active,
+            name=active,
             pose=pose,
             antennas=self.antennas,
             schedule=self.schedule,
-            payload=self.payload(frame),
+            payload=self.timetable.payload(active, frame),
             amplitude=transmit_amplitude(self.scenario.noise),
+            first_block=self.timetable.first_block(active, frame),
         )
 
-    def receive_samples(self, frame: int, sent: Transmission, paths: PathSet, poses: dict[str, Pose]) -> IFCube:
-        """IF samples of one receiver, with its noise. They depend on nothing but the frame and the receiver."""
-        level = self.noise_power(poses, (paths.tx, paths.rx))
+    def receive_samples(
+        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+    ) -> IFCube:
+        """IF samples of a link's receiver, dechirped in the resource blocks of the link's transmitter, with noise.
+
+        `sent` holds every active terminal; what the others' chirps leave in these blocks is in the samples. They depend on
+        nothing but the frame and the link.
+        """
+        tx, rx = link
+        level = self.noise_power(poses, link)
+        order = [tx, *(name for name in sent if name != tx)]
         cube = if_signal(
             self.waveform,
-            [(sent, paths)],
-            poses[paths.rx],
+            [(sent[name], paths[name, rx]) for name in order],
+            poses[rx],
             self.antennas,
-            start_time=self.start_time(frame),
+            start_time=self.timetable.start_time(frame),
             filter_transition=self.scenario.radio.filter_transition_hz,
             noise_power=level,
         )
-        words = seed_sequence(self.scenario.seed, "noise", paths.rx, frame).generate_state(2)
+        words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
         return add_noise(cube, level, words)
 
 
 def link_budgets(setup: Setup) -> list[LinkBudget]:
     """The link budget of every link at the first frame."""
-    poses = setup.swarm.poses(setup.epoch(0))
+    poses = setup.swarm.poses(setup.timetable.epoch(0))
     rows = []
-    for tx, rx in setup.links(0):
+    for tx, rx in setup.timetable.links(0):
         amplitude = setup.reference.reference_amplitude(poses, tx, rx)
         name = rx if tx != rx else setup.reference.strongest_target(poses, tx)
         distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
@@ -150,15 +131,17 @@ def prepare(scenario: Scenario) -> Setup:
     times = np.linspace(0, scenario.frames * interval, 9)
     centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
     city = load_city(scenario.city, scenario.folder, waveform.carrier_frequency, centre)
+    schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
     return Setup(
         scenario,
         waveform,
         antennas,
-        schedule_of(scenario, waveform, generator(scenario.seed, "schedule")),
+        schedule,
         swarm,
         city,
         make_propagation(scenario, waveform, antennas, city),
         FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
+        Timetable(scenario, waveform, schedule),
     )
 
 
@@ -187,35 +170,37 @@ class _Heard:
     reception: Reception
     tracks: TrackSet
     state: int
-    slips: int
 
 
 class _Observer:
-    """One receiving terminal with its score."""
+    """One link's receiving terminal with its score."""
 
-    def __init__(self, setup: Setup, name: str) -> None:
+    def __init__(self, setup: Setup, link: Link) -> None:
         s = setup.scenario
-        self.name, self.setup, self.passes = name, setup, 2 if name == setup.active else 1
+        self.link, self.setup, self.passes = link, setup, 2 if link[0] == link[1] else 1
+        self.groups = setup.timetable.groups(link)
         self.terminal: ActiveTerminal | PassiveTerminal
         if self.passes == 2:
             self.terminal = ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
         else:
             amplitude = transmit_amplitude(s.noise)
             order = s.modulation.dpsk_order
-            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude)
+            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude, groups=self.groups)
         self.score = SensingScore(resolutions(setup.waveform, setup.antennas, self.passes))
 
-    def hear(self, frame: int, sent: Transmission, paths: PathSet, poses: dict[str, Pose], maps: bool, clock: _Clock) -> _Heard:
+    def hear(self, frame: _Frame, clock: _Clock) -> _Heard:
         """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
+        number, when = frame.number, self.setup.timetable.epoch(frame.number)
         with clock.stage("synthesis"):
-            cube = self.setup.receive_samples(frame, sent, paths, poses)
+            cube = self.setup.receive_samples(number, self.link, frame.sent, frame.paths, frame.poses)
         with clock.stage("receive"):
-            own, when = poses[self.name], self.setup.epoch(frame)
+            tx, rx = self.link
             if isinstance(self.terminal, ActiveTerminal):
-                reception, tracks = self.terminal.step(cube, sent.payload, own, when, maps=maps)
-                return _Heard(reception, tracks, int(TerminalState.TRACKING), 0)
-            reception, tracks = self.terminal.step(cube, own, when, self.setup.modulated(frame), maps=maps)
-            return _Heard(reception, tracks, int(self.terminal.state), self.terminal.slips_repaired)
+                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, frame.poses[rx], when, maps=frame.snapshot)
+                return _Heard(reception, tracks, int(TerminalState.TRACKING))
+            modulated = self.setup.timetable.modulated(number)
+            reception, tracks = self.terminal.step(cube, frame.poses[rx], when, modulated, maps=frame.snapshot)
+            return _Heard(reception, tracks, int(self.terminal.state))
 
 
 def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None) -> Results:
@@ -235,29 +220,28 @@ def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | 
     with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
         with clock.stage("setup"):
             setup = setup or prepare(scenario)
-            names = [setup.active, *setup.swarm.with_role("passive")]
-            observers = {name: _Observer(setup, name) for name in names}
-            recorder = Recorder(scenario, setup.waveform, names, [state.name.lower() for state in TerminalState])
+            timetable = setup.timetable
+            observers = {link: _Observer(setup, link) for link in timetable.all_links}
+            recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
         snapshots = _snapshot_frames(scenario)
-        waiting: tuple[_Frame, dict[str, Future[_Heard]]] | None = None
-        for frame in range(scenario.frames):
+        waiting: tuple[_Frame, dict[Link, Future[_Heard]]] | None = None
+        for number in range(scenario.frames):
             with clock.stage("trace"):
-                poses, paths = setup.trace(frame)
+                poses, paths = setup.trace(number)
             if waiting is not None:
                 _collect(recorder, observers, *waiting, clock)
                 if progress:
-                    progress(frame, scenario.frames)
-            sent = setup.transmission(frame, poses[setup.active])
-            snap = frame in snapshots
-            jobs = {p.rx: pool.submit(observers[p.rx].hear, frame, sent, p, poses, snap, clock) for p in paths.values()}
-            waiting = _Frame(frame, poses, {p.rx: p for p in paths.values()}, sent, snap), jobs
+                    progress(number, scenario.frames)
+            sent = {name: setup.transmission(name, number, poses[name]) for name in timetable.with_role("active", number)}
+            frame = _Frame(number, poses, paths, sent, number in snapshots)
+            waiting = frame, {link: pool.submit(observers[link].hear, frame, clock) for link in timetable.links(number)}
         if waiting is not None:
             _collect(recorder, observers, *waiting, clock)
         if progress:
             progress(scenario.frames, scenario.frames)
     clock.seconds["total"] = time.perf_counter() - begin
     return recorder.finish(
-        scores={name: o.score for name, o in observers.items()},
+        scores={link: o.score for link, o in observers.items()},
         timing=clock.seconds,
         fidelity=_fidelity(setup),
         materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in setup.city.materials},
@@ -271,8 +255,8 @@ class _Frame:
 
     number: int
     poses: dict[str, Pose]
-    paths: dict[str, PathSet]
-    sent: Transmission
+    paths: dict[Link, PathSet]
+    sent: dict[str, Transmission]
     snapshot: bool
 
 
@@ -283,17 +267,18 @@ def _snapshot_frames(scenario: Scenario) -> set[int]:
     return {heard[0], heard[len(heard) // 2], heard[-1]}
 
 
-def _collect(recorder: Recorder, observers: dict[str, _Observer], frame: _Frame, jobs: dict[str, Future], clock: _Clock) -> None:
+def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame, jobs: dict[Link, Future], clock: _Clock) -> None:
     """Wait for a frame's receivers, score and record it."""
-    heard = {name: job.result() for name, job in jobs.items()}
+    heard = {link: job.result() for link, job in jobs.items()}
     with clock.stage("track"):
+        timetable = recorder.timetable
         recorder.add(
             FrameRecord(
                 frame=frame.number,
-                time=observers[next(iter(observers))].setup.epoch(frame.number),
-                modulated=frame.sent.payload.modulated,
+                time=timetable.epoch(frame.number),
+                modulated=timetable.modulated(frame.number),
                 poses=frame.poses,
-                observers={name: _record(observers[name], frame, h) for name, h in heard.items()},
+                observers={timetable.labels[link]: _record(observers[link], frame, h) for link, h in heard.items()},
                 snapshot=frame.snapshot,
             )
         )
@@ -301,14 +286,14 @@ def _collect(recorder: Recorder, observers: dict[str, _Observer], frame: _Frame,
 
 def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord:
     """Hold one observer's reception against the truth."""
-    setup, paths, reception = observer.setup, frame.paths[observer.name], heard.reception
-    names, own, active = list(setup.swarm.uavs), frame.poses[observer.name], frame.poses[setup.active]
+    setup, (tx, rx), reception = observer.setup, observer.link, heard.reception
+    paths, names, own, active = frame.paths[observer.link], list(setup.swarm.uavs), frame.poses[rx], frame.poses[tx]
     truth: list[Truth | None] = []
     for name in names:
-        by_way = active if observer.passes == 1 and name != setup.active else None
-        truth.append(None if name == observer.name else truth_of(own, frame.poses[name], by_way))
-    in_view = np.array([name != observer.name and _in_view(setup, own, active, frame.poses[name]) for name in names])
-    direct = _direct_targets(paths, names, setup.active)
+        by_way = active if observer.passes == 1 and name != tx else None
+        truth.append(None if name == rx else truth_of(own, frame.poses[name], by_way))
+    in_view = np.array([name != rx and _in_view(setup, own, active, frame.poses[name]) for name in names])
+    direct = _direct_targets(paths, names)
     seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
     targets = [t for i in seen if (t := truth[i]) is not None]
     kind, target = explain(reception.detections, paths, setup.waveform, observer.passes)
@@ -325,7 +310,7 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
     stray[[j for _, j in to_detection]] = False
     raw = reception.raw_delay_symbols
     return ObserverRecord(
-        transmitter=setup.active,
+        transmitter=tx,
         reception=reception,
         paths=paths,
         truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in truth]),
@@ -339,7 +324,7 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
         state=heard.state,
         detection_kind=kind,
         detection_target=target,
-        symbols=count_symbols(frame.sent.payload, reception) if observer.passes == 1 else SymbolCount(),
+        symbols=count_symbols(frame.sent[tx].payload, reception, observer.groups) if observer.passes == 1 else SymbolCount(),
         num_false=int((stray & (kind < 0)).sum()),
         slips=int(((raw < 0) | (raw >= setup.waveform.num_delay_symbols)).sum()),
         reference_snr=_reference_snr(setup, frame, paths),
@@ -360,11 +345,11 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _direct_targets(paths: PathSet, names: list[str], active: str) -> np.ndarray:
+def _direct_targets(paths: PathSet, names: list[str]) -> np.ndarray:
     """Whether each UAV is reached without the city: the transmitter by the line of sight, the others by their echo."""
     echo = {paths.target_names[i] for i in paths.target[paths.kind == PathKind.TARGET]}
     sight = bool((paths.kind == PathKind.LINE_OF_SIGHT).any())
-    return np.array([sight if name == active and paths.rx != active else name in echo for name in names])
+    return np.array([sight if name == paths.tx != paths.rx else name in echo for name in names])
 
 
 def _reference_snr(setup: Setup, frame: _Frame, paths: PathSet) -> float:
@@ -372,7 +357,7 @@ def _reference_snr(setup: Setup, frame: _Frame, paths: PathSet) -> float:
     kind = PathKind.TARGET if paths.tx == paths.rx else PathKind.LINE_OF_SIGHT
     power = paths.power[paths.kind == kind]
     level = setup.noise_power(frame.poses, (paths.tx, paths.rx))
-    return float(frame.sent.amplitude**2 * power.max() / level) if power.size else float("nan")
+    return float(frame.sent[paths.tx].amplitude**2 * power.max() / level) if power.size else float("nan")
 
 
 def _values(rows: list[np.ndarray | None]) -> UavValues:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
 
-from isac_rt.scenario import Scenario
+from isac_rt.scenario import Scenario, num_resource_blocks
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
@@ -108,12 +107,8 @@ class Waveform:
 
     @property
     def num_resource_blocks(self) -> int:
-        """Resource blocks in a slot, floor(T- / (2 T_d)), in integers: 19 for the paper's numbers.
-
-        With r = B/f_s: T- / (2 T_d) = (r - 2)/2 + 1 + L_tx.
-        """
-        ratio = Fraction(self.bandwidth).limit_denominator() / Fraction(self.sampling_rate).limit_denominator()
-        return int((ratio - 2) / 2 + 1 + self.num_tx)
+        """Resource blocks in a slot: as many chirps, 2 T_d apart, start in it."""
+        return num_resource_blocks(self.bandwidth, self.sampling_rate, self.num_tx)
 
     @property
     def wavelength(self) -> float:

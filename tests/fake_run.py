@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import antennas_of
+from isac_rt.arrays import antennas_of, conventional_schedule
 from isac_rt.metrics import SensingScore, SymbolCount, Truth, resolutions
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
 from isac_rt.results import FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
 from isac_rt.scenario import Scenario, Uav
 from isac_rt.swarm import Swarm
+from isac_rt.timetable import Timetable
 from isac_rt.waveform import waveform_of
 
 STATES = ("acquiring", "tracking", "lost")
@@ -113,14 +114,14 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
 
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
-    recorder = Recorder(scenario, waveform_of(scenario), ("AT", "PT1"), STATES)
     w = waveform_of(scenario)
-    scores = {name: SensingScore(resolutions(w, antennas_of(scenario, w), passes)) for name, passes in (("AT", 2), ("PT1", 1))}
+    recorder = Recorder(scenario, w, Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)), STATES)
+    scores = {("AT", name): SensingScore(resolutions(w, antennas_of(scenario, w), passes)) for name, passes in (("AT", 2), ("PT1", 1))}
     for record in fake_records(scenario, detections=detections):
         recorder.add(record)
         for name, o in record.observers.items():
             t = o.truth
             truth = Truth(t.range[2], t.velocity[2], *o.reception.detections.direction[0], t.azimuth[2], t.elevation[2]) if detections else None
-            scores[name].add([truth] if truth else [], o.reception.detections, kinds=o.detection_kind)
+            scores["AT", name].add([truth] if truth else [], o.reception.detections, kinds=o.detection_kind)
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
     return recorder.finish(scores=scores, timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)

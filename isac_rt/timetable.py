@@ -1,0 +1,107 @@
+"""Who sends what to whom in every frame: roles and their changes, resource blocks, pilots, streams. All of it public."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from isac_rt.arrays import Schedule
+from isac_rt.payload import Payload, random_payload, unmodulated
+from isac_rt.randomness import generator
+from isac_rt.scenario import Scenario
+from isac_rt.waveform import Waveform
+
+Link = tuple[str, str]
+"""(transmitter, receiver); twice the same name is an active terminal's own echoes."""
+
+
+@dataclass(frozen=True)
+class Timetable:
+    """The frames of a run."""
+
+    scenario: Scenario
+    waveform: Waveform
+    schedule: Schedule
+
+    def start_time(self, frame: int) -> float:
+        """Of a frame's first slot [s]."""
+        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
+        return frame * interval
+
+    def epoch(self, frame: int) -> float:
+        """Middle of a frame [s]."""
+        return self.start_time(frame) + self.waveform.frame_duration / 2
+
+    def modulated(self, frame: int) -> bool:
+        """Whether a frame carries data: all but the periodic pilots and the acquisition frames at the start and after a change of roles."""
+        m = self.scenario.modulation
+        pilot = m.pilot_every_frames is not None and frame % m.pilot_every_frames == 0
+        since = frame - max((c.frame for c in self.scenario.role_changes if c.frame <= frame), default=0)
+        return since >= m.acquisition_frames and not pilot
+
+    @cached_property
+    def _roles(self) -> list[tuple[int, dict[str, str]]]:
+        """(first frame, role of every UAV) of each stretch between changes."""
+        roles = {name: str(uav.role) for name, uav in self.scenario.swarm.items()}
+        out = [(0, roles)]
+        for change in self.scenario.role_changes:
+            roles = roles | {change.from_uav: "passive", change.to_uav: "active"}
+            out.append((change.frame, roles))
+        return out
+
+    def roles(self, frame: int) -> dict[str, str]:
+        """Role of every UAV in a frame."""
+        return [roles for first, roles in self._roles if first <= frame][-1]
+
+    def with_role(self, role: str, frame: int) -> list[str]:
+        """Names of the UAVs of one role in a frame, in the scenario's order."""
+        return [name for name, is_now in self.roles(frame).items() if is_now == role]
+
+    def roles_taken(self, name: str) -> list[str]:
+        """The roles of a UAV over the run, in order."""
+        every = [roles[name] for _, roles in self._roles]
+        return [role for i, role in enumerate(every) if i == 0 or role != every[i - 1]]
+
+    def first_block(self, active: str, frame: int) -> int:
+        """First resource block of an active terminal: its own, or that of the terminal whose role it took over."""
+        blocks = self.scenario.first_blocks()
+        for change in self.scenario.role_changes:
+            if change.frame <= frame:
+                blocks[change.to_uav] = blocks.pop(change.from_uav)
+        return blocks[active]
+
+    def links(self, frame: int) -> list[Link]:
+        """Links that are received in a frame: every active terminal's own (when it processes the frame), and from each active
+        terminal to every passive one."""
+        active, passive = self.with_role("active", frame), self.with_role("passive", frame)
+        own = frame % self.scenario.receivers.active_every_frames == 0
+        return [(a, a) for a in active if own] + [(a, p) for a in active for p in passive]
+
+    @cached_property
+    def all_links(self) -> list[Link]:
+        """Every link that is received at some time, in the order of first use."""
+        found: dict[Link, None] = {}
+        for first, roles in self._roles:
+            active = [name for name, role in roles.items() if role == "active"]
+            found |= dict.fromkeys((a, a) for a in active)
+            found |= dict.fromkeys((a, p) for a in active for p, role in roles.items() if role == "passive")
+        return list(found)
+
+    @cached_property
+    def labels(self) -> dict[Link, str]:
+        """A name for each of `all_links`: the receiver's where it has one transmitter in the whole run, else "TX->RX"."""
+        receivers = [rx for _, rx in self.all_links]
+        alone = len({tx for tx, _ in self.all_links}) == 1 and len(set(receivers)) == len(receivers)
+        return {(tx, rx): rx if alone else f"{tx}->{rx}" for tx, rx in self.all_links}
+
+    def groups(self, link: Link) -> tuple[int, ...] | None:
+        """Groups whose data are meant for a link's receiver; None: all of them."""
+        chosen = self.scenario.modulation.streams.get(link[1])
+        return None if chosen is None or link[0] == link[1] else tuple(sorted(chosen))
+
+    def payload(self, active: str, frame: int) -> Payload:
+        """What an active terminal's chirps carry in a frame."""
+        if not self.modulated(frame):
+            return unmodulated(self.waveform)
+        rng = generator(self.scenario.seed, "payload", active, frame)
+        return random_payload(self.waveform, self.schedule, self.scenario.modulation.dpsk_order, rng)
