@@ -134,8 +134,8 @@ def view(
 
         setup = simulate.prepare(loaded)
         found = simulate.trace(loaded, frame, setup=setup)
-        times = np.linspace(setup.epoch(0), setup.epoch(loaded.frames - 1), 60)
-        picture = view_scene(setup.city, setup.swarm, times, setup.epoch(frame), found)
+        times = np.linspace(setup.timetable.epoch(0), setup.timetable.epoch(loaded.frames - 1), 60)
+        picture = view_scene(setup.city, setup.swarm, times, setup.timetable.epoch(frame), found)
         write_view(picture, out)
     _out().print(f"{out}", soft_wrap=True)
 

@@ -40,6 +40,7 @@ class Transmission:
     amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
     clock_offset, clock_drift : of the transmitter's clock against the receiver's [s, 1]; they add to every delay
     active : (M, P) bool, False where nothing is sent (on-off keying)
+    first_block : resource block of its group 0; block b starts 2 b T_d into every slot
     """
 
     name: str
@@ -51,6 +52,7 @@ class Transmission:
     clock_offset: float = 0.0
     clock_drift: float = 0.0
     active: np.ndarray | None = None
+    first_block: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +81,7 @@ def if_signal(
     start_time: float,
     filter_transition: float,
     schedule: Schedule | None = None,
+    first_block: int | None = None,
     method: Method = "auto",
     noise_power: float = 0.0,
     max_direct: int = 16,
@@ -87,23 +90,24 @@ def if_signal(
 
     .. math:: s[m,l,p,n] = \sum A \beta_{m'p}\, \bar g\, h(\alpha\tau)\, e^{j2\pi(f_c\tau + \alpha\tau(u-\tau/2))}
 
-    over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (m' - m) T_d + element delays (notes,
-    section 2); h is the IF filter. A farther target has a higher fast-time frequency, a receding one a positive slow-time
+    over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (b' + m' - b - m) T_d + element delays
+    (notes, section 2), b' and b the first resource blocks of the transmitter and of the receiver's reference; h is the IF filter. A farther target has a higher fast-time frequency, a receding one a positive slow-time
     frequency; a wave from body direction u turns element r by exp(-j 2 pi f r.u/c).
 
     Parameters
     ----------
     links : transmissions and the paths from each to this receiver; amplitudes in sqrt(W), gains without unit
     rx_pose, rx_antennas : of the receiver, at the middle of the frame
-    start_time : of the frame's first reference chirp [s]; the paths' epoch is half a frame later
+    start_time : of the frame's first reference chirp [s], block `first_block` of its slot
     filter_transition : width of the filter's skirts [Hz]
     schedule : of the cube; by default that of the first transmission
+    first_block : resource block of the first reference chirp; by default that of the first transmission
     method : see `Method`
     noise_power : per complex sample [W], for "auto"; with 0 the `max_direct` strongest go direct
 
     Raises
     ------
-    ValueError  If a path set belongs to another instant, or there is no link and no schedule.
+    ValueError  If a path set belongs to another slot than the one in the middle of the frame, or there is no link and no schedule.
 
     Notes
     -----
@@ -116,8 +120,11 @@ def if_signal(
         if not links:
             raise ValueError("if_signal got neither a link nor a schedule; pass the schedule of the cube")
         schedule = links[0][0].schedule
-    _check_epochs(links, start_time + waveform.frame_duration / 2)
-    tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas)
+    if first_block is None:
+        first_block = links[0][0].first_block if links else 0
+    middle = start_time + waveform.frame_duration / 2
+    _check_epochs(links, middle, waveform.slot_duration)
+    tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas, middle, first_block)
     shape = (waveform.num_groups, rx_antennas.num_rx, waveform.num_chirps, waveform.num_samples)
     if method == "exact":
         samples = exact(waveform, tones, filter_transition).astype(np.complex64)
@@ -143,12 +150,12 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     return cube
 
 
-def _check_epochs(links: Sequence[tuple[Transmission, PathSet]], epoch: float) -> None:
+def _check_epochs(links: Sequence[tuple[Transmission, PathSet]], middle: float, slot: float) -> None:
     for transmission, paths in links:
-        if abs(paths.epoch - epoch) > 1e-9:
+        if abs(paths.epoch - middle) >= slot:
             raise ValueError(
-                f"paths {transmission.name}->{paths.rx} have epoch {paths.epoch!r} s, the middle of the frame is {epoch!r} s; "
-                "compute the paths at start_time + frame_duration/2"
+                f"paths {transmission.name}->{paths.rx} have epoch {paths.epoch!r} s, the middle of the frame is {middle!r} s; "
+                f"compute the paths within a slot ({slot:g} s) of start_time + frame_duration/2"
             )
 
 
@@ -163,7 +170,12 @@ def _direct_paths(power: np.ndarray, sight: np.ndarray, size: int, noise_power: 
 
 
 def _tones(
-    waveform: Waveform, links: Sequence[tuple[Transmission, PathSet]], rx_pose: Pose, rx_antennas: Antennas
+    waveform: Waveform,
+    links: Sequence[tuple[Transmission, PathSet]],
+    rx_pose: Pose,
+    rx_antennas: Antennas,
+    middle: float,
+    first_block: int,
 ) -> tuple[Tones, np.ndarray, np.ndarray]:
     """All links' paths as flat arrays, whether each is a line of sight, and its received power [W]."""
     w = waveform
@@ -183,14 +195,16 @@ def _tones(
         rows += near.size
         tx_delay, rx_delay = _element_delay(tx, s.departure, s.tx_radius), _element_delay(rx, s.arrival, s.rx_radius)
         joint = _straight_delay(tx, rx, s.departure[near], s.rx_radius[near])
+        later = middle - s.epoch  # blocks start at different times of a slot, the paths' epoch is one for all
+        moved = s.delay + (s.delay_rate + s.delay_accel * later / 2) * later
         values = {
             "link": np.full(len(s), q, np.int64),
             "factor": s.gain.conj(),
-            "delay": s.delay + t.clock_offset,
-            "rate": s.delay_rate + t.clock_drift,
+            "delay": moved + t.clock_offset + (t.first_block - first_block) * w.group_spacing,
+            "rate": s.delay_rate + s.delay_accel * later + t.clock_drift,
             "accel": s.delay_accel.copy(),
-            "begin": s.begin.copy(),
-            "end": s.end.copy(),
+            "begin": s.begin - later,
+            "end": s.end - later,
             "tx_delay": tx_delay,
             "rx_delay": rx_delay,
             "cross_row": row,

@@ -101,7 +101,7 @@ class Setup:
             [(sent[name], paths[name, rx]) for name in order],
             poses[rx],
             self.antennas,
-            start_time=self.timetable.start_time(frame),
+            start_time=self.timetable.start_time(frame, tx),
             filter_transition=self.scenario.radio.filter_transition_hz,
             noise_power=level,
         )
@@ -190,16 +190,17 @@ class _Observer:
 
     def hear(self, frame: _Frame, clock: _Clock) -> _Heard:
         """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
-        number, when = frame.number, self.setup.timetable.epoch(frame.number)
+        number, when = frame.number, self.setup.timetable.epoch(frame.number, self.link[0])
         with clock.stage("synthesis"):
             cube = self.setup.receive_samples(number, self.link, frame.sent, frame.paths, frame.poses)
         with clock.stage("receive"):
             tx, rx = self.link
+            own = self.setup.swarm.trajectories[rx].pose(when)
             if isinstance(self.terminal, ActiveTerminal):
-                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, frame.poses[rx], when, maps=frame.snapshot)
+                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, own, when, maps=frame.snapshot)
                 return _Heard(reception, tracks, int(TerminalState.TRACKING))
             modulated = self.setup.timetable.modulated(number)
-            reception, tracks = self.terminal.step(cube, frame.poses[rx], when, modulated, maps=frame.snapshot)
+            reception, tracks = self.terminal.step(cube, own, when, modulated, maps=frame.snapshot)
             return _Heard(reception, tracks, int(self.terminal.state))
 
 
@@ -287,12 +288,13 @@ def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame
 def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord:
     """Hold one observer's reception against the truth."""
     setup, (tx, rx), reception = observer.setup, observer.link, heard.reception
-    paths, names, own, active = frame.paths[observer.link], list(setup.swarm.uavs), frame.poses[rx], frame.poses[tx]
+    poses = setup.swarm.poses(setup.timetable.epoch(frame.number, tx))  # of this link's own chirps
+    paths, names, own, active = frame.paths[observer.link], list(setup.swarm.uavs), poses[rx], poses[tx]
     truth: list[Truth | None] = []
     for name in names:
         by_way = active if observer.passes == 1 and name != tx else None
-        truth.append(None if name == rx else truth_of(own, frame.poses[name], by_way))
-    in_view = np.array([name != rx and _in_view(setup, own, active, frame.poses[name]) for name in names])
+        truth.append(None if name == rx else truth_of(own, poses[name], by_way))
+    in_view = np.array([name != rx and _in_view(setup, own, active, poses[name]) for name in names])
     direct = _direct_targets(paths, names)
     seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
     targets = [t for i in seen if (t := truth[i]) is not None]

@@ -23,14 +23,15 @@ class Timetable:
     waveform: Waveform
     schedule: Schedule
 
-    def start_time(self, frame: int) -> float:
-        """Of a frame's first slot [s]."""
+    def start_time(self, frame: int, active: str | None = None) -> float:
+        """Of a frame's first slot [s]; of the first chirp of an active terminal, whose block may start later in the slot."""
         interval = self.scenario.frame_interval_s or self.waveform.frame_duration
-        return frame * interval
+        block = 0 if active is None else self.first_block(active, frame)
+        return frame * interval + block * self.waveform.group_spacing
 
-    def epoch(self, frame: int) -> float:
-        """Middle of a frame [s]."""
-        return self.start_time(frame) + self.waveform.frame_duration / 2
+    def epoch(self, frame: int, active: str | None = None) -> float:
+        """Middle of a frame [s]; of the chirps of an active terminal."""
+        return self.start_time(frame, active) + self.waveform.frame_duration / 2
 
     def modulated(self, frame: int) -> bool:
         """Whether a frame carries data: all but the periodic pilots and the acquisition frames at the start and after a change of roles."""

@@ -112,10 +112,15 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
     return out
 
 
+def fake_recorder(scenario: Scenario) -> Recorder:
+    w = waveform_of(scenario)
+    return Recorder(scenario, w, Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)), STATES)
+
+
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
     w = waveform_of(scenario)
-    recorder = Recorder(scenario, w, Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)), STATES)
+    recorder = fake_recorder(scenario)
     scores = {("AT", name): SensingScore(resolutions(w, antennas_of(scenario, w), passes)) for name, passes in (("AT", 2), ("PT1", 1))}
     for record in fake_records(scenario, detections=detections):
         recorder.add(record)

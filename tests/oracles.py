@@ -7,10 +7,10 @@ import numpy as np
 LIGHT = np.longdouble(299_792_458)
 
 
-def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition):
+def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0):
     """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long double).
 
-    Times are counted from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are
+    `start_time` is that of the first reference chirp, which is sent in resource block `block` of its slot. Times are counted from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are
     placed as points: a path with a radius comes from (goes to) a point at this distance; a line of sight joins two elements.
     """
     ld = np.longdouble
@@ -30,14 +30,17 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition):
     out = np.zeros((w.num_groups, len(rx), w.num_chirps, w.num_samples), np.complex128)
     for sender, paths in links:
         tx = (sender.pose.rotation @ sender.antennas.tx_positions.T).T.astype(ld)
+        later = ld(start_time) + frame / 2 - ld(paths.epoch)
         for m, source, p, k in np.ndindex(w.num_groups, w.num_groups, w.num_chirps, len(paths)):
             a = sender.schedule[source, p]
-            begun = 2 * source * longest + ld(sender.payload.delay_symbols[source, p]) / (slope * window)
-            slot_time = 2 * m * longest + fast
-            t = slot_time + p * slot - frame / 2
-            tau = ld(paths.delay[k]) + ld(sender.clock_offset) + (ld(paths.delay_rate[k]) + ld(sender.clock_drift)) * t
-            tau = tau + ld(paths.delay_accel[k]) * t * t / 2
-            middle = begun + tau[w.num_samples // 2] - 2 * m * longest
+            begun = 2 * (source + sender.first_block) * longest + ld(sender.payload.delay_symbols[source, p]) / (slope * window)
+            reference = 2 * (m + block) * longest
+            slot_time = reference + fast
+            t = 2 * m * longest + fast + p * slot - frame / 2
+            aged = t + later
+            tau = ld(paths.delay[k]) + ld(paths.delay_rate[k]) * aged + ld(paths.delay_accel[k]) * aged * aged / 2
+            tau = tau + ld(sender.clock_offset) + ld(sender.clock_drift) * t
+            middle = begun + tau[w.num_samples // 2] - reference
             beat = float(slope * middle)
             if -transition < beat < 0:
                 gain = np.cos(np.pi * beat / transition / 2) ** 2
@@ -45,13 +48,13 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition):
                 gain = np.cos(np.pi * (beat - w.sampling_rate) / transition / 2) ** 2
             else:
                 gain = float(0 <= beat <= w.sampling_rate)
-            lives = (paths.begin[k] <= t) & (t < paths.end[k])
+            lives = (paths.begin[k] <= aged) & (aged < paths.end[k])
             on = 1.0 if sender.active is None else sender.active[source, p]
             sent = sender.amplitude * np.conj(sender.payload.phases[source, p]) * on
             for r in range(len(rx)):
                 extra = _element_path(paths, k, tx[a], rx[r]) / LIGHT
                 cycles = oscillator(slot_time - begun - tau - extra)
-                turn = oscillator(slot_time - 2 * m * longest) - cycles
+                turn = oscillator(slot_time - reference) - cycles
                 turn = (turn - np.floor(turn)).astype(float)
                 received = paths.gain[k] * sent * gain * lives
                 out[m, r, p] += np.conj(received) * np.exp(2j * np.pi * turn)

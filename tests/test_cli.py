@@ -41,7 +41,8 @@ def simulation(monkeypatch):
     def prepare(scenario):
         from isac_rt.city.mesh import empty_city
 
-        return types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(scenario), epoch=lambda f: 0.043 * f)
+        return types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(scenario),
+                                     timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))  # fmt: skip
 
     def run(scenario, *, setup, progress):
         for k in range(scenario.frames):

@@ -91,9 +91,25 @@ def test_exact_model_is_what_mixing_gives():
     """Planted bugs: + alpha tau^2/2; conj(beta); 2 (m - m') T_d with the other sign; rotation transposed."""
     links = hard_links(SMALL, np.random.default_rng(11))
     truth = mixed_chirps(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START, SKIRT)
-    tones, _, _ = _tones(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL))
+    tones, _, _ = _tones(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START + SMALL.frame_duration / 2, 0)
     assert relative(exact(SMALL, tones, SKIRT), truth) < FLOAT64
     assert relative(synthesise(SMALL, links, "exact"), truth) < COMPLEX64
+
+
+@pytest.mark.parametrize("block", [0, 2, 4])
+def test_resource_blocks_are_what_mixing_gives(block):
+    """Two senders in the blocks 2..4 and 3..5, received in blocks from `block` on, the paths given for the middle of the slots:
+    partly the right blocks, partly neighbours that pass the filter. Planted bugs: first_block with the other sign; the paths not
+    moved to the cube's own middle."""
+    w, links = SMALL, hard_links(SMALL, np.random.default_rng(17))
+    links = [(replace(links[i][0], first_block=2 + i), links[i][1]) for i in (0, 1)]
+    start = START + block * w.group_spacing
+    truth = mixed_chirps(w, links, pose(0.2, 1.0, 0.3), antennas(w), start, SKIRT, block)
+    found = if_signal(
+        w, links, pose(0.2, 1.0, 0.3), antennas(w), start_time=start, filter_transition=SKIRT, first_block=block, method="exact"
+    )
+    assert np.abs(truth).max() > 0.1
+    assert relative(found.samples, truth) < COMPLEX64
 
 
 @pytest.mark.parametrize("shape", [(90, 10, 5, 3), (128, 12, 3, 1), (77, 9, 1, 1), (101, 8, 2, 2)])

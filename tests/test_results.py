@@ -8,12 +8,12 @@ import os
 import numpy as np
 import pytest
 import xarray as xr
-from fake_run import STATES, TIMING, fake_records, fake_run, fake_scenario
+from fake_run import TIMING, fake_recorder, fake_records, fake_run, fake_scenario
 
 from isac_rt import results as module
 from isac_rt.arrays import antennas_of
 from isac_rt.metrics import SensingScore, resolutions
-from isac_rt.results import KINDS, Recorder, ResultsError, check_folder, errors_of, load, save, write_ledger
+from isac_rt.results import KINDS, ResultsError, check_folder, errors_of, load, save, write_ledger
 from isac_rt.scenario_file import to_yaml
 from isac_rt.waveform import waveform_of
 
@@ -53,8 +53,8 @@ def test_round_trip_is_bit_exact(tmp_path, detections):
 def test_two_runs_are_bit_identical(tmp_path, run):
     """Exact, for other timings too: nothing of the clock is in the dataset. Seen to fail with time.time() as an attribute."""
     w = waveform_of(run.scenario)
-    scores = {name: SensingScore(resolutions(w, antennas_of(run.scenario, w), 1)) for name in ("AT", "PT1")}
-    recorder = Recorder(run.scenario, waveform_of(run.scenario), ("AT", "PT1"), STATES)
+    scores = {("AT", name): SensingScore(resolutions(w, antennas_of(run.scenario, w), 1)) for name in ("AT", "PT1")}
+    recorder = fake_recorder(run.scenario)
     for record in fake_records(run.scenario):
         recorder.add(record)
     other = recorder.finish(scores=scores, timing={k: 9 * v for k, v in TIMING.items()}, fidelity=run.summary["fidelity"],

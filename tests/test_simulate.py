@@ -80,10 +80,10 @@ def test_receivers_use_no_truth(tmp_path):
     cubes, poses, expected = [], [], {}
     for frame in range(3):
         now, paths = setup.trace(frame)
-        cubes.append(setup.receive_samples(frame, setup.transmission(frame, now["AT"]), paths["AT", "PT1"], now))
+        cubes.append(setup.receive_samples(frame, ("AT", "PT1"), {"AT": setup.transmission("AT", frame, now["AT"])}, paths, now))
         poses.append(now["PT1"])
-        expected |= flat(frame, *live.step(cubes[-1], now["PT1"], setup.epoch(frame), setup.modulated(frame)))
-    times, modulated = [setup.epoch(f) for f in range(3)], [setup.modulated(f) for f in range(3)]
+        expected |= flat(frame, *live.step(cubes[-1], now["PT1"], setup.timetable.epoch(frame), setup.timetable.modulated(frame)))
+    times, modulated = [setup.timetable.epoch(f) for f in range(3)], [setup.timetable.modulated(f) for f in range(3)]
     file, out = tmp_path / "capture.npz", tmp_path / "out.npz"
     save_capture(file, cubes, poses, times, modulated, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0)
     subprocess.run([sys.executable, "-m", "isac_rt.terminal", str(file), str(out)], check=True, timeout=300)
