@@ -71,6 +71,16 @@ class IFCube:
     schedule: Schedule
     start_time: float
 
+    def of_groups(self, groups: Sequence[int]) -> IFCube:
+        """What a receiver of these groups alone has."""
+        chosen = list(groups)
+        return IFCube(
+            samples=self.samples[chosen],
+            waveform=self.waveform.of_groups(groups),
+            schedule=self.schedule[chosen],
+            start_time=self.start_time,
+        )
+
 
 def if_signal(
     waveform: Waveform,
@@ -91,8 +101,9 @@ def if_signal(
     .. math:: s[m,l,p,n] = \sum A \beta_{m'p}\, \bar g\, h(\alpha\tau)\, e^{j2\pi(f_c\tau + \alpha\tau(u-\tau/2))}
 
     over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (b' + m' - b - m) T_d + element delays
-    (notes, section 2), b' and b the first resource blocks of the transmitter and of the receiver's reference; h is the IF filter. A farther target has a higher fast-time frequency, a receding one a positive slow-time
-    frequency; a wave from body direction u turns element r by exp(-j 2 pi f r.u/c).
+    (notes, section 2), b' and b the first resource blocks of the transmitter and of the receiver's reference; h is the IF filter.
+    A farther target has a higher fast-time frequency, a receding one a positive slow-time frequency; a wave from body direction
+    u turns element r by exp(-j 2 pi f r.u/c).
 
     Parameters
     ----------
@@ -107,7 +118,8 @@ def if_signal(
 
     Raises
     ------
-    ValueError  If a path set belongs to another slot than the one in the middle of the frame, or there is no link and no schedule.
+    ValueError  If a path set belongs to another slot than the one in the middle of the frame, there is no link and no schedule, or
+        the waveform is a receiver's view of some groups.
 
     Notes
     -----
@@ -120,6 +132,8 @@ def if_signal(
         if not links:
             raise ValueError("if_signal got neither a link nor a schedule; pass the schedule of the cube")
         schedule = links[0][0].schedule
+    if waveform.blocks is not None:
+        raise ValueError("if_signal makes all groups of a frame; take those that a receiver reads with IFCube.of_groups")
     if first_block is None:
         first_block = links[0][0].first_block if links else 0
     middle = start_time + waveform.frame_duration / 2

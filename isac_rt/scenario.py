@@ -264,7 +264,7 @@ class Uav(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.resource_block is not None and self.role != "active":
-            said = f"has no meaning for a UAV that is {self.role} at the start: one that takes over the active role takes over its blocks too; remove it"
+            said = f"has no meaning for a UAV that is {self.role} at the start (who takes over the active role takes over its blocks); remove it"
             yield Problem((("resource_block",), ("role",)), said)
         if self.waypoints is None and self.position_m is None:
             yield Problem((("position_m",),), "missing: a UAV needs either position_m or waypoints")
@@ -554,7 +554,7 @@ class Scenario(Node):
         """What may stand but is probably not meant: values in the wrong unit, active UAVs that talk over each other."""
         for (a, first), (b, second) in itertools.combinations(self.first_blocks().items(), 2):
             if abs(first - second) < self.radio.groups:
-                yield Problem((("swarm", b, "resource_block"),), f"{b} and {a} send in the same resource blocks; are they meant to collide?")
+                yield Problem((("swarm", b, "resource_block"),), f"{b} and {a} send in the same resource blocks; shall they collide?")
         low, high = CARRIERS_HZ
         if not low <= self.radio.carrier_hz <= high:
             yield Problem((("radio", "carrier_hz"),), f"{self.radio.carrier_hz:g} Hz is outside {low:g} to {high:g} Hz; is it in hertz?")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from enum import IntEnum
 from pathlib import Path
@@ -87,6 +88,8 @@ class ActiveTerminal:
 class PassiveTerminal:
     """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of sight, and comes back.
 
+    `groups` carry data for it, None for all (see `receive_passive`).
+
     Attributes
     ----------
     state : TerminalState
@@ -102,7 +105,9 @@ class PassiveTerminal:
         tracking: Tracking,
         dpsk_order: int,
         transmit_amplitude: float,
+        groups: Sequence[int] | None = None,
     ) -> None:
+        self._groups = groups
         self._waveform, self._antennas, self._receivers, self._order = waveform, antennas, receivers, dpsk_order
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
@@ -135,7 +140,9 @@ class PassiveTerminal:
         return reception, self.tracker.snapshot(own_pose, self.reference)
 
     def _receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
-        return receive_passive(cube, self._antennas, self._receivers, self._order, prediction, modulated, maps=maps)
+        return receive_passive(
+            cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, maps=maps
+        )
 
     def _expect(self, own: Pose) -> Prediction | None:
         """Prediction for a data frame; None when the range is no longer known well enough to read a fraction of a cell."""
@@ -199,7 +206,7 @@ class PassiveTerminal:
         numbers); two are asked for, over at most `EVIDENCE_FRAMES` frames, and none of the latter, which a second
         path in the cell would leave there.
         """
-        self._ends.append(_end_symbols(reception, self._antennas.num_rx, self._waveform))
+        self._ends.append(_end_symbols(reception, self._groups, self._antennas.num_rx, self._waveform))
         cells = slip_cells(np.concatenate(self._ends), self._waveform.num_delay_symbols)
         if cells == 0 or self.reference is None:
             return reception
@@ -215,11 +222,12 @@ class PassiveTerminal:
         return again
 
 
-def _end_symbols(reception: Reception, num_rx: int, waveform: Waveform) -> np.ndarray:
+def _end_symbols(reception: Reception, groups: Sequence[int] | None, num_rx: int, waveform: Waveform) -> np.ndarray:
     """Confident raw symbols of a frame near and beyond either end of the alphabet."""
+    confidence = reception.delay_confidence if groups is None else reception.delay_confidence[list(groups)]
     raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
-    sure = reception.delay_confidence > stats.gamma(num_rx, scale=1 / num_rx).isf(SLIP_FALSE_RATE / searched)
+    sure = confidence > stats.gamma(num_rx, scale=1 / num_rx).isf(SLIP_FALSE_RATE / searched)
     return raw[sure & ((raw < EXTRA_CELLS) | (raw > last - EXTRA_CELLS))]
 
 

@@ -82,7 +82,7 @@ class Timetable:
     def all_links(self) -> list[Link]:
         """Every link that is received at some time, in the order of first use."""
         found: dict[Link, None] = {}
-        for first, roles in self._roles:
+        for _, roles in self._roles:
             active = [name for name, role in roles.items() if role == "active"]
             found |= dict.fromkeys((a, a) for a in active)
             found |= dict.fromkeys((a, p) for a in active for p, role in roles.items() if role == "passive")

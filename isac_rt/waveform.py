@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +30,8 @@ class Waveform:
     num_chirps : P, slots per frame
     num_groups : M, resource blocks that are used at once
     num_tx : L_tx, transmit antennas that share the slots
+    blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A receiver that reads some of
+        the groups only sees a waveform of these (`of_groups`)
     """
 
     carrier_frequency: float = 77e9
@@ -38,6 +41,7 @@ class Waveform:
     num_chirps: int = 120
     num_groups: int = 3
     num_tx: int = 3
+    blocks: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.bandwidth <= 2 * self.sampling_rate:
@@ -160,10 +164,16 @@ class Waveform:
         u.setflags(write=False)
         return u
 
+    def of_groups(self, groups: Sequence[int]) -> Waveform:
+        """The same frame seen by a receiver that reads only these groups."""
+        blocks = self.blocks or tuple(range(self.num_groups))
+        return replace(self, num_groups=len(groups), blocks=tuple(blocks[m] for m in groups))
+
     @cached_property
     def chirp_time(self) -> np.ndarray:
-        """Start of each reference chirp [s] (num_groups, num_chirps) since the start of the frame."""
-        m, p = np.arange(self.num_groups)[:, None], np.arange(self.num_chirps)[None, :]
+        """Start of each reference chirp [s] (num_groups, num_chirps) since the start of the first block's first."""
+        blocks = range(self.num_groups) if self.blocks is None else self.blocks
+        m, p = np.array(blocks)[:, None], np.arange(self.num_chirps)[None, :]
         t = p * self.slot_duration + m * self.group_spacing
         t.setflags(write=False)
         return t

@@ -8,7 +8,6 @@ import pytest
 from isac_rt import simulate
 from isac_rt.metrics import SensingScore, pool
 from isac_rt.scenario import Array, Modulation, Noise, Propagation, Radio, Receivers, RoleChange, Scenario, Uav
-from isac_rt.scenario_file import load, to_yaml
 
 SMALL = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60)
 """A frame of an eighth of the paper's samples: range cells of half a metre one way, 16 m of data range per 2 dB."""
@@ -83,18 +82,6 @@ def test_a_change_of_roles_in_flight():
     decoded = d.decoded.sel(observer="P1->A").values
     assert decoded.tolist() == [False] * 7 + [True] * 4
     assert not d.processed.sel(observer="A->A").values[5:].any()
-    assert load_again(s) == s
-
-
-def load_again(s: Scenario) -> Scenario:
-    """Through a YAML file's text."""
-    import tempfile
-    from pathlib import Path
-
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "s.yaml"
-        file.write_text(to_yaml(s))
-        return load(file)
 
 
 def test_pooled_scores_add_up():

@@ -8,7 +8,7 @@ import pytest
 from isac_rt.arrays import pseudo_random_schedule
 from isac_rt.payload import demodulate_bits, random_payload
 from isac_rt.scenario import Modulation, Radio, RoleChange, Scenario, Uav
-from isac_rt.scenario_file import ScenarioWarning, load
+from isac_rt.scenario_file import ScenarioWarning, load, to_yaml
 from isac_rt.timetable import Timetable
 from isac_rt.waveform import Waveform, waveform_of
 
@@ -40,6 +40,15 @@ def test_a_change_of_roles():
     assert t.roles_taken("AT") == ["active", "passive"] and t.roles_taken("PT2") == ["passive"]
     assert t.first_block("PT1", 17) == t.first_block("AT", 16) == 0
     assert t.labels["PT1", "AT"] == "PT1->AT" and len(t.labels) == 6
+
+
+def test_changes_streams_and_blocks_survive_a_file(tmp_path):
+    """Planted bug: role_changes missing from the written file."""
+    swarm = {"AT": AT.model_copy(update={"resource_block": 5}), "PT1": PT1}
+    change = RoleChange(frame=17, from_uav="AT", to_uav="PT1")
+    t = timetable(swarm=swarm, role_changes=(change,), modulation=Modulation(streams={"PT1": (2, 0)}))
+    (tmp_path / "s.yaml").write_text(to_yaml(t.scenario))
+    assert load(tmp_path / "s.yaml").model_dump() == t.scenario.model_dump()
 
 
 def test_a_role_that_comes_back_is_the_same_link():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,7 @@ def receive_passive(
     prediction: Prediction | None,
     modulated: bool,
     *,
+    groups: Sequence[int] | None = None,
     maps: bool = False,
 ) -> Reception:
     """Data symbols, bits and detections of one frame.
@@ -40,6 +42,8 @@ def receive_passive(
     cube : IFCube
     prediction : row 0 is the line of sight; None when nothing is tracked. Unmodulated frames need none
     modulated : whether the frame carries data (public)
+    groups : that carry data for this terminal, None for all. It decodes these, and senses with these alone while there are
+        data: what the others carry it does not know
     maps : also return pictures
 
     Returns
@@ -48,6 +52,9 @@ def receive_passive(
     a modulated frame cannot be read: nothing is detected. When the decisions look like noise or like a path that moves
     otherwise, or nothing is found where the reference is expected, `line_of_sight` is False and all symbols are erased.
     """
+    if groups is not None and modulated:
+        mine = receive_passive(cube.of_groups(groups), antennas, settings, dpsk_order, prediction, modulated, maps=maps)
+        return _among_all(mine, groups, cube.waveform)
     w = cube.waveform
     if not modulated:
         pilot = unmodulated(w)
@@ -65,6 +72,23 @@ def receive_passive(
     found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
     detections, reference = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
     return _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
+
+
+def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Reception:
+    """A reception of some groups in the shapes of all: nothing is decided in the others."""
+
+    def spread(values: np.ndarray, missing: int) -> np.ndarray:
+        out = np.full((waveform.num_groups, *values.shape[1:]), missing, values.dtype)
+        out[list(groups)] = values
+        return out
+
+    return replace(
+        mine,
+        delay_symbols=spread(mine.delay_symbols, -1),
+        transitions=spread(mine.transitions, -1),
+        delay_confidence=spread(mine.delay_confidence, 0),
+        transition_confidence=spread(mine.transition_confidence, 0),
+    )
 
 
 def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:

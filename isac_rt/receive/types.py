@@ -99,9 +99,9 @@ class Reception:
     decoded : whether data symbols were decided (a PT in a data frame with its line of sight)
     delay_symbols : (M, P) int, -1 where nothing was decided
     transitions : (M, L_tx, P/L_tx - 1) int, -1 where nothing was decided
-    bits : (bits_per_frame,) uint8, empty when not decoded
+    bits : (bits_per_frame,) uint8, of the groups that are read, in the order of `Payload.bits_of`; empty when not decoded
     delay_confidence : (M, P), transition_confidence : as `transitions`; larger is surer
-    raw_delay_symbols : (M, P) int, decisions of a search that runs a few cells past the alphabet on both sides (so -3 and
+    raw_delay_symbols : (groups read, P) int, decisions of a search that runs a few cells past the alphabet on both sides (so -3 and
         N/2 + 2 can occur), for slip detection; empty when not decoded
     line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
     reference_power : mean power of the reference path per sample and receive antenna [W], NaN where there is none
