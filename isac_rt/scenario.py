@@ -318,10 +318,24 @@ class Propagation(Node):
 
 
 class Clutter(Node):
-    """What buildings and ground scatter diffusely."""
+    """What buildings and ground scatter diffusely.
 
-    model: Literal["none", "diffuse"] = "none"
+    field: scatterers pinned to the mesh, the same in all frames and links. diffuse: Sionna's own, traced anew in every frame, which draws
+    the points anew as well; to compare with.
+    """
+
+    model: Literal["none", "diffuse", "field"] = "none"
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
+    """Of a diffuse re-trace, per transmitter."""
+    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.03
+    """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m]."""
+    smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
+    """field: cells of this area are cut no further, however near."""
+
+    def applies(self, name: str) -> bool:
+        if name == "rays":
+            return self.model == "diffuse"
+        return name == "model" or self.model == "field"
 
 
 class Noise(Node):
@@ -544,10 +558,11 @@ class Scenario(Node):
                     (("swarm", name, "rcs", "model"), ("noise", "model")),
                     "relative goes with noise.model snr only: a link budget needs a radar cross-section; use constant or tr38901",
                 )
-        if self.clutter.model == "diffuse" and (self.propagation.model != "ray_traced" or self.city is None):
+        if self.clutter.model in ("diffuse", "field") and (self.propagation.model != "ray_traced" or self.city is None):
             yield Problem(
                 (("clutter", "model"), ("propagation", "model"), ("city",)),
-                "diffuse needs propagation.model ray_traced and a city to scatter from; add them or set clutter.model to none",
+                f"{self.clutter.model} needs propagation.model ray_traced and a city to scatter from; "
+                "add them or set clutter.model to none",
             )
 
     def doubts(self) -> Iterator[Problem]:

@@ -74,6 +74,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         (BASE + "receivers: {guard_cells: [1]}\n", "receivers.guard_cells = [1]: has too few numbers"),
         (BASE + "tracking: {confirm_hits: 6}\n", "tracking.confirm_hits = 6: 6 hits cannot be reached within confirm_window = 5"),
         (BASE + "clutter: {model: diffuse}\n", "clutter.model = diffuse: diffuse needs propagation.model ray_traced and a city"),
+        (BASE + "clutter: {model: field}\n", "clutter.model = field: field needs propagation.model ray_traced and a city"),
         (BASE + "city: {source: canyon, name: munich}\n", "city.name = munich: has no meaning with city.source canyon, only with builtin"),
         (BASE + "city: {source: mesh}\n", "city.source mesh needs a file"),
         (BASE + "city: {source: builtin}\n", "city.source builtin needs the name"),

@@ -31,6 +31,7 @@ import sionna.rt as rt
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.city.scene import build_scene
+from isac_rt.propagation.clutter import ClutterField
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.geometry import Legs, edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
@@ -75,6 +76,9 @@ class RayTracer:
         self._handle = build_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
+        pinned = scenario.clutter.model == "field"
+        self.field = ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength) if pinned else None
+        """The scatterers on the city's surfaces."""
         self.dropped = 0
         """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
         self.duplicates = 0
@@ -202,6 +206,8 @@ class RayTracer:
                 parts.append(self._by_way_of(local, tx, rx, name, number, legs, common))
         if (tx, rx) in hits:
             parts.append(self._scattered(local[tx], local[rx], *hits[tx, rx], common))
+        if self.field is not None:
+            parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common))
         leakage = self._scenario.propagation.leakage
         if tx == rx and leakage.enabled:
             ahead = local[tx].rotation[:, 1][None]

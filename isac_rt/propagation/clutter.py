@@ -1,0 +1,286 @@
+r"""Diffuse clutter pinned to the mesh: scatterers that stay where they are while the radar flies.
+
+Each scatterer stands for one cell of a surface (`cells`) and returns, from one isotropic antenna to another,
+
+.. math:: |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A / (r_1 r_2)^2,
+
+times its own complex-Gaussian amplitude of unit power, so that the mean power over a surface is the effective-roughness integral
+[1]_ that Sionna RT takes by shooting rays, and its speckle is Rayleigh however few scatterers share a cell of range and Doppler.
+S is the material's scattering coefficient, Gamma the slab's reflection (ITU-R P.2040) for the vertically polarised wave as its TE and TM
+parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is kept: what comes in vertical goes
+out vertical, as with Sionna's default. Gamma belongs to the way in, so the two directions of a link differ a little.
+
+One bounce. Delay, rate, acceleration and directions are float64 closed forms of the point and the poses.
+Import only after `isac_rt.runtime.activate()`.
+
+References
+----------
+.. [1] V. Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans. Antennas Propag. 55(1),
+   2007, doi:10.1109/TAP.2006.888422.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import comb
+
+import mitsuba as mi
+import numba
+import numpy as np
+
+from isac_rt.arrays import Antennas
+from isac_rt.city.materials import VACUUM_PERMITTIVITY, Material
+from isac_rt.city.mesh import City
+from isac_rt.propagation.cells import Cells, Density, cut
+from isac_rt.propagation.elements import element_amplitude
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.visibility import KNOT_SPACING, Flight, Shadows, Sight
+from isac_rt.scenario import Scenario
+from isac_rt.swarm import Pose, Swarm
+from isac_rt.waveform import SPEED_OF_LIGHT
+
+TABLE = 4097
+"""Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines between them."""
+KEPT_SPACING = 1.0
+"""Flight of the transmitters from one test of all cells to the next [m]; a cell in sight of none of these places is left out."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What the kernel needs of a city's faces and materials.
+
+    Attributes
+    ----------
+    normals : (F, 3) unit normals
+    material : (F,) int64
+    table : (M, T, 3) TE and TM power reflectivity, and the pattern's norm 1/F, over the cosine of incidence from 0 to 1
+    coefficient : (M,) S^2
+    lobe : (M,) share of the lobe about the mirror direction; -1 for Lambert's pattern
+    exponent : (M,) of the lobes
+    """
+
+    normals: np.ndarray
+    material: np.ndarray
+    table: np.ndarray
+    coefficient: np.ndarray
+    lobe: np.ndarray
+    exponent: np.ndarray
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What K scatterers of the field do between two terminals at one instant, isotropic antennas.
+
+    Attributes
+    ----------
+    index : (K,) into the field's cells
+    magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own amplitude not
+    length, rate, accel : (K,) of the way over the scatterer [m, m/s, m/s^2]
+    tx_radius, rx_radius : (K,) distances from either end [m]
+    departure, arrival : (K, 3) unit vectors from either end to the scatterer
+    """
+
+    index: np.ndarray
+    magnitude: np.ndarray
+    length: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+    tx_radius: np.ndarray
+    rx_radius: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+
+class ClutterField:
+    """The scatterers of one run. All links and frames see the same ones; `plan` makes it from a scenario."""
+
+    def __init__(self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int) -> None:
+        self._city, self._sight = city, sight
+        self.cells = cells
+        self.num_candidates = num_candidates
+        """Cells of the whole city, those that are never in sight included."""
+        self._surfaces = surfaces(city, wavelength)
+        self._scale = wavelength / (4 * np.pi)
+
+    @classmethod
+    def plan(cls, scenario: Scenario, city: City, scene: mi.Scene, wavelength: float) -> ClutterField:
+        """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any place of its flight."""
+        duration = scenario.frames * (scenario.frame_interval_s or scenario.frame_duration_s)
+        trajectories = Swarm.from_scenario(scenario).trajectories
+        names = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
+        flights = {name: Flight(trajectories[name], duration, city.origin) for name in names}
+        places = np.concatenate([flight.knots for flight in flights.values()])
+        density = Density(scenario.clutter.cell_area_per_metre_m, scenario.clutter.smallest_cell_m2)
+        scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[city.face_material]
+        candidates = cut(city, scatters, places, density, scenario.seed)
+        shadows = Shadows(scene)
+        active = {n for n in names if scenario.swarm[n].role == "active"} | {change.to_uav for change in scenario.role_changes}
+        kept = _ever_seen(shadows, [flights[n] for n in names if n in active], candidates.points, city.normals[candidates.face])
+        cells = candidates.select(np.flatnonzero(kept))
+        sight = Sight(shadows, flights, cells.points, city.normals[cells.face])
+        return cls(city, cells, sight, wavelength, len(candidates))
+
+    @property
+    def nbytes(self) -> int:
+        """Of the scatterers and of what is remembered of their sight."""
+        return sum(a.nbytes for a in vars(self.cells).values()) + self._sight.nbytes
+
+    def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float) -> Seen:
+        """What is in sight of both ends of a link, poses in local coordinates."""
+        share = self._sight.share(tx, start, time)
+        if tx != rx:
+            share = share * self._sight.share(rx, end, time)
+        index = np.flatnonzero(share)
+        count = index.size
+        out = [np.empty(count) for _ in range(6)] + [np.empty((count, 3)) for _ in range(2)]
+        s, c = self._surfaces, self.cells
+        motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
+        _advance(index, share, c.points, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
+                 self._scale, *motion, *out)  # fmt: skip
+        found = Seen(index, *out)
+        lit = found.magnitude > 0
+        return found if lit.all() else Seen(*(a[lit] for a in vars(found).values()))
+
+    def paths(self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict) -> PathSet:
+        """The link's paths at ``common["epoch"]``; poses and points in local coordinates."""
+        seen = self.seen(tx, rx, start, end, common["epoch"])
+        elements = element_amplitude(antennas, start, end, seen.departure, seen.arrival)
+        return make_paths(
+            gain=self.cells.amplitude[seen.index] * (seen.magnitude * elements),
+            delay=seen.length / SPEED_OF_LIGHT,
+            delay_rate=seen.rate / SPEED_OF_LIGHT,
+            delay_accel=seen.accel / SPEED_OF_LIGHT,
+            departure=seen.departure,
+            arrival=seen.arrival,
+            tx_radius=seen.tx_radius,
+            rx_radius=seen.rx_radius,
+            kind=PathKind.DIFFUSE,
+            bounces=1,
+            points=self.cells.points[seen.index][:, None],
+            faces=self.cells.face[seen.index][:, None],
+            **common,
+        )
+
+
+def _ever_seen(shadows: Shadows, flights: Sequence[Flight], points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(N,) whether points are seen from a place of the flights."""
+    step = round(KEPT_SPACING / KNOT_SPACING)
+    kept = np.zeros(len(points), bool)
+    for flight in flights:
+        for place in [*flight.knots[::step], flight.knots[-1]]:
+            left = np.flatnonzero(~kept)
+            kept[left] = shadows.sees(place, points[left], normals[left])
+    return kept
+
+
+def surfaces(city: City, wavelength: float) -> Surfaces:
+    """Tables of a city's materials."""
+    cosine = np.linspace(0.0, 1.0, TABLE)
+    table = [np.stack([*slab_reflectivity(m, cosine, wavelength), 1 / lobe_norm(m, cosine)], axis=1) for m in city.materials]
+    lobes = {"lambertian": -1.0, "directive": 1.0, "backscattering": 0.5}
+    return Surfaces(
+        city.normals,
+        city.face_material.astype(np.int64),
+        np.array(table).reshape(-1, TABLE, 3),
+        np.array([m.scattering_coefficient**2 for m in city.materials]),
+        np.array([lobes[m.scattering_pattern] for m in city.materials]),
+        np.array([m.pattern_exponent for m in city.materials], np.int64),
+    )
+
+
+def slab_reflectivity(material: Material, cosine: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Power reflectivity of a slab for TE and TM waves over the cosine of incidence (ITU-R P.2040-3, eqs. 37, 43 and 44)."""
+    omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
+    eta = material.relative_permittivity - 1j * material.conductivity / (omega * VACUUM_PERMITTIVITY)
+    root = np.sqrt(eta - (1 - cosine**2))
+    turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
+    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
+    first, second = (np.abs(r * (1 - turn) / (1 - r**2 * turn)) ** 2 for r in (te, tm))
+    return first, second
+
+
+def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
+    """Integral over the half-space of the lobe ((1 + cos psi)/2)^alpha about a direction (Degli-Esposti [1]_, eqs. 13 and 15).
+
+    The lobes about the mirror direction and about the way in have one exponent, so both have this norm.
+    """
+    alpha = material.pattern_exponent
+    if material.scattering_pattern == "lambertian":
+        return np.ones_like(cosine)
+    total, odd = np.zeros_like(cosine), np.zeros_like(cosine)
+    for j in range(alpha + 1):
+        if j % 2:
+            n = (j - 1) // 2
+            odd = odd + (1 - cosine**2) ** n * comb(2 * n, n) / 4.0**n
+        total = total + comb(alpha, j) * 2 * np.pi / (j + 1) * (cosine * odd if j % 2 else 1.0)
+    return total / 2.0**alpha
+
+
+@numba.njit(cache=True, nogil=True)
+def _advance(index, share, points, face, area, normals, material, table, coefficient, lobe, exponent, scale, start, end,
+             magnitude, length, rate, accel, tx_radius, rx_radius, departure, arrival):  # fmt: skip
+    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`: position, velocity, acceleration."""
+    same = True
+    for k in range(3):
+        for i in range(3):
+            same = same and start[i, k] == end[i, k]
+    for row in range(index.size):
+        i = index[row]
+        f = face[i]
+        n = normals[f]
+        r1 = _leg(points[i], start, departure[row], rate, accel, row, True)
+        if same:
+            r2 = r1
+            rate[row] *= 2
+            accel[row] *= 2
+            for k in range(3):
+                arrival[row, k] = departure[row, k]
+        else:
+            r2 = _leg(points[i], end, arrival[row], rate, accel, row, False)
+        tx_radius[row], rx_radius[row], length[row] = r1, r2, r1 + r2
+        u, v = departure[row], arrival[row]
+        into = u[0] * n[0] + u[1] * n[1] + u[2] * n[2]
+        back = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
+        if into * back <= 0:
+            magnitude[row] = 0.0
+            continue
+        m = material[f]
+        cos_i, cos_o = min(abs(into), 1.0), abs(back)
+        x = cos_i * (table.shape[1] - 1)
+        cell = min(int(x), table.shape[1] - 2)
+        x -= cell
+        te = table[m, cell, 0] + x * (table[m, cell + 1, 0] - table[m, cell, 0])
+        tm = table[m, cell, 1] + x * (table[m, cell + 1, 1] - table[m, cell, 1])
+        # the vertical field is across the horizontal u x z: its TE part is the part of n along u x z, of all of n across u
+        across = (n[1] * u[0] - n[0] * u[1]) ** 2
+        whole = (u[0] * u[0] + u[1] * u[1]) * (1 - cos_i * cos_i)
+        part = min(across / whole, 1.0) if whole > 1e-12 else 0.5
+        power = coefficient[m] * (part * te + (1 - part) * tm) * cos_i * area[i]
+        if lobe[m] < 0:
+            power *= cos_o / np.pi
+        else:
+            norm = table[m, cell, 2] + x * (table[m, cell + 1, 2] - table[m, cell, 2])
+            with_way_in = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+            with_mirror = 2 * into * back - with_way_in
+            mirror = max(0.5 * (1 + with_mirror), 0.0) ** exponent[m]
+            way_in = max(0.5 * (1 + with_way_in), 0.0) ** exponent[m]
+            power *= (lobe[m] * mirror + (1 - lobe[m]) * way_in) * norm
+        magnitude[row] = scale * share[i] * np.sqrt(power) / (r1 * r2)
+
+
+@numba.njit(inline="always")
+def _leg(point, body, unit, rate, accel, row, first):
+    """Distance from a moving body to a point; unit vector towards it; rate and acceleration of the distance, set or added to."""
+    x, y, z = point[0] - body[0, 0], point[1] - body[0, 1], point[2] - body[0, 2]
+    r = np.sqrt(x * x + y * y + z * z)
+    unit[0], unit[1], unit[2] = x / r, y / r, z / r
+    a = -(unit[0] * body[1, 0] + unit[1] * body[1, 1] + unit[2] * body[1, 2])
+    speed = body[1, 0] ** 2 + body[1, 1] ** 2 + body[1, 2] ** 2
+    b = (speed - a * a) / r - (unit[0] * body[2, 0] + unit[1] * body[2, 1] + unit[2] * body[2, 2])
+    if first:
+        rate[row], accel[row] = a, b
+    else:
+        rate[row] += a
+        accel[row] += b
+    return r
