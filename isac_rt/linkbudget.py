@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.arrays import Antennas
-from isac_rt.scenario import Noise
+from isac_rt.scenario import Clutter, Noise
 from isac_rt.waveform import BOLTZMANN, Waveform
 
 
@@ -26,6 +26,11 @@ def noise_power(noise: Noise, waveform: Waveform, reference_amplitude: float) ->
     if noise.model == "snr":
         return reference_amplitude**2 / 10 ** (noise.snr_db / 10)
     return thermal_noise_power(noise, waveform)
+
+
+def noise_rise(clutter: Clutter) -> float:
+    """Power of thermal noise and Gaussian clutter together over the thermal noise's: the sum of two white Gaussian processes is one."""
+    return 1 + 10 ** (clutter.clutter_to_noise_db / 10) if clutter.model == "gaussian" else 1.0
 
 
 @dataclass(frozen=True)

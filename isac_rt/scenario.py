@@ -13,12 +13,12 @@ import re
 from collections.abc import Iterator
 from fractions import Fraction as Rational
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, field_validator, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Field, PrivateAttr, field_validator
 
-Key = tuple[str | int, ...]
+from isac_rt.scenario_base import Finite, Fraction, Key, Node, Positive, Problem, Vector
+from isac_rt.scenario_clutter import Clutter
 
 
 def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> int:
@@ -32,63 +32,6 @@ NEAREST_M = 0.05
 FASTEST_MPS = 200.0
 FARTHEST_M = 1e5
 CARRIERS_HZ = (1e9, 1e12)
-
-
-class Problem(NamedTuple):
-    """Something that cannot stand: the keys that take part in it, the one to name first, and what to say."""
-
-    keys: tuple[Key, ...]
-    text: str
-
-
-def dotted(key: Key) -> str:
-    """swarm.PT1.position_m.2 for ("swarm", "PT1", "position_m", 2)."""
-    return ".".join(map(str, key))
-
-
-def _three_numbers(value: Any) -> Any:
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ValueError("must be three numbers [x, y, z]")
-    return value
-
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Vector = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_three_numbers)]
-
-
-def _holds_bool(value: Any) -> bool:
-    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_holds_bool, value)))
-
-
-class Node(BaseModel):
-    """One mapping of the tree."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _no_truth_for_a_number(cls, value: Any, info: Any) -> Any:
-        if cls.model_fields[info.field_name].annotation is not bool and _holds_bool(value):
-            raise ValueError("true and false do not belong here")
-        return value
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Node:
-        problems = list(self.problems())
-        if problems:
-            text = "; ".join(f"{dotted(p.keys[0])}: {p.text}" for p in problems)
-            raise PydanticCustomError("inconsistent", "{text}", {"text": text, "problems": problems})
-        return self
-
-    def problems(self) -> Iterator[Problem]:
-        """What in this mapping contradicts itself; keys are relative to it."""
-        yield from ()
-
-    def applies(self, name: str) -> bool:
-        """Whether a field means anything beside the values of the others."""
-        return True
 
 
 class MaterialOverride(Node):
@@ -113,7 +56,7 @@ class City(Node):
     up_axis: Literal["y", "z"] = "z"
     scale: Positive = 1.0
     material: str = "concrete"
-    material_map: dict[str, str] = {}
+    material_map: dict[str, str] = Field({})
     # footprints
     coordinates: Literal["auto", "metres", "lonlat"] = "auto"
     height_property: str = "height"
@@ -132,7 +75,7 @@ class City(Node):
     blocks_y: Annotated[int, Field(ge=1, le=100)] = 3
     # all
     keep_radius_m: Positive | None = None
-    materials: dict[str, MaterialOverride] = {}
+    materials: dict[str, MaterialOverride] = Field({})
 
     def applies(self, name: str) -> bool:
         return name in CITY_KEYS[self.source] or name in ("source", "keep_radius_m", "materials")
@@ -209,7 +152,7 @@ class Modulation(Node):
     """Unmodulated frames at the start, from which every terminal acquires."""
     pilot_every_frames: Annotated[int, Field(ge=2)] | None = 25
     """One unmodulated frame in so many, for late and lost terminals; null: none after the start."""
-    streams: dict[str, tuple[Annotated[int, Field(ge=0)], ...]] = {}
+    streams: dict[str, tuple[Annotated[int, Field(ge=0)], ...]] = Field({})
     """Groups that carry data for a passive terminal, by its name; a terminal that is not named reads them all."""
 
 
@@ -315,27 +258,6 @@ class Propagation(Node):
     weakest_path_db: Annotated[float, Field(ge=0)] = 40.0
     """Paths this far below the noise of one range-Doppler-antenna cell are left out."""
     leakage: Leakage = Leakage()
-
-
-class Clutter(Node):
-    """What buildings and ground scatter diffusely.
-
-    field: scatterers pinned to the mesh, the same in all frames and links. diffuse: Sionna's own, traced anew in every frame, which draws
-    the points anew as well; to compare with.
-    """
-
-    model: Literal["none", "diffuse", "field"] = "none"
-    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
-    """Of a diffuse re-trace, per transmitter."""
-    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.03
-    """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m]."""
-    smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
-    """field: cells of this area are cut no further, however near."""
-
-    def applies(self, name: str) -> bool:
-        if name == "rays":
-            return self.model == "diffuse"
-        return name == "model" or self.model == "field"
 
 
 class Noise(Node):

@@ -18,7 +18,8 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from isac_rt.scenario import Key, Node, Problem, Scenario, dotted
+from isac_rt.scenario import Scenario
+from isac_rt.scenario_base import Key, Node, Problem, dotted
 
 MAX_MESSAGES = 10
 MAX_BYTES = 4_000_000

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
-from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, thermal_noise_power, transmit_amplitude
+from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
 from isac_rt.metrics import (
     SensingScore,
     SymbolCount,
@@ -57,10 +57,11 @@ class Setup:
     timetable: Timetable
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
-        """E|n|^2 of a sample at the link's receiver [W]."""
+        """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
+        rise = noise_rise(self.scenario.clutter)
         if self.scenario.noise.model == "link_budget":
-            return thermal_noise_power(self.scenario.noise, self.waveform)
-        return noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
+            return rise * thermal_noise_power(self.scenario.noise, self.waveform)
+        return rise * noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
 
     def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         """Poses and paths of a frame, interference between active terminals included; what is too weak to matter is left out."""

@@ -8,6 +8,7 @@ from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.statistical import RayleighClutter
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose
 from isac_rt.waveform import Waveform
@@ -18,8 +19,10 @@ __all__ = ["FreeSpace", "PathKind", "PathSet", "Propagation", "make_paths", "mak
 class Propagation(Protocol):
     """What simulate needs of a propagation model."""
 
-    dropped: int
-    """Paths left out because float64 geometry contradicts the ray tracer."""
+    @property
+    def dropped(self) -> int:
+        """Paths left out because float64 geometry contradicts the ray tracer."""
+        ...
 
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
         """Paths of every link at the middle of a frame."""
@@ -28,11 +31,15 @@ class Propagation(Protocol):
 
 def make_propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City) -> Propagation:
     """The model that the scenario asks for. `ray_traced` starts the JIT back end."""
-    if scenario.propagation.model == "free_space":
-        return FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed)
-    from isac_rt import runtime
+    free = FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed)
+    model: Propagation = free
+    if scenario.propagation.model == "ray_traced":
+        from isac_rt import runtime
 
-    runtime.activate()
-    from isac_rt.propagation.raytrace import RayTracer
+        runtime.activate()
+        from isac_rt.propagation.raytrace import RayTracer
 
-    return RayTracer(scenario, city, antennas, waveform.wavelength, waveform.carrier_frequency)
+        model = RayTracer(scenario, city, antennas, waveform.wavelength, waveform.carrier_frequency)
+    if scenario.clutter.model == "rayleigh":
+        return RayleighClutter(model, free, scenario.clutter, waveform, antennas, scenario.seed)
+    return model
