@@ -135,7 +135,7 @@ def collided(first_block, modulated, rng, strength=1.0):
         fields = {"pose": STILL, "antennas": antennas, "schedule": schedule, "payload": payload, "first_block": block}
         links.append((Transmission(name="A", **fields), sight(w, length, speed, gain)))
     cube = if_signal(w, links, STILL, antennas, start_time=0.0, filter_transition=SKIRT, method="direct")
-    noise = np.sqrt(0.05) * rng.standard_normal((*cube.samples.shape, 2), np.float32).view(np.complex64)[..., 0]
+    noise = np.float32(np.sqrt(0.05)) * rng.standard_normal((*cube.samples.shape, 2), np.float32).view(np.complex64)[..., 0]
     cube.samples[:] += noise
     known = Prediction(
         range=np.array([43.817]),
