@@ -21,7 +21,7 @@ UNIT = 1e-6 * np.sqrt(2)
 could go either way after the city has been recentred and shifted back."""
 ALIKE = 1e-9
 """Edges whose lengths differ by less than this share are equally long; then the first is halved."""
-MOST_CELLS = 20_000_000
+MOST_CELLS = 8_000_000
 
 
 @dataclass(frozen=True)

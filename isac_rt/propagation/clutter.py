@@ -96,7 +96,7 @@ class ClutterField:
     """The scatterers of one run. All links and frames see the same ones; `plan` makes it from a scenario."""
 
     def __init__(self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int) -> None:
-        self._city, self._sight = city, sight
+        self._city, self.sight = city, sight
         self.cells = cells
         self.num_candidates = num_candidates
         """Cells of the whole city, those that are never in sight included."""
@@ -124,13 +124,13 @@ class ClutterField:
     @property
     def nbytes(self) -> int:
         """Of the scatterers and of what is remembered of their sight."""
-        return sum(a.nbytes for a in vars(self.cells).values()) + self._sight.nbytes
+        return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
 
     def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float) -> Seen:
         """What is in sight of both ends of a link, poses in local coordinates."""
-        share = self._sight.share(tx, start, time)
+        share = self.sight.share(tx, start, time)
         if tx != rx:
-            share = share * self._sight.share(rx, end, time)
+            share = share * self.sight.share(rx, end, time)
         index = np.flatnonzero(share)
         count = index.size
         out = [np.empty(count) for _ in range(6)] + [np.empty((count, 3)) for _ in range(2)]
