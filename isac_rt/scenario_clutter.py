@@ -44,7 +44,7 @@ class Clutter(Node):
     """rayleigh: how often number, centre, places, directions and amplitudes are drawn."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
     """diffuse: rays of a re-trace, per transmitter."""
-    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.015
+    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.024
     """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m]."""
     smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
     """field: cells of this area are cut no further, however near."""
