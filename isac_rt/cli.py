@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _run(loaded: Scenario, folder: Path) -> None:
         setup = simulate.prepare(loaded)
         budget = simulate.link_budgets(setup)
     _print_budget(budget)
-    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report), loaded.frames)
+    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report), "frames", loaded.frames)
     save(results, folder)
     with _err().status("figures and report"):
         from isac_rt.figures import make_figures
@@ -141,6 +142,49 @@ def view(
 
 
 @app.command()
+def reproduce(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Tables, figures and claims; none: list them.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller samples: at most 2 minutes each on 2 cores.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where the files go; default runs/reproduction/NAME.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")] = 20260,
+) -> None:
+    """Run the paper's tables, figures and claims again and judge them."""
+    from isac_rt.experiments import TITLES
+    from isac_rt.experiments import names as experiments
+
+    if not names:
+        table = _table("name", "what it shows", justify="left")
+        for name in experiments():
+            table.add_row(name, TITLES[name])
+        _out().print(table)
+        return
+    if unknown := [name for name in names if name not in experiments()]:
+        raise InputProblem(f"{', '.join(unknown)}: no such table or figure; choose from {', '.join(experiments())}")
+    for name in dict.fromkeys(names):
+        folder = out if out is not None else Path("runs") / "reproduction" / name
+        with _ending_soon_after_interrupt(folder):
+            _reproduce(name, folder, quick, seed)
+
+
+def _reproduce(name: str, folder: Path, quick: bool, seed: int) -> None:
+    from isac_rt.results import check_folder
+
+    check_folder(folder)
+    from isac_rt.experiments import experiment
+    from isac_rt.experiments.outcome import write
+
+    outcome = _with_progress(lambda report: experiment(name)(quick, seed, report), name)
+    files = write(outcome, folder)
+    table = _table(name, "verdict", "finding", justify="left")
+    table.columns[0].no_wrap = False
+    colours = {"holds": "green", "holds under a condition": "yellow", "does not hold": "red"}
+    for v in outcome.verdicts:
+        table.add_row(v.claim, f"[{colours[v.verdict]}]{v.verdict}[/]", escape(v.finding))
+    _out().print(table)
+    _out().print(f"in {folder}: {', '.join(file.name for file in files)}", soft_wrap=True)
+
+
+@app.command()
 def doctor() -> None:
     """Back end, LLVM, memory, threads, and what to install."""
     from isac_rt.runtime import doctor as look
@@ -169,13 +213,13 @@ def _check_frame(scenario: Scenario, frame: int) -> None:
         raise InputProblem(f"--frame {frame}: {scenario.name} has frames 0 to {scenario.frames - 1}; choose one of these or set frames higher")
 
 
-def _with_progress(work: Any, frames: int) -> Results:
+def _with_progress(work: Any, what: str, steps: int | None = None) -> Any:
     """Do `work(report)` with a bar on stderr; `report(done, total)` moves it."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=_err()) as bar:
-        task = bar.add_task("frames", total=frames)
+        task = bar.add_task(what, total=steps)
         return work(lambda done, total: bar.update(task, completed=done, total=total))
 
 
