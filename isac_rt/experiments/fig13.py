@@ -57,7 +57,7 @@ def _figure(table: pd.DataFrame):
             for reading in READINGS:
                 part = table[(table.D == order) & (table["T"] == reading)]
                 ax.plot(part.L_tx, part.rate_kbps, _DASHES[reading] + _MARKS[order], color=f"C{i}", label=f"D = {order}, T = {reading}")
-        ax.set(xlabel="number of transmit antennas $L_{tx}$ (groups $M = L_{tx}$)", ylabel="bit rate [kbit/s]", xlim=(1, 6), ylim=(0, None))
+        ax.set(xlabel="number of transmit antennas $L_{tx}$ (groups $M = L_{tx}$)", ylabel="bit rate [kbit/s]", xlim=(1, 6), ylim=(0, 2450))
         ax.legend(fontsize=6.2, ncols=2, loc="upper left")
     return figure
 

@@ -20,7 +20,7 @@ Judgement = Literal["holds", "holds under a condition", "does not hold"]
 Progress = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
 
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "figure.dpi": 130, "figure.constrained_layout.use": True, "font.size": 9, "axes.grid": True, "grid.color": "#D8D8D8",
     "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.titlesize": 9.5, "legend.fontsize": 8, "lines.linewidth": 1.4,
     "lines.markersize": 4.5,
