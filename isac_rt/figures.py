@@ -194,7 +194,7 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
     for o, terminal in enumerate(dataset.observer.values):
         for group, dash in (("detected", "--"), ("tracked", "-")):
             e = np.abs(errors_of(dataset, group, name)[:, o]).ravel() * scale
-            e = np.sort(e[np.isfinite(e) & (dataset[f"truth_range"].values[:, o].ravel() > 0)])
+            e = np.sort(e[np.isfinite(e) & (dataset["truth_range"].values[:, o].ravel() > 0)])
             if e.size:
                 ax.plot(np.maximum(e, 1e-9), np.arange(1, e.size + 1) / e.size, dash, color=UAV_COLOURS[o % len(UAV_COLOURS)],
                         label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})")  # fmt: skip

@@ -266,7 +266,8 @@ def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolC
     """One terminal's (or link's) figures under the fixed keys of `summary.json`; null where one does not apply.
 
     `bits` are the payload bits that were decoded, right or wrong; `bit_rate_bps` is these over `duration` [s], the time from
-    the first frame to the end of the last, pauses and pilots included. `ber` counts undecoded bits as errors.
+    the first frame to the end of the last, pauses and pilots included. `ber` counts undecoded bits as errors. `counts` holds
+    numerator and denominator of the rates, for pooling and for intervals.
     """
     c = symbols or SymbolCount()
     receives = symbols is not None
@@ -289,6 +290,12 @@ def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolC
         "clutter_per_frame": share(sensing.clutter, sensing.frames),
         "rmse": sensing.detection_errors.rmse(),
         "rmse_tracked": sensing.track_errors.rmse(),
+        "counts": {
+            "ser_delay": [c.delay_errors, c.delay_total],
+            "ser_dpsk": [c.dpsk_errors, c.dpsk_total],
+            "ber": [c.bit_errors, c.bits_total],
+            "hit_rate": [sensing.hits, sensing.target_frames],
+        },
     }
 
 

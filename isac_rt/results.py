@@ -7,11 +7,8 @@ clock of the machine is in the dataset, so two runs of one scenario give bit-ide
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
-import platform
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +19,7 @@ import xarray as xr
 
 from isac_rt.metrics import SensingScore, SymbolCount, pool, summary_block
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.provenance import provenance, versions
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_file import to_yaml
@@ -35,7 +33,6 @@ MEASURES = {"range": ("m", "range_m"), "velocity": ("m s-1", "velocity_mps"), "a
             "elevation": ("rad", "elevation_deg")}  # fmt: skip
 """What is estimated of a UAV: unit inside, key in the summary."""
 TIMINGS = ("setup", "trace", "synthesis", "receive", "track", "total")
-PACKAGES = ("isac_rt", "numpy", "scipy", "numba", "drjit", "mitsuba", "sionna-rt", "trimesh", "xarray", "h5netcdf", "pydantic")
 FILE = "results.nc"
 
 
@@ -230,44 +227,6 @@ def errors_of(dataset: xr.Dataset, group: str, name: str) -> np.ndarray:
     """"detected" or "tracked" value less the truth (frame, observer, uav), NaN where none; angles [rad] wrapped to (-pi, pi]."""
     e = (dataset[f"{group}_{name}"] - dataset[f"truth_{name}"]).values
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
-
-
-def versions() -> dict[str, str]:
-    """Python's version and that of every package that a result depends on."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def commit() -> str:
-    """Commit of the checkout that this package lies in, with ``+changes`` where it was edited; "" outside a checkout."""
-    folder = Path(__file__).resolve().parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # an installed copy may lie inside somebody else's checkout
-        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--", ".") else "")
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-def provenance(scenario: Scenario) -> dict[str, str | int]:
-    """Attributes that say where a file comes from: scenario, seed, versions, commit, platform."""
-    return {
-        "title": f"isac_rt: {scenario.name}",
-        "scenario": to_yaml(scenario),
-        "seed": scenario.seed,
-        "versions": json.dumps(versions()),
-        "commit": commit(),
-        "platform": f"{platform.system()} {platform.machine()}",
-        "Conventions": "CF-1.11",
-    }
 
 
 _DIMENSIONLESS = "1"

@@ -21,6 +21,8 @@ from pydantic import BaseModel, ValidationError
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_base import Key, Node, Problem, dotted
 
+Tree = typing.TypeVar("Tree", bound=Node)
+
 MAX_MESSAGES = 10
 MAX_BYTES = 4_000_000
 MAX_NODES = 200_000
@@ -250,9 +252,9 @@ def _models_in(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
     return None, False
 
 
-def _names_allowed(key: Key) -> list[str]:
-    """Keys that the tree knows in the mapping at `key`."""
-    model: type[BaseModel] = Scenario
+def _names_allowed(root: type[BaseModel], key: Key) -> list[str]:
+    """Keys that a tree of class `root` knows in the mapping at `key`."""
+    model = root
     parts = iter(key)
     for part in parts:
         inner, keyed = _models_in(model.model_fields[str(part)].annotation)
@@ -267,8 +269,8 @@ def _names_allowed(key: Key) -> list[str]:
 class _Complaints:
     """Turns what is wrong with a tree into lines that say where."""
 
-    def __init__(self, path: Path, data: Any, places: dict[Key, str | int]) -> None:
-        self._path, self._data, self._places = path, data, places
+    def __init__(self, root: type[Node], path: Path, data: Any, places: dict[Key, str | int]) -> None:
+        self._root, self._path, self._data, self._places = root, path, data, places
 
     def line(self, keys: Sequence[Key], text: str) -> str:
         """One complaint. The first key is named; the place is that of an option if one set any of the keys, else of the
@@ -304,7 +306,7 @@ class _Complaints:
     def _standard(self, key: Key, found: Any) -> str:
         kind = found["type"]
         if kind == "extra_forbidden":
-            allowed = _names_allowed(key[:-1])
+            allowed = _names_allowed(self._root, key[:-1])
             near = difflib.get_close_matches(str(key[-1]), allowed, n=1, cutoff=0.6)
             guess = f"did you mean {near[0]}? " if near else ""
             return self.line([key], f"unknown key; {guess}allowed here: {', '.join(allowed)}")
@@ -313,7 +315,7 @@ class _Complaints:
         if kind == "missing":
             return self.line([key], "missing, and it has no default; add it")
         if kind in ("model_type", "model_attributes_type", "dict_type"):
-            allowed = _names_allowed(key)
+            allowed = _names_allowed(self._root, key)
             return self.line([key], f"must be a mapping{' with keys out of ' + ', '.join(allowed) if allowed else ''}")
         if kind == "value_error":
             return self.line([key], str(found["ctx"]["error"]))
@@ -360,18 +362,7 @@ def load(path: str | os.PathLike[str], overrides: Iterable[str] = (), frames: in
         About values that look as if their unit were another.
     """
     path = Path(path)
-    text = _text_of(path)
-    reader = _Reader(None)
-    try:
-        data = _parse(text, reader)
-    except yaml.YAMLError as error:
-        line, said = _yaml_complaint(error, text)
-        raise ScenarioError(f"{path}{f':{line}' if line else ''}: {said}") from None
-    if data is None:
-        raise ScenarioError(f"{path}: is empty; a scenario needs at least a swarm")
-    if not isinstance(data, dict):
-        raise ScenarioError(f"{path}:{reader.places[()]}: must be a mapping of keys such as swarm and radio, not {_shown(data)}")
-    places = reader.places
+    data, places = read_tree(path, "a scenario needs at least a swarm")
     for override in overrides:
         _apply_override(data, places, override)
     for name, value in (("frames", frames), ("seed", seed)):
@@ -381,13 +372,50 @@ def load(path: str | os.PathLike[str], overrides: Iterable[str] = (), frames: in
     return _checked(path, data, places)
 
 
-def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> Scenario:
-    complaints = _Complaints(path, data, places)
+def read_tree(path: Path, needs: str) -> tuple[dict[str, Any], dict[Key, str | int]]:
+    """The mapping that a YAML file holds, and the line of each of its keys; `needs` is what to say of an empty file.
+
+    Raises
+    ------
+    ScenarioError
+    """
+    text = _text_of(path)
+    reader = _Reader(None)
     try:
-        scenario = Scenario.model_validate(data).in_folder(path.parent)
+        data = _parse(text, reader)
+    except yaml.YAMLError as error:
+        line, said = _yaml_complaint(error, text)
+        raise ScenarioError(f"{path}{f':{line}' if line else ''}: {said}") from None
+    if data is None:
+        raise ScenarioError(f"{path}: is empty; {needs}")
+    if not isinstance(data, dict):
+        raise ScenarioError(f"{path}:{reader.places[()]}: must be a mapping of keys ({needs}), not {_shown(data)}")
+    return data, reader.places
+
+
+def check_tree(root: type[Tree], path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> Tree:
+    """The mapping of a file as a tree of class `root`.
+
+    Raises
+    ------
+    ScenarioError
+        With one line per problem.
+    """
+    try:
+        return root.model_validate(data)
     except ValidationError as error:
-        _refuse(complaints.of(error))
+        _refuse(_Complaints(root, path, data, places).of(error))
         raise
+
+
+def complain(root: type[Node], path: Path, data: dict[str, Any], places: dict[Key, str | int], problem: Problem) -> ScenarioError:
+    """A problem found outside the tree's own checks, with the line of its key."""
+    return ScenarioError(_Complaints(root, path, data, places).problem(problem))
+
+
+def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> Scenario:
+    scenario = check_tree(Scenario, path, data, places).in_folder(path.parent)
+    complaints = _Complaints(Scenario, path, data, places)
     if scenario.city is not None and scenario.city.file is not None and not scenario.city_path().is_file():
         said = f"no such file in {path.parent}; the path is relative to the scenario's folder"
         raise ScenarioError(complaints.line([("city", "file")], said))
@@ -396,18 +424,18 @@ def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> 
     return scenario
 
 
-def _plain(value: Any) -> Any:
+def plain_tree(value: Any) -> Any:
     """A tree as lists, mappings and numbers, without the keys that have no meaning beside the others."""
     if isinstance(value, Node):
         fields = type(value).model_fields
         return {
-            name: _plain(item)
+            name: plain_tree(item)
             for name, item in value
             if value.applies(name) and not (item is None and fields[name].default is None)
         }
     if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+        return {name: plain_tree(item) for name, item in value.items()}
+    return [plain_tree(item) for item in value] if isinstance(value, tuple) else value
 
 
 class _Dumper(yaml.SafeDumper):
@@ -450,7 +478,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     -------
     text : str
     """
-    data = _plain(scenario)
+    data = plain_tree(scenario)
     if folder is not None and scenario.city is not None and scenario.city.file is not None:
         data["city"]["file"] = os.path.relpath(scenario.city_path(), folder)
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -27,7 +29,9 @@ from isac_rt.metrics import (
     truth_of,
 )
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
+from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.propagation.pathset import drop_weak
+from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import Reception
 from isac_rt.results import TIMINGS, FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
@@ -123,8 +127,8 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
     return rows
 
 
-def prepare(scenario: Scenario) -> Setup:
-    """Load and build everything that frames share."""
+def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
+    """Load and build everything that frames share. With a `store` traced paths are looked up there first and kept there."""
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
     swarm = Swarm.from_scenario(scenario)
@@ -140,10 +144,29 @@ def prepare(scenario: Scenario) -> Setup:
         schedule,
         swarm,
         city,
-        make_propagation(scenario, waveform, antennas, city),
+        _propagation(scenario, waveform, antennas, city, store),
         FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
         Timetable(scenario, waveform, schedule),
     )
+
+
+UNSEEN_BY_PATHS = ("name", "modulation", "noise", "receivers", "tracking")
+"""Parts of a scenario on which its paths do not depend."""
+
+
+def path_content(scenario: Scenario) -> str:
+    """All that a scenario's paths depend on, but the instant, as text; the city's file by its content."""
+    tree = {key: value for key, value in scenario.model_dump(mode="json").items() if key not in UNSEEN_BY_PATHS}
+    file = ""
+    if scenario.city is not None and scenario.city.file is not None:
+        file = hashlib.sha256(scenario.city_path().read_bytes()).hexdigest()
+    return json.dumps([tree, file, program_fingerprint()], sort_keys=True)
+
+
+def _propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, store: PathStore | None) -> Propagation:
+    if store is None or scenario.propagation.model == "free_space":
+        return make_propagation(scenario, waveform, antennas, city)
+    return CachedPropagation(lambda: make_propagation(scenario, waveform, antennas, city), store, path_content(scenario))
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
@@ -205,7 +228,9 @@ class _Observer:
             return _Heard(reception, tracks, int(self.terminal.state))
 
 
-def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None) -> Results:
+def run(
+    scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None, threads: int | None = None
+) -> Results:
     """Simulate every frame of a scenario.
 
     Parameters
@@ -213,13 +238,14 @@ def run(scenario: Scenario, *, progress: Progress | None = None, setup: Setup | 
     scenario : Scenario
     progress : called with the frames done and the frames in all
     setup : from `prepare`, if it is there already
+    threads : receivers at work at once; None: as many as the machine has cores
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
     clock, begin = _Clock(), time.perf_counter()
-    with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
+    with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
         with clock.stage("setup"):
             setup = setup or prepare(scenario)
             timetable = setup.timetable

@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).parent.parent / "isac_rt"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # a module may import those before it
 ORDER = (
-    "scenario_base scenario_clutter scenario scenario_file runtime randomness waveform arrays payload timetable city swarm linkbudget propagation synthesis gridding "
+    "scenario_base scenario_clutter scenario scenario_file provenance runtime randomness waveform arrays payload timetable city swarm "
+    "linkbudget propagation synthesis gridding "
     "noise ifsignal receive tracking terminal baselines access metrics fidelity results simulate sweep experiments validation "
     "bench figures render report cli"
 ).split()

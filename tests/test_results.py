@@ -10,14 +10,14 @@ import pytest
 import xarray as xr
 from fake_run import TIMING, fake_recorder, fake_records, fake_run, fake_scenario
 
-from isac_rt import results as module
+from isac_rt import provenance
 from isac_rt.arrays import antennas_of
 from isac_rt.metrics import SensingScore, resolutions
 from isac_rt.results import KINDS, ResultsError, check_folder, errors_of, load, save, write_ledger
 from isac_rt.scenario_file import to_yaml
 from isac_rt.waveform import waveform_of
 
-TERMINAL_KEYS = {"role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased", "matched",
+TERMINAL_KEYS = {"counts", "role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased", "matched",
                  "matched_tracked", "false_per_frame", "clutter_per_frame"}  # fmt: skip
 RMSE_KEYS = {"range_m", "velocity_mps", "azimuth_deg", "elevation_deg"}
 ROUNDING = 1e-12
@@ -183,6 +183,6 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
 
 
 def test_commit_is_of_the_package_not_of_the_current_folder(tmp_path, monkeypatch):
-    here = module.commit()
+    here = provenance.commit()
     monkeypatch.chdir(tmp_path)
-    assert module.commit() == here
+    assert provenance.commit() == here

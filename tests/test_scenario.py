@@ -99,7 +99,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         ("swarm: {}\n", "no UAV has the role active"),
         ("", "s.yaml: is empty; a scenario needs at least a swarm"),
         ("# nothing\n", "s.yaml: is empty"),
-        ("- 1\n", "s.yaml:1: must be a mapping of keys such as swarm and radio"),
+        ("- 1\n", "s.yaml:1: must be a mapping of keys (a scenario needs at least a swarm)"),
         ("a: [1\n", "s.yaml:2: expected ',' or ']'"),
         ("a:\n\tb: 1\n", "s.yaml:2: a tab stands where YAML wants spaces; indent with spaces"),
         (b"a: 1\nb: \xff\n", "s.yaml:2: byte 0xff is not UTF-8; save the file as UTF-8"),

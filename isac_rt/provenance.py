@@ -1,0 +1,70 @@
+"""Where a result comes from: scenario, versions, commit, platform."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+import subprocess
+from functools import lru_cache
+from pathlib import Path
+
+from isac_rt.scenario import Scenario
+from isac_rt.scenario_file import to_yaml
+
+PACKAGES = ("isac_rt", "numpy", "scipy", "numba", "drjit", "mitsuba", "sionna-rt", "trimesh", "xarray", "h5netcdf", "pydantic")
+
+
+@lru_cache(maxsize=1)
+def program_fingerprint() -> str:
+    """Version of this package and a digest of its source: two runs with the same one were made by the same program."""
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parent
+    for file in sorted(package.rglob("*.py")):
+        digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes() + b"\0")
+    return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Python's version and that of every package that a result depends on."""
+    return dict(_versions())
+
+
+@lru_cache(maxsize=1)
+def commit() -> str:
+    """Commit of the checkout that this package lies in, with ``+changes`` where it was edited; "" outside a checkout."""
+    folder = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # an installed copy may lie inside somebody else's checkout
+        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--", ".") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def provenance(scenario: Scenario) -> dict[str, str | int]:
+    """Attributes that say where a file comes from: scenario, seed, versions, commit, platform."""
+    return {
+        "title": f"isac_rt: {scenario.name}",
+        "scenario": to_yaml(scenario),
+        "seed": scenario.seed,
+        "versions": json.dumps(versions()),
+        "commit": commit(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "Conventions": "CF-1.11",
+    }

@@ -1,0 +1,290 @@
+"""What a sweep is: a base scenario, axes, repetitions; its points and the key under which each is kept."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError, field_validator
+
+from isac_rt.provenance import program_fingerprint
+from isac_rt.randomness import seed_sequence
+from isac_rt.scenario import Key, Node, Problem, Scenario, dotted
+from isac_rt.scenario_file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
+
+MAX_POINTS = 100_000
+"""More points than this are taken for a slip unless asked for."""
+OWN_DIMENSIONS = ("link", "repetition", "kind")
+"""Dimensions of the results that an axis cannot be named after."""
+
+
+class _Free(Node):
+    """A node whose values are any that a scenario may have."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, value: Any, info: Any) -> Any:
+        return value
+
+
+class Axis(_Free):
+    """One axis: `key` and its `values`; or `zip`, several keys that change together; or `list`, named sets of keys."""
+
+    key: str | None = None
+    values: tuple[Any, ...] | None = None
+    zip: dict[str, tuple[Any, ...]] | None = None
+    list: dict[str, dict[str, Any]] | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        given = [n for n, v in (("key", self.key), ("zip", self.zip), ("list", self.list)) if v is not None]
+        if len(given) != 1 or (self.values is not None) != (given == ["key"]):
+            yield Problem(((given[0] if given else "key",),), "an axis has either key and values, or zip, or list; keep one of these")
+        elif not self.size:
+            yield Problem(((given[0],),), "has no entry; give it one value or more")
+        elif self.zip is not None and len({len(v) for v in self.zip.values()}) > 1:
+            lengths = ", ".join(f"{k}: {len(v)}" for k, v in self.zip.items())
+            yield Problem((("zip",),), f"the keys that change together have different numbers of values ({lengths}); make them alike")
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        if self.zip is not None:
+            return len(next(iter(self.zip.values()), ()))
+        return len(self.list or self.values or ())
+
+    @property
+    def keys(self) -> set[str]:
+        """Keys of the scenario that the axis sets."""
+        if self.list is not None:
+            return {key for entry in self.list.values() for key in entry}
+        return set(self.zip) if self.zip is not None else {str(self.key)}
+
+    def entry(self, index: int) -> dict[str, Any]:
+        """What the axis sets at one of its entries."""
+        if self.list is not None:
+            return next(itertools.islice(self.list.values(), index, None))
+        if self.zip is not None:
+            return {key: values[index] for key, values in self.zip.items()}
+        assert self.values is not None
+        return {str(self.key): self.values[index]}
+
+    def labels(self) -> list[float] | list[int] | list[str]:
+        """The coordinate along the axis: the numbers of its key (the first of a zip), else words."""
+        if self.list is not None:
+            return [*self.list]
+        values = self.values if self.values is not None else next(iter((self.zip or {}).values()))
+        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+            return [*values]
+        return [v if isinstance(v, str) else json.dumps(v) for v in values]
+
+
+class Figure(_Free):
+    """A picture of one quantity against an axis, a curve for each entry of another."""
+
+    quantity: str
+    against: str
+    by: str | None = None
+
+
+class Sweep(_Free):
+    """A sweep file."""
+
+    name: str = "sweep"
+    scenario: str
+    """The base scenario, a path relative to the sweep's file."""
+    set: dict[str, Any] = {}
+    """Keys of the base scenario to replace in all points."""
+    axes: dict[str, Axis]
+    """By name; every combination of their entries is a point."""
+    repetitions: Annotated[int, Field(ge=1)] = 1
+    """Runs of each point, with seeds spawned from `seed`; all points of one repetition have the same seed."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    keep: tuple[str, ...] = ("*",)
+    """Names of the quantities in the dataset, with wildcards, such as ser_* or rmse_range_m."""
+    figures: tuple[Figure, ...] = ()
+
+    def problems(self) -> Iterator[Problem]:
+        if not self.axes:
+            yield Problem((("axes",),), "has no axis; for a single scenario use isac-rt run")
+        for name in self.axes:
+            if name in OWN_DIMENSIONS or not name.isidentifier():
+                said = f"an axis's name must be a word other than {', '.join(OWN_DIMENSIONS)}; rename it"
+                yield Problem((("axes", name),), said)
+        every: list[tuple[Key, str]] = [(("set", key), key) for key in self.set]
+        every += [(("axes", name), key) for name, axis in self.axes.items() for key in sorted(axis.keys)]
+        every += [(("seed",), "seed")]
+        for (here, a), (there, b) in itertools.combinations(every, 2):
+            if here != there and (a == b or a.startswith(f"{b}.") or b.startswith(f"{a}.")):
+                first = "repetitions set it" if there == ("seed",) else f"{dotted(there)} sets {b} too"
+                yield Problem((here, there), f"sets {a}, but {first}; set each key in one place")
+        for i, figure in enumerate(self.figures):
+            for end in ("against", "by"):
+                axis = getattr(figure, end)
+                if axis is not None and axis not in self.axes:
+                    yield Problem((("figures", i, end), ("axes",)), f"is no axis of this sweep; the axes are {', '.join(self.axes)}")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Entries of every axis, repetitions last."""
+        return (*(axis.size for axis in self.axes.values()), self.repetitions)
+
+    @property
+    def num_points(self) -> int:
+        return math.prod(self.shape)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run of a sweep.
+
+    Attributes
+    ----------
+    index : along every axis and the repetitions
+    tree : its scenario as plain values, without the name
+    key : digest of the tree, the city's file and the program; under it the outcome is kept
+    paths_key : digest of what its paths depend on, None where they are not traced: points with the same one share them
+    """
+
+    index: tuple[int, ...]
+    tree: dict[str, Any]
+    key: str
+    paths_key: str | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep with its base scenario, ready to be run: what `load_sweep` gives."""
+
+    sweep: Sweep
+    base: Scenario
+
+    def points(self) -> Iterator[Point]:
+        """All points in order, made one by one: a million of them need no memory."""
+        tree = plain_tree(self.base)
+        tree.pop("name")
+        for index in itertools.product(*(range(n) for n in self.sweep.shape)):
+            here = copy.deepcopy(tree)
+            for axis, i in zip(self.sweep.axes.values(), index[:-1], strict=True):
+                for key, value in axis.entry(i).items():
+                    put(here, key, value)
+            here["seed"] = self.seed(index[-1])
+            yield Point(index, here, self.key_of(here), self._paths_key(here))
+
+    def seed(self, repetition: int) -> int:
+        """The scenario's seed in a repetition."""
+        return int(seed_sequence(self.sweep.seed, "repetition", repetition).generate_state(1)[0])
+
+    def key_of(self, tree: dict[str, Any]) -> str:
+        """Under which a point is kept."""
+        return _digest([tree, self._city_file(tree), program_fingerprint()])
+
+    def _paths_key(self, tree: dict[str, Any]) -> str | None:
+        if (tree.get("propagation") or {}).get("model") != "ray_traced":
+            return None
+        unseen = ("modulation", "noise", "receivers", "tracking")
+        return _digest([{k: v for k, v in tree.items() if k not in unseen}, self._city_file(tree)])
+
+    def _city_file(self, tree: dict[str, Any]) -> str:
+        city = tree.get("city") or {}
+        file = city.get("file") if isinstance(city, dict) else None
+        return "" if file is None else _file_digest(self.base.folder / str(file))
+
+
+def put(tree: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key, making the mappings on its way; numbers index lists."""
+    *way, last = key.split(".")
+    here: Any = tree
+    for name in way:
+        if isinstance(here, list):
+            here = here[int(name)]
+        else:
+            if here.get(name) is None:
+                here[name] = {}
+            here = here[name]
+    if isinstance(here, list):
+        here[int(last)] = value
+    else:
+        here[last] = value
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+
+
+@lru_cache(maxsize=64)
+def _file_digest(file: Path) -> str:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return ""  # the point's own check says that it is missing
+
+
+def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
+    """Read and check a sweep: every entry of every axis is tried on the base scenario before anything runs.
+
+    Parameters
+    ----------
+    path : of the sweep's YAML file
+    max_points : refuse more points than these
+
+    Raises
+    ------
+    ScenarioError
+        One line per problem, with the place in the file.
+    """
+    path = Path(path)
+    data, places = read_tree(path, "a sweep needs a scenario and axes")
+    sweep = check_tree(Sweep, path, data, places)
+
+    def refuse(key: Key, text: str) -> ScenarioError:
+        return complain(Sweep, path, data, places, Problem((key,), text))
+
+    if sweep.num_points > max_points:
+        factors = " x ".join(f"{n} {name}" for name, n in zip([*sweep.axes, "repetitions"], sweep.shape, strict=True))
+        said = f"{factors} are {sweep.num_points:,} points, more than {max_points:,}; shorten the axes or raise --max-points"
+        raise refuse(("axes",), said)
+    file = path.parent / sweep.scenario
+    try:
+        base = load(file, _options(sweep.set))
+    except ScenarioError as error:
+        raise refuse(("set",) if sweep.set and file.is_file() else ("scenario",), f"the base scenario cannot be used: {error}") from None
+    base = base.in_folder(file.parent.resolve())
+    tree = plain_tree(base)
+    for name, axis in sweep.axes.items():
+        for i in range(axis.size):
+            _try(tree, axis.entry(i), lambda text, n=name, j=i: refuse(("axes", n), f"entry {j} of {n} {text}"))
+    return Plan(sweep, base)
+
+
+def _options(values: dict[str, Any]) -> list[str]:
+    return [f"{key}={json.dumps(value)}" for key, value in values.items()]
+
+
+def _try(tree: dict[str, Any], entry: dict[str, Any], refuse: Any) -> None:
+    """Check one entry of an axis alone on the base scenario.
+
+    What depends on the other axes too is left to the points: a combination that cannot be is recorded as a failed point.
+    """
+    here = copy.deepcopy(tree)
+    shown = ", ".join(f"{key} = {json.dumps(value)}" for key, value in entry.items())
+    try:
+        for key, value in entry.items():
+            put(here, key, value)
+        Scenario.model_validate(here)
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        if not isinstance(error, ValidationError):
+            raise refuse(f"({shown}): the scenario has no such place; check the key") from None
+        first = error.errors()[0]
+        if first["type"] == "inconsistent":
+            return
+        where = dotted(first["loc"])
+        words = "unknown key" if first["type"] == "extra_forbidden" else first["msg"].replace("Input should be", "must be")
+        raise refuse(f"({shown}): {where}: {words}") from None

@@ -1,0 +1,213 @@
+"""Outcomes of a sweep's points on disk, and the labelled dataset that is made of them.
+
+A point's file holds the summary of its run, or its error. It appears whole or not at all, under the digest of the point's content;
+so the files are the only state of a sweep: what is there is done, whoever did it.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from isac_rt.metrics import binomial_interval
+from isac_rt.provenance import commit, program_fingerprint, versions
+from isac_rt.results import ResultsError, write_bytes, write_text
+from isac_rt.scenario import Scenario
+from isac_rt.scenario_file import plain_tree
+from isac_rt.sweep.definition import Plan, Sweep
+
+FILE, DEFINITION = "sweep.nc", "sweep.json"
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """The folder of a sweep."""
+
+    folder: Path
+
+    def file(self, key: str) -> Path:
+        """Of a point; 256 folders keep each of them short."""
+        return self.folder / "points" / key[:2] / f"{key}.json"
+
+    def read(self, key: str) -> dict[str, Any] | None:
+        """A point's outcome, None where there is none yet."""
+        try:
+            return json.loads(self.file(key).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+
+    def write(self, key: str, outcome: dict[str, Any]) -> None:
+        write_text(self.file(key), json.dumps(outcome, allow_nan=False) + "\n")
+
+    def done(self, key: str, retry_failed: bool) -> bool:
+        """Whether a point needs no run: it succeeded, or it failed and is not to be tried again."""
+        if not self.file(key).is_file():
+            return False
+        return not retry_failed or (self.read(key) or {}).get("status") == "done"
+
+    def save_definition(self, plan: Plan) -> None:
+        """Keep the sweep and its base scenario beside the outcomes, so that the folder can be read alone."""
+        tree = {"sweep": plan.sweep.model_dump(mode="json"), "base": plain_tree(plan.base), "folder": str(plan.base.folder)}
+        write_text(self.folder / DEFINITION, json.dumps(tree, indent=1) + "\n")
+
+    def definition(self) -> Plan:
+        """The sweep that this folder belongs to.
+
+        Raises
+        ------
+        ResultsError  If it is the folder of no sweep.
+        """
+        try:
+            tree = json.loads((self.folder / DEFINITION).read_text(encoding="utf-8"))
+            return Plan(Sweep.model_validate(tree["sweep"]), Scenario.model_validate(tree["base"]).in_folder(Path(tree["folder"])))
+        except (OSError, ValueError, KeyError) as problem:
+            raise ResultsError(f"{self.folder} holds no sweep ({problem}); give the folder that `isac-rt sweep` wrote") from problem
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a sweep is: counts of points, and the errors of those that failed (index along the axes, message)."""
+
+    total: int
+    done: int
+    failed: int
+    errors: list[tuple[tuple[int, ...], str]]
+
+
+def status(folder: Path | str) -> Status:
+    """Count the outcomes in a sweep's folder; at most 20 errors are kept."""
+    outcomes = Outcomes(Path(folder))
+    plan = outcomes.definition()
+    done, failed, errors = 0, 0, []
+    for point in plan.points():
+        outcome = outcomes.read(point.key)
+        if outcome is None:
+            continue
+        if outcome["status"] == "done":
+            done += 1
+        else:
+            failed += 1
+            if len(errors) < 20:
+                errors.append((point.index, outcome["error"]))
+    return Status(plan.sweep.num_points, done, failed, errors)
+
+
+def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Numbers of a nested mapping by their names joined with _; null is NaN; words and lists are left out."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat_numbers(value, f"{prefix}{key}_")
+        elif value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+            yield f"{prefix}{key}", np.nan if value is None else float(value)
+
+
+class _Table:
+    """Arrays that grow by name as the points come in; a missing value is NaN."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        self.links: list[str] = []
+        self.values: dict[str, dict[str, np.ndarray]] = {}
+
+    def put(self, name: str, column: str, index: tuple[int, ...], value: float) -> None:
+        columns = self.values.setdefault(name, {})
+        if column not in columns:
+            columns[column] = np.full(self.shape, np.nan)
+        columns[column][index] = value
+
+
+def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
+    """All outcomes so far as one dataset.
+
+    Returns
+    -------
+    dataset : over the axes, ``repetition`` and ``link``: the kept quantities of each link, NaN where a point is not done or does not
+        apply; without ``repetition`` the rates pooled over the repetitions (``NAME_pooled``) with the 95 % Clopper-Pearson bounds
+        ``NAME_low`` and ``NAME_high``, which take symbols for independent; ``state``: 1 done, 0 not yet, -1 failed; ``paths`` by
+        ``kind``. Coordinates are the axes' values. Nothing in it depends on who computed what when.
+    """
+    sweep = plan.sweep
+    table, paths = _Table(sweep.shape), _Table(sweep.shape)
+    counts: dict[str, dict[str, np.ndarray]] = {}
+    state = np.zeros(sweep.shape, np.int8)
+    for point in plan.points():
+        outcome = outcomes.read(point.key)
+        if outcome is None:
+            continue
+        state[point.index] = 1 if outcome["status"] == "done" else -1
+        for link, block in outcome.get("links", {}).items():
+            for name, value in flat_numbers(block):
+                table.put(name, link, point.index, value)
+            for name, pair in block["counts"].items():
+                columns = counts.setdefault(name, {})
+                total = columns.setdefault(link, np.zeros((*sweep.shape[:-1], 2), np.int64))
+                total[point.index[:-1]] += pair
+        for kind, number in outcome.get("paths", {}).items():
+            paths.put("paths", kind, point.index, number)
+    return _dataset(plan, table, paths, counts, state)
+
+
+def _dataset(plan: Plan, table: _Table, paths: _Table, counts: dict[str, dict[str, np.ndarray]], state: np.ndarray) -> xr.Dataset:
+    sweep, dims = plan.sweep, [*plan.sweep.axes, "repetition"]
+    links = list(dict.fromkeys(link for columns in table.values.values() for link in columns))
+    out: dict[str, xr.Variable] = {"state": xr.Variable(dims, state, {"long_name": "1 done, 0 not yet, -1 failed"})}
+
+    def stacked(columns: dict[str, np.ndarray], names: list[str], missing: np.ndarray) -> np.ndarray:
+        return np.stack([columns.get(name, missing) for name in names], axis=-1)
+
+    for name, columns in table.values.items():
+        out[name] = xr.Variable([*dims, "link"], stacked(columns, links, np.full(table.shape, np.nan)))
+    for name, columns in counts.items():
+        pair = stacked(columns, links, np.zeros((*sweep.shape[:-1], 2), np.int64))  # ..., 2, link
+        errors, trials = pair[..., 0, :], pair[..., 1, :]
+        bounds = np.array([binomial_interval(int(e), int(n), CONFIDENCE) if n else (np.nan, np.nan)
+                           for e, n in zip(errors.ravel(), trials.ravel(), strict=True)]).reshape(*errors.shape, 2)  # fmt: skip
+        about = {"long_name": f"{name} over all repetitions", "confidence": CONFIDENCE}
+        with np.errstate(invalid="ignore"):
+            out[f"{name}_pooled"] = xr.Variable([*dims[:-1], "link"], errors / np.where(trials, trials, np.nan), about)
+        for i, end in enumerate(("low", "high")):
+            out[f"{name}_{end}"] = xr.Variable([*dims[:-1], "link"], bounds[..., i], {"long_name": f"{end} bound of {name}_pooled", **about})
+    if "paths" in paths.values:
+        kinds = sorted(paths.values["paths"])
+        out["paths"] = xr.Variable([*dims, "kind"], stacked(paths.values["paths"], kinds, np.full(table.shape, np.nan)))
+        out["kind"] = xr.Variable(["kind"], np.array(kinds, object))
+    kept = {name: v for name, v in out.items() if name in ("state", "kind") or any(fnmatch.fnmatch(name, p) for p in sweep.keep)}
+    coordinates: dict[str, Any] = {name: np.array(axis.labels()) for name, axis in sweep.axes.items()}
+    for name, values in coordinates.items():
+        coordinates[name] = values.astype(object) if values.dtype.kind in "US" else values
+    coordinates |= {"repetition": np.arange(sweep.repetitions), "link": np.array(links, object)}
+    keys = {f"axis_{name}": ", ".join(sorted(axis.keys)) for name, axis in sweep.axes.items()}
+    about = {"title": f"isac_rt sweep: {sweep.name}", "program": program_fingerprint(), "versions": json.dumps(versions()),
+             "commit": commit(), "base": json.dumps(plain_tree(plan.base)), "seed": sweep.seed}  # fmt: skip
+    return xr.Dataset(kept, coordinates, {**about, **keys})
+
+
+def save_dataset(dataset: xr.Dataset, folder: Path) -> Path:
+    """Write ``sweep.nc`` into a sweep's folder, whole or not at all."""
+    file = folder / FILE
+    write_bytes(file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf"))
+    return file
+
+
+def open_sweep(folder: Path | str) -> xr.Dataset:
+    """The outcomes of a sweep so far, finished or not, as one labelled dataset (see `assemble`).
+
+    Raises
+    ------
+    ResultsError  If the folder is no sweep's.
+    """
+    outcomes = Outcomes(Path(folder))
+    return assemble(outcomes.definition(), outcomes)
+
+
+def pending(plan: Plan, outcomes: Outcomes, retry_failed: bool) -> Iterable:
+    """Points that need a run, in order."""
+    return (point for point in plan.points() if not outcomes.done(point.key, retry_failed))
