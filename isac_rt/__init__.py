@@ -33,6 +33,9 @@ _HOME = {
     "Results": "results",
     "save": "results",
     "open_results": "results",
+    "load_sweep": "sweep",
+    "run_sweep": "sweep",
+    "open_sweep": "sweep",
 }
 
 __all__ = sorted(_HOME)

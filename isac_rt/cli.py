@@ -185,6 +185,76 @@ def _reproduce(name: str, folder: Path, quick: bool, seed: int) -> None:
 
 
 @app.command()
+def sweep(
+    file: Annotated[Path | None, typer.Argument(metavar="SWEEP", help="The sweep, a YAML file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where the outcomes go; default runs/NAME.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default one per core, as memory allows.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler to use instead.")] = None,
+    max_points: Annotated[int, typer.Option("--max-points", min=1, help="Refuse a sweep with more points.")] = 100_000,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run points again that failed.")] = False,
+    status: Annotated[Path | None, typer.Option("--status", metavar="DIR", help="Only say how far the sweep in DIR is.")] = None,
+) -> None:
+    """Run a sweep, or what is missing of it: the same command again goes on."""
+    if (file is None) == (status is None):
+        raise InputProblem("isac-rt sweep needs either a sweep file or --status DIR; give one of them")
+    if status is not None:
+        _print_status(status)
+        return
+    assert file is not None
+    from isac_rt.results import check_folder
+    from isac_rt.sweep import SchedulerLost, load_sweep, run_sweep
+
+    plan = load_sweep(file, max_points)
+    folder = out if out is not None else Path("runs") / plan.sweep.name
+    check_folder(folder)
+    with _ending_soon_after_interrupt(folder):
+        try:
+            _with_points(lambda report: run_sweep(plan, folder, workers=workers, scheduler=scheduler,
+                                                  retry_failed=retry_failed, progress=report))  # fmt: skip
+        except SchedulerLost as lost:
+            sys.stderr.write(f"{lost}\n")
+            raise typer.Exit(1) from None
+        _finish_sweep(plan, folder)
+
+
+def _finish_sweep(plan: Any, folder: Path) -> None:
+    """The dataset and the figures of a sweep's outcomes, and where they are."""
+    from isac_rt.figures import make_sweep_figures
+    from isac_rt.sweep import Outcomes, assemble, save_dataset
+
+    with _err().status("dataset and figures"):
+        dataset = assemble(plan, Outcomes(folder))
+        save_dataset(dataset, folder)
+        wanted = [(f.quantity, f.against, f.by) for f in plan.sweep.figures]
+        make_sweep_figures(dataset, wanted, folder)
+    _print_status(folder)
+    _out().print(f"outcomes in {folder}: sweep.nc (isac_rt.open_sweep reads it, finished or not), figures/", soft_wrap=True)
+
+
+def _with_points(work: Any) -> None:
+    """Do `work(report)` with a bar on stderr; `report(done, failed, total)` moves it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("points"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[failed]} failed"), TimeElapsedColumn(),
+               TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False))  # fmt: skip
+    with Progress(*columns, console=_err()) as bar:
+        task = bar.add_task("points", total=None, failed=0)
+        work(lambda done, failed, total: bar.update(task, completed=done + failed, total=total, failed=failed))
+
+
+def _print_status(folder: Path) -> None:
+    from isac_rt.sweep import status
+
+    found = status(folder)
+    left = found.total - found.done - found.failed
+    _out().print(f"{found.done} of {found.total} points done, {found.failed} failed, {left} to do", soft_wrap=True)
+    for index, error in found.errors:
+        _out().print(f"  failed at {list(index)}: {error.splitlines()[0]}", soft_wrap=True, markup=False)
+    if found.failed:
+        _out().print("  --retry-failed runs them again", soft_wrap=True)
+
+
+@app.command()
 def doctor() -> None:
     """Back end, LLVM, memory, threads, and what to install."""
     from isac_rt.runtime import doctor as look
@@ -290,7 +360,8 @@ def _say_interrupted() -> None:
 
 def _user_problems() -> tuple[type[BaseException], ...]:
     """What the user can mend. Imported only once something was raised: a module that is not loaded raised nothing."""
-    names = {"scenario_file": "ScenarioError", "city.materials": "CityError", "runtime": "RuntimeProblem", "results": "ResultsError"}
+    names = {"scenario_file": "ScenarioError", "city.materials": "CityError", "runtime": "RuntimeProblem", "results": "ResultsError",
+             "sweep": "SweepError"}  # fmt: skip
     loaded = {name: sys.modules.get(f"isac_rt.{name}") for name in names}
     return (InputProblem, *(getattr(module, names[name]) for name, module in loaded.items() if module is not None))
 

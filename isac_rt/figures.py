@@ -333,3 +333,53 @@ def make_figures(results: Results, folder: str | Path, city: City | None = None)
             write_bytes(file, lambda temporary, f=figure: f.savefig(temporary, format="png", metadata={"Software": None}))
             written.append(file)
     return written
+
+
+def sweep_curves(ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by: str | None = None) -> Axes:
+    """A quantity of a sweep against one of its axes, a curve for each link and each entry of the axis `by`.
+
+    A rate (a quantity with bounds beside it) is pooled over the repetitions and drawn with its bounds, logarithmically; anything else is
+    the mean over them. Of the axes that are neither of the two the first entry is taken.
+    """
+    rate = f"{quantity}_low" in dataset
+    values = dataset[f"{quantity}_pooled"] if rate else dataset[quantity].mean("repetition")
+    rest = {d: 0 for d in values.dims if d not in (against, by, "link")}
+    values = values.isel(rest)
+    x = np.arange(values.sizes[against]) if values[against].dtype == object else values[against].values
+    curve = 0
+    for link in values.link.values:
+        for entry in values[by].values if by else [None]:
+            where = {"link": link} | ({by: entry} if by else {})
+            y = values.sel(where).values
+            if not np.isfinite(y).any():
+                continue
+            colour, label = UAV_COLOURS[curve % len(UAV_COLOURS)], f"{link}" + (f", {by} {entry}" if by else "")
+            ax.plot(x, np.maximum(y, 1e-9) if rate else y, "o-", ms=3.5, color=colour, label=label)
+            if rate:
+                low, high = (dataset[f"{quantity}_{end}"].isel(rest).sel(where).values for end in ("low", "high"))
+                ax.fill_between(x, np.maximum(low, 1e-9), high, color=colour, alpha=0.15, lw=0)
+            curve += 1
+    if rate:
+        found = values.values[values.values > 0]
+        ax.set(yscale="log", ylim=(0.5 * found.min() if found.size else 1e-4, 1.5))
+    if values[against].dtype == object:
+        ax.set_xticks(x, [str(v) for v in values[against].values])
+    kept = ", ".join(f"{d} {values[d].values}" for d in rest)
+    ax.set(xlabel=f"{against} ({dataset.attrs[f'axis_{against}']})", ylabel=quantity.replace("_", " "))
+    ax.set_title(f"{quantity.replace('_', ' ')} against {against}" + (f" ({kept})" if kept else ""))
+    if curve:
+        ax.legend(loc="best")
+    return ax
+
+
+def make_sweep_figures(dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path) -> list[Path]:
+    """Write (quantity, against, by) figures of a sweep as ``figures/*.png`` under `folder`."""
+    written = []
+    with matplotlib.rc_context(STYLE):
+        for quantity, against, by in figures:
+            figure, axes = _figure(1, 1, 4.4)
+            sweep_curves(axes[0, 0], dataset, quantity, against, by)
+            file = Path(folder) / "figures" / f"{quantity}_{against}{f'_{by}' if by else ''}.png"
+            write_bytes(file, lambda temporary, f=figure: f.savefig(temporary, format="png", metadata={"Software": None}))
+            written.append(file)
+    return written

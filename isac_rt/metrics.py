@@ -27,6 +27,10 @@ GATE_RESOLUTIONS = 3.0
 ERROR_KEYS = ("range_m", "velocity_mps", "azimuth_deg", "elevation_deg")
 
 
+RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
+"""Shares of a summary that have a numerator and a denominator."""
+
+
 class Truth(NamedTuple):
     """One UAV as one terminal ought to see it.
 
@@ -275,6 +279,12 @@ def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolC
     def share(part: int, whole: int) -> float | None:
         return part / whole if whole else None
 
+    counts = [
+        [c.delay_errors, c.delay_total],
+        [c.dpsk_errors, c.dpsk_total],
+        [c.bit_errors, c.bits_total],
+        [sensing.hits, sensing.target_frames],
+    ]
     return {
         "role": role,
         "ser_dpsk": share(c.dpsk_errors, c.dpsk_total),
@@ -290,12 +300,7 @@ def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolC
         "clutter_per_frame": share(sensing.clutter, sensing.frames),
         "rmse": sensing.detection_errors.rmse(),
         "rmse_tracked": sensing.track_errors.rmse(),
-        "counts": {
-            "ser_delay": [c.delay_errors, c.delay_total],
-            "ser_dpsk": [c.dpsk_errors, c.dpsk_total],
-            "ber": [c.bit_errors, c.bits_total],
-            "hit_rate": [sensing.hits, sensing.target_frames],
-        },
+        "counts": dict(zip(RATES, counts, strict=True)),
     }
 
 

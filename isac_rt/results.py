@@ -164,12 +164,10 @@ class Recorder:
             "materials": json.dumps(dict(materials or {})),
             "link_budget": json.dumps([dict(row) for row in link_budget]),
         }
-        return Results(dataset, self._summary(dataset, scores, timing, fidelity), self.scenario)
+        return Results(dataset, self.summary(scores=scores, timing=timing, fidelity=fidelity), self.scenario)
 
-    def _summary(
-        self, dataset: xr.Dataset, scores: Mapping[Link, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """The fixed keys of `summary.json`; null stands for what does not apply."""
+    def summary(self, *, scores: Mapping[Link, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]) -> dict[str, Any]:
+        """The fixed keys of `summary.json` alone; null stands for what does not apply."""
         frames = self._frames
         interval = self.scenario.frame_interval_s or self.waveform.frame_duration
         duration = (frames[-1].frame - frames[0].frame) * interval + self.waveform.frame_duration if frames else 0.0
@@ -186,13 +184,14 @@ class Recorder:
             role = roles[0] if len(roles) == 1 else roles
             pooled = sum(received, SymbolCount()) if received else None
             terminals[name] = summary_block(role, pool([scores[link] for link in mine]), pooled, duration)
+        counted = sum((o.counts for f in frames for o in f.observers.values()), np.zeros(len(KINDS), int))
         return {
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "frames": len(frames),
             "terminals": terminals,
             "links": links,
-            "paths": {kind: int(n) for kind, n in zip(KINDS, dataset.path_count.sum(("frame", "observer")).values, strict=True)},
+            "paths": {kind: int(n) for kind, n in zip(KINDS, counted, strict=True)},
             "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
             "fidelity": dict(fidelity),
             "versions": versions(),

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -244,6 +245,37 @@ def run(
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
+    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario))
+    return flight.recorder.finish(
+        **flight.figures(),
+        materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in flight.setup.city.materials},
+        link_budget=[vars(row) for row in link_budgets(flight.setup)],
+    )
+
+
+def summarise(scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None) -> dict[str, Any]:
+    """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
+    flight = _fly(scenario, None, setup, threads, set())
+    return flight.recorder.summary(**flight.figures())
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """All frames of a run, recorded and scored."""
+
+    setup: Setup
+    recorder: Recorder
+    observers: dict[Link, _Observer]
+    seconds: dict[str, float]
+
+    def figures(self) -> dict[str, Any]:
+        """What a summary needs beside the frames."""
+        scores = {link: o.score for link, o in self.observers.items()}
+        return {"scores": scores, "timing": self.seconds, "fidelity": _fidelity(self.setup)}
+
+
+def _fly(scenario: Scenario, progress: Progress | None, setup: Setup | None, threads: int | None, snapshots: set[int]) -> _Flight:
+    """Frame after frame; while the receivers work on one the next is traced."""
     clock, begin = _Clock(), time.perf_counter()
     with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
         with clock.stage("setup"):
@@ -251,7 +283,6 @@ def run(
             timetable = setup.timetable
             observers = {link: _Observer(setup, link) for link in timetable.all_links}
             recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
-        snapshots = _snapshot_frames(scenario)
         waiting: tuple[_Frame, dict[Link, Future[_Heard]]] | None = None
         for number in range(scenario.frames):
             with clock.stage("trace"):
@@ -268,13 +299,7 @@ def run(
         if progress:
             progress(scenario.frames, scenario.frames)
     clock.seconds["total"] = time.perf_counter() - begin
-    return recorder.finish(
-        scores={link: o.score for link, o in observers.items()},
-        timing=clock.seconds,
-        fidelity=_fidelity(setup),
-        materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in setup.city.materials},
-        link_budget=[vars(row) for row in link_budgets(setup)],
-    )
+    return _Flight(setup, recorder, observers, clock.seconds)
 
 
 @dataclass(frozen=True)

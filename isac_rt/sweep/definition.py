@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import fnmatch
 import hashlib
 import itertools
 import json
@@ -13,8 +14,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
+from isac_rt.metrics import RATES, SensingScore, SymbolCount, summary_block
 from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import seed_sequence
 from isac_rt.scenario import Key, Node, Problem, Scenario, dotted
@@ -125,7 +128,12 @@ class Sweep(_Free):
             if here != there and (a == b or a.startswith(f"{b}.") or b.startswith(f"{a}.")):
                 first = "repetitions set it" if there == ("seed",) else f"{dotted(there)} sets {b} too"
                 yield Problem((here, there), f"sets {a}, but {first}; set each key in one place")
+        for i, pattern in enumerate(self.keep):
+            if not fnmatch.filter(quantities(), pattern):
+                yield Problem((("keep", i),), f"fits no quantity; there are {', '.join(quantities())}")
         for i, figure in enumerate(self.figures):
+            if figure.quantity not in quantities() or figure.quantity == "paths":
+                yield Problem((("figures", i, "quantity"),), f"is no quantity of a link; there are {', '.join(quantities()[:-1])}")
             for end in ("against", "by"):
                 axis = getattr(figure, end)
                 if axis is not None and axis not in self.axes:
@@ -196,6 +204,23 @@ class Plan:
         city = tree.get("city") or {}
         file = city.get("file") if isinstance(city, dict) else None
         return "" if file is None else _file_digest(self.base.folder / str(file))
+
+
+def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Numbers of a nested mapping by their names joined with _; null is NaN; words and lists are left out."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat_numbers(value, f"{prefix}{key}_")
+        elif value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+            yield f"{prefix}{key}", np.nan if value is None else float(value)
+
+
+@lru_cache(maxsize=1)
+def quantities() -> tuple[str, ...]:
+    """Names of what a link's outcome holds (see `isac_rt.metrics.summary_block`), the pooled rates included."""
+    block = summary_block("passive", SensingScore(np.ones(4)), SymbolCount(), 1.0)
+    names = [name for name, _ in flat_numbers(block)]
+    return (*names, *(f"{name}_{end}" for name in RATES for end in ("pooled", "low", "high")), "paths")
 
 
 def put(tree: dict[str, Any], key: str, value: Any) -> None:

@@ -33,7 +33,11 @@ Progress = Callable[[int, int, int], None]
 
 
 class SweepError(Exception):
-    """The sweep cannot go on; what was finished is kept. The text says what to do."""
+    """The sweep cannot start. The text says what to do."""
+
+
+class SchedulerLost(Exception):
+    """The sweep cannot go on; what was finished is kept."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def _simulate(job: Job) -> dict[str, Any]:
     if scenario.propagation.model == "ray_traced":
         _limit_tracer(job.threads)
     setup = simulate.prepare(scenario, store)
-    return simulate.run(scenario, setup=setup, threads=job.threads).summary
+    return simulate.summarise(scenario, setup=setup, threads=job.threads)
 
 
 @lru_cache(maxsize=1)
@@ -150,7 +154,8 @@ def run_sweep(
 
     Raises
     ------
-    SweepError  If the scheduler cannot be reached or is lost.
+    SweepError  If the scheduler cannot be reached.
+    SchedulerLost  If it is lost on the way.
     isac_rt.results.ResultsError  If the folder cannot be written.
     """
     outcomes = Outcomes(Path(folder).resolve())
@@ -198,9 +203,9 @@ class _Runner:
         if self._active:
             raise self._lost(None)
 
-    def _lost(self, problem: BaseException | None) -> SweepError:
+    def _lost(self, problem: BaseException | None) -> SchedulerLost:
         why = f" ({problem})" if problem is not None and str(problem) else ""
-        return SweepError(f"the scheduler was lost{why}; {self._done} of {self._plan.sweep.num_points} points are done and kept: "
+        return SchedulerLost(f"the scheduler was lost{why}; {self._done} of {self._plan.sweep.num_points} points are done and kept: "
                           "start the same command again to go on")  # fmt: skip
 
     def _fill(self, points: Iterator[Point], queue: Any) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from isac_rt.provenance import commit, program_fingerprint, versions
 from isac_rt.results import ResultsError, write_bytes, write_text
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_file import plain_tree
-from isac_rt.sweep.definition import Plan, Sweep
+from isac_rt.sweep.definition import Plan, Point, Sweep, flat_numbers
 
 FILE, DEFINITION = "sweep.nc", "sweep.json"
 CONFIDENCE = 0.95
@@ -98,15 +98,6 @@ def status(folder: Path | str) -> Status:
             if len(errors) < 20:
                 errors.append((point.index, outcome["error"]))
     return Status(plan.sweep.num_points, done, failed, errors)
-
-
-def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Numbers of a nested mapping by their names joined with _; null is NaN; words and lists are left out."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from flat_numbers(value, f"{prefix}{key}_")
-        elif value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
-            yield f"{prefix}{key}", np.nan if value is None else float(value)
 
 
 class _Table:
@@ -208,6 +199,6 @@ def open_sweep(folder: Path | str) -> xr.Dataset:
     return assemble(outcomes.definition(), outcomes)
 
 
-def pending(plan: Plan, outcomes: Outcomes, retry_failed: bool) -> Iterable:
+def pending(plan: Plan, outcomes: Outcomes, retry_failed: bool) -> Iterator[Point]:
     """Points that need a run, in order."""
     return (point for point in plan.points() if not outcomes.done(point.key, retry_failed))
