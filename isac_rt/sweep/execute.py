@@ -26,6 +26,7 @@ WORKER_BYTES = 1.5e9
 """Memory that a worker is reckoned with when their number is chosen: a ray-traced city, three receivers at work."""
 LOST_AFTER = 5
 """Workers that a point may take with it before it counts as failed: one that is killed from outside must not condemn its points."""
+CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
 
 Progress = Callable[[int, int, int], None]
@@ -49,14 +50,18 @@ class Job:
     scenario_folder: str
     folder: str
     threads: int
+    retry_failed: bool = False
 
 
 def run_job(job: Job) -> tuple[str, bool]:
     """Simulate a point and write its outcome; in a worker. Returns its key and whether it succeeded.
 
-    An outcome that cannot be written (a full disk) raises: then nothing is recorded, and the point is run again next time.
+    An outcome that cannot be written (a full disk) raises: then nothing is recorded, and the point is run again next time. Dask
+    repeats a task whose worker dies before its word reached the client; a point whose outcome is there is not repeated.
     """
     outcomes = Outcomes(Path(job.folder))
+    if outcomes.done(job.key, job.retry_failed):
+        return job.key, (outcomes.read(job.key) or {}).get("status") == "done"
     begin = time.perf_counter()
     try:
         summary = _simulate(job)
@@ -108,11 +113,11 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     from distributed import Client, LocalCluster
 
     quiet = {"distributed.scheduler.allowed-failures": LOST_AFTER, "distributed.worker.daemon": True,
-             "distributed.comm.timeouts.connect": "10s", "distributed.logging.distributed": "critical"}  # fmt: skip
+             "distributed.comm.timeouts.connect": f"{CONNECT_S}s", "distributed.logging.distributed": "critical"}  # fmt: skip
     with dask.config.set(quiet):
         if scheduler is not None:
             try:
-                client = Client(scheduler, timeout=10)
+                client = Client(scheduler, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as problem:
                 raise SweepError(f"no scheduler answers at {scheduler}: {problem}; start one with `dask scheduler`, or leave --scheduler out") from problem
             try:
@@ -167,7 +172,7 @@ def run_sweep(
     if not todo:
         return
     with _client(workers, scheduler) as client:
-        _Runner(plan, outcomes, client, total - todo, progress).run(pending(plan, outcomes, retry_failed))
+        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run(pending(plan, outcomes, retry_failed))
 
 
 class _Runner:
@@ -176,7 +181,10 @@ class _Runner:
     Of the points that share their paths one goes first; the others follow when its paths are on the disk.
     """
 
-    def __init__(self, plan: Plan, outcomes: Outcomes, client: Any, done: int, progress: Progress | None) -> None:
+    def __init__(
+        self, plan: Plan, outcomes: Outcomes, client: Any, done: int, retry_failed: bool, progress: Progress | None
+    ) -> None:
+        self._retry_failed = retry_failed
         self._plan, self._outcomes, self._client, self._progress = plan, outcomes, client, progress
         self._done, self._failed = done, 0
         threads = sum(client.nthreads().values()) or 1
@@ -225,7 +233,7 @@ class _Runner:
             self._submit(point, queue)
 
     def _submit(self, point: Point, queue: Any) -> None:
-        job = Job(point.key, point.tree, str(self._plan.base.folder), str(self._outcomes.folder), self._threads)
+        job = Job(point.key, point.tree, str(self._plan.base.folder), str(self._outcomes.folder), self._threads, self._retry_failed)
         self._active[point.key] = point
         queue.add(self._client.submit(run_job, job, key=f"point-{point.key}", pure=False))
 
