@@ -283,6 +283,11 @@ class Receivers(Node):
     cluster_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1, 1)
     max_detections: Annotated[int, Field(ge=1, le=10_000)] = 64
     min_range_m: Annotated[float, Field(ge=0)] = 2.0
+    clutter_filter: Literal["none", "runs"] = "none"
+    """runs: the paper's. Range cells that lie in a run of occupied ones are cleared of what stands still (AT), or left out of the
+    symbol decision (PT)."""
+    clutter_run_cells: Annotated[int, Field(ge=2)] = 15
+    """Consecutive occupied range cells from which on a run counts as clutter."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """The AT processes one frame in so many."""
 

@@ -7,6 +7,7 @@ import numpy as np
 from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload
+from isac_rt.receive.clutter_filter import remove_standing
 from isac_rt.receive.common import make_maps, sense
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Reception
@@ -29,6 +30,8 @@ def receive_active(
     """
     w = cube.waveform
     spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
+    if settings.clutter_filter == "runs":
+        remove_standing(spectra, cube.schedule, settings.clutter_run_cells)
     found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
     groups, chirps = payload.delay_symbols.shape
     return Reception(

@@ -15,6 +15,7 @@ from scipy import stats
 
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import by_antenna, demodulate_bits, running_phases
+from isac_rt.receive.clutter_filter import chirp_runs
 from isac_rt.receive.estimate import beat_cells, middle_phase
 from isac_rt.receive.spectrum import data_phase, window_length
 from isac_rt.receive.types import Prediction
@@ -54,7 +55,7 @@ def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
     return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
 
 
-def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int) -> Symbols:
+def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells: int | None = None) -> Symbols:
     """Decide all symbols of a frame.
 
     Parameters
@@ -62,6 +63,7 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int) -> Symbols
     cube : IFCube of a modulated frame
     prediction : row 0 is the reference path; further rows vote with their predicted power
     dpsk_order : D
+    run_cells : leave runs of so many occupied cells out of the decision (`isac_rt.receive.clutter_filter`); None: do not look
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
@@ -81,6 +83,8 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int) -> Symbols
         power = np.zeros(spectra.shape[1:], np.float32)
         for one in spectra:
             power += one.real**2 + one.imag**2
+        if run_cells is not None:
+            power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
         raw[m], sure[m] = _decide(power, [(g, o[m]) for g, o in others], w)
         picked[m] = np.take_along_axis(spectra, (raw[m] % w.num_samples)[None, :, None], axis=2)[..., 0]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)

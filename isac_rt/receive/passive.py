@@ -63,7 +63,8 @@ def receive_passive(
         return _reception(cube, settings, *_earliest(found, antennas, settings), found, None, maps)
     if prediction is None:
         return _reception(cube, settings, no_detections(), None, None, None, maps)
-    symbols = demodulate(cube, prediction, dpsk_order)
+    run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
+    symbols = demodulate(cube, prediction, dpsk_order, run_cells)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
     confident = np.median(symbols.delay_confidence) >= confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
     if not confident or not moves_as_predicted(symbols, antennas.num_rx, dpsk_order):
