@@ -70,7 +70,7 @@ def run_job(job: Job) -> tuple[str, bool]:
         text = f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
         outcome = {"status": "failed", "error": text, "where": "".join(where)}
     else:
-        outcome = {"status": "done", **{key: summary[key] for key in ("links", "terminals", "paths", "fidelity", "versions")}}
+        outcome = {"status": "done", **{key: summary[key] for key in ("links", "terminals", "paths", "fidelity", "timing_s", "versions")}}
     outcomes.write(job.key, {"key": job.key, "scenario": job.tree, "seconds": time.perf_counter() - begin, **outcome})
     return job.key, outcome["status"] == "done"
 
