@@ -44,6 +44,7 @@ def test_every_message_comes_back_and_single_errors_are_caught():
             assert book.decode(bits) == Message(sender, block)
             for i in range(bits.size):
                 assert book.decode(bits ^ (np.arange(bits.size) == i)) is None
+    assert book.decode(np.zeros(9, np.uint8)) is None
     with pytest.raises(ValueError, match="19 blocks"):
         book.encode(Message(1, 19))
 

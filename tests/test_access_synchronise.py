@@ -131,7 +131,7 @@ def test_two_real_receptions_give_the_clock():
     nees = []
     for seed in range(6):
         both = [
-            round_of(received(w, antennas, forward, t, offset, held, seed, 0.063).detections, t, forward, held)
+            round_of(received(w, antennas, forward, t, offset, held, seed, 0.063).detections, t, forward, cell=w.range_cell(1), held=held)
             for t, forward in ((0.0, True), (gap, False))
         ]
         found = estimate_clock([r for r in both if r is not None])
@@ -139,6 +139,7 @@ def test_two_real_receptions_give_the_clock():
         scale = np.array([found.offset_std, found.drift_std])
         print(e * 1e12, scale * 1e12)
         assert (np.abs(e) < 4 * scale).all()
+        assert abs(found.range - 47.31) < 4 * np.sqrt(found.covariance[2, 2])
         assert found.offset_std < 10e-12
         assert found.drift_std < 0.2e-9
         nees.append((e / scale) @ np.linalg.solve(found.covariance[:2, :2] / np.outer(scale, scale), e / scale))

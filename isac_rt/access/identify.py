@@ -6,11 +6,15 @@ strongest cell, added over antennas, stands out of its other cells; a block is t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import scipy.fft
 from scipy import stats
+
+T = TypeVar("T", bound=Hashable)
 
 HOT_RATE = 0.01
 """Chance that noise alone makes a chirp hot."""
@@ -58,10 +62,9 @@ def choose_run(taken: np.ndarray, length: int, wished: int | None = None) -> int
     return min(starts, key=lambda b: (abs(b - (wished or 0)), b))
 
 
-def consensus(heard: Sequence[tuple[int, object]]) -> tuple[int, object] | None:
-    """The (first block on the listener's grid, message) that most blocks agree on; None without any or with a tie."""
-    votes = {key: list(heard).count(key) for key in heard}
-    ranked = sorted(votes, key=lambda key: -votes[key])
-    if not ranked or (len(ranked) > 1 and votes[ranked[0]] == votes[ranked[1]]):
+def consensus(heard: Sequence[T]) -> T | None:
+    """What most blocks agree on; None without any or with a tie."""
+    ranked = Counter(heard).most_common(2)
+    if not ranked or (len(ranked) > 1 and ranked[0][1] == ranked[1][1]):
         return None
-    return ranked[0]
+    return ranked[0][0]

@@ -30,7 +30,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Codebook:
-    """Fields of a message: sender, block, and a parity bit that makes the number of ones even."""
+    """Fields of a message: sender, block, and a parity bit that makes the number of ones odd, so that silence is no message."""
 
     num_senders: int
     num_blocks: int
@@ -56,11 +56,11 @@ class Codebook:
         bits = [
             (value >> place) & 1 for (value, _), width in zip(fields, self.widths, strict=True) for place in range(width - 1, -1, -1)
         ]
-        return np.array([*bits, sum(bits) % 2], np.uint8)
+        return np.array([*bits, (sum(bits) + 1) % 2], np.uint8)
 
     def decode(self, bits: np.ndarray) -> Message | None:
         """The message, or None when the parity or a field is wrong."""
-        if bits.sum() % 2:
+        if bits.sum() % 2 == 0:
             return None
         first = self.widths[0]
         sender = int("".join(map(str, bits[:first])), 2)

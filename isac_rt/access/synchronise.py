@@ -86,12 +86,25 @@ EXTERNAL = ClockEstimate(time=0.0, offset=0.0, drift=0.0, range=np.nan, velocity
 """Clocks that an external source keeps equal: nothing to estimate, stage 2 is left out."""
 
 
-def round_of(detections: Detections, time: float, forward: bool, held: float = 0.0) -> Round | None:
-    """The reference of a reception as a round; `held` is how much later than its clock the sender sent on purpose [s]."""
+def round_of(detections: Detections, time: float, forward: bool, *, cell: float, held: float = 0.0) -> Round | None:
+    """The reference of a reception as a round: the strongest detection within a range cell of the earliest sure one.
+
+    One group alone samples an antenna's chirps so sparsely that a strong path leaves Doppler sidelobes at its own range, and one of
+    these may seem earlier by less than a cell.
+
+    Parameters
+    ----------
+    detections : of an unmodulated frame
+    time : of its middle [s]
+    forward : whether the active terminal sent
+    cell : size of a range cell [m]
+    held : how much later than its clock the sender sent on purpose [s]
+    """
     which = np.flatnonzero(detections.is_reference)
     if which.size == 0:
         return None
-    i = which[0]
+    near = np.abs(detections.range - detections.range[which[0]]) < cell
+    i = np.where(near, detections.snr, -np.inf).argmax()
     return Round(
         time=time,
         forward=forward,

@@ -1,0 +1,397 @@
+"""The stages before the data, on the exact signal: blocks found and announced, clocks measured, links acknowledged.
+
+Active terminals join one after the other; those that have joined send data all the while, so that the next ones hear them (or collide
+with them, if they cannot). One terminal's stages, each frame right after the last:
+
+1. It listens to M blocks per frame until it has heard all of them, takes the free run nearest to its wish, and announces its first block
+   by on-off keying in all M blocks while the passive terminals scan the blocks as it did.
+2. Round 1: it sends an unmodulated frame to all. Round 2: its passive terminals answer unmodulated, up to M in one frame, each in one
+   block of the run. With an external clock this stage is left out.
+3. Those that understood the announcement and heard round 1 acknowledge by on-off keying in their block.
+
+Whoever sends here sends `hold` later than its clock says, so that a clock that is ahead by more than the path's delay is heard all
+the same; receivers know it. Not modelled: the passage of round 1's estimate from one end to the other, taken as free of errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from isac_rt.access.identify import choose_run, consensus, hot_chirps, needed_chirps
+from isac_rt.access.ook import Codebook, Message, keyed, read
+from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, Round, estimate_clock, round_of
+from isac_rt.arrays import Antennas, Schedule
+from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
+from isac_rt.payload import random_payload, unmodulated
+from isac_rt.propagation.pathset import PathSet
+from isac_rt.randomness import generator, seed_sequence
+from isac_rt.receive import receive_passive
+from isac_rt.receive.types import Detections
+from isac_rt.scenario import Receivers
+from isac_rt.swarm import Pose
+from isac_rt.waveform import Waveform
+
+Link = tuple[str, str]
+Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, PathSet]]]
+"""Poses of all terminals at a time, and the paths of these links with this time as their epoch."""
+
+HOLD_SHARE = 0.125
+"""Agreed lateness of every sender here, as a share of T_d (213 ns, 64 m with the paper's numbers)."""
+BLOCK_FALSE_RATE = 1e-4
+"""Chance that noise makes a free block look taken."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A terminal's clock against true time: it shows t + offset + drift t, and what it sends is late by that [s, 1]."""
+
+    offset: float = 0.0
+    drift: float = 0.0
+
+    def late(self, time: float) -> float:
+        return self.offset + self.drift * time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """Everything that the stages need, none of it known to the terminals beyond the public numbers.
+
+    Attributes
+    ----------
+    waveform, antennas, schedule : public
+    receivers : settings of the passive receiver
+    scene : poses and paths at any time
+    wishes : first block that each active terminal would like, in the order in which they join; None for no wish
+    listeners : passive terminals of each active one
+    clocks : of every terminal; those left out are right
+    noise_power : E|n|^2 per IF sample of every receiver [W]
+    amplitude : sqrt(transmit power) of every terminal's antenna
+    filter_transition : [Hz]
+    seed : of all randomness here
+    external_clock : whether stage 2 is left out
+    dpsk_order : of the data of those that have joined
+    start : of the first frame [s]
+    """
+
+    waveform: Waveform
+    antennas: Antennas
+    schedule: Schedule
+    receivers: Receivers
+    scene: Scene
+    wishes: Mapping[str, int | None]
+    listeners: Mapping[str, Sequence[str]]
+    noise_power: Mapping[str, float]
+    filter_transition: float
+    seed: int
+    clocks: Mapping[str, Clock] = field(default_factory=dict)
+    amplitude: float = 1.0
+    external_clock: bool = False
+    dpsk_order: int = 8
+    start: float = 0.0
+
+    @property
+    def names(self) -> list[str]:
+        """Active terminals in their order, then the passive ones."""
+        return [*self.wishes, *dict.fromkeys(name for pts in self.listeners.values() for name in pts)]
+
+    @property
+    def codebook(self) -> Codebook:
+        return Codebook(len(self.names), self.waveform.num_resource_blocks)
+
+    @property
+    def hold(self) -> float:
+        return HOLD_SHARE * self.waveform.max_delay
+
+
+@dataclass(frozen=True)
+class LinkState:
+    """What became of one link.
+
+    Attributes
+    ----------
+    heard_block : first block on the passive terminal's own grid, None when no announcement was understood
+    message : what it understood
+    identified : whether that is what was announced
+    clock : estimate, `EXTERNAL` with an external clock, None when a round was missed
+    sent_acknowledgment, acknowledged : by the passive terminal; as the active one read it
+    """
+
+    heard_block: int | None
+    message: Message | None
+    identified: bool
+    clock: ClockEstimate | None
+    sent_acknowledgment: bool
+    acknowledged: bool
+
+
+@dataclass(frozen=True)
+class Establishment:
+    """Outcome of the stages before the data.
+
+    Attributes
+    ----------
+    blocks : first block of each active terminal, None where no run was free
+    links : state of every (active, passive) link
+    missed_blocks, false_blocks : taken blocks that each active terminal did not hear, free ones that it thought taken
+    missed_announcements, wrong_announcements : links whose passive terminal understood nothing, or something else
+    missed_acknowledgments, false_acknowledgments : sent and not read; read and not sent
+    num_frames, duration : of all of it [1, s]
+    """
+
+    blocks: dict[str, int | None]
+    links: dict[Link, LinkState]
+    missed_blocks: dict[str, int]
+    false_blocks: dict[str, int]
+    missed_announcements: int
+    wrong_announcements: int
+    missed_acknowledgments: int
+    false_acknowledgments: int
+    num_frames: int
+    duration: float
+
+
+class _Air:
+    """The frames as they go by: who has joined, what everybody hears."""
+
+    def __init__(self, network: Network) -> None:
+        self.n = network
+        self.frame = 0
+        self.blocks: dict[str, int | None] = {}
+
+    @property
+    def time(self) -> float:
+        """Middle of the present frame [s]."""
+        return self.n.start + (self.frame + 0.5) * self.n.waveform.frame_duration
+
+    def sender(self, name: str, block: int, *, data: bool = False, **change: object) -> Transmission:
+        """A transmission of a terminal on its own grid: held, and unmodulated unless it has joined."""
+        w, n = self.n.waveform, self.n
+        rng = generator(n.seed, "access", "payload", name, self.frame)
+        payload = random_payload(w, n.schedule, n.dpsk_order, rng) if data else unmodulated(w)
+        made = Transmission(
+            name=name,
+            pose=n.scene(self.time, [])[0][name],
+            antennas=n.antennas,
+            schedule=n.schedule,
+            payload=payload,
+            amplitude=n.amplitude,
+            first_block=block,
+            clock_offset=0.0 if data else n.hold,
+        )
+        return replace(made, **change)  # type: ignore[arg-type]
+
+    def hear(self, name: str, first_block: int, sent: Sequence[Transmission] = ()) -> IFCube:
+        """Samples of a terminal with its references in M blocks from `first_block` of its own grid, those that have joined included."""
+        n, w = self.n, self.n.waveform
+        busy = {t.name for t in sent} | {name}
+        joined = [self.sender(at, b, data=True) for at, b in self.blocks.items() if b is not None and at not in busy]
+        every = [*sent, *joined]
+        poses, paths = n.scene(self.time, [(t.name, name) for t in every])
+        own = n.clocks.get(name, Clock())
+        links = []
+        for t in every:
+            clock = n.clocks.get(t.name, Clock())
+            apart = clock.late(self.time) - own.late(self.time)
+            shifted = replace(t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift)
+            links.append((shifted, paths[t.name, name]))
+        cube = if_signal(
+            w,
+            links,
+            poses[name],
+            n.antennas,
+            start_time=self.time - w.frame_duration / 2 + first_block * w.group_spacing,
+            filter_transition=n.filter_transition,
+            schedule=n.schedule,
+            first_block=first_block,
+            noise_power=n.noise_power[name],
+        )
+        words = seed_sequence(n.seed, "access", "noise", name, self.frame).generate_state(2)
+        return add_noise(cube, n.noise_power[name], words)
+
+
+def establish(network: Network) -> Establishment:
+    """Stages 1 to 3 for all active terminals of a network.
+
+    Returns
+    -------
+    Establishment; wrong decisions are among its counts and have their consequences: a terminal that misses the announcement hears no round,
+    one whose clock is unknown is not acknowledged.
+    """
+    air = _Air(network)
+    links: dict[Link, LinkState] = {}
+    missed: dict[str, int] = {}
+    false: dict[str, int] = {}
+    for at, wish in network.wishes.items():
+        taken = _listen(air, at)
+        truth = _occupied(air)
+        missed[at], false[at] = int((truth & ~taken).sum()), int((taken & ~truth).sum())
+        block = choose_run(taken, network.waveform.num_groups, wish)
+        if block is None:
+            links |= {(at, pt): LinkState(None, None, False, None, False, False) for pt in network.listeners[at]}
+        else:
+            links |= _join(air, at, block)
+        air.blocks[at] = block
+    states = list(links.values())
+    return Establishment(
+        blocks=dict(air.blocks),
+        links=links,
+        missed_blocks=missed,
+        false_blocks=false,
+        missed_announcements=sum(s.message is None for s in states),
+        wrong_announcements=sum(s.message is not None and not s.identified for s in states),
+        missed_acknowledgments=sum(s.sent_acknowledgment and not s.acknowledged for s in states),
+        false_acknowledgments=sum(s.acknowledged and not s.sent_acknowledgment for s in states),
+        num_frames=air.frame,
+        duration=air.frame * network.waveform.frame_duration,
+    )
+
+
+def scan(num_blocks: int, width: int) -> list[int]:
+    """First blocks of the stretches of `width` blocks in which all blocks are heard; the last stretch may overlap."""
+    return [min(first, num_blocks - width) for first in range(0, num_blocks, width)]
+
+
+def _occupied(air: _Air) -> np.ndarray:
+    """(blocks,) bool, where those that have joined send."""
+    truth = np.zeros(air.n.waveform.num_resource_blocks, bool)
+    for block in air.blocks.values():
+        if block is not None:
+            truth[block : block + air.n.waveform.num_groups] = True
+    return truth
+
+
+def _listen(air: _Air, at: str) -> np.ndarray:
+    """Blocks that an active terminal hears somebody in, (blocks,) bool."""
+    w = air.n.waveform
+    taken = np.zeros(w.num_resource_blocks, bool)
+    for first in scan(taken.size, w.num_groups):
+        hot = hot_chirps(air.hear(at, first).samples)
+        taken[first : first + w.num_groups] |= hot >= needed_chirps(w.num_chirps, BLOCK_FALSE_RATE)
+        air.frame += 1
+    return taken
+
+
+def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
+    """Announcement, two rounds and acknowledgments of one active terminal."""
+    n = air.n
+    pts = list(n.listeners[at])
+    said = Message(n.names.index(at), block)
+    heard = _announce(air, said, pts)
+    rounds: dict[str, list[Round | None]] = {pt: [] for pt in pts}
+    understood = {pt: got[0] for pt, got in heard.items() if got is not None}
+    if not n.external_clock:
+        _first_round(air, at, block, understood, rounds)
+        understood = {pt: b for pt, b in understood.items() if rounds[pt][0] is not None}
+        _second_round(air, at, block, pts, understood, rounds)
+    read_back = _acknowledge(air, at, block, pts, understood)
+    out = {}
+    for pt in pts:
+        got = heard[pt]
+        message = None if got is None else got[1]
+        both = [r for r in rounds[pt] if r is not None]
+        clock = EXTERNAL if n.external_clock else estimate_clock(both) if len(both) == 2 else None
+        out[at, pt] = LinkState(
+            heard_block=None if got is None else got[0],
+            message=message,
+            identified=message == said,
+            clock=clock,
+            sent_acknowledgment=pt in understood,
+            acknowledged=pt in read_back and clock is not None,
+        )
+    return out
+
+
+def _announce(air: _Air, said: Message, pts: Sequence[str]) -> dict[str, tuple[int, Message] | None]:
+    """What each passive terminal made of the announcement: (first block on its own grid, message)."""
+    n, w = air.n, air.n.waveform
+    mask = keyed(w, n.codebook.encode(said))
+    votes: dict[str, list[tuple[int, Message]]] = {pt: [] for pt in pts}
+    known: dict[str, set[int]] = {pt: set() for pt in pts}
+    for first in scan(w.num_resource_blocks, w.num_groups):
+        sent = air.sender(n.names[said.sender], said.block, active=mask)
+        for pt in pts:
+            samples = air.hear(pt, first, [sent]).samples
+            for m in range(w.num_groups):
+                if first + m in known[pt]:
+                    continue
+                known[pt].add(first + m)
+                got = read(samples[m : m + 1], n.codebook.num_bits)
+                message = n.codebook.decode(got.bits) if got.found else None
+                if message is not None:
+                    votes[pt].append((first + m, message))
+        air.frame += 1
+    return {pt: _first_heard(v, w.num_groups) for pt, v in votes.items()}
+
+
+def _first_heard(votes: Sequence[tuple[int, Message]], width: int) -> tuple[int, Message] | None:
+    """The message that most blocks carry, in at least half of a run, and the first of these blocks: another's data may look like one."""
+    agreed = consensus([message for _, message in votes])
+    blocks = [block for block, message in votes if message == agreed]
+    return None if agreed is None or 2 * len(blocks) < width else (min(blocks), agreed)
+
+
+def _sight(air: _Air, cube: IFCube) -> Detections:
+    return receive_passive(cube, air.n.antennas, air.n.receivers, air.n.dpsk_order, None, False).detections
+
+
+def _first_round(air: _Air, at: str, block: int, understood: Mapping[str, int], rounds: dict[str, list[Round | None]]) -> None:
+    """The active terminal's unmodulated frame at every passive one that knows where to listen."""
+    sent = air.sender(at, block)
+    for pt, first in understood.items():
+        found = _sight(air, air.hear(pt, first, [sent]))
+        whole = (first - block) * air.n.waveform.group_spacing  # blocks by which the two grids differ
+        rounds[pt].append(round_of(found, air.time, True, cell=air.n.waveform.range_cell(1), held=air.n.hold - whole))
+    air.frame += 1
+
+
+def _turns(pts: Sequence[str], width: int) -> list[list[tuple[int, str]]]:
+    """(group, passive terminal) of each frame in which they answer."""
+    return [list(enumerate(pts[first : first + width])) for first in range(0, len(pts), width)]
+
+
+def _answers(
+    air: _Air, turn: Sequence[tuple[int, str]], understood: Mapping[str, int], bits: Mapping[str, np.ndarray]
+) -> list[Transmission]:
+    """Transmissions of those of a turn that have something to answer, each in its group alone."""
+    w, out = air.n.waveform, []
+    for group, pt in turn:
+        if pt not in understood:
+            continue
+        mask = keyed(w, bits[pt]) if pt in bits else np.ones((w.num_groups, w.num_chirps), bool)
+        mask[np.arange(w.num_groups) != group] = False
+        out.append(air.sender(pt, understood[pt], active=mask))
+    return out
+
+
+def _second_round(
+    air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int], rounds: dict[str, list[Round | None]]
+) -> None:
+    """The passive terminals' unmodulated answers at the active one."""
+    w = air.n.waveform
+    for turn in _turns(pts, w.num_groups):
+        cube = air.hear(at, block, _answers(air, turn, understood, {}))
+        for group, pt in turn:
+            if pt in understood:
+                found = _sight(air, cube.of_groups([group]))
+                # it answers on its own grid, `whole` blocks late by the other one's: both ends know this
+                whole = (understood[pt] - block) * w.group_spacing
+                rounds[pt].append(round_of(found, air.time, False, cell=w.range_cell(1), held=air.n.hold + whole))
+        air.frame += 1
+
+
+def _acknowledge(air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int]) -> set[str]:
+    """Passive terminals whose acknowledgment the active one reads: their own name and its block."""
+    n = air.n
+    words = {pt: n.codebook.encode(Message(n.names.index(pt), block)) for pt in pts}
+    out = set()
+    for turn in _turns(pts, n.waveform.num_groups):
+        cube = air.hear(at, block, _answers(air, turn, understood, words))
+        for group, pt in turn:
+            got = read(cube.samples[group : group + 1], n.codebook.num_bits)
+            if got.found and n.codebook.decode(got.bits) == Message(n.names.index(pt), block):
+                out.add(pt)
+        air.frame += 1
+    return out
