@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +38,9 @@ from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import Reception
 from isac_rt.results import TIMINGS, FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
+from isac_rt.scenario import City as CityTree
 from isac_rt.scenario import Scenario
+from isac_rt.scenario_file import plain_tree
 from isac_rt.swarm import Pose, Swarm
 from isac_rt.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 from isac_rt.timetable import Link, Timetable
@@ -136,7 +140,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     interval = scenario.frame_interval_s or waveform.frame_duration
     times = np.linspace(0, scenario.frames * interval, 9)
     centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
-    city = load_city(scenario.city, scenario.folder, waveform.carrier_frequency, centre)
+    city = _city(scenario, waveform.carrier_frequency, tuple(centre.tolist()))
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
     return Setup(
         scenario,
@@ -151,6 +155,25 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     )
 
 
+def _city(scenario: Scenario, carrier: float, centre: tuple[float, ...]) -> City:
+    """The scenario's city; the same object again while scenario after scenario flies over the same one."""
+    text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
+    return _loaded_city(text, scenario.folder, _city_digest(scenario), carrier, centre)
+
+
+@lru_cache(maxsize=2)
+def _loaded_city(text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]) -> City:
+    tree = CityTree.model_validate(json.loads(text)) if text else None
+    return load_city(tree, folder, carrier, centre)
+
+
+def _city_digest(scenario: Scenario) -> str:
+    """Of the city's file, "" without one."""
+    if scenario.city is None or scenario.city.file is None:
+        return ""
+    return hashlib.sha256(scenario.city_path().read_bytes()).hexdigest()
+
+
 UNSEEN_BY_PATHS = ("name", "modulation", "noise", "receivers", "tracking")
 """Parts of a scenario on which its paths do not depend."""
 
@@ -158,10 +181,7 @@ UNSEEN_BY_PATHS = ("name", "modulation", "noise", "receivers", "tracking")
 def path_content(scenario: Scenario) -> str:
     """All that a scenario's paths depend on, but the instant, as text; the city's file by its content."""
     tree = {key: value for key, value in scenario.model_dump(mode="json").items() if key not in UNSEEN_BY_PATHS}
-    file = ""
-    if scenario.city is not None and scenario.city.file is not None:
-        file = hashlib.sha256(scenario.city_path().read_bytes()).hexdigest()
-    return json.dumps([tree, file, program_fingerprint()], sort_keys=True)
+    return json.dumps([tree, _city_digest(scenario), program_fingerprint()], sort_keys=True)
 
 
 def _propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, store: PathStore | None) -> Propagation:

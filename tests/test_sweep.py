@@ -387,3 +387,12 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     assert store.get("d4") is None
     (tmp_path / "file").write_text("")
     PathStore(tmp_path / "file" / "below").put("a", paths, 0)
+
+
+def test_a_city_is_loaded_once_while_it_stays_the_same(tmp_path):
+    """The same object for another seed and noise; another one when the city or the place of the swarm (so its origin) differs."""
+    (tmp_path / "s.yaml").write_text(BASE + "city: {source: canyon, street_width_m: 17.3}\n")
+    city = prepare(load(tmp_path / "s.yaml")).city
+    assert prepare(load(tmp_path / "s.yaml", ["seed=9", "noise.snr_db=1"])).city is city
+    assert prepare(load(tmp_path / "s.yaml", ["city.street_width_m=17.4"])).city is not city
+    assert not np.array_equal(prepare(load(tmp_path / "s.yaml", ["swarm.A.position_m=[7, 0.2, 50]"])).city.origin, city.origin)

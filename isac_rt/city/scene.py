@@ -5,6 +5,7 @@ Import only after `isac_rt.runtime.activate()`: Sionna and Mitsuba start the JIT
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -43,11 +44,18 @@ class SceneHandle:
         return out
 
 
+_latest: tuple[weakref.ref[City], float, SceneHandle] | None = None
+
+
 def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
-    """Sionna scene of a city.
+    """Sionna scene of a city; the one built last is handed out again for the same city object: whoever traces in it clears away what
+    the one before has placed.
 
     Materials carry their constants at the carrier, so that none can be undefined there; they are set before the frequency.
     """
+    global _latest
+    if _latest is not None and _latest[0]() is city and _latest[1] == carrier_frequency:
+        return _latest[2]
     scene = rt.load_scene()
     shapes, faces = [], []
     for index, material in enumerate(city.materials):
@@ -60,7 +68,9 @@ def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
         scene.edit(add=shapes)
     scene.frequency = carrier_frequency
     numbers = [int(np.asarray(shape.object_id).ravel()[0]) for shape in shapes]
-    return SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
+    handle = SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
+    _latest = weakref.ref(city), carrier_frequency, handle
+    return handle
 
 
 def _shape(city: City, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
