@@ -20,7 +20,8 @@ from pydantic import Field, ValidationError, field_validator
 from isac_rt.metrics import RATES, SensingScore, SymbolCount, summary_block
 from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import seed_sequence
-from isac_rt.scenario import Key, Node, Problem, Scenario, dotted
+from isac_rt.scenario import Scenario
+from isac_rt.scenario_base import Key, Node, Problem, dotted
 from isac_rt.scenario_file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
 
 MAX_POINTS = 100_000
