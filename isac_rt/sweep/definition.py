@@ -104,7 +104,7 @@ class Sweep(_Free):
     name: str = "sweep"
     scenario: str
     """The base scenario, a path relative to the sweep's file."""
-    set: dict[str, Any] = {}
+    set: dict[str, Any] = Field({})
     """Keys of the base scenario to replace in all points."""
     axes: dict[str, Axis]
     """By name; every combination of their entries is a point."""

@@ -119,7 +119,8 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             try:
                 client = Client(scheduler, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as problem:
-                raise SweepError(f"no scheduler answers at {scheduler}: {problem}; start one with `dask scheduler`, or leave --scheduler out") from problem
+                said = f"no scheduler answers at {scheduler}: {problem}; start one with `dask scheduler`, or leave --scheduler out"
+                raise SweepError(said) from problem
             try:
                 yield client
             finally:

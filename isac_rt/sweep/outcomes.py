@@ -165,7 +165,8 @@ def _dataset(plan: Plan, table: _Table, paths: _Table, counts: dict[str, dict[st
         with np.errstate(invalid="ignore"):
             out[f"{name}_pooled"] = xr.Variable([*dims[:-1], "link"], errors / np.where(trials, trials, np.nan), about)
         for i, end in enumerate(("low", "high")):
-            out[f"{name}_{end}"] = xr.Variable([*dims[:-1], "link"], bounds[..., i], {"long_name": f"{end} bound of {name}_pooled", **about})
+            meaning = {**about, "long_name": f"{end} bound of {name}_pooled"}
+            out[f"{name}_{end}"] = xr.Variable([*dims[:-1], "link"], bounds[..., i], meaning)
     if "paths" in paths.values:
         kinds = sorted(paths.values["paths"])
         out["paths"] = xr.Variable([*dims, "kind"], stacked(paths.values["paths"], kinds, np.full(table.shape, np.nan)))
