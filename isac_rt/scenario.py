@@ -283,9 +283,10 @@ class Receivers(Node):
     cluster_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1, 1)
     max_detections: Annotated[int, Field(ge=1, le=10_000)] = 64
     min_range_m: Annotated[float, Field(ge=0)] = 2.0
-    clutter_filter: Literal["none", "runs"] = "none"
+    clutter_filter: Literal["none", "zero_doppler", "runs"] = "none"
     """runs: the paper's. Range cells that lie in a run of occupied ones are cleared of what stands still (AT), or left out of the
-    symbol decision (PT)."""
+    symbol decision (PT). zero_doppler: all range cells are cleared of what stands still at the AT; a PT's line of sight may, so that it
+    filters nothing."""
     clutter_run_cells: Annotated[int, Field(ge=2)] = 15
     """Consecutive occupied range cells from which on a run counts as clutter."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1

@@ -30,8 +30,8 @@ def receive_active(
     """
     w = cube.waveform
     spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-    if settings.clutter_filter == "runs":
-        remove_standing(spectra, cube.schedule, settings.clutter_run_cells)
+    if settings.clutter_filter != "none":
+        remove_standing(spectra, cube.schedule, settings.clutter_run_cells if settings.clutter_filter == "runs" else None)
     found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
     groups, chirps = payload.delay_symbols.shape
     return Reception(

@@ -6,6 +6,7 @@ counts as clutter from a least number of cells on. What happens in a run:
 
 - the AT, which has taken its data out, subtracts from each range cell what stands still over the chirps of each antenna and group.
   A target at rest relative to the radar goes with it;
+  `zero_doppler` does so in all range cells, for clutter that is too weak or too short to make a run;
 - a PT, which does not know the data yet, leaves the run out of the symbol decision, chirp by chirp. A line of sight within
   the run is left out too.
 """
@@ -54,23 +55,25 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
     return ndimage.binary_dilation(long, np.ones((1, 2 * MARGIN + 1), bool)).reshape(power.shape)
 
 
-def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int) -> np.ndarray:
+def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
     """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna and group.
 
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) windowed, data removed
-    least : cells of a run
+    least : cells of a run; None: every cell is filtered, in a run or not
 
     Returns
     -------
     rows : (rows,) bool, those that were filtered
     """
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
-    power = np.zeros(num_rows)
-    for channel in spectra.reshape(-1, num_rows, num_chirps):
-        power += (channel.real**2 + channel.imag**2).mean(axis=1)
-    rows = runs(power / (num_groups * num_rx), num_groups * num_rx * num_chirps, least)
+    rows = np.ones(num_rows, bool)
+    if least is not None:
+        power = np.zeros(num_rows)
+        for channel in spectra.reshape(-1, num_rows, num_chirps):
+            power += (channel.real**2 + channel.imag**2).mean(axis=1)
+        rows = runs(power / (num_groups * num_rx), num_groups * num_rx * num_chirps, least)
     chosen = np.flatnonzero(rows)
     for m in range(num_groups):
         part = spectra[m][:, chosen]
