@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from matplotlib.image import imread
 
 from isac_rt import experiments
 from isac_rt.cli import main
-from isac_rt.experiments import fig13
+from isac_rt.experiments import fig5, fig13, flight, table1, table2, tracks
 from isac_rt.experiments.outcome import Outcome, Verdict, blank, proportion, style, write
 from isac_rt.results import ResultsError
+from isac_rt.waveform import Waveform
 
 
 def silent(done, total):
@@ -97,3 +100,67 @@ def test_rates_are_the_formula_by_hand(reading, low, high):
 def test_fig13_verdicts():
     judged = [v.verdict for v in fig13.run(True, 1, silent).verdicts]
     assert judged == ["does not hold", "holds"]
+
+
+@pytest.mark.parametrize(("terminal", "first", "second", "half"), [("AT", 247.571, 511.646, 127.911), ("PT", 495.141, 1023.292, 255.823)])
+def test_table1_range_columns_contradict_each_other(terminal, first, second, half):
+    """The three lengths as worked out by hand in the notes. Planted bug: T_d = f_s T / B."""
+    rows = {r["quantity"]: r for r in table1.entries(Waveform(), terminal)}
+    assert rows["range, first expression"]["paper"] == pytest.approx(first, rel=2e-6)
+    assert rows["range, second expression"]["paper"] == pytest.approx(second, rel=2e-6)
+    assert rows["range, first expression"]["ours"] == pytest.approx(half, rel=4e-6)
+
+
+def test_table1_verdicts():
+    judged = {v.claim: v.verdict for v in table1.run(True, 1, silent).verdicts}
+    assert judged["AT range resolution"] == "holds" and judged["PT velocity range"] == "holds under a condition"
+    assert {c for c, v in judged.items() if v == "does not hold"} == {
+        f"{t} range, {n} expression" for t in ("AT", "PT") for n in ("first", "second")
+    }
+
+
+def test_table2_views_by_hand():
+    """The frames worked out from straight lines and 60 degrees per axis. Planted bug: PT2 left to fly along -y.
+
+    AT (0, 10 t), PT2 (4, -8 + 20 t): in view once 4 <= tan(60) (10 t - 8), counted at the middle of a frame."""
+    scene = flight.scenario("consistent")
+    seen = flight.views(scene)
+    tan, frame = np.tan(np.pi / 3), 7.7824e-3
+    enters = (8 + 4 / tan) / 10 / frame - 0.5
+    assert flight.span(seen["AT", "PT2"]) == f"{int(np.ceil(enters))} to 499"
+    # PT1 (-8, 8 + 15 t) faces -y and PT2 (4, -8 + 20 t) must be 12/tan behind it
+    leaves = (16 - 12 / tan) / 5 / frame - 0.5
+    assert flight.span(seen["PT1", "PT2"]) == f"0 to {int(np.floor(leaves))}"
+    assert flight.span(np.zeros(5, bool)) == "never" and flight.span(np.array([1, 0, 1, 1], bool)) == "0 to 0, 2 to 3"
+
+
+def test_table2_verdicts():
+    judged = [v.verdict for v in table2.run(True, 1, silent).verdicts]
+    mended = "holds under a condition"
+    assert judged == ["holds", mended, mended, "does not hold", "does not hold", mended]
+
+
+def test_fig5_ambiguities_are_the_pulse_rates():
+    """One antenna's pulses come every L_tx slots in turn: c/(4 L_tx T- f) is the limit, and without the order c/(4 T- f).
+
+    Planted bug: the second answer searched from the first bin instead of from the peak."""
+    w = Waveform()
+    limit = 299_792_458 / (4 * w.slot_duration * w.effective_carrier)
+    chosen = fig5.schedules(11)
+    (a,) = fig5.spectra("a", chosen["a"])
+    alone, united = fig5.spectra("d", chosen["d"])
+    assert a.unambiguous == pytest.approx(limit / 3, rel=1e-9)
+    assert alone.unambiguous == pytest.approx(limit, rel=1e-9) and united.unambiguous == pytest.approx(limit, rel=1e-9)
+    # 40 of 120 pulses, mean over 9 channels: sidelobes stand near 1/40 (-16 dB); the full sampling has only those of its window
+    assert -20 < alone.sidelobe_db < -6 and united.sidelobe_db < -40
+
+
+def test_filter_verdict_needs_every_decile():
+    """Made-up errors: halved by the filter in range, doubled in velocity."""
+    rng = np.random.default_rng(5)
+    e = rng.standard_normal((60, 1))
+    columns = {f"truth_{q}": (("frame", "uav"), np.zeros((60, 1))) for q in tracks.UNITS}
+    columns |= {f"detected_{q}": (("frame", "uav"), e) for q in tracks.UNITS}
+    columns |= {f"tracked_{q}": (("frame", "uav"), e * f) for q, f in zip(tracks.UNITS, (0.5, 2.0, 0.5), strict=True)}
+    v = tracks.filter_verdict([xr.Dataset(columns, {"uav": ["AT"]})], ("AT",), "PT1")
+    assert v.verdict == "holds under a condition" and "range, azimuth" in v.finding and "(60 of 60)" in v.finding
