@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from isac_rt.experiments import tracks
@@ -21,13 +23,18 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     variants = ["consistent"] * count + ["printed"]
     done = []
     for i, variant in enumerate(variants):
-        done.append(fly(variant, "AT", FRAMES, EVERY, seed + i, lambda k, n, i=i: progress(i * n + k, len(variants) * n)))
+        before, total = i * FRAMES, len(variants) * FRAMES
+        done.append(fly(variant, "AT", FRAMES, EVERY, seed + i, partial(_report, progress, before, total)))
     runs, printed = done[:count], done[-1]
     settings = {"quick": quick, "seed": seed, "runs": count, "frames_per_run": FRAMES, "every_frames": EVERY, "snr_db": 10,
                 "scene": "paper_swarm_consistent.yaml; as printed: paper_swarm.yaml"}  # fmt: skip
     tables = {"consistent": tracks.table(runs, EVERY, ("PT1", "PT2")), "printed": tracks.table([printed], EVERY, ("PT1", "PT2"))}
     figure = tracks.figure(runs, EVERY, ("PT1", "PT2"), ("PT1", "PT2"), (160,))
     return Outcome("fig9", "Tracking at the AT", tables, figure, _verdicts(runs, printed), settings)
+
+
+def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+    progress(before + done, total)
 
 
 def _verdicts(runs, printed) -> tuple[Verdict, ...]:

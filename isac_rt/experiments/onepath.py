@@ -43,8 +43,9 @@ def frame(
     snr_db : per sample and antenna; None: no noise
     seed, purpose : of the noise
     """
+    ahead = np.array([[0.0, 1.0, 0.0]])
     path = make_paths(
-        gain=np.ones(1), delay=np.array([delay]), delay_rate=rate, departure=[[0, 1, 0]], arrival=[[0, 1, 0]],
+        gain=np.ones(1), delay=np.array([delay]), delay_rate=rate, departure=ahead, arrival=ahead,
         kind=int(PathKind.LINE_OF_SIGHT), epoch=waveform.frame_duration / 2, tx="sender", rx="receiver",
     )  # fmt: skip
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))

@@ -14,7 +14,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from isac_rt.metrics import binomial_interval
-from isac_rt.results import commit, versions, write_bytes, write_text
+from isac_rt.provenance import commit, versions
+from isac_rt.results import write_bytes, write_text
 
 Judgement = Literal["holds", "holds under a condition", "does not hold"]
 Progress = Callable[[int, int], None]
