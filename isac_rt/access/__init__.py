@@ -1,1 +1,23 @@
-"""How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, and the stages before the data."""
+"""How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, the stages before the data, and feedback."""
+
+from isac_rt.access.dma import Isolation, isolation
+from isac_rt.access.feedback import Correction, Feedback, correct, summarise
+from isac_rt.access.protocol import Clock, Establishment, LinkState, Network, establish
+from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock
+
+__all__ = [
+    "Clock",
+    "ClockEstimate",
+    "Correction",
+    "Establishment",
+    "Feedback",
+    "Isolation",
+    "LinkState",
+    "Network",
+    "Round",
+    "correct",
+    "establish",
+    "estimate_clock",
+    "isolation",
+    "summarise",
+]
