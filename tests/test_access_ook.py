@@ -156,7 +156,7 @@ def test_the_majority_of_blocks_is_believed():
 def test_taken_blocks_are_missed_and_free_ones_suspected_as_the_binomial_says():
     """Share of blocks of 12 chirps called free with a sender in them, and taken without one, at a false rate of 2 % and a cell SNR of 2.
 
-    Planted bug: one chirp more than needed."""
+    Planted bug: the threshold for a single cell."""
     rng, num_cells, rx, chirps, trials = np.random.default_rng(6), 64, 2, 12, 1500
     needed, g = needed_chirps(chirps, 0.02), 2.0
     t = hot_threshold(rx, num_cells)
