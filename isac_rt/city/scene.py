@@ -47,15 +47,20 @@ class SceneHandle:
 _latest: tuple[weakref.ref[City], float, SceneHandle] | None = None
 
 
+def shared_scene(city: City, carrier_frequency: float) -> SceneHandle:
+    """As `build_scene`, but the one built last is handed out again for the same city object, to tracers that place and clear away
+    their own terminals: compilation is paid once in a worker that runs many points of a sweep."""
+    global _latest
+    if _latest is None or _latest[0]() is not city or _latest[1] != carrier_frequency:
+        _latest = weakref.ref(city), carrier_frequency, build_scene(city, carrier_frequency)
+    return _latest[2]
+
+
 def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
-    """Sionna scene of a city; the one built last is handed out again for the same city object: whoever traces in it clears away what
-    the one before has placed.
+    """Sionna scene of a city, new.
 
     Materials carry their constants at the carrier, so that none can be undefined there; they are set before the frequency.
     """
-    global _latest
-    if _latest is not None and _latest[0]() is city and _latest[1] == carrier_frequency:
-        return _latest[2]
     scene = rt.load_scene()
     shapes, faces = [], []
     for index, material in enumerate(city.materials):
@@ -68,9 +73,7 @@ def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
         scene.edit(add=shapes)
     scene.frequency = carrier_frequency
     numbers = [int(np.asarray(shape.object_id).ravel()[0]) for shape in shapes]
-    handle = SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
-    _latest = weakref.ref(city), carrier_frequency, handle
-    return handle
+    return SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
 
 
 def _shape(city: City, chosen: NDArray[np.int64], name: str) -> mi.Mesh:

@@ -30,7 +30,7 @@ import sionna.rt as rt
 
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
-from isac_rt.city.scene import build_scene
+from isac_rt.city.scene import shared_scene
 from isac_rt.propagation.clutter import ClutterField
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.elements import element_amplitude
@@ -73,7 +73,7 @@ class RayTracer:
         self._names = tuple(scenario.swarm)
         self._terminals = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
         self._sections = {name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()}
-        self._handle = build_scene(city, carrier)
+        self._handle = shared_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
         pinned = scenario.clutter.model == "field"
