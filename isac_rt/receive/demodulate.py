@@ -85,13 +85,12 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells:
             power += one.real**2 + one.imag**2
         if run_cells is not None:
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
-        raw[m], sure[m] = _decide(power, [(g, o[m]) for g, o in others], w)
+        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others], w)
         picked[m] = np.take_along_axis(spectra, (raw[m] % w.num_samples)[None, :, None], axis=2)[..., 0]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
-    known = middle_phase(w, delays[0], rates[0]) - beats * (window_length(w) / 2 / w.num_samples)
-    known += data_phase(w, raw) - (w.slope * w.delay_step * raw) * delays[0]
+    known = known_cycles(w, delays[0], rates[0], raw)
     picked *= np.exp(-2j * np.pi * known)[:, None, :]
-    transitions, share, spread = _dpsk(picked, cube.schedule, w.num_tx, dpsk_order)
+    transitions, share, spread = decide_transitions(picked, cube.schedule, w.num_tx, dpsk_order)
     return Symbols(
         raw=raw,
         delay=delay,
@@ -104,7 +103,14 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells:
     )
 
 
-def _decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+def known_cycles(waveform: Waveform, delay: float, delay_rate: float, raw: np.ndarray) -> np.ndarray:
+    """(M, P) phase [cycles] of the picked cells of a path that is as predicted and carries the symbols `raw`, but for its DPSK."""
+    w, beats = waveform, beat_cells(waveform, delay, delay_rate)
+    cycles = middle_phase(w, delay, delay_rate) - beats * (window_length(w) / 2 / w.num_samples)
+    return cycles + data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay
+
+
+def decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
     """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from (P, N) power."""
     cells = np.arange(-EXTRA_CELLS, waveform.num_delay_symbols + EXTRA_CELLS)
     metric = power[:, cells % waveform.num_samples].astype(np.float64)
@@ -117,7 +123,7 @@ def _decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform:
     return cells[best], peak / np.maximum(rest, 1e-300)
 
 
-def _dpsk(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray, float]:
+def decide_transitions(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of the earlier one."""
     chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
     product = chains[..., 1:] * chains[..., :-1].conj()
