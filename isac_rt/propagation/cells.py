@@ -45,7 +45,7 @@ class Cells:
     Attributes
     ----------
     points : (N, 3) float64, local coordinates [m]
-    area : (N,) of the cell [m^2]
+    area : (N,) float32 of the cell [m^2]
     amplitude : (N,) complex64, circular Gaussian of unit power
     face : (N,) int32 face of the city's mesh
     """
@@ -110,7 +110,7 @@ def cut(city: City, scattering: np.ndarray, places: np.ndarray, density: Density
     order = np.lexsort([codes, rows])
     rows, codes, areas, triangles = rows[order], codes[order], areas[order], triangles[order]
     point, amplitude = _draw(_mixed(state[rows], codes), triangles)
-    return Cells(point, areas, amplitude, face[rows].astype(np.int32))
+    return Cells(point, areas.astype(np.float32), amplitude, face[rows].astype(np.int32))
 
 
 def _too_large(corners: np.ndarray, area: np.ndarray, tree: cKDTree, density: Density) -> np.ndarray:

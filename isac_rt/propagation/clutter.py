@@ -72,9 +72,11 @@ class Surfaces:
 class Seen:
     """What K scatterers of the field do between two terminals at one instant, isotropic antennas.
 
+    Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link share is one array.
+
     Attributes
     ----------
-    index : (K,) into the field's cells
+    index : (K,) int32 into the field's cells
     magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own amplitude not
     length, rate, accel : (K,) of the way over the scatterer [m, m/s, m/s^2]
     tx_radius, rx_radius : (K,) distances from either end [m]
@@ -90,6 +92,11 @@ class Seen:
     rx_radius: np.ndarray
     departure: np.ndarray
     arrival: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """Of the arrays, each counted once."""
+        return sum({id(a): a.nbytes for a in vars(self).values()}.values())
 
 
 class ClutterField:
@@ -131,21 +138,30 @@ class ClutterField:
         share = self.sight.share(tx, start, time)
         if tx != rx:
             share = share * self.sight.share(rx, end, time)
-        index = np.flatnonzero(share)
-        count = index.size
-        out = [np.empty(count) for _ in range(6)] + [np.empty((count, 3)) for _ in range(2)]
+        index = np.flatnonzero(share).astype(np.int32)
+        count, own = index.size, tx == rx
+        radius, departure = np.empty(count), np.empty((count, 3))
+        out = [np.empty(count, np.float32), np.empty(count), np.empty(count), np.empty(count, np.float32), radius]
+        out += [radius, departure, departure] if own else [np.empty(count), departure, np.empty((count, 3))]
         s, c = self._surfaces, self.cells
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
         _advance(index, share, c.points, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
-                 self._scale, *motion, *out)  # fmt: skip
+                 self._scale, *motion, own, *out)  # type: ignore[call-arg]  # fmt: skip
         found = Seen(index, *out)
         lit = found.magnitude > 0
-        return found if lit.all() else Seen(*(a[lit] for a in vars(found).values()))
+        if lit.all():
+            return found
+        parts = {id(a): a[lit] for a in vars(found).values()}
+        return Seen(*(parts[id(a)] for a in vars(found).values()))
 
     def paths(self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict) -> PathSet:
         """The link's paths at ``common["epoch"]``; poses and points in local coordinates."""
         seen = self.seen(tx, rx, start, end, common["epoch"])
-        elements = element_amplitude(antennas, start, end, seen.departure, seen.arrival)
+        elements = (
+            antennas.element_gain(start.to_body(seen.departure))
+            if tx == rx
+            else element_amplitude(antennas, start, end, seen.departure, seen.arrival)
+        )
         return make_paths(
             gain=self.cells.amplitude[seen.index] * (seen.magnitude * elements),
             delay=seen.length / SPEED_OF_LIGHT,
@@ -217,51 +233,45 @@ def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
     return total / 2.0**alpha
 
 
-@numba.njit(cache=True, nogil=True)
-def _advance(index, share, points, face, area, normals, material, table, coefficient, lobe, exponent, scale, start, end,
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _advance(index, share, points, face, area, normals, material, table, coefficient, lobe, exponent, scale, start, end, own,
              magnitude, length, rate, accel, tx_radius, rx_radius, departure, arrival):  # fmt: skip
-    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`: position, velocity, acceleration."""
-    same = True
-    for k in range(3):
-        for i in range(3):
-            same = same and start[i, k] == end[i, k]
+    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`: position, velocity, acceleration;
+    `own`: both are one body, and `arrival` is `departure`."""
+    last = table.shape[1] - 2
     for row in range(index.size):
         i = index[row]
         f = face[i]
-        n = normals[f]
-        r1 = _leg(points[i], start, departure[row], rate, accel, row, True)
-        if same:
-            r2 = r1
-            rate[row] *= 2
-            accel[row] *= 2
-            for k in range(3):
-                arrival[row, k] = departure[row, k]
-        else:
-            r2 = _leg(points[i], end, arrival[row], rate, accel, row, False)
-        tx_radius[row], rx_radius[row], length[row] = r1, r2, r1 + r2
-        u, v = departure[row], arrival[row]
-        into = u[0] * n[0] + u[1] * n[1] + u[2] * n[2]
-        back = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
+        nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
+        r1, v1, a1, x1, y1, z1 = _leg(points[i, 0], points[i, 1], points[i, 2], start)
+        r2, v2, a2, x2, y2, z2 = r1, v1, a1, x1, y1, z1
+        departure[row, 0], departure[row, 1], departure[row, 2] = x1, y1, z1
+        if not own:
+            r2, v2, a2, x2, y2, z2 = _leg(points[i, 0], points[i, 1], points[i, 2], end)
+            arrival[row, 0], arrival[row, 1], arrival[row, 2] = x2, y2, z2
+        tx_radius[row], rx_radius[row] = r1, r2
+        length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2
+        into = x1 * nx + y1 * ny + z1 * nz
+        back = x2 * nx + y2 * ny + z2 * nz
         if into * back <= 0:
             magnitude[row] = 0.0
             continue
         m = material[f]
-        cos_i, cos_o = min(abs(into), 1.0), abs(back)
-        x = cos_i * (table.shape[1] - 1)
-        cell = min(int(x), table.shape[1] - 2)
-        x -= cell
-        te = table[m, cell, 0] + x * (table[m, cell + 1, 0] - table[m, cell, 0])
-        tm = table[m, cell, 1] + x * (table[m, cell + 1, 1] - table[m, cell, 1])
+        cos_i = min(abs(into), 1.0)
+        at = cos_i * (last + 1)
+        k = min(int(at), last)
+        at -= k
+        te = table[m, k, 0] + at * (table[m, k + 1, 0] - table[m, k, 0])
+        tm = table[m, k, 1] + at * (table[m, k + 1, 1] - table[m, k, 1])
         # the vertical field is across the horizontal u x z: its TE part is the part of n along u x z, of all of n across u
-        across = (n[1] * u[0] - n[0] * u[1]) ** 2
-        whole = (u[0] * u[0] + u[1] * u[1]) * (1 - cos_i * cos_i)
-        part = min(across / whole, 1.0) if whole > 1e-12 else 0.5
+        whole = (x1 * x1 + y1 * y1) * (1 - cos_i * cos_i)
+        part = min((ny * x1 - nx * y1) ** 2 / whole, 1.0) if whole > 1e-12 else 0.5
         power = coefficient[m] * (part * te + (1 - part) * tm) * cos_i * area[i]
         if lobe[m] < 0:
-            power *= cos_o / np.pi
+            power *= abs(back) / np.pi
         else:
-            norm = table[m, cell, 2] + x * (table[m, cell + 1, 2] - table[m, cell, 2])
-            with_way_in = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+            norm = table[m, k, 2] + at * (table[m, k + 1, 2] - table[m, k, 2])
+            with_way_in = x1 * x2 + y1 * y2 + z1 * z2
             with_mirror = 2 * into * back - with_way_in
             mirror = max(0.5 * (1 + with_mirror), 0.0) ** exponent[m]
             way_in = max(0.5 * (1 + with_way_in), 0.0) ** exponent[m]
@@ -269,18 +279,13 @@ def _advance(index, share, points, face, area, normals, material, table, coeffic
         magnitude[row] = scale * share[i] * np.sqrt(power) / (r1 * r2)
 
 
-@numba.njit(inline="always")
-def _leg(point, body, unit, rate, accel, row, first):
-    """Distance from a moving body to a point; unit vector towards it; rate and acceleration of the distance, set or added to."""
-    x, y, z = point[0] - body[0, 0], point[1] - body[0, 1], point[2] - body[0, 2]
+@numba.njit(inline="always", error_model="numpy")
+def _leg(px, py, pz, body):
+    """Distance from a moving body to a point, its rate and acceleration, and the unit vector towards the point."""
+    x, y, z = px - body[0, 0], py - body[0, 1], pz - body[0, 2]
     r = np.sqrt(x * x + y * y + z * z)
-    unit[0], unit[1], unit[2] = x / r, y / r, z / r
-    a = -(unit[0] * body[1, 0] + unit[1] * body[1, 1] + unit[2] * body[1, 2])
+    x, y, z = x / r, y / r, z / r
+    a = -(x * body[1, 0] + y * body[1, 1] + z * body[1, 2])
     speed = body[1, 0] ** 2 + body[1, 1] ** 2 + body[1, 2] ** 2
-    b = (speed - a * a) / r - (unit[0] * body[2, 0] + unit[1] * body[2, 1] + unit[2] * body[2, 2])
-    if first:
-        rate[row], accel[row] = a, b
-    else:
-        rate[row] += a
-        accel[row] += b
-    return r
+    b = (speed - a * a) / r - (x * body[2, 0] + y * body[2, 1] + z * body[2, 2])
+    return r, a, b, x, y, z
