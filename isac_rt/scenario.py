@@ -274,7 +274,9 @@ class Noise(Node):
 class Receivers(Node):
     """How terminals detect and demodulate."""
 
-    velocity_method: Literal["auto", "omp", "latin_union"] = "auto"
+    velocity_method: Literal["auto", "omp", "latin_union", "conventional"] = "auto"
+    """omp: the paper's, for sparse sampling. latin_union: all groups as one uniform sampling, for M = L_tx. conventional: the DFT over each
+    antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the schedule and the groups received."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Of one cell of the range-Doppler map."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)

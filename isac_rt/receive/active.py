@@ -46,4 +46,5 @@ def receive_active(
         line_of_sight=False,
         reference_power=float("nan"),
         maps=make_maps(found.power, cube, settings, 2) if maps else None,
+        sparse=found.sparse,
     )

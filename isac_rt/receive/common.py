@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.fft
@@ -10,7 +11,17 @@ import scipy.fft
 from isac_rt.arrays import Antennas, Schedule, is_latin
 from isac_rt.ifsignal import IFCube
 from isac_rt.receive.cfar import detect, detect_chirps, peaks, without_sidelobes
-from isac_rt.receive.doppler import UNION_FLOOR, accumulate, channel_maps, doppler_bins, omp_power
+from isac_rt.receive.doppler import (
+    UNION_FLOOR,
+    accumulate,
+    channel_maps,
+    conventional_power,
+    doppler_bins,
+    omp_power,
+    own_bins,
+    slow_window,
+    sparse_enough,
+)
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -28,19 +39,34 @@ OMP_SPARSITY = 4
 
 @dataclass(frozen=True)
 class Sensed:
-    """Detections of a frame with their estimates, strongest first, and the maps that they came from."""
+    """Detections of a frame with their estimates, strongest first, and the maps that they came from. `sparse`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
     power: np.ndarray
     noise: float
+    sparse: bool | None = None
 
 
 def use_omp(settings: Receivers, schedule: Schedule, num_tx: int) -> bool:
-    """`auto`: the union where it samples every antenna in every slot, OMP elsewhere."""
+    """Whether the method is OMP."""
+    return velocity_method(settings, schedule, num_tx) == "omp"
+
+
+def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Literal["omp", "latin_union", "conventional"]:
+    """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT where its chirps are equally
+    spaced, as in a conventional schedule; OMP elsewhere."""
     if settings.velocity_method != "auto":
-        return settings.velocity_method == "omp"
-    return not (is_latin(schedule, num_tx) and len(schedule) == num_tx)
+        return settings.velocity_method
+    if is_latin(schedule, num_tx) and len(schedule) == num_tx:
+        return "latin_union"
+    return "conventional" if (schedule[:, num_tx:] == schedule[:, :-num_tx]).all() else "omp"
+
+
+def num_looks(settings: Receivers, schedule: Schedule, antennas: Antennas) -> int:
+    """Channels whose powers are added in the map."""
+    groups = len(schedule) if velocity_method(settings, schedule, antennas.num_tx) == "conventional" else 1
+    return groups * antennas.num_tx * antennas.num_rx
 
 
 def sense(
@@ -53,23 +79,37 @@ def sense(
     passes: int,
 ) -> Sensed:
     """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose `delay_symbols` were removed."""
-    w = waveform
-    power = accumulate(channel_maps(spectra, w, schedule, delay_symbols))
-    looks = antennas.num_tx * antennas.num_rx
+    w, method = waveform, velocity_method(settings, schedule, waveform.num_tx)
+    conventional = method == "conventional"
+    if conventional:
+        power = conventional_power(spectra, w, schedule)
+    else:
+        power = accumulate(channel_maps(spectra, w, schedule, delay_symbols))
+    looks = num_looks(settings, schedule, antennas)
     above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     above[: int(np.ceil(settings.min_range_m / w.range_cell(passes)))] = False
-    if use_omp(settings, schedule, w.num_tx):
+    sparse = None
+    if conventional:
+        above[:, ~own_bins(w)] = False
+    elif method == "omp":
+        noise = float(np.median(power)) / window_gain(w, schedule)
+        sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, w, schedule)
         above &= _confirmed_by_omp(spectra, above, level, w, schedule)
     rows, bins = peaks(power, above, settings.cluster_cells)
     keep = without_sidelobes(rows, bins, power, w.num_chirps, UNION_FLOOR)
     rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
     estimates = []
     for row, column in zip(rows, bins, strict=True):
-        local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row))
+        local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row), separate=conventional)
         estimates.append(refine(local, *start_point(power, int(row), int(column), w)))
     snr = power[rows, bins] / level[rows, bins]
     found = describe(estimates, snr, antennas, w, passes)
-    return Sensed(estimates, found, power, float(np.median(power)))
+    return Sensed(estimates, found, power, float(np.median(power)), sparse)
+
+
+def window_gain(waveform: Waveform, schedule: Schedule) -> float:
+    """Noise power of a map's cell over that of a sample of the spectra: the squared window over an antenna's chirps."""
+    return float((slow_window(waveform) ** 2).sum()) * len(schedule) / waveform.num_tx
 
 
 def _confirmed_by_omp(

@@ -16,6 +16,9 @@ UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler bin; reached within 2 % of the
 unambiguous velocity."""
 
+MOST_UNEXPLAINED = 1 / 3
+"""Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably may leave."""
+
 
 def slow_window(waveform: Waveform) -> np.ndarray:
     """Hann over the slots (P,), periodic, float32."""
@@ -88,6 +91,84 @@ def accumulate(maps: np.ndarray) -> np.ndarray:
     for channel in maps.reshape(-1, *maps.shape[-2:]):
         power += channel.real**2 + channel.imag**2
     return np.fft.fftshift(power, axes=-1) / (maps.shape[0] * maps.shape[1])
+
+
+def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
+    """Mean power of the DFT over each antenna's own chirps in each group: the conventional TDM-MIMO receiver, schemes (a) and (c).
+
+    An antenna's P/L_tx samples lie L_tx slots apart, so the map repeats every P/L_tx bins: velocities are known up to the
+    unambiguous velocity divided by L_tx. Groups are added in power. The few slots by which the antennas' samples start later,
+    and the data delays, only turn phases.
+
+    Returns
+    -------
+    power : (rows, P) float32, Doppler centred, periodic
+    """
+    num_groups, num_rx, num_rows, num_chirps = spectra.shape
+    size = num_chirps // waveform.num_tx
+    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    analyse = (np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size) * window).astype(np.complex64)
+    power = np.zeros((num_rows, size), np.float32)
+    for m in range(num_groups):
+        for tx in range(waveform.num_tx):
+            own = spectra[m][..., schedule[m] == tx].reshape(-1, size) @ analyse.T
+            power += (own.real**2 + own.imag**2).reshape(num_rx, num_rows, size).sum(axis=0)
+    return np.fft.fftshift(np.tile(power / (num_groups * waveform.num_tx * num_rx), waveform.num_tx), axes=-1)
+
+
+def own_bins(waveform: Waveform) -> np.ndarray:
+    """(P,) bool: the centred bins within the unambiguous velocity of one antenna's uniform sampling."""
+    size = waveform.num_chirps // waveform.num_tx
+    bins = doppler_bins(waveform)
+    return (bins >= -(size // 2)) & (bins < size - size // 2)
+
+
+def recovery_limit(num_samples: int, num_chirps: int) -> int:
+    """Doppler atoms per row that OMP recovers dependably from `num_samples` chirps at random out of P: S / (2 ln P), at least 1.
+
+    References
+    ----------
+    .. [1] J. Tropp, A. Gilbert, "Signal recovery from random measurements via orthogonal matching pursuit", 2007: S >= 2 K ln P.
+    """
+    return max(int(num_samples / (2 * np.log(num_chirps))), 1)
+
+
+def unexplained(spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
+    """(len(rows),) share of each row's power that as many OMP atoms as the sampling's `recovery_limit` do not explain."""
+    total, left = np.zeros(len(rows)), np.zeros(len(rows))
+    for m in range(len(schedule)):
+        for tx in range(waveform.num_tx):
+            chosen = np.flatnonzero(schedule[m] == tx)
+            part = spectra[m][:, rows][:, :, chosen]
+            found = omp(part.reshape(-1, chosen.size), chosen, waveform.num_chirps, recovery_limit(chosen.size, waveform.num_chirps))
+            atoms = np.exp(2j * np.pi * np.outer(np.arange(waveform.num_chirps), chosen) / waveform.num_chirps) / chosen.size
+            rest = part - (found @ atoms).reshape(part.shape)
+            total += (np.abs(part) ** 2).sum(axis=(0, 2))
+            left += (np.abs(rest) ** 2).sum(axis=(0, 2))
+    return left / np.maximum(total, 1e-300)
+
+
+def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, waveform: Waveform, schedule: Schedule) -> bool:
+    """Whether the occupied range rows are sparse enough in Doppler for random sampling (scheme (d)).
+
+    The paper falls back to scheme (c) "when the scene is not sparse" and gives no rule. Here: in a majority of the occupied rows,
+    weighted by power over the noise, as many atoms as the sampling recovers dependably must explain all but `MOST_UNEXPLAINED` of what
+    is above the noise. A path half a bin off the grid needs two atoms for 81 % of its power.
+
+    Parameters
+    ----------
+    spectra : (M, L_rx, rows, P) cleaned
+    rows : indices of the occupied rows; none is sparse
+    noise : mean power of a sample of `spectra` without paths
+    """
+    if not len(rows):
+        return True
+    power = np.mean(np.abs(spectra[:, :, rows]) ** 2, axis=(0, 1, 3))
+    above = np.maximum(power - noise, 1e-3 * noise)
+    size = waveform.num_chirps // waveform.num_tx
+    kept = 1 - recovery_limit(size, waveform.num_chirps) / size  # of the noise: each atom takes one dimension
+    share = (unexplained(spectra, rows, waveform, schedule) * power - kept * noise) / above
+    return bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
 
 
 def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> np.ndarray:

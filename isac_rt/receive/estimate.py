@@ -77,28 +77,44 @@ class LocalSpectra:
     """The few range rows around a peak, ready for repeated evaluation of templates over the slow-time window."""
 
     def __init__(
-        self, spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray, row: int
+        self,
+        spectra: np.ndarray,
+        waveform: Waveform,
+        schedule: Schedule,
+        delay_symbols: np.ndarray,
+        row: int,
+        *,
+        separate: bool = False,
     ) -> None:
+        """`separate`: the groups are not added coherently, as where the velocity is known up to aliases only."""
         w, low = waveform, max(row - HALF_WIDTH, 0)
+        self._sets = w.num_groups if separate else 1
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
         self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1)).reshape(schedule.size, rows.shape[2], -1)
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
-        self._tx = np.ascontiguousarray(schedule.ravel())
+        own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
+        self._tx = np.ascontiguousarray((schedule + own).ravel())
         self._time = (middle_times(w) + delay_symbols * w.delay_step).ravel()
         self._numbers = np.array(
             [w.carrier_frequency, w.slope, window_middle(w), w.sampled_duration, window_length(w), w.num_samples]
         )
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
-        """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its amplitude."""
-        out = np.zeros((self.waveform.num_tx, self._data.shape[2]), np.complex128)
+        """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its amplitude; of separate
+        groups the mean, each antenna turned into the phase that it has in the first one."""
+        sets = self._match(delay, delay_rate)
+        turn = np.exp(-1j * np.angle((sets * sets[0].conj()).sum(axis=2, keepdims=True)))
+        return (sets * turn).mean(axis=0)
+
+    def _match(self, delay: float, delay_rate: float) -> np.ndarray:
+        out = np.zeros((self._sets * self.waveform.num_tx, self._data.shape[2]), np.complex128)
         _match(self._data, self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out)
-        return out
+        return out.reshape(self._sets, self.waveform.num_tx, -1)
 
     def power(self, delay: float, delay_rate: float) -> float:
         """Power summed over the virtual channels: what the estimate maximises."""
-        out = self.respond(delay, delay_rate)
+        out = self._match(delay, delay_rate)
         return float((out.real**2 + out.imag**2).sum())
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
+from isac_rt.arrays import Antennas, Schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive.cfar import detect, threshold
-from isac_rt.receive.common import Sensed, describe, make_maps, sense
+from isac_rt.receive.common import Sensed, describe, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point
 from isac_rt.receive.spectrum import clean_spectrum
@@ -60,7 +60,7 @@ def receive_passive(
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        return _reception(cube, settings, *_earliest(found, antennas, settings), found, None, maps)
+        return _reception(cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps)
     if prediction is None:
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
@@ -92,11 +92,11 @@ def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Re
     )
 
 
-def _earliest(found: Sensed, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:
+def _earliest(found: Sensed, schedule: Schedule, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:
     """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the false-alarm rate is asked of the
     whole map here and not of one cell, or an empty pilot would now and then be acquired."""
     d = found.detections
-    looks = antennas.num_tx * antennas.num_rx
+    looks = num_looks(settings, schedule, antennas)
     rate = settings.false_alarm_rate / found.power.size
     sure = d.snr > threshold(looks, rate, settings.guard_cells, settings.training_cells)
     if not sure.any():
@@ -130,11 +130,12 @@ def _at_prediction(
     columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
     gate = found.power[np.ix_(rows, columns)]
     i, j = np.unravel_index(gate.argmax(), gate.shape)
-    looks = antennas.num_tx * antennas.num_rx
+    looks = num_looks(settings, cube.schedule, antennas)
     above, level = detect(found.power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     if not above[rows[i], columns[j]]:
         return no_detections(), None
-    local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]))
+    separate = velocity_method(settings, cube.schedule, w.num_tx) == "conventional"
+    local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]), separate=separate)
     estimate = refine(local, *start_point(found.power, int(rows[i]), int(columns[j]), w))
     snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
     reference = describe([estimate], np.array([snr]), antennas, w, 1)
@@ -186,4 +187,5 @@ def _reception(
         line_of_sight=reference is not None,
         reference_power=float("nan") if reference is None else _power(reference),
         maps=picture,
+        sparse=None if found is None else found.sparse,
     )

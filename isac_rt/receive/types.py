@@ -106,6 +106,9 @@ class Reception:
     line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
     reference_power : mean power of the reference path per sample and receive antenna [W], NaN where there is none
     maps : Maps or None
+    sparse : where the velocities came from sparse sampling with OMP, whether the scene was sparse enough for it
+        (`isac_rt.receive.doppler.sparse_enough`); False advises the transmitter to fall back from a pseudo-random schedule to a
+        conventional one. None elsewhere
     """
 
     detections: Detections
@@ -119,3 +122,4 @@ class Reception:
     line_of_sight: bool
     reference_power: float
     maps: Maps | None = None
+    sparse: bool | None = None
