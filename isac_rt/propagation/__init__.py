@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from isac_rt.arrays import Antennas
@@ -29,8 +30,14 @@ class Propagation(Protocol):
         ...
 
 
-def make_propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City) -> Propagation:
-    """The model that the scenario asks for. `ray_traced` starts the JIT back end."""
+def make_propagation(
+    scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, instants: Sequence[float] = ()
+) -> Propagation:
+    """The model that the scenario asks for. `ray_traced` starts the JIT back end.
+
+    With `instants` (rising, those of the first and the last frame among them) the city is traced then only; between them paths are
+    unfolded anew (`between`).
+    """
     free = FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed)
     model: Propagation = free
     if scenario.propagation.model == "ray_traced":
@@ -39,7 +46,7 @@ def make_propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas,
         runtime.activate()
         from isac_rt.propagation.raytrace import RayTracer
 
-        model = RayTracer(scenario, city, antennas, waveform.wavelength, waveform.carrier_frequency)
+        model = RayTracer(scenario, city, antennas, waveform.wavelength, waveform.carrier_frequency, instants)
     if scenario.clutter.model == "rayleigh":
         return RayleighClutter(model, free, scenario.clutter, waveform, antennas, scenario.seed)
     return model

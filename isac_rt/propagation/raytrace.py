@@ -22,7 +22,8 @@ Points are world coordinates outside this module and local (recentred) coordinat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -31,14 +32,15 @@ import sionna.rt as rt
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.city.scene import shared_scene
+from isac_rt.propagation.between import Between, LegSet, leg_set, pick
 from isac_rt.propagation.clutter import ClutterField
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.geometry import Legs, edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario import Scenario
-from isac_rt.swarm import Pose
+from isac_rt.swarm import Pose, Swarm
 from isac_rt.waveform import SPEED_OF_LIGHT
 
 POINT_TOLERANCE = 1e-3
@@ -52,23 +54,12 @@ MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so fewer rays get less room."""
 
 
-@dataclass(frozen=True)
-class LegSet:
-    """All legs between a terminal and a UAV, local coordinates."""
-
-    amplitude: np.ndarray
-    legs: Legs
-    faces: np.ndarray
-
-    @property
-    def bounces(self) -> np.ndarray:
-        return (self.faces >= 0).sum(axis=1)
-
-
 class RayTracer:
     """Paths of all links of a frame in one city."""
 
-    def __init__(self, scenario: Scenario, city: City, antennas: Antennas, wavelength: float, carrier: float) -> None:
+    def __init__(
+        self, scenario: Scenario, city: City, antennas: Antennas, wavelength: float, carrier: float, instants: Sequence[float] = ()
+    ) -> None:
         self._scenario, self._city, self._antennas, self._wavelength = scenario, city, antennas, wavelength
         self._names = tuple(scenario.swarm)
         self._terminals = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
@@ -79,6 +70,10 @@ class RayTracer:
         pinned = scenario.clutter.model == "field"
         self.field = ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength) if pinned else None
         """The scatterers on the city's surfaces."""
+        self._trajectories = Swarm.from_scenario(scenario).trajectories
+        mirrors, rays = (self._normals, self._offsets), self._handle.scene.mi_scene
+        self.between = Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength) if len(instants) > 1 else None
+        """Legs from those of the traced instants; None: every frame is traced."""
         self.dropped = 0
         """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
         self.duplicates = 0
@@ -96,9 +91,14 @@ class RayTracer:
         local = {name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()}
         if not all(np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all() for pose in local.values()):
             raise ValueError("a UAV's position or velocity is not finite")
-        legs = self._specular_legs(local)
+        legs = self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
         hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
         return {link: self._link(local, epoch, *link, legs, hits) for link in links}
+
+    def _legs_on_the_way(self, time: float) -> dict[tuple[str, str], LegSet]:
+        """Legs traced at an instant of the run."""
+        poses = {name: trajectory.pose(time) for name, trajectory in self._trajectories.items()}
+        return self._specular_legs({name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()})
 
     def _solve(
         self, sources: dict[str, np.ndarray], sinks: dict[str, np.ndarray], max_depth: int, samples_per_src: int, **options: bool
@@ -187,16 +187,8 @@ class RayTracer:
             keep = one_of_each_chain(planes, chain, good)
             self.duplicates += int(good.sum()) - keep.size
             keep = keep[np.argsort(legs.length[keep], kind="stable")]
-            parts.append((amplitude[which][keep], _pick(legs, keep), chain[keep]))
-        depth = faces.shape[1]
-        widths = [depth - chain.shape[1] for _, _, chain in parts]
-        return LegSet(
-            np.concatenate([a for a, _, _ in parts]) if parts else np.zeros(0, complex),
-            _join([legs for _, legs, _ in parts], depth),
-            np.concatenate([np.pad(c, ((0, 0), (0, w)), constant_values=-1) for (_, _, c), w in zip(parts, widths, strict=True)])
-            if parts
-            else np.zeros((0, depth), np.int64),
-        )
+            parts.append((amplitude[which][keep], pick(legs, keep), chain[keep], planes[keep]))
+        return leg_set(parts, faces.shape[1])
 
     def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict) -> PathSet:
         common = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
@@ -309,15 +301,3 @@ class RayTracer:
             faces=face[:, None],
             **common,
         )
-
-
-def _pick(legs: Legs, which: np.ndarray) -> Legs:
-    return Legs(*(getattr(legs, name)[which] for name in ("length", "rate", "accel", "departure", "arrival", "points")))
-
-
-def _join(parts: list[Legs], depth: int) -> Legs:
-    if not parts:
-        return Legs(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, depth, 3)))
-    points = [np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan) for p in parts]
-    names = ("length", "rate", "accel", "departure", "arrival")
-    return Legs(*(np.concatenate([getattr(p, name) for p in parts]) for name in names), np.concatenate(points))

@@ -1,0 +1,136 @@
+"""Legs between traced instants: against tracing every frame, and against the geometry of a wall that ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt import scenario
+from isac_rt.arrays import antennas_of
+from isac_rt.city import City, Material, load_city
+from isac_rt.propagation import PathKind, PathSet
+from isac_rt.swarm import Swarm
+from isac_rt.waveform import waveform_of
+
+pytestmark = pytest.mark.sionna
+F_C = 77e9
+TIMES = np.linspace(0.013, 0.913, 13)
+AMPLITUDE = 2e-4  # Sionna's float32 through Fresnel's square roots
+ASIDE = 1e-2  # of corners, to which the tracer measures 0.1 m beside the terminal, 14 m and more away
+LINKS = [("A", "A"), ("A", "P")]
+
+
+def swarm_over(a, p, u, **changes) -> scenario.Scenario:
+    """Three bodies with start, velocity each; isotropic elements, mirror reflections only."""
+    rcs = {"model": "constant", "value_dbsm": -11.7}
+    roles = {"A": "active", "P": "passive", "U": "target"}
+    uavs = {
+        name: {"role": roles[name], "position_m": list(start), "velocity_mps": list(velocity), "rcs": rcs}
+        for name, (start, velocity) in {"A": a, "P": p, "U": u}.items()
+    }
+    tree = {
+        "swarm": uavs,
+        "city": {"source": "canyon"},
+        "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
+        "propagation": {"model": "ray_traced", "max_bounces": 2, "leakage": {"enabled": False}},
+    } | changes
+    return scenario.Scenario.model_validate(tree)
+
+
+def tracer(s: scenario.Scenario, city: City, instants=()):
+    from isac_rt.propagation.raytrace import RayTracer
+
+    w = waveform_of(s)
+    return RayTracer(s, city, antennas_of(s, w), w.wavelength, w.carrier_frequency, instants)
+
+
+def keyed(paths: PathSet) -> dict[tuple, int]:
+    """Paths by kind, target, number of bounces and length to a micrometre."""
+    rows = zip(paths.kind, paths.target, paths.bounces, np.round(paths.delay * 3e14), strict=True)
+    return {tuple(int(v) for v in row): i for i, row in enumerate(rows)}
+
+
+@pytest.fixture(scope="module")
+def streets():
+    """Every frame traced, and only every sixth, past a crossing where paths come and go."""
+    s = swarm_over(
+        ((-3.1, -20.3, 9.2), (0.4, 6.3, 0.1)), ((4.2, 13.7, 11.4), (-0.3, -3.1, 0.2)), ((-1.3, -4.9, 10.1), (0.5, 9.7, 0.3)),
+        city={"source": "blocks", "street_width_m": 19, "block_size_m": 16, "building_height_m": 14, "blocks_x": 2, "blocks_y": 3},
+    )  # fmt: skip
+    city = load_city(s.city, ".", F_C, (0.0, 0.0, 9.0))
+    swarm = Swarm.from_scenario(s)
+    full, between = tracer(s, city), tracer(s, city, TIMES[::6])
+    frames = [(t, full.paths(swarm.poses(t), t, LINKS), between.paths(swarm.poses(t), t, LINKS)) for t in TIMES]
+    return frames, between, full
+
+
+def test_between_traces_the_paths_are_those_of_a_trace(streets):
+    """The same chains, delays to 1 um (the key), gains to Sionna's rounding. Planted bug: TE and TM coefficients swapped."""
+    for t, full, got in streets[0]:
+        for link in LINKS:
+            a, b = keyed(full[link]), keyed(got[link])
+            assert a.keys() == b.keys(), (t, link)
+            one, other = full[link].gain[list(a.values())], got[link].gain[[b[k] for k in a]]
+            corner = (link == ("A", "A")) & (full[link].bounces[list(a.values())] > 1)
+            error = np.abs(other - one) / np.abs(one).max()
+            assert (error < np.where(corner, ASIDE, AMPLITUDE)).all()
+
+
+def test_births_and_deaths_happened_and_were_counted(streets):
+    """Or the test above would not have tested them. Planted bug: the two counts swapped."""
+    _, between, full = streets
+    traced = [full._legs_on_the_way(t) for t in TIMES[::6]]
+    chains = [{(pair, *row) for pair, legs in at.items() for row in legs.planes.tolist()} for at in traced]
+    assert between.between.num_traced == 3
+    assert between.between.changes == {i: (len(chains[i + 1] - chains[i]), len(chains[i] - chains[i + 1])) for i in (0, 1)}
+    assert min(min(pair) for pair in between.between.changes.values()) > 0
+
+
+def test_at_a_traced_instant_nothing_changes(streets):
+    """Bit for bit what the tracer gives. Planted bug: the instants' poses taken without the city's origin."""
+    for t, full, got in streets[0]:
+        if t in TIMES[::6]:
+            for link in LINKS:
+                for name in ("gain", "delay", "delay_rate", "delay_accel", "departure", "arrival"):
+                    assert np.array_equal(getattr(full[link], name), getattr(got[link], name)), name
+
+
+def test_a_path_dies_where_its_wall_ends():
+    """A wall x = 7, y from -40 to 3: the mirror point of a path from A to P lies, by similar triangles, at the mean of their y when both
+    are as far from the wall, so the path dies when that passes 3 m. Planted bug: the test behind the wall left out (it lives on)."""
+    corners = np.array([[7.0, -40, -20], [7, 3, -20], [7, 3, 40], [7, -40, 40]])
+    material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
+    city = City("wall", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (material,), np.zeros(3))
+    s = swarm_over(((0, -11.3, 8.7), (0, 10.3, 0)), ((0, 7.9, 10.1), (0, 9.1, 0)), ((-30, 1, 4), (0, 1, 0)))
+    swarm = Swarm.from_scenario(s)
+    between = tracer(s, city, [TIMES[0], TIMES[-1]])
+    for t in TIMES:
+        poses = swarm.poses(t)
+        mirror = (poses["A"].position[1] + poses["P"].position[1]) / 2
+        found = between.paths(poses, t, LINKS)["A", "P"]
+        specular = int((found.kind == PathKind.SPECULAR).sum())
+        assert abs(mirror - 3) > 0.05  # the case is a sure one
+        assert specular == (mirror < 3), t
+    assert between.between.num_traced == 2
+
+
+def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
+    """The line of sight of A to P crosses the plane y = 0 at x_A + (x_P - x_A) |y_A|/(|y_A| + y_P); a screen there from x = 2 on hides it.
+    Planted bug: rays tested from the first stop only."""
+    corners = np.array([[2.0, 0, -20], [60, 0, -20], [60, 0, 40], [2, 0, 40]])
+    material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
+    city = City("screen", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (material,), np.zeros(3))
+    s = swarm_over(((-4.3, -13.1, 8.7), (9.7, 0, 0)), ((-1.2, 21.3, 10.1), (8.3, 0, 0)), ((-30, 1, 4), (0, 1, 0)))
+    swarm = Swarm.from_scenario(s)
+    between = tracer(s, city, [TIMES[0], TIMES[-1]])
+    seen = []
+    for t in TIMES:
+        poses = swarm.poses(t)
+        a, p = poses["A"].position, poses["P"].position
+        crossing = a[0] + (p[0] - a[0]) * abs(a[1]) / (abs(a[1]) + p[1])
+        found = between.paths(poses, t, LINKS)["A", "P"]
+        seen.append(bool((found.kind == PathKind.LINE_OF_SIGHT).any()))
+        assert abs(crossing - 2) > 0.01
+        assert seen[-1] == (crossing < 2), t
+    assert True in seen
+    assert False in seen
