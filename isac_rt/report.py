@@ -149,6 +149,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         budget=row_table(json.loads(d.attrs["link_budget"])),
         paths=Table(("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]),
         figures=_embedded(pictures),
+        access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
         timing=Table(("Stage", "Seconds"), [(k, number(v)) for k, v in s["timing_s"].items()]),

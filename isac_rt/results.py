@@ -152,11 +152,12 @@ class Recorder:
         scores: Mapping[Link, SensingScore],
         timing: Mapping[str, float],
         fidelity: Mapping[str, Any],
+        access: Mapping[str, Any] | None = None,
         materials: Mapping[str, Any] | None = None,
         link_budget: Sequence[Mapping[str, Any]] = (),
     ) -> Results:
-        """The results of the frames so far. `scores` holds every link's sensing; `timing` [s] goes into the summary only;
-        `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the dataset."""
+        """The results of the frames so far. `scores` holds every link's sensing; `timing` [s] goes into the summary only, as does what
+        became of the stages before the data (`access`); `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the dataset."""
         dataset = _Builder(self.scenario, self.waveform, self.timetable, tuple(self.states), self._frames).dataset()
         dataset.attrs |= {
             **provenance(self.scenario),
@@ -164,9 +165,17 @@ class Recorder:
             "materials": json.dumps(dict(materials or {})),
             "link_budget": json.dumps([dict(row) for row in link_budget]),
         }
-        return Results(dataset, self.summary(scores=scores, timing=timing, fidelity=fidelity), self.scenario)
+        summary = self.summary(scores=scores, timing=timing, fidelity=fidelity, access=access)
+        return Results(dataset, summary, self.scenario)
 
-    def summary(self, *, scores: Mapping[Link, SensingScore], timing: Mapping[str, float], fidelity: Mapping[str, Any]) -> dict[str, Any]:
+    def summary(
+        self,
+        *,
+        scores: Mapping[Link, SensingScore],
+        timing: Mapping[str, float],
+        fidelity: Mapping[str, Any],
+        access: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
         """The fixed keys of `summary.json` alone; null stands for what does not apply."""
         frames = self._frames
         interval = self.scenario.frame_interval_s or self.waveform.frame_duration
@@ -194,6 +203,7 @@ class Recorder:
             "paths": {kind: int(n) for kind, n in zip(KINDS, counted, strict=True)},
             "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
             "fidelity": dict(fidelity),
+            "access": None if access is None else dict(access),
             "versions": versions(),
         }
 

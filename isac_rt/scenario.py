@@ -187,6 +187,10 @@ class Uav(Node):
     waypoints: tuple[Waypoint, ...] | None = None
     boresight: Literal["velocity"] | Vector = "velocity"
     rcs: Rcs = Rcs()
+    clock_offset_s: Finite = 0.0
+    """By how much the clock is late at time 0: what the UAV sends arrives later by it, what it receives seems earlier."""
+    clock_drift_ppm: Finite = 0.0
+    """How much later it gets [us/s]; 0.01 ppm against another clock is 3 m/s of apparent velocity."""
     resource_block: Annotated[int, Field(ge=0)] | None = None
     """First of the consecutive resource blocks, one per group, in which the UAV sends while it is active; null: the lowest that
     the active UAVs before it leave free."""
@@ -312,6 +316,17 @@ class Tracking(Node):
             )
 
 
+class Access(Node):
+    """How terminals find each other before the first frame."""
+
+    establish: bool = False
+    """Go through the stages before the data (`isac_rt.access.establish`): active terminals listen for free blocks and announce theirs,
+    clocks are measured, links acknowledged, with every wrong decision that the noise brings. Else blocks and links are as stated."""
+    synchronisation: Literal["external", "two_round", "none"] = "external"
+    """external: an outside source keeps all clocks equal. two_round: passive terminals correct theirs by what the stages measured.
+    none: nobody corrects anything."""
+
+
 class RoleChange(Node):
     """An active terminal and a passive one change places."""
 
@@ -336,6 +351,7 @@ class Scenario(Node):
     modulation: Modulation = Modulation()
     swarm: dict[str, Uav]
     role_changes: tuple[RoleChange, ...] = ()
+    access: Access = Access()
     city: City | None = None
     propagation: Propagation = Propagation()
     clutter: Clutter = Clutter()
@@ -442,6 +458,12 @@ class Scenario(Node):
                     yield Problem(((*key, end), ("swarm",)), f"{name} {now}; name a UAV that is {role} then")
             roles |= {change.from_uav: "passive", change.to_uav: "active"}
             ever_passive.add(change.from_uav)
+        if self.access.synchronisation == "two_round" and not self.access.establish:
+            said = "two_round measures clocks in the stages before the data; set access.establish: true, or take external or none"
+            yield Problem((("access", "synchronisation"), ("access", "establish")), said)
+        if self.access.establish and self.role_changes:
+            said = "the stages are gone through once, before the first frame, and a change of roles would need them again; leave one of the two out"
+            yield Problem((("access", "establish"), ("role_changes",)), said)
         for name, groups in self.modulation.streams.items():
             stream: Key = ("modulation", "streams", name)
             if name not in ever_passive:

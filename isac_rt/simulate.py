@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from isac_rt.access import Connections, connect
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
@@ -64,6 +65,7 @@ class Setup:
     reference: FreeSpace
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
     timetable: Timetable
+    connections: Connections
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
@@ -105,10 +107,14 @@ class Setup:
         """
         tx, rx = link
         level = self.noise_power(poses, link)
-        order = [tx, *(name for name in sent if name != tx)]
+        when = self.timetable.epoch(frame, tx)
+        links = []
+        for name in [tx, *(name for name in sent if name != tx)]:
+            clock = self.connections.apart(name, link, when)
+            links.append((replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift), paths[name, rx]))
         cube = if_signal(
             self.waveform,
-            [(sent[name], paths[name, rx]) for name in order],
+            links,
             poses[rx],
             self.antennas,
             start_time=self.timetable.start_time(frame, tx),
@@ -142,7 +148,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
     city = _city(scenario, waveform.carrier_frequency, tuple(centre.tolist()))
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
-    return Setup(
+    setup = Setup(
         scenario,
         waveform,
         antennas,
@@ -152,7 +158,24 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         _propagation(scenario, waveform, antennas, city, store),
         FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
         Timetable(scenario, waveform, schedule),
+        Connections(),
     )
+    return _connected(setup)
+
+
+def _connected(setup: Setup) -> Setup:
+    """The same after the stages before the data, where the scenario has them."""
+
+    def scene(when: float, links: list[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
+        poses = setup.swarm.poses(when)
+        return poses, setup.propagation.paths(poses, when, links) if links else {}
+
+    first = setup.swarm.poses(setup.timetable.epoch(0))
+    found = connect(
+        setup.scenario, setup.waveform, setup.antennas, setup.schedule, scene, lambda link: setup.noise_power(first, link)
+    )
+    timetable = replace(setup.timetable, blocks=found.blocks(), refused=found.refused())
+    return replace(setup, timetable=timetable, connections=found)
 
 
 def _city(scenario: Scenario, carrier: float, centre: tuple[float, ...]) -> City:
@@ -174,7 +197,7 @@ def _city_digest(scenario: Scenario) -> str:
     return hashlib.sha256(scenario.city_path().read_bytes()).hexdigest()
 
 
-UNSEEN_BY_PATHS = ("name", "modulation", "noise", "receivers", "tracking")
+UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
 """Parts of a scenario on which its paths do not depend."""
 
 
@@ -290,8 +313,12 @@ class _Flight:
 
     def figures(self) -> dict[str, Any]:
         """What a summary needs beside the frames."""
-        scores = {link: o.score for link, o in self.observers.items()}
-        return {"scores": scores, "timing": self.seconds, "fidelity": _fidelity(self.setup)}
+        return {
+            "scores": {link: o.score for link, o in self.observers.items()},
+            "timing": self.seconds,
+            "fidelity": _fidelity(self.setup),
+            "access": self.setup.connections.summary(self.setup.timetable.epoch(0)),
+        }
 
 
 def _fly(scenario: Scenario, progress: Progress | None, setup: Setup | None, threads: int | None, snapshots: set[int]) -> _Flight:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +23,11 @@ class Timetable:
     scenario: Scenario
     waveform: Waveform
     schedule: Schedule
+    blocks: Mapping[str, int] | None = None
+    """First resource blocks where the stages before the data chose them, without those that found none and stay silent;
+    None: as the scenario has them."""
+    refused: frozenset[Link] = frozenset()
+    """Links that these stages did not establish."""
 
     def start_time(self, frame: int, active: str | None = None) -> float:
         """Of a frame's first slot [s]; of the first chirp of an active terminal, whose block may start later in the slot."""
@@ -55,8 +61,9 @@ class Timetable:
         return [roles for first, roles in self._roles if first <= frame][-1]
 
     def with_role(self, role: str, frame: int) -> list[str]:
-        """Names of the UAVs of one role in a frame, in the scenario's order."""
-        return [name for name, is_now in self.roles(frame).items() if is_now == role]
+        """Names of the UAVs of one role in a frame, in the scenario's order; active ones that send."""
+        silent = () if self.blocks is None or role != "active" else set(self.scenario.first_blocks()) - set(self.blocks)
+        return [name for name, is_now in self.roles(frame).items() if is_now == role and name not in silent]
 
     def roles_taken(self, name: str) -> list[str]:
         """The roles of a UAV over the run, in order."""
@@ -65,7 +72,7 @@ class Timetable:
 
     def first_block(self, active: str, frame: int) -> int:
         """First resource block of an active terminal: its own, or that of the terminal whose role it took over."""
-        blocks = self.scenario.first_blocks()
+        blocks = dict(self.scenario.first_blocks() if self.blocks is None else self.blocks)
         for change in self.scenario.role_changes:
             if change.frame <= frame:
                 blocks[change.to_uav] = blocks.pop(change.from_uav)
@@ -76,16 +83,16 @@ class Timetable:
         terminal to every passive one."""
         active, passive = self.with_role("active", frame), self.with_role("passive", frame)
         own = frame % self.scenario.receivers.active_every_frames == 0
-        return [(a, a) for a in active if own] + [(a, p) for a in active for p in passive]
+        return [(a, a) for a in active if own] + [(a, p) for a in active for p in passive if (a, p) not in self.refused]
 
     @cached_property
     def all_links(self) -> list[Link]:
         """Every link that is received at some time, in the order of first use."""
         found: dict[Link, None] = {}
-        for _, roles in self._roles:
-            active = [name for name, role in roles.items() if role == "active"]
+        for first, roles in self._roles:
+            active = self.with_role("active", first)
             found |= dict.fromkeys((a, a) for a in active)
-            found |= dict.fromkeys((a, p) for a in active for p, role in roles.items() if role == "passive")
+            found |= dict.fromkeys((a, p) for a in active for p, role in roles.items() if role == "passive" and (a, p) not in self.refused)
         return list(found)
 
     @cached_property

@@ -1,5 +1,6 @@
 """How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, the stages before the data, and feedback."""
 
+from isac_rt.access.connect import Connections, connect
 from isac_rt.access.dma import Isolation, isolation
 from isac_rt.access.feedback import Correction, Feedback, correct, summarise
 from isac_rt.access.protocol import Clock, Establishment, LinkState, Network, establish
@@ -8,6 +9,7 @@ from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock
 __all__ = [
     "Clock",
     "ClockEstimate",
+    "Connections",
     "Correction",
     "Establishment",
     "Feedback",
@@ -15,6 +17,7 @@ __all__ = [
     "LinkState",
     "Network",
     "Round",
+    "connect",
     "correct",
     "establish",
     "estimate_clock",
