@@ -325,6 +325,9 @@ class Access(Node):
     synchronisation: Literal["external", "two_round", "none"] = "external"
     """external: an outside source keeps all clocks equal. two_round: passive terminals correct theirs by what the stages measured.
     none: nobody corrects anything."""
+    feedback: bool = False
+    """After every frame that the active terminals process, the passive ones report their range and their symbols, and the active ones,
+    which have the same distance from their echoes, answer by how many whole range cells it is off."""
 
 
 class RoleChange(Node):
@@ -461,6 +464,9 @@ class Scenario(Node):
         if self.access.synchronisation == "two_round" and not self.access.establish:
             said = "two_round measures clocks in the stages before the data; set access.establish: true, or take external or none"
             yield Problem((("access", "synchronisation"), ("access", "establish")), said)
+        if self.access.synchronisation == "none" and self.access.feedback:
+            said = "feedback compares ranges of two terminals, which need the same clock; leave it out, or take external or two_round"
+            yield Problem((("access", "feedback"), ("access", "synchronisation")), said)
         if self.access.establish and self.role_changes:
             said = "the stages are gone through once, before the first frame, and a change of roles would need them again; leave one of the two out"
             yield Problem((("access", "establish"), ("role_changes",)), said)

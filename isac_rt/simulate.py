@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from isac_rt.access import Connections, connect
+from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
@@ -255,6 +255,20 @@ class _Observer:
             order = s.modulation.dpsk_order
             self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude, groups=self.groups)
         self.score = SensingScore(resolutions(setup.waveform, setup.antennas, self.passes))
+        self.feedback = {"answers": 0, "corrections": 0}
+
+    def feed_back(self, frame: _Frame, heard: _Heard, at_active: _Heard) -> None:
+        """The passive terminal's feedback after a frame, and the active one's answer to it."""
+        if not isinstance(self.terminal, PassiveTerminal):
+            return
+        s, when = self.setup, self.setup.timetable.epoch(frame.number, self.link[0])
+        clock_std = s.connections.offset_std(self.link, when)
+        answer = exchange(heard.reception, heard.tracks, at_active.tracks, s.antennas.num_rx, clock_std, s.waveform)
+        if answer is not None:
+            self.feedback["answers"] += 1
+            self.feedback["corrections"] += answer.cells != 0
+            if answer.cells:
+                self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link[1]].pose(when))
 
     def hear(self, frame: _Frame, clock: _Clock) -> _Heard:
         """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
@@ -317,8 +331,15 @@ class _Flight:
             "scores": {link: o.score for link, o in self.observers.items()},
             "timing": self.seconds,
             "fidelity": _fidelity(self.setup),
-            "access": self.setup.connections.summary(self.setup.timetable.epoch(0)),
+            "access": self._access(),
         }
+
+    def _access(self) -> dict[str, Any] | None:
+        stages = self.setup.connections.summary(self.setup.timetable.epoch(0))
+        if not self.setup.scenario.access.feedback:
+            return stages
+        told = {f"{tx}->{rx}": o.feedback for (tx, rx), o in self.observers.items() if tx != rx}
+        return (stages or {}) | {"feedback": told}
 
 
 def _fly(scenario: Scenario, progress: Progress | None, setup: Setup | None, threads: int | None, snapshots: set[int]) -> _Flight:
@@ -372,6 +393,10 @@ def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame
     heard = {link: job.result() for link, job in jobs.items()}
     with clock.stage("track"):
         timetable = recorder.timetable
+        if recorder.scenario.access.feedback:
+            for tx, rx in heard:
+                if (tx, tx) in heard:
+                    observers[tx, rx].feed_back(frame, heard[tx, rx], heard[tx, tx])
         recorder.add(
             FrameRecord(
                 frame=frame.number,

@@ -139,6 +139,12 @@ class PassiveTerminal:
             self.tracker.update(reception.detections, own_pose, self.reference.state)
         return reception, self.tracker.snapshot(own_pose, self.reference)
 
+    def shorten(self, cells: int, own_pose: Pose) -> None:
+        """Take whole cells off the reference's range, as the active terminal's answer to feedback says."""
+        if self.reference is not None:
+            self.reference.state = _moved(self.reference.state, own_pose, -cells * self._cells[0])
+            self._ends.clear()
+
     def _receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
         return receive_passive(
             cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, maps=maps

@@ -7,7 +7,7 @@ import pytest
 
 from isac_rt import simulate
 from isac_rt.access import Clock, ClockEstimate, Connections, Establishment, LinkState
-from isac_rt.scenario import Access, Array, Modulation, Noise, Propagation, Radio, RoleChange, Scenario, Uav
+from isac_rt.scenario import Access, Array, Modulation, Noise, Propagation, Radio, Receivers, RoleChange, Scenario, Uav
 
 C = 299792458.0
 SMALL = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60)
@@ -121,3 +121,28 @@ def test_what_cannot_be_together_is_refused(access, said):
     changes = {"role_changes": (RoleChange(frame=2, from_uav="A", to_uav="P"),)} if access.establish else {}
     with pytest.raises(ValueError, match=said):
         run(access=access, **changes)
+
+
+@pytest.mark.parametrize("feedback", [True, False])
+def test_feedback_undoes_a_slip(monkeypatch, feedback):
+    """The terminal's own repair taken away and its range a cell too long from frame 7 on: read wrong in frames 7 and 8, after which
+    the active terminal answers, or to the end. The active terminal processes every second frame.
+
+    Planted bug: the range moved the other way."""
+    from isac_rt import terminal
+
+    monkeypatch.setattr(terminal, "slip_cells", lambda ends, size: 0)
+    step, times = terminal.PassiveTerminal.step, []
+
+    def slipping(self, cube, own_pose, time, modulated, **options):
+        times.append(time)
+        if len(times) == 8:
+            self.shorten(-1, own_pose)
+        return step(self, cube, own_pose, time, modulated, **options)
+
+    monkeypatch.setattr(terminal.PassiveTerminal, "step", slipping)
+    r = run(frames=12, access=Access(feedback=feedback), receivers=Receivers(active_every_frames=2))
+    wrong = 2 if feedback else 5
+    assert r.summary["terminals"]["P"]["ser_delay"] == pytest.approx(wrong / 10, abs=0.01)  # a slipped symbol is never right
+    told = (r.summary["access"] or {}).get("feedback")
+    assert (told["A->P"]["corrections"] if feedback else told) == (1 if feedback else None)

@@ -2,7 +2,7 @@
 
 from isac_rt.access.connect import Connections, connect
 from isac_rt.access.dma import Isolation, isolation
-from isac_rt.access.feedback import Correction, Feedback, correct, summarise
+from isac_rt.access.feedback import Correction, Feedback, correct, exchange, summarise
 from isac_rt.access.protocol import Clock, Establishment, LinkState, Network, establish
 from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock
 
@@ -21,6 +21,7 @@ __all__ = [
     "correct",
     "establish",
     "estimate_clock",
+    "exchange",
     "isolation",
     "summarise",
 ]

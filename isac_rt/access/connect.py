@@ -54,6 +54,11 @@ class Connections:
             offset, drift = offset - known.offset_at(time), drift - known.drift
         return Clock(offset, drift)
 
+    def offset_std(self, link: Link, time: float) -> float:
+        """Standard deviation of what is left of a link's clocks at `time` [s]."""
+        state = None if self.establishment is None else self.establishment.links[link].clock
+        return 0.0 if state is None else state.offset_std_at(time)
+
     def summary(self, time: float) -> dict[str, Any] | None:
         """For `summary.json`: what was decided, what was decided wrongly, clock errors left at `time`; None without the stages."""
         e = self.establishment
@@ -67,7 +72,7 @@ class Connections:
                 "identified": state.identified,
                 "acknowledged": state.acknowledged,
                 "clock_error_s": left.offset if known else None,
-                "clock_error_std_s": state.clock.offset_std_at(time) if state.clock is not None else None,
+                "clock_error_std_s": self.offset_std((tx, rx), time) if known else None,
                 "drift_error": left.drift if known else None,
             }
         return {

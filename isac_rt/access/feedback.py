@@ -15,6 +15,7 @@ from scipy import stats
 
 from isac_rt.receive.demodulate import EXTRA_CELLS
 from isac_rt.receive.types import Reception
+from isac_rt.tracking import TrackSet
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 LARGEST_SLIP = 16  # cells; what is farther off was never acquired
@@ -22,6 +23,8 @@ CONFIDENT_RATE = 1e-3
 """Chance that noise alone makes one chirp's decision count."""
 SUFFICIENT = 0.999
 """Probability of a slip from which it is corrected."""
+SAME_DIRECTION = np.radians(4.0)
+"""Half of the 16-element beam: an echo farther off the direction that the passive terminal reports is another's."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,44 @@ def summarise(reception: Reception, range_: float, range_std: float, num_rx: int
     if sure.size < 2:
         return Feedback(range_, range_std, None, None, int(sure.size))
     return Feedback(range_, range_std, int(sure[1]), int(sure[-2]), int(sure.size))
+
+
+def echo_of(reported: TrackSet, own: TrackSet) -> int | None:
+    """The active terminal's track of a passive one: the nearest in direction to the line of sight that this one reports.
+
+    Parameters
+    ----------
+    reported : the passive terminal's tracks; its reference points at the active one
+    own : the active terminal's tracks
+    """
+    reference, sure = np.flatnonzero(reported.is_reference), np.flatnonzero(own.confirmed)
+    if not reference.size or not sure.size:
+        return None
+    back = -reported.mean[reference[0], :3]
+    ways = own.mean[sure, :3]
+    cosine = ways @ back / (np.linalg.norm(ways, axis=1) * np.linalg.norm(back))
+    best = int(cosine.argmax())
+    return int(sure[best]) if cosine[best] > np.cos(SAME_DIRECTION) else None
+
+
+def exchange(
+    reception: Reception, reported: TrackSet, own: TrackSet, num_rx: int, clock_std: float, waveform: Waveform
+) -> Correction | None:
+    """One passive terminal's feedback after a frame and the active one's answer; None where either has nothing to go by.
+
+    Parameters
+    ----------
+    reception, reported : of the passive terminal, the same frame
+    own : the active terminal's tracks, the same frame
+    num_rx : receive antennas of the passive terminal
+    clock_std : of what is left of the clocks' offset [s]
+    """
+    echo = echo_of(reported, own)
+    if echo is None or not reception.decoded:
+        return None
+    q = int(np.flatnonzero(reported.is_reference)[0])
+    said = summarise(reception, float(reported.range[q]), float(reported.std[q, 0]), num_rx, waveform)
+    return correct(said, float(own.range[echo]), float(own.std[echo, 0]), clock_std, waveform)
 
 
 def _of_decided(reception: Reception) -> np.ndarray:
