@@ -234,6 +234,17 @@ def test_the_command_runs_resumes_and_gives_the_same_with_any_workers(folder, ca
     same(isac_rt.open_sweep(folder / "two"), open_sweep(folder / "none"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 4])
+def test_one_worker_and_four_give_the_same(folder, workers):
+    """Two are in the test above. Planted bug: results in the order of arrival."""
+    plan = plan_of(folder, SWEEP)
+    run_sweep(plan, folder / "many", workers=workers)
+    run_here(plan, folder / "none", reversed(list(plan.points())))
+    Outcomes(folder / "none").save_definition(plan)
+    same(isac_rt.open_sweep(folder / "many"), open_sweep(folder / "none"))
+
+
 CLIENT = """
 import sys
 from isac_rt.cli import main
