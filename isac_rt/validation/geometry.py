@@ -128,8 +128,8 @@ def delay_over_a_slanting_wall() -> float:
     why=NANOMETRE,
     planted=(
         "propagation/geometry.py",
-        "for b in range(depth):",
-        "for b in range(min(depth, 1)):",
+        "image = image - 2 * ((n * image).sum(1) - offsets[:, b])",
+        "image = image - 2 * ((n * image).sum(1) - offsets[:, 0])",
     ),
 )
 def delay_over_two_planes() -> float:
@@ -144,8 +144,8 @@ def delay_over_two_planes() -> float:
     why=NANOMETRE,
     planted=(
         "propagation/geometry.py",
-        "for b in range(depth):",
-        "for b in range(min(depth, 2)):",
+        "image = image - 2 * ((n * image).sum(1) - offsets[:, b])",
+        "image = image - 2 * ((n * image).sum(1) - offsets[:, min(b, 1)])",
     ),
 )
 def delay_over_three_planes() -> float:
