@@ -339,7 +339,7 @@ def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
     return Gospa(float(np.sqrt(square + missed + false)), square, missed, false)
 
 
-def binomial_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+def binomial_interval(successes: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
     """Clopper-Pearson: the proportions that would not make `successes` or fewer, or as many or more, too unlikely."""
     tail = (1 - confidence) / 2
     low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
