@@ -257,6 +257,61 @@ def _print_status(folder: Path) -> None:
 
 
 @app.command()
+def validate(
+    quick: Annotated[bool, typer.Option("--quick", help="The quick selection: within a minute on 2 cores.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write validation.json and validation.md there.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the table as JSON.")] = None,
+    only: Annotated[str, typer.Option("--only", metavar="WORDS", help="Only cases with these words in group or name.")] = "",
+) -> None:
+    """Hold every physical and numerical claim of the program against an independent truth."""
+    from isac_rt.results import check_folder
+    from isac_rt.validation import all_cases
+    from isac_rt.validation.table import write_json, write_markdown
+
+    cases = [case for case in all_cases(quick) if only.lower() in f"{case.group} {case.name}".lower()]
+    if not cases:
+        raise InputProblem(f"--only {only}: no case has these words in its group or name; leave it out to see them all")
+    for folder in {file for file in (out, json_file.parent if json_file else None) if file is not None}:
+        check_folder(folder)
+    with _ending_soon_after_interrupt(out if out is not None else Path("runs")):
+        verdicts = _validate(cases)
+    if out is not None:
+        write_json(verdicts, out / "validation.json")
+        write_markdown(verdicts, out / "validation.md")
+    if json_file is not None:
+        write_json(verdicts, json_file)
+    if any(v.passed is False for v in verdicts):
+        raise typer.Exit(1)
+
+
+def _validate(cases: list[Any]) -> list[Any]:
+    """Run cases with a bar, print their table, return the verdicts."""
+    from isac_rt.validation import run_case
+    from isac_rt.validation.table import STATES, shown
+
+    verdicts: list[Any] = []
+
+    def work(report: Any) -> None:
+        for number, case in enumerate(cases, start=1):
+            verdicts.append(run_case(case))
+            report(number, len(cases))
+
+    _with_progress(work, "cases", len(cases))
+    table = _table("case", "group", "error", "bound", "unit", "", "s")
+    colours = {True: "green", False: "red", None: "yellow"}
+    for v in verdicts:
+        words = f"[{colours[v.passed]}]{STATES[v.passed]}[/]"
+        table.add_row(escape(v.case.name), v.case.group, shown(v.error), shown(v.case.bound), v.case.unit, words, f"{v.seconds:.1f}")
+    _out().print(table)
+    for v in verdicts:
+        if v.note and v.passed is not True:
+            _out().print(f"{v.case.name}: {v.note}", markup=False, soft_wrap=True)
+    counts = {word: sum(v.passed is state for v in verdicts) for state, word in STATES.items()}
+    _out().print(f"{counts['passes']} cases pass, {counts['FAILS']} fail, {counts['left out']} left out")
+    return verdicts
+
+
+@app.command()
 def doctor() -> None:
     """Back end, LLVM, memory, threads, and what to install."""
     from isac_rt.runtime import doctor as look
