@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.experiments import tracks
-from isac_rt.experiments.flight import fly, span
+from isac_rt.experiments.flight import fly
 from isac_rt.experiments.outcome import Judgement, Outcome, Progress, Verdict, proportion
 
 FRAMES = 500
@@ -26,11 +26,18 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
                 "scene": "paper_swarm_consistent.yaml; as printed: paper_swarm.yaml"}  # fmt: skip
     tables = {"consistent": tracks.table([found], every, ("AT", "PT2")),
               "printed": tracks.table([printed], FRAMES // PRINTED_FRAMES, ("AT", "PT2"))}  # fmt: skip
-    figure = tracks.figure([found], every, ("AT",), ("AT", "PT2"), (107, 359))
-    return Outcome("fig10", "Tracking at PT1", tables, figure, _verdicts(found, printed, every), settings)
+    grid = tracks.on_grid([found], ("AT",), every, "PT1")
+    figure = tracks.figure([found], every, ("AT",), ("AT", "PT2"), (107, 359), grid)
+    return Outcome("fig10", "Tracking at PT1", tables, figure, _verdicts(found, printed, every, grid), settings)
 
 
-def _verdicts(found, printed, every: int) -> tuple[Verdict, ...]:
+def _seen(mask: np.ndarray, every: int) -> str:
+    """Frames in view as numbers of the whole flight."""
+    frames = np.flatnonzero(mask) * every
+    return f"{frames.min()} to {frames.max()}" if frames.size else "none"
+
+
+def _verdicts(found, printed, every: int, grid: tracks.Pairs) -> tuple[Verdict, ...]:
     followed = tracks.followed([found], "AT", WARM_UP)
     heard = int(np.isfinite(printed.sel(uav="AT").detected_range.values).sum())
     wrong, symbols = (found[f"symbol_{name}"].values.sum(axis=0) for name in ("errors", "total"))
@@ -48,8 +55,8 @@ def _verdicts(found, printed, every: int) -> tuple[Verdict, ...]:
                 f"{proportion(int(wrong[1]), int(symbols[1]))}; condition: unmodulated frames first, "
                 "fractional decisions, all data phases removed"),
         Verdict("PT2 appears between frames 107 and 359", "does not hold",
-                f"consistent variant: in view in {span(two.in_view.values)} (of frames {every} apart), detected in {seen.sum()} of "
+                f"consistent variant: in view in frames {_seen(two.in_view.values, every)}, detected in {seen.sum()} of "
                 f"{int(two.in_view.values.sum())}" + (f", frames {frames.min()} to {frames.max()}" if frames.size else "")
                 + f"; as printed in {int(np.isfinite(printed.sel(uav='PT2').detected_range.values).sum())}"),
-        tracks.filter_verdict([found], ("AT",), "PT1"),
+        tracks.filter_verdict([found], ("AT",), "PT1", grid),
     )  # fmt: skip
