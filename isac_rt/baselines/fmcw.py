@@ -39,8 +39,14 @@ def receive_fmcw(cube: IFCube, antennas: Antennas, settings: Receivers) -> Detec
     w, schedule = cube.waveform, np.asarray(cube.schedule[0])
     if not np.array_equal(schedule[: -w.num_tx], schedule[w.num_tx :]):
         raise ValueError("receive_fmcw needs antennas in turn (fmcw_frame); this schedule is pseudo-random")
-    window = np.sin(np.pi * (np.arange(w.num_samples) + 0.5) / w.num_samples).astype(np.float32) ** 2
-    spectra = scipy.fft.fft(cube.samples[0] * window, axis=-1, workers=1, overwrite_x=True).transpose(0, 2, 1)
     first = int(np.ceil(settings.min_range_m / w.range_cell(2)))
     times = np.arange(w.num_chirps) * w.slot_duration
+    spectra = fmcw_spectra(cube.samples[0])
     return sense_tdm(spectra, schedule, times, lambda cell, bin_: to_delay(cell, bin_, w), w, antennas, settings, first)
+
+
+def fmcw_spectra(samples: np.ndarray) -> np.ndarray:
+    """(L_rx, N, P) Hann-windowed range spectra of (L_rx, P, N) samples."""
+    size = samples.shape[-1]
+    window = np.sin(np.pi * (np.arange(size) + 0.5) / size).astype(np.float32) ** 2
+    return scipy.fft.fft(samples * window, axis=-1, workers=1, overwrite_x=True).transpose(0, 2, 1)

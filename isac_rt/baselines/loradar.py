@@ -24,6 +24,7 @@ Assumed here, where it is silent:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -208,6 +209,14 @@ def receive_loradar(
     frame: LoRadarFrame, system: LoRadar, antennas: Antennas, settings: Receivers, compensation: Compensation = "ordered"
 ) -> Detections:
     """Range (one way), velocity and direction of the echoes of a terminal's own symbols."""
+    w = system.waveform
+    spectra, times = loradar_spectra(frame, system, compensation)
+    first = int(np.ceil(settings.min_range_m / system.range_cell))
+    return sense_tdm(spectra, frame.schedule, times, partial(loradar_delay, system), w, antennas, settings, first)
+
+
+def loradar_spectra(frame: LoRadarFrame, system: LoRadar, compensation: Compensation) -> tuple[np.ndarray, np.ndarray]:
+    """Hann-windowed range spectra (L_rx, N, P) of a terminal's own symbols, and the times (P,) that their phases belong to [s]."""
     w, size = system.waveform, system.waveform.num_samples
     begin = frame.symbols / system.num_symbols * size  # where in the band each chirp starts, in samples
     whole = np.floor(begin).astype(int) if compensation == "ordered" else np.zeros(w.num_chirps, int)
@@ -215,17 +224,17 @@ def receive_loradar(
     turn = np.zeros(w.num_chirps) if compensation == "none" else begin - whole
     cells = np.exp(-2j * np.pi * np.outer(np.arange(size), turn) / size).astype(np.complex64)
     order = (np.arange(size) - whole[:, None]) % size
-    spectra = np.empty((antennas.num_rx, size, w.num_chirps), np.complex64)
+    spectra = np.empty((len(frame.samples), size, w.num_chirps), np.complex64)
     for rx, one in enumerate(frame.samples):
         sorted_ = np.take_along_axis(one, order, axis=1) * window.astype(np.float32)
         spectra[rx] = scipy.fft.fft(sorted_, axis=1, workers=1).T * cells
     middle = (0.5 - begin / size) % 1.0 if compensation == "ordered" else np.full(w.num_chirps, 0.5)
-    times = np.arange(w.num_chirps) * w.slot_duration + middle * w.sampled_duration
+    return spectra, np.arange(w.num_chirps) * w.slot_duration + middle * w.sampled_duration
+
+
+def loradar_delay(system: LoRadar, cell: float, doppler_bin: float) -> tuple[float, float]:
+    """Delay [s] and delay rate of a range cell and a Doppler bin."""
+    w = system.waveform
     carrier = w.carrier_frequency + w.bandwidth / 2
-
-    def convert(cell: float, doppler_bin: float) -> tuple[float, float]:
-        rate = doppler_bin / (w.frame_duration * carrier)
-        return (cell - rate * carrier * w.sampled_duration) / w.bandwidth, rate
-
-    first = int(np.ceil(settings.min_range_m / system.range_cell))
-    return sense_tdm(spectra, frame.schedule, times, convert, w, antennas, settings, first)
+    rate = doppler_bin / (w.frame_duration * carrier)
+    return (cell - rate * carrier * w.sampled_duration) / w.bandwidth, rate

@@ -75,16 +75,29 @@ def sense_tdm(
     rows, columns = peaks(power, above, settings.cluster_cells)
     keep = without_sidelobes(rows, columns, power, power.shape[1], SIDELOBES)
     rows, columns = rows[keep][: settings.max_detections], columns[keep][: settings.max_detections]
-    estimates = []
-    for row, column in zip(rows, columns, strict=True):
-        cell, fraction = row + hann_fraction(power[:, column], row, False), hann_fraction(power[row], column, True)
-        centred = column - power.shape[1] // 2
-        # TDM: antennas answer at different times; the whole bin's turn is in the transform, the fraction's is taken out here
-        middle = np.array([times[schedule == tx].mean() for tx in range(w.num_tx)])
-        turn = np.exp(-2j * np.pi * fraction / w.frame_duration * middle)
-        channels = maps[:, :, row, centred % power.shape[1]] * turn[:, None]
-        estimates.append(Estimate(*convert(cell, centred + fraction), channels))
+    estimates = [estimate_tdm(maps, power, int(r), int(c), schedule, times, convert, w) for r, c in zip(rows, columns, strict=True)]
     return describe(estimates, power[rows, columns] / level[rows, columns], antennas, w, 2)
+
+
+def estimate_tdm(
+    maps: np.ndarray,
+    power: np.ndarray,
+    row: int,
+    column: int,
+    schedule: np.ndarray,
+    times: np.ndarray,
+    convert: Conversion,
+    waveform: Waveform,
+) -> Estimate:
+    """The path behind a peak of the accumulated, centred map `power` of `maps`."""
+    w = waveform
+    cell, fraction = row + hann_fraction(power[:, column], row, False), hann_fraction(power[row], column, True)
+    centred = column - power.shape[1] // 2
+    # TDM: antennas answer at different times; the whole bin's turn is in the transform, the fraction's is taken out here
+    middle = np.array([times[schedule == tx].mean() for tx in range(w.num_tx)])
+    turn = np.exp(-2j * np.pi * fraction / w.frame_duration * middle)
+    channels = maps[:, :, row, centred % power.shape[1]] * turn[:, None]
+    return Estimate(*convert(cell, centred + fraction), channels)
 
 
 def hann_fraction(power: np.ndarray, peak: int, wraps: bool) -> float:
