@@ -295,6 +295,12 @@ class Receivers(Node):
     filters nothing."""
     clutter_run_cells: Annotated[int, Field(ge=2)] = 15
     """Consecutive occupied range cells from which on a run counts as clutter."""
+    clutter_detector: Literal["cfar", "map", "angle_doppler", "sample_matrix"] = "cfar"
+    """What the AT holds a cell against, after the filter if there is one. cfar: its surroundings. map: the clutter power that the city's
+    mesh predicts. angle_doppler: filtered over the antennas with the covariance that the mesh and the terminal's own velocity predict.
+    sample_matrix: filtered with the covariance of the cells around."""
+    clutter_channels: Literal["arms", "joint"] = "arms"
+    """angle_doppler, sample_matrix: filter each arm of the virtual L by itself, or both jointly (several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """The AT processes one frame in so many."""
 
@@ -521,6 +527,12 @@ class Scenario(Node):
                 (("clutter", "model"), ("propagation", "model"), ("city",)),
                 f"{self.clutter.model} needs propagation.model ray_traced and a city to scatter from; "
                 "add them or set clutter.model to none",
+            )
+        if self.receivers.clutter_detector in ("map", "angle_doppler") and (self.propagation.model != "ray_traced" or self.city is None):
+            yield Problem(
+                (("receivers", "clutter_detector"), ("propagation", "model"), ("city",)),
+                f"{self.receivers.clutter_detector} predicts clutter from a city's mesh: it needs propagation.model ray_traced and a city; "
+                "add them or set receivers.clutter_detector to cfar or sample_matrix",
             )
 
     def doubts(self) -> Iterator[Problem]:

@@ -120,9 +120,13 @@ def detect(
     level : (rows, P) background
     """
     level = np.maximum(background(power, ~strong_lobes(power), guard, training), ROUNDING * power.max())
-    rows = side_rows(len(power), guard[0], training[0])
-    factor = np.array([_factor(looks, false_alarm_rate, guard, training, *count) for count in rows.tolist()])
-    return power > factor[:, None] * level, level
+    return power > row_factors(len(power), looks, false_alarm_rate, guard, training)[:, None] * level, level
+
+
+def row_factors(rows: int, looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
+    """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
+    sides = side_rows(rows, guard[0], training[0])
+    return np.array([_factor(looks, false_alarm_rate, guard, training, *count) for count in sides.tolist()])
 
 
 def detect_chirps(power: np.ndarray, looks: int, false_alarm_rate: float, guard: int, training: int) -> np.ndarray:

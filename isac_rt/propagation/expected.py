@@ -1,0 +1,68 @@
+"""What a terminal that has the city's mesh expects of its clutter: mean powers, delays, rates and directions, no phases.
+
+A terminal knows the mesh, where it is and how it flies. It does not know the scatterers: in `expectation` it cuts the same
+surfaces with points of its own, drawn from another seed, so that what it expects of a range-Doppler cell is the mean over the surface
+there and not the very points that scatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isac_rt.propagation.pathset import PathSet
+from isac_rt.swarm import Pose
+
+
+@dataclass(frozen=True)
+class ExpectedClutter:
+    """K independent scatterers of known mean power, as one receiver expects them at the middle of a frame.
+
+    Attributes
+    ----------
+    delay, delay_rate : (K,) [s, 1]
+    power : (K,) mean received power per sample and antenna pair [W], elements included
+    departure, arrival : (K, 3) unit vectors in the body frame of the transmitter and of the receiver
+    """
+
+    delay: np.ndarray
+    delay_rate: np.ndarray
+    power: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+    def __len__(self) -> int:
+        return self.delay.size
+
+    def select(self, which: np.ndarray) -> ExpectedClutter:
+        """The scatterers that a mask or an index array chooses."""
+        return ExpectedClutter(*(a[which] for a in vars(self).values()))
+
+    def louder(self, decibels: float) -> ExpectedClutter:
+        """The same clutter with all powers raised."""
+        return replace(self, power=self.power * 10 ** (decibels / 10))
+
+
+def expected_of(paths: PathSet, amplitude: float, start: Pose, end: Pose) -> ExpectedClutter:
+    """Paths as independent scatterers, each with its own power as the mean.
+
+    Parameters
+    ----------
+    paths : of the city alone, at the epoch of the frame
+    amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
+    start, end : poses of transmitter and receiver
+    """
+    return ExpectedClutter(
+        paths.delay,
+        paths.delay_rate,
+        amplitude**2 * paths.power,
+        start.to_body(paths.departure),
+        end.to_body(paths.arrival),
+    )
+
+
+def joined(parts: list[ExpectedClutter]) -> ExpectedClutter:
+    """Several kinds of clutter as one."""
+    names = ("delay", "delay_rate", "power", "departure", "arrival")
+    return ExpectedClutter(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
