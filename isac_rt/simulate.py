@@ -34,6 +34,7 @@ from isac_rt.metrics import (
 )
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.cache import CachedPropagation, PathStore
+from isac_rt.propagation.expected import ClutterExpectation, ExpectedClutter, make_expectation
 from isac_rt.propagation.pathset import drop_weak
 from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import generator, seed_sequence
@@ -66,6 +67,18 @@ class Setup:
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
     timetable: Timetable
     connections: Connections
+    expectation: ClutterExpectation | None = None
+    """What an active terminal's receiver predicts of its clutter from the mesh; None where its detector needs none."""
+
+    def expected_clutter(self, frame: int) -> dict[str, ExpectedClutter]:
+        """What each active terminal expects of its own link. Traces rays: from the thread that traces only."""
+        if self.expectation is None:
+            return {}
+        amplitude, out = transmit_amplitude(self.scenario.noise), {}
+        for name in self.timetable.with_role("active", frame):
+            when = self.timetable.epoch(frame, name)
+            out[name] = self.expectation.clutter(name, self.swarm.trajectories[name].pose(when), when, amplitude)
+        return out
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
@@ -159,6 +172,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
         Timetable(scenario, waveform, schedule),
         Connections(),
+        make_expectation(scenario, waveform, antennas, city),
     )
     return _connected(setup)
 
@@ -279,7 +293,8 @@ class _Observer:
             tx, rx = self.link
             own = self.setup.swarm.trajectories[rx].pose(when)
             if isinstance(self.terminal, ActiveTerminal):
-                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, own, when, maps=frame.snapshot)
+                clutter = frame.expected.get(tx)
+                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, own, when, clutter=clutter, maps=frame.snapshot)
                 return _Heard(reception, tracks, int(TerminalState.TRACKING))
             modulated = self.setup.timetable.modulated(number)
             reception, tracks = self.terminal.step(cube, own, when, modulated, maps=frame.snapshot)
@@ -360,7 +375,7 @@ def _fly(scenario: Scenario, progress: Progress | None, setup: Setup | None, thr
                 if progress:
                     progress(number, scenario.frames)
             sent = {name: setup.transmission(name, number, poses[name]) for name in timetable.with_role("active", number)}
-            frame = _Frame(number, poses, paths, sent, number in snapshots)
+            frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), number in snapshots)
             waiting = frame, {link: pool.submit(observers[link].hear, frame, clock) for link in timetable.links(number)}
         if waiting is not None:
             _collect(recorder, observers, *waiting, clock)
@@ -378,6 +393,7 @@ class _Frame:
     poses: dict[str, Pose]
     paths: dict[Link, PathSet]
     sent: dict[str, Transmission]
+    expected: dict[str, ExpectedClutter]
     snapshot: bool
 
 

@@ -20,6 +20,7 @@ from scipy import stats
 from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload
+from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive import Detections, Prediction, Reception, receive_active, receive_passive
 from isac_rt.receive.demodulate import EXTRA_CELLS
 from isac_rt.scenario import Receivers, Tracking
@@ -76,10 +77,10 @@ class ActiveTerminal:
         self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
 
     def step(
-        self, cube: IFCube, payload: Payload, own_pose: Pose, time: float, *, maps: bool = False
+        self, cube: IFCube, payload: Payload, own_pose: Pose, time: float, *, clutter: ExpectedClutter | None = None, maps: bool = False
     ) -> tuple[Reception, TrackSet]:
-        """Receive and track one frame; `time` is its middle [s]."""
-        reception = receive_active(cube, payload, self._antennas, self._receivers, maps=maps)
+        """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal expects of its mesh there."""
+        reception = receive_active(cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps)
         self.tracker.predict(time)
         self.tracker.update(reception.detections, own_pose)
         return reception, self.tracker.snapshot(own_pose)

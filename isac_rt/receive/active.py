@@ -7,21 +7,30 @@ import numpy as np
 from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload
+from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.clutter_filter import remove_standing
 from isac_rt.receive.common import make_maps, sense
+from isac_rt.receive.in_clutter import sense_in_clutter
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Receivers
 
 
 def receive_active(
-    cube: IFCube, payload: Payload, antennas: Antennas, settings: Receivers, *, maps: bool = False
+    cube: IFCube,
+    payload: Payload,
+    antennas: Antennas,
+    settings: Receivers,
+    *,
+    clutter: ExpectedClutter | None = None,
+    maps: bool = False,
 ) -> Reception:
     """Range, velocity and direction of what the transmitter's own echoes show.
 
     Parameters
     ----------
     cube : IFCube, received by the terminal that sent `payload`
+    clutter : what the city is expected to return, for the detectors that need it (`isac_rt.receive.detectors`)
     maps : also return pictures
 
     Returns
@@ -32,7 +41,10 @@ def receive_active(
     spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
     if settings.clutter_filter != "none":
         remove_standing(spectra, cube.schedule, settings.clutter_run_cells if settings.clutter_filter == "runs" else None)
-    found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
+    if settings.clutter_detector == "cfar":
+        found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
+    else:
+        found = sense_in_clutter(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter)
     groups, chirps = payload.delay_symbols.shape
     return Reception(
         detections=found.detections,

@@ -162,7 +162,7 @@ def covariances(
     order = np.argsort(beat, kind="stable")
     clutter, beat, doppler = clutter.select(order), beat[order], doppler[order]
     column = np.round(doppler * t.fine).astype(np.int64) % (w.num_chirps * t.fine)
-    size, full = len(channels), np.ones((w.num_tx, w.num_chirps), bool)
+    size = len(channels)
     first, second = np.tril_indices(size)
     shape = _angle_taper(channels, w, t.cosine)[first, second]
     pairs = channels.tx[first], channels.tx[second]
@@ -172,7 +172,7 @@ def covariances(
         products = doppler_products(w, kept, t.doppler_bins, t.fine)
         return products[0, 0, :, None].real.astype(np.float32) if kept.all() else products[pairs].T.astype(np.complex64)
 
-    whole = kernel(full)
+    whole = kernel(kept_slots(w, schedule, delay_symbols, 0))
     rows = np.flatnonzero(wanted.any(axis=1))
     for block in np.array_split(rows, max(1, -(-rows.size // ROWS))) if rows.size else []:
         low, high = int(block[0]) - REACH, int(block[-1]) + REACH
