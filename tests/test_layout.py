@@ -16,7 +16,7 @@ ORDER = (
     "scenario_base scenario_clutter scenario scenario_file provenance runtime randomness waveform arrays payload timetable city swarm "
     "linkbudget propagation synthesis gridding "
     "noise ifsignal receive tracking terminal baselines access metrics fidelity results simulate sweep experiments validation "
-    "bench figures render report cli"
+    "bench figures render interactive animate report interchange starter cli"
 ).split()
 ALONE = {"runtime", "randomness"}
 MAX_MODULE_LINES = 600
