@@ -65,17 +65,18 @@ def run(
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where the results go; default runs/NAME.")] = None,
     frames: Annotated[int | None, typer.Option("--frames", help="Simulate so many frames.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Replace the scenario's seed.")] = None,
+    snapshots: Annotated[int, typer.Option("--snapshots", min=1, help="Frames of which maps and path ledger are kept.")] = 3,
     overrides: Overrides = None,
 ) -> None:
     """Simulate a scenario: results, summary, figures and a report."""
     loaded = _load(scenario, overrides, frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
     with _ending_soon_after_interrupt(folder):
-        _run(loaded, folder)
+        _run(loaded, folder, snapshots)
     _out().print(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/", soft_wrap=True)
 
 
-def _run(loaded: Scenario, folder: Path) -> None:
+def _run(loaded: Scenario, folder: Path, snapshots: int) -> None:
     from isac_rt.results import check_folder, save
 
     check_folder(folder)
@@ -85,7 +86,7 @@ def _run(loaded: Scenario, folder: Path) -> None:
         setup = simulate.prepare(loaded)
         budget = simulate.link_budgets(setup)
     _print_budget(budget)
-    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report), "frames", loaded.frames)
+    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots), "frames", loaded.frames)
     save(results, folder)
     with _err().status("figures and report"):
         from isac_rt.figures import make_figures
@@ -120,11 +121,13 @@ def paths(
 @app.command()
 def view(
     scenario: ScenarioFile,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.png", help="Where the picture goes.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="A .png, or an .html page with the scene to turn about.")],
     frame: FrameNumber = 0,
     overrides: Overrides = None,
 ) -> None:
     """Render the city, the swarm and the paths of a frame."""
+    if out.suffix not in (".png", ".html"):
+        raise InputProblem(f"--out {out}: a view is a .png picture or an .html page; name it so")
     loaded = _load(scenario, overrides)
     _check_frame(loaded, frame)
     with _ending_soon_after_interrupt(out.parent), _err().status("tracing and drawing"):
@@ -136,8 +139,13 @@ def view(
         setup = simulate.prepare(loaded)
         found = simulate.trace(loaded, frame, setup=setup)
         times = np.linspace(setup.timetable.epoch(0), setup.timetable.epoch(loaded.frames - 1), 60)
-        picture = view_scene(setup.city, setup.swarm, times, setup.timetable.epoch(frame), found)
-        write_view(picture, out)
+        scene = setup.city, setup.swarm, times, setup.timetable.epoch(frame), found
+        if out.suffix == ".html":
+            from isac_rt.interactive import scene_3d, write_page
+
+            write_page(scene_3d(*scene), out)
+        else:
+            write_view(view_scene(*scene), out)
     _out().print(f"{out}", soft_wrap=True)
 
 
@@ -328,11 +336,44 @@ def doctor() -> None:
 @app.command()
 def schema() -> None:
     """JSON Schema of the scenario, for editors."""
-    import json
+    from isac_rt.starter import schema_text
 
-    from isac_rt.scenario import json_schema
+    typer.echo(schema_text(), nl=False)
 
-    typer.echo(json.dumps(json_schema(), indent=1))
+
+@app.command()
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The scenario to write.")],
+    footprints: Annotated[Path | None, typer.Option("--footprints", metavar="FILE", help="Buildings, as GeoJSON or CityJSON.")] = None,
+) -> None:
+    """Write a commented scenario to start from, over a street canyon or over one's own buildings, and the schema for editors."""
+    from isac_rt.starter import write_starter
+
+    for made in write_starter(file, footprints):
+        _out().print(f"{made}", soft_wrap=True)
+
+
+@app.command()
+def animate(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run --snapshots N` wrote.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="A .gif or an .mp4; default DIR/run.gif.")] = None,
+    observer: Annotated[str | None, typer.Option("--observer", metavar="NAME", help="Whose map; default the first.")] = None,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=60, help="Pictures per second.")] = 5.0,
+) -> None:
+    """Draw a run as a moving picture: the swarm with tracks, and a range-Doppler map, in step."""
+    from isac_rt.results import load as load_results
+
+    results = load_results(folder)
+    names = [str(name) for name in results.dataset.observer.values]
+    if observer is not None and observer not in names:
+        raise InputProblem(f"--observer {observer}: no such observer in {folder}; choose from {', '.join(names)}")
+    from isac_rt.animate import write_animation
+    from isac_rt.simulate import city_of
+
+    target = out if out is not None else folder / "run.gif"
+    with _ending_soon_after_interrupt(folder), _err().status("drawing"):
+        write_animation(results, target, names.index(observer) if observer else 0, city_of(results.scenario), rate)
+    _out().print(f"{target}", soft_wrap=True)
 
 
 def _check_frame(scenario: Scenario, frame: int) -> None:

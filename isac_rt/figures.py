@@ -276,7 +276,8 @@ def _figure(rows: int, columns: int, height: float, width: float = 8.4) -> tuple
 
 def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
     d = results.dataset
-    observers, shots = range(d.sizes["observer"]), range(d.sizes["snapshot"])
+    observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
+    shots = sorted({0, kept // 2, kept - 1}) if kept else []
     figure, axes = _figure(1, 1, 6.4)
     scene_map(axes[0, 0], d, city)
     yield "scene", figure

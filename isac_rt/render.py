@@ -177,12 +177,12 @@ def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mappi
                 ax.plot(flat[:, 0], flat[:, 1], ".", color=colour, ms=2.6, alpha=0.8, mew=0)
             elif kind != PathKind.LEAKAGE:
                 for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
-                    _line(ax, _polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, 1.0, 0.85)
+                    _line(ax, polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, 1.0, 0.85)
     drawn = [k for k in PathKind if count[k] and k != PathKind.LEAKAGE]
     return [Line2D([], [], color=KIND_COLOURS[k.name.lower()], label=f"{words(k.name.lower())} ({count[k]})") for k in drawn]
 
 
-def _polyline(p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapping[str, Pose]) -> np.ndarray:
+def polyline(p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapping[str, Pose]) -> np.ndarray:
     """Corners of a path from transmitter to receiver, its UAV included."""
     inner = p.points[k][np.isfinite(p.points[k]).all(axis=1)]
     if not inner.size and p.target[k] >= 0:

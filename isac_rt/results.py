@@ -130,6 +130,16 @@ class Results:
     summary: dict[str, Any]
     scenario: Scenario
 
+    def __repr__(self) -> str:
+        def say(value: float | None, form: str) -> str:
+            return "-" if value is None else format(value, form)
+
+        lines = [
+            f"  {name}: hit rate {say(block['hit_rate'], '.2f')}, delay SER {say(block['ser_delay'], '.2e')}, DPSK SER {say(block['ser_dpsk'], '.2e')}"
+            for name, block in self.summary["terminals"].items()
+        ]
+        return "\n".join([f"<Results of {self.scenario.name}: {self.summary['frames']} frames, seed {self.summary['seed']}", *lines]) + ">"
+
 
 @dataclass
 class Recorder:

@@ -156,10 +156,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
     swarm = Swarm.from_scenario(scenario)
-    interval = scenario.frame_interval_s or waveform.frame_duration
-    times = np.linspace(0, scenario.frames * interval, 9)
-    centre = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
-    city = _city(scenario, waveform.carrier_frequency, tuple(centre.tolist()))
+    city = city_of(scenario)
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
     setup = Setup(
         scenario,
@@ -192,8 +189,12 @@ def _connected(setup: Setup) -> Setup:
     return replace(setup, timetable=timetable, connections=found)
 
 
-def _city(scenario: Scenario, carrier: float, centre: tuple[float, ...]) -> City:
-    """The scenario's city; the same object again while scenario after scenario flies over the same one."""
+def city_of(scenario: Scenario) -> City:
+    """The scenario's city about the middle of the flight; the same object again while scenario after scenario flies over the same one."""
+    waveform, swarm = waveform_of(scenario), Swarm.from_scenario(scenario)
+    times = np.linspace(0, scenario.frames * (scenario.frame_interval_s or waveform.frame_duration), 9)
+    middle = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
+    carrier, centre = waveform.carrier_frequency, tuple(middle.tolist())
     text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
     return _loaded_city(text, scenario.folder, _city_digest(scenario), carrier, centre)
 
@@ -302,7 +303,7 @@ class _Observer:
 
 
 def run(
-    scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None, threads: int | None = None
+    scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None, threads: int | None = None, snapshots: int = 3
 ) -> Results:
     """Simulate every frame of a scenario.
 
@@ -312,12 +313,13 @@ def run(
     progress : called with the frames done and the frames in all
     setup : from `prepare`, if it is there already
     threads : receivers at work at once; None: as many as the machine has cores
+    snapshots : frames, spread over those that the active terminals process, of which maps and path ledger are kept
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
-    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario))
+    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario, snapshots))
     return flight.recorder.finish(
         **flight.figures(),
         materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in flight.setup.city.materials},
@@ -397,11 +399,11 @@ class _Frame:
     snapshot: bool
 
 
-def _snapshot_frames(scenario: Scenario) -> set[int]:
-    """Frames of which maps and ledger are kept: three of those that the active terminal processes, the first in data mode."""
+def _snapshot_frames(scenario: Scenario, count: int) -> set[int]:
+    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those that the active terminal processes."""
     step = scenario.receivers.active_every_frames
     heard = [f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames] or [0]
-    return {heard[0], heard[len(heard) // 2], heard[-1]}
+    return {heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)}
 
 
 def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame, jobs: dict[Link, Future], clock: _Clock) -> None:

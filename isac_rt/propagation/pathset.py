@@ -78,6 +78,11 @@ class PathSet:
     def __len__(self) -> int:
         return self.delay.shape[0]
 
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items() if count)
+        spans = f", {self.delay.min() * 1e9:.1f} to {self.delay.max() * 1e9:.1f} ns" if len(self) else ""
+        return f"<PathSet {self.tx} -> {self.rx} at {self.epoch:.4f} s: {kinds or 'no paths'}{spans}>"
+
     @property
     def power(self) -> np.ndarray:
         """(K,) |gain|^2."""

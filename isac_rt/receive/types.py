@@ -58,6 +58,16 @@ class Detections:
     def __len__(self) -> int:
         return self.range.shape[0]
 
+    def __repr__(self) -> str:
+        rows = ["  range [m]  velocity [m/s]     u_x     u_z  SNR [dB]"]
+        for i in range(min(len(self), 20)):
+            mark = "  line of sight" if self.is_reference[i] else ""
+            u_x, u_z = self.direction[i]
+            level = 10 * np.log10(max(self.snr[i], 1e-30))
+            rows.append(f"{self.range[i]:11.3f}{self.velocity[i]:16.3f}{u_x:8.3f}{u_z:8.3f}{level:10.1f}{mark}")
+        more = [f"  and {len(self) - 20} more"] if len(self) > 20 else []
+        return "\n".join([f"<{len(self)} detections", *(rows if len(self) else []), *more]) + ">"
+
 
 def no_detections() -> Detections:
     return Detections(
@@ -123,3 +133,8 @@ class Reception:
     reference_power: float
     maps: Maps | None = None
     sparse: bool | None = None
+
+    def __repr__(self) -> str:
+        data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"
+        sight = "line of sight, " if self.line_of_sight else ""
+        return f"<Reception {len(self.detections)} detections, {sight}{data}>"
