@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,10 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from isac_rt.arrays import Antennas, conventional_schedule, is_latin, l_shape, pseudo_random_schedule
+from isac_rt.scenario_file import load
+from isac_rt.simulate import prepare
 
+SCENES = Path(__file__).parents[1] / "scenes"
 PAPER = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=2.2480e-3)
 
 
@@ -67,6 +72,45 @@ def test_pseudo_random_schedules(num_tx, cycles, seed, data):
     assert is_latin(schedule, num_tx)
     again = pseudo_random_schedule(groups, cycles * num_tx, num_tx, np.random.default_rng(seed))
     assert (schedule == again).all()
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(num_tx=st.integers(1, 8), cycles=st.integers(1, 12), data=st.data())
+def test_conventional_schedules(num_tx, cycles, data):
+    """Schemes (a) and (c) for any L_tx and M: each antenna of each group every L_tx slots, never twice in a slot. Planted bug: all groups
+    at the same antenna."""
+    groups = data.draw(st.integers(1, num_tx))
+    schedule = conventional_schedule(groups, cycles * num_tx, num_tx)
+    assert is_latin(schedule, num_tx)
+    for row in schedule:
+        for tx in range(num_tx):
+            slots = np.flatnonzero(row == tx)
+            assert slots.size == cycles
+            assert (np.diff(slots) == num_tx).all()
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(num_tx=st.integers(1, 8), cycles=st.integers(1, 12), seed=st.integers(0, 2**32))
+def test_as_many_groups_as_antennas_sample_everything(num_tx, cycles, seed):
+    """With M = L_tx every antenna sends in every slot, in (c) and (d): the reason why the union needs no compressed sensing."""
+    chirps, rng = cycles * num_tx, np.random.default_rng(seed)
+    for schedule in (conventional_schedule(num_tx, chirps, num_tx), pseudo_random_schedule(num_tx, chirps, num_tx, rng)):
+        assert (np.sort(schedule, axis=0) == np.arange(num_tx)[:, None]).all()
+
+
+@pytest.mark.parametrize(("groups", "order"), [(1, "conventional"), (1, "pseudo_random"), (3, "conventional"), (3, "pseudo_random")])
+def test_the_four_schemes_come_from_the_scenario_and_its_seed(groups, order):
+    """Fig. 5(a) to (d) by two keys; the same seed gives the same schedule whatever else was drawn, another seed another random one.
+
+    Planted bug: a seed of its own."""
+    one, again, other = (
+        load(SCENES / "paper_swarm.yaml", (f"radio.groups={groups}", f"array.schedule={order}"), None, seed) for seed in (8, 8, 9)
+    )
+    first, second, third = (prepare(s).schedule for s in (one, again, other))
+    assert first.shape == (groups, 120)
+    assert (first == second).all()
+    assert (first == third).all() == (order == "conventional")
+    assert (order == "conventional") == (first == conventional_schedule(groups, 120, 3)).all()
 
 
 def test_pseudo_random_order_is_not_periodic():
