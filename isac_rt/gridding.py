@@ -1,66 +1,100 @@
 r"""IF samples of many paths through an oversampled grid of fast-time frequency (a non-uniform FFT per chirp).
 
-In each chirp every path is a tone of known start phase and frequency (float64). It is spread with WIDTH weights on a grid of
-1.5 N frequencies, all receive elements at once; one FFT and one division make the samples. Three sets of weights on the same
-grid points carry 1, x and x^2 (x: time from the middle of the chirp), so that the wideband delay of each receive
-element (to second order) and the quadratic phase of motion (to first) need no second transform.
+In each chirp every path is a tone of known start phase and frequency (float64). It is spread with a few weights on a grid of
+frequencies, all receive elements at once; one FFT and one division make the samples. Further sets of weights on the same
+grid points carry x and x^2 (x: time from the middle of the chirp), so that the quadratic phase of motion and the wideband
+delay of each receive element need no second transform:
+
+.. math:: z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx
+    z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
+
+with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the frequency sent tau earlier), c the
+mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa x). The narrowband model has theta_l = 0.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import scipy.fft
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
+from numba import njit
 
-from isac_rt.synthesis import FAST, Tones, chirp_terms, numbers, passed, sources
+from isac_rt.lanefft import ROW, plan, transform
+from isac_rt.simd import LANES, aligned, cos_sin, floor, load, narrow, splat, store, transpose, zip_high, zip_low
+from isac_rt.synthesis import FAST, Tones, chirp_terms, filter_gain, numbers, passed, sources
 from isac_rt.waveform import Waveform
 
+
+@dataclass(frozen=True)
+class Setting:
+    """How a grid is made. Errors and costs: docs/performance.md.
+
+    Attributes
+    ----------
+    oversampling : grid points per sample, at least
+    width : grid points per path, 2 to 16, even
+    wideband : delays of the receive elements applied to the whole chirp (to second order), not to its middle alone
+    """
+
+    oversampling: float
+    width: int
+    wideband: bool
+
+
+DEFAULT = Setting(1.5, 6, True)
+"""For runs: error below `GRIDDED_ERROR`."""
 GRIDDED_ERROR = 1e-4
-"""Bound of the relative RMS error against the exact model (measured: see tests/test_ifsignal.py)."""
-_OVERSAMPLING = 1.5
-_WIDTH = 6  # grid points per path
-_DEGREE = 8  # of the polynomials that give the weights between grid points
-_LANES = 24  # 3 weight sets of _WIDTH, padded to whole vectors
-_BATCH = 8  # chirps per FFT call: the grids stay in the second-level cache
+"""Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see tests/test_ifsignal.py)."""
+ACCURATE = Setting(1.5, 8, True)
+"""Error below 2e-6 of the narrowband model (`wideband` off), 3e-5 of the full one at 15 m/s: the third order in x is missing."""
+_MANY = 4000  # paths that no longer stay in the second-level cache beside the grid; they are read once for several chirps
+_TOGETHER = 3
+_MARGIN = LANES  # rows beyond the grid
+_FIELDS = 3  # float64 of a path before its transmit elements' delays
+_ONE, _HALF, _SIXTH = np.float32(1), np.float32(0.5), np.float32(1 / 6)
+_SKEW = np.float32(4 / 15)  # x (x^2 - 1/3) is nearest to 4/15 x
+_BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on the grid
 
 
-@lru_cache(maxsize=8)
-def weights(num_samples: int) -> tuple[int, np.ndarray, np.ndarray]:
+@lru_cache(maxsize=16)
+def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.ndarray, np.ndarray]:
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
 
     A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2, weights such that
-    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 for the three sets, x = -N/2 .. N/2 scaled to [-1, 1].
-    Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
+    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c for the three sets, x = -N/2 .. N/2 scaled to
+    [-1, 1]. Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
 
     Returns
     -------
     grid : G, number of grid frequencies
-    polynomials : (DEGREE + 1, LANES) float32, highest power first
-    deconvolution : (N,) float64, D at x = n - N//2
+    polynomials : (3, degree + 1, WIDTH) float32, highest power first
+    deconvolution : (N,) float32, D at x = n - N//2
     """
-    half = num_samples // 2
-    grid = scipy.fft.next_fast_len(max(int(np.ceil(_OVERSAMPLING * num_samples)), 4 * _WIDTH))
+    half, degree = num_samples // 2, width + 2
+    grid = scipy.fft.next_fast_len(max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True)
     x = np.arange(-half, half + 1)
-    nodes = np.cos(np.pi * (np.arange(2 * _DEGREE) + 0.5) / (2 * _DEGREE)) / 2
-    steps = np.arange(_WIDTH) - (_WIDTH - 1) / 2
+    nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
+    steps = np.arange(width) - (width - 1) / 2
     basis = np.exp(2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None]))
     scaled = x / half
-    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 + 0j], axis=1)
-    bell = np.i0(2.05 * _WIDTH * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / _WIDTH) ** 2, 0, None)))
-    for _ in range(6):
+    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 - mean_square(num_samples) + 0j], axis=1)
+    beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * width
+    bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / width) ** 2, 0, None)))
+    for _ in range(12):
         response = np.einsum("rxj,rj->rx", basis, bell)
-        deconvolution = (response.real.sum(0)) / (np.abs(response) ** 2).sum(0)
+        deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
         fits = [_real_least_squares(deconvolution[:, None] * b, goals) for b in basis]
         bell = np.array([f[:, 0] for f in fits])
-    table = np.array(fits).transpose(0, 2, 1).reshape(nodes.size, 3 * _WIDTH)
-    polynomials = np.zeros((_DEGREE + 1, _LANES), np.float32)
-    polynomials[:, : 3 * _WIDTH] = np.polyfit(nodes, table, _DEGREE)
-    return grid, polynomials, deconvolution[:num_samples]
+    polynomials = np.array([np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(3)])
+    return grid, polynomials.astype(np.float32), deconvolution[:num_samples].astype(np.float32)
+
+
+def mean_square(num_samples: int) -> float:
+    """Mean of x^2 over the samples, x scaled to [-1, 1]."""
+    half = num_samples // 2
+    return float(((np.arange(num_samples) - half) ** 2).mean()) / half**2
 
 
 def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -70,185 +104,302 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _horner(kernel, poly, r):
-    """All weights at `r`; the powers are the inner loop, of constant length, so that the outer one becomes vector code."""
-    for j in range(_LANES):
-        value = poly[0, j]
-        for d in range(1, _DEGREE + 1):
-            value = value * r + poly[d, j]
-        kernel[j] = value
-
-
-@intrinsic
-def _add_vector(typingctx, grid, index, strengths, start, lanes, w, u, v):
-    """grid[index : index + 16] += w a + u b + v c; a, b, c: 16 of strengths from start, start + lanes, start + 2 lanes.
-
-    LLVM does not turn the plain loop into vector code (it cannot know that the arrays do not overlap), so this says it.
-    """
-
-    def codegen(context, builder, signature, args):
-        vector = ir.VectorType(ir.FloatType(), 16)
-
-        def at(array, kind, position):
-            data = make_array(kind)(context, builder, array).data
-            return builder.bitcast(builder.gep(data, [position]), vector.as_pointer())
-
-        def every(scalar):
-            first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
-            zeros = ir.Constant(ir.VectorType(ir.IntType(32), 16), [0] * 16)
-            return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
-
-        target = at(args[0], signature.args[0], args[1])
-        total, position = builder.load(target, align=4), args[3]
-        for scalar in args[5:]:
-            strength = builder.load(at(args[2], signature.args[2], position), align=4)
-            product = builder.fmul(every(scalar), strength, flags=("contract",))
-            total = builder.fadd(total, product, flags=("contract",))
-            position = builder.add(position, args[4])
-        builder.store(total, target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(grid, types.intp, strengths, types.intp, types.intp, types.float32, types.float32, types.float32), codegen
+def _prepare(work, places, table, at, tx, factor, f, w, time, symbol, send, half, centre, size):
+    """Of 16 paths: place on the grid to `places`; distance from the middle of the cell, complex factor (less the filter's gain),
+    quadratic term [rad] and lambda, 16 floats of each, to `work`."""
+    f_c, slope, ts, u = w[0], w[1], w[2], w[3]
+    delay, rate, accel, extra = load(table, at), load(table, at + 16), load(table, at + 32), load(table, at + tx)
+    tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
+    element = tau + extra
+    b, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
+    carrier = splat(f_c + slope * u)
+    sent = carrier - splat(slope) * element
+    cycles = element * (carrier - splat(slope / 2) * element)
+    frequency = sent * b + splat(slope * ts) * element
+    place = (frequency - floor(frequency)) * splat(size * _BELOW)
+    cell = floor(place)
+    store(places, 0, cell)
+    store(work, 0, narrow(place - cell) - splat(_HALF))
+    bend = narrow((sent * a + splat(slope) * b * (splat(ts) - splat(0.5) * b)) * splat(half * half))
+    c, s = cos_sin(narrow(cycles - floor(cycles + splat(0.5))) + bend * splat(np.float32(centre)))
+    br, bi = load(factor, f), load(factor, f + 16)
+    sr, si = splat(np.float32(send.real)), splat(np.float32(send.imag))
+    ar, ai = br * sr - bi * si, br * si + bi * sr
+    store(work, 16, ar * c - ai * s)
+    store(work, 32, ar * s + ai * c)
+    store(work, 48, bend * splat(np.float32(2 * np.pi)))
+    store(work, 64, narrow(tau * splat(1 / (ts * half))))
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _spread(grid, start, kernel, strengths):
-    """Add the three strengths (3 lanes,) of a path, all receive elements at once, to WIDTH rows of the flat grid from `start`."""
-    lanes = strengths.shape[0] // 3
-    for j in range(_WIDTH):
-        for lane in range(0, lanes, 16):
-            _add_vector(
-                grid, start + j * lanes + lane, strengths, lane, lanes, kernel[j], kernel[_WIDTH + j], kernel[2 * _WIDTH + j]
-            )
+def _gate(work, table, at, life, f, w, time, symbol):
+    """Multiply the factors of 16 paths by the filter's gain, and by 0 when they are not alive."""
+    for i in range(16):
+        tau = table[at + i] + symbol + (table[at + 16 + i] + table[at + 32 + i] * time / 2) * time
+        alive = life[f + i] <= time < life[f + 16 + i]
+        gain = np.float32(passed(w, tau)) if alive else np.float32(0)
+        work[16 + i] *= gain
+        work[32 + i] *= gain
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _strengths(out, steer, lanes, cr, ci, lag, curve):
-    """Strengths (3 lanes,) of 1, x, x^2: the steering (its phasors z, j z, the slants d) times the chirp's factor cr + j ci.
+def _weigh(work, scratch, poly, width, degree, wideband):
+    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the three sets as they are."""
+    r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
+    set_size = (degree + 1) * width
+    for j in range(width):
+        v0, v1, v2 = splat(poly[j]), splat(poly[set_size + j]), splat(poly[2 * set_size + j])
+        for d in range(1, degree + 1):
+            v0 = v0 * r + splat(poly[d * width + j])
+            v2 = v2 * r + splat(poly[2 * set_size + d * width + j])
+            if wideband:
+                v1 = v1 * r + splat(poly[set_size + d * width + j])
+        if wideband:
+            store(scratch, 48 * j, v0)
+            store(scratch, 48 * j + 16, v1)
+            store(scratch, 48 * j + 32, v2)
+        else:
+            bent = q * v2
+            store(scratch, 48 * j, c * v0 - s * bent)
+            store(scratch, 48 * j + 16, s * v0 + c * bent)
 
-    Real and imaginary parts alternate; with z and j z both at hand no lane needs its neighbour.
-    """
-    phasor, ahead, slant = steer[:lanes], steer[lanes : 2 * lanes], steer[2 * lanes :]
-    level, slope, bow = out[:lanes], out[lanes : 2 * lanes], out[2 * lanes :]
-    for i in range(lanes):
-        z, jz, d = phasor[i], ahead[i], slant[i]
-        plain, turned = cr * z + ci * jz, cr * jz - ci * z
-        late = lag * d  # the array sees the frequency that was sent, tau before
-        value, quadrature = plain - late * turned, turned + late * plain
-        level[i] = value
-        slope[i] = d * value
-        bow[i] = np.float32(-0.5) * d * d * value + curve * quadrature
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread(grid, base, places, scratch, count, width, steer, k):
+    """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        ar, ai = load(steer, k), load(steer, k + 16)
+        for j in range(i, i + 48 * width, 48):
+            c, s = splat(scratch[j]), splat(scratch[j + 16])
+            store(grid, at, load(grid, at) + c * ar - s * ai)
+            store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
+            at += ROW
+        k += 32
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _fill(grids, w, m, first, half, poly, path, offset, steer, link, factor, delay, rate, accel, begin, end, tx, symbol,
-          send, antenna):  # fmt: skip
-    """Spread every path of chirps first, first + 1, ... of group m on their grids (B, G + WIDTH, 2 lanes) float32."""
-    groups, lanes = send.shape[1], grids.shape[2]
-    size = grids.shape[1] - _WIDTH
-    kernel = np.empty(_LANES, np.float32)
-    strengths = np.zeros(3 * lanes, np.float32)
-    grids[:] = np.float32(0)
-    for i in range(path.shape[0]):  # chirps inside: a path's steering is read once, and its places on the grids are near
-        k, source = path[i], m - offset[i]
-        if source < 0 or source >= groups:
-            continue
-        for b in range(grids.shape[0]):
-            p = first + b
-            time = w[6] + p * w[4] + m * w[5]
-            if time < begin[k] or time >= end[k]:
-                continue
-            q = link[k]
-            tau = symbol[q, source, p] + delay[k] + (rate[k] + accel[k] * time / 2) * time - offset[i] * w[5]
-            gain = passed(w, tau)
-            if gain == 0.0:
-                continue
-            speed = rate[k] + accel[k] * time
-            element = tau + tx[k, antenna[q, source, p]]
-            phase, frequency, quadratic = chirp_terms(w, element, speed, accel[k])
-            c = gain * factor[k] * send[q, source, p]
-            angle = np.float32(2 * np.pi * (phase - 0.5))  # within half a turn, where float32 is finest
-            co, si = -np.cos(angle), -np.sin(angle)
-            cr, ci = np.float32(c.real) * co - np.float32(c.imag) * si, np.float32(c.real) * si + np.float32(c.imag) * co
-            curve = np.float32(2 * np.pi * quadratic * half * half)
-            lag = np.float32(tau / (w[2] * half))
-            _strengths(strengths, steer[i], lanes, cr, ci, lag, curve)
-            place = (frequency - np.floor(frequency)) * size
-            cell = min(int(place), size - 1)
-            r = np.float32(place - cell - 0.5)
-            _horner(kernel, poly, r)
-            _spread(grids[b].reshape(-1), cell * lanes, kernel, strengths)
-    for b in range(grids.shape[0]):
-        _fold(grids[b], size)
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread_wideband(grid, base, places, scratch, count, width, steer, k, work, centre):
+    """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
+        c, s, q, late = splat(work[16 + i]), splat(work[32 + i]), splat(work[48 + i]), theta * splat(work[64 + i])
+        pr, pi = c * ar - s * ai, c * ai + s * ar
+        square = late * late
+        cosine, sine = splat(_ONE) - square * splat(_HALF), late - late * square * splat(_SIXTH)
+        er, ei = pr * cosine + pi * sine, pi * cosine - pr * sine
+        minus = theta * theta * splat(-_HALF)
+        gr, gi = minus * er - q * ei, minus * ei + q * er
+        bow = minus * splat(centre)
+        skew = q * splat(_SKEW)
+        br, bi = theta * (er - skew * ei), theta * (ei + skew * er)
+        er, ei = er + bow * er, ei + bow * ei
+        for j in range(i, i + 48 * width, 48):
+            u, v, w = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32])
+            store(grid, at, load(grid, at) + u * er + v * br + w * gr)
+            store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi + w * gi)
+            at += ROW
+        k += 48
 
 
 @njit(nogil=True)
-def _fold(grid, size):
-    """Wrap the margins: row g + WIDTH/2 - 1 is frequency g, taken modulo the size of the grid."""
-    low = _WIDTH // 2 - 1
-    for row in range(low):
-        for lane in range(grid.shape[1]):
-            grid[row + size, lane] += grid[row, lane]
-    for row in range(low, _WIDTH - 1):
-        for lane in range(grid.shape[1]):
-            grid[row, lane] += grid[row + size, lane]
+def _fold(grid, size, low, width):
+    """Wrap the margins: row g + low is frequency g, taken modulo the size of the grid."""
+    for i in range(0, low * ROW, 16):
+        store(grid, size * ROW + i, load(grid, size * ROW + i) + load(grid, i))
+    for i in range(low * ROW, width * ROW, 16):
+        store(grid, i, load(grid, i) + load(grid, size * ROW + i))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _emit(out, spectra, deconvolution, m, first):
-    """Add the transformed grids (B, G, lanes) complex64, divided by the kernel's response, to out (M, L_rx, P, N)."""
-    num_rx, size, grid, half = out.shape[1], out.shape[3], spectra.shape[1], out.shape[3] // 2
-    block = 32
-    for b in range(spectra.shape[0]):
-        for start in range(0, size, block):
-            for r in range(num_rx):
-                for n in range(start, min(start + block, size)):
-                    mode = n - half
-                    out[m, r, first + b, n] += deconvolution[n] * spectra[b, mode if mode >= 0 else mode + grid, r]
+@njit(nogil=True)
+def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolution, tile, fresh):
+    """Write the rows of the samples, divided by the kernel's response: channel r of sample n to out[at + r stride + 2 n]."""
+    half, size = num_samples // 2, order.shape[0]
+    for start in range(0, num_samples, 16):
+        count = min(16, num_samples - start)
+        for i in range(count):
+            mode = start + i - half
+            row = (low + order[mode if mode >= 0 else mode + size]) * ROW
+            d = splat(deconvolution[start + i])
+            store(tile, 16 * i, d * load(grid, row))
+            store(tile, 256 + 16 * i, d * load(grid, row + 16))
+        transpose(tile, 0)
+        transpose(tile, 256)
+        for r in range(channels):
+            to = at + r * stride + 2 * start
+            re, im = load(tile, 16 * r), load(tile, 256 + 16 * r)
+            if count == 16 and fresh:
+                store(out, to, zip_low(re, im))
+                store(out, to + 16, zip_high(re, im))
+            elif count == 16:
+                store(out, to, load(out, to) + zip_low(re, im))
+                store(out, to + 16, load(out, to + 16) + zip_high(re, im))
+            else:
+                for i in range(count):
+                    re_i, im_i = tile[16 * r + i], tile[256 + 16 * r + i]
+                    out[to + 2 * i] = re_i if fresh else out[to + 2 * i] + re_i
+                    out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
 
 
-def _steering(waveform: Waveform, tones: Tones, path: np.ndarray, lanes: int) -> np.ndarray:
-    """Per source the phasors z of the receive elements at mid-window, j z, and twice each slant pi alpha e T [rad].
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _chirps(out, shape, first_channel, chirps, together, w, half, centre, width, wideband, poly, deconvolution, radices, twiddles, rows,
+            table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, grid, work, scratch, tile):  # fmt: skip
+    """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
+    _, num_rx, num_chirps, num_samples = shape
+    groups, size, low, degree = send.shape[1], rows.shape[0], width // 2 - 1, poly.shape[0] // (3 * width) - 1
+    channels, per_block = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1)
+    top, skirt = w[7] / w[1], w[8] / w[1]
+    cut = top + skirt
+    stride, places = (size + _MARGIN) * ROW, np.zeros(16)
+    for start in range(0, chirps.shape[0], together):
+        now = chirps[start : start + together]
+        grid[:] = np.float32(0)
+        for b in range(blocks.shape[0]):
+            at, count = b * per_block, blocks[b, 2]
+            for g in range(now.shape[0]):
+                m, p = now[g] // num_chirps, now[g] % num_chirps
+                q, source = blocks[b, 0], m - blocks[b, 1]
+                if source < 0 or source >= groups or send[q, source, p] == 0:
+                    continue
+                time, delay, tx = w[6] + p * w[4] + m * w[5], symbol[q, source, p], (_FIELDS + antenna[q, source, p]) * 16
+                if bounds[b, 0] + delay > cut or bounds[b, 1] + delay < -skirt:
+                    continue
+                _prepare(work, places, table, at, tx, factor, 32 * b, w, time, delay, send[q, source, p], half, centre, size)
+                if blocks[b, 3] or bounds[b, 0] + delay < 0 or bounds[b, 1] + delay > top:
+                    _gate(work, table, at, life, 32 * b, w, time, delay)
+                _weigh(work, scratch, poly, width, degree, wideband)
+                if wideband:
+                    _spread_wideband(grid, g * stride, places, scratch, count, width, steer, b * 16 * 48, work, np.float32(centre))
+                else:
+                    _spread(grid, g * stride, places, scratch, count, width, steer, b * 16 * 32)
+        for g in range(now.shape[0]):
+            m, p = now[g] // num_chirps, now[g] % num_chirps
+            table_g = grid[g * stride : (g + 1) * stride]
+            _fold(table_g, size, low, width)
+            transform(table_g, low * ROW, size, radices, twiddles)
+            to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
+            _emit(out, to, 2 * num_samples * num_chirps, channels, num_samples, table_g, low, rows, deconvolution, tile, fresh)
 
-    Returns (C, 6 lanes) float32, real and imaginary parts alternating.
-    """
-    w, num_rx = waveform, tones.rx_delay.shape[1]
-    delay = tones.rx_delay
+
+def _steering(waveform: Waveform, delay: np.ndarray, wideband: bool) -> np.ndarray:
+    """Phasors of up to 16 receive elements at mid-window and their turn over half a chirp: (K, 48) float32."""
+    w = waveform
     cycles = (w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]) * delay - w.slope * delay**2 / 2
-    out = np.zeros((len(tones), 3, lanes), np.complex64)
-    out[:, 0, :num_rx] = np.exp(2j * np.pi * (cycles % 1))
-    out[:, 1] = 1j * out[:, 0]
-    slant = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2) * delay
-    out[:, 2, :num_rx] = slant * (1 + 1j)
-    return out.reshape(len(tones), -1).view(np.float32)[path]
+    angle = 2 * np.pi * (cycles - np.rint(cycles))
+    planes = 3 if wideband else 2
+    out = aligned(len(delay) * planes * LANES).reshape(len(delay), planes, LANES)
+    count = delay.shape[1]
+    out[:, 0, :count], out[:, 1, :count] = np.cos(angle), np.sin(angle)
+    if wideband:
+        out[:, 2, :count] = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2) * delay
+    return out.reshape(len(delay), -1)
 
 
-def add_gridded(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float) -> None:
-    """Add many weak paths; relative RMS error against `exact` below `GRIDDED_ERROR` (up to 30 m/s and 15 elements of the L).
+@dataclass(frozen=True)
+class _Blocks:
+    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one offset.
+
+    Attributes
+    ----------
+    path : (16 B,) index into the tones, the last repeated where a block is not full
+    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit element
+    factor : float32, of each block 16 real and 16 imaginary parts
+    life : float64, of each block 16 begins and 16 ends
+    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
+    bounds : (B, 2) least and greatest delay in the frame, without data
+    """
+
+    path: np.ndarray
+    table: np.ndarray
+    factor: np.ndarray
+    life: np.ndarray
+    blocks: np.ndarray
+    bounds: np.ndarray
+
+
+def _blocks(waveform: Waveform, t: Tones, transition: float) -> _Blocks:
+    w = waveform
+    path, offset = sources(w, t, transition)
+    order = np.lexsort((t.delay[path], offset, t.link[path]))
+    path, offset = path[order], offset[order]
+    segment = np.cumsum(np.r_[True, np.diff(t.link[path] * (2 * w.num_groups) + offset) != 0]) - 1 if path.size else path
+    _, starts, counts = np.unique(segment, return_index=True, return_counts=True)
+    full = -(-counts // LANES)
+    first = np.concatenate([s + LANES * np.arange(f) for s, f in zip(starts, full, strict=True)] or [starts])
+    last = np.repeat(starts + counts, full) - 1
+    index = np.minimum(first[:, None] + np.arange(LANES), last[:, None])
+    k, lag = path[index], offset[index]
+    delay = t.delay[k] - lag * w.group_spacing
+    table = np.stack([delay, t.rate[k], t.accel[k], *np.moveaxis(t.tx_delay[k], 2, 0)], axis=1)
+    life = np.stack([t.begin[k], t.end[k]], axis=1)
+    reach = w.frame_duration / 2
+    motion = np.abs(t.rate[k]) * reach + np.abs(t.accel[k]) * reach**2 / 2
+    bounds = np.stack([(delay - motion).min(axis=1), (delay + motion).max(axis=1)], axis=1)
+    mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
+    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], np.minimum(last - first + 1, LANES), mortal], axis=1)
+    factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
+    return _Blocks(k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds)
+
+
+def add_gridded(
+    samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT, *, fresh: bool = False
+) -> None:
+    """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and 15 elements of the L).
 
     Left out: the joint curvature `Tones.cross`; the third order of the wideband term. A path lives in whole chirps. Runs
-    in one thread; kernels and transforms release the interpreter's lock; the result depends on nothing but the arguments.
+    in one thread without the interpreter's lock; the result depends on nothing but the arguments.
 
     Parameters
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, added to
+    fresh : write instead of adding, whatever `samples` held
     """
     w, t = waveform, tones
-    path, offset = sources(w, t, transition)
-    if path.size == 0:
+    b = _blocks(w, t, transition)
+    if b.path.size == 0:
+        if fresh:
+            samples[:] = 0
         return
-    order = np.lexsort((path, t.delay[path], offset))  # neighbours on the grid follow each other
-    path, offset = path[order], offset[order]
-    size, poly, deconvolution = weights(w.num_samples)
-    lanes = -(-t.rx_delay.shape[1] // 8) * 8
-    steer = _steering(w, t, path, lanes)
-    values = numbers(w, transition)
-    buffer = np.empty((_BATCH, size + _WIDTH, 2 * lanes), np.float32)
-    low = _WIDTH // 2 - 1
-    for m in range(w.num_groups):
-        for first in range(0, w.num_chirps, _BATCH):
-            grids = buffer[: min(_BATCH, w.num_chirps - first)]
-            _fill(grids, values, m, first, w.num_samples // 2, poly, path, offset, steer, t.link, t.factor, t.delay,
-                  t.rate, t.accel, t.begin, t.end, t.tx_delay, t.symbol_delay, t.send, t.antenna)  # fmt: skip
-            spectra = scipy.fft.ifft(grids.view(np.complex64)[:, low : low + size], axis=1, norm="forward")
-            _emit(samples, spectra, deconvolution.astype(np.float32), m, first)
+    size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
+    radices, twiddles, rows = plan(size)
+    half, together = w.num_samples // 2, _TOGETHER if b.path.size > _MANY else 1
+    buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(48 * setting.width), aligned(512)
+    chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(w.num_samples)
+    for first in range(0, samples.shape[1], LANES):
+        steer = _steering(w, t.rx_delay[b.path, first : first + LANES], setting.wideband)
+        _chirps(samples.reshape(-1).view(np.float32), samples.shape, first, chirps, together, numbers(w, transition), float(half), centre,
+                setting.width, setting.wideband, poly.ravel(), deconvolution, radices, twiddles, rows, b.table, b.factor, b.life,
+                b.blocks, b.bounds, steer.ravel(), t.symbol_delay, t.send, t.antenna, fresh, *buffers)  # fmt: skip
+
+
+def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT) -> None:
+    """What `add_gridded` does, path by path in numpy float64: its oracle, slow."""
+    w, t, half = waveform, tones, waveform.num_samples // 2
+    size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
+    values, centre, steps = numbers(w, transition), mean_square(w.num_samples), np.arange(setting.width) - setting.width // 2 + 1
+    e = t.rx_delay
+    steer = np.exp(2j * np.pi * (((w.carrier_frequency + w.slope * w.fast_time[half]) * e - w.slope * e**2 / 2) % 1))
+    theta = 2 * np.pi * w.slope * w.sample_interval * half * e
+    for m, p in np.ndindex(w.num_groups, w.num_chirps):
+        grid = np.zeros((size, samples.shape[1]), complex)
+        time = values[6] + p * values[4] + m * values[5]
+        for k, offset in zip(*sources(w, t, transition), strict=True):
+            q, source = t.link[k], m - offset
+            if not (0 <= source < w.num_groups and t.begin[k] <= time < t.end[k]):
+                continue
+            tau = t.symbol_delay[q, source, p] + t.delay[k] + (t.rate[k] + t.accel[k] * time / 2) * time - offset * w.group_spacing
+            gain = filter_gain(np.array(w.slope * tau), w.sampling_rate, transition)
+            sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
+            phase, frequency, bend = chirp_terms(values, sent, t.rate[k] + t.accel[k] * time, t.accel[k])
+            z = gain * t.factor[k] * t.send[q, source, p] * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
+            turn, lag = 2 * np.pi * bend * half**2, tau / (w.sample_interval * half)
+            cell, r = divmod(frequency % 1 * size, 1)
+            one, x, square = (np.polyval(poly[i], r - 0.5) for i in range(3))
+            slant = theta[k] if setting.wideband else np.zeros_like(theta[k])
+            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(x, slant * (1 + 4j / 15 * turn))
+            strengths += np.outer(square, 1j * turn - slant**2 / 2)
+            strengths = strengths * steer[k] * np.exp(-1j * lag * slant)
+            np.add.at(grid, (int(cell) + steps) % size, z * strengths)
+        modes = (np.arange(w.num_samples) - half) % size
+        samples[m, :, p] += (np.fft.ifft(grid, axis=0, norm="forward")[modes] * deconvolution[:, None]).T

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
-from isac_rt.gridding import GRIDDED_ERROR, add_gridded
+from isac_rt.gridding import DEFAULT, GRIDDED_ERROR, Setting, add_gridded
 from isac_rt.noise import add_white_noise
 from isac_rt.payload import Payload
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -100,6 +100,7 @@ def if_signal(
     method: Method = "auto",
     noise_power: float = 0.0,
     max_direct: int = 16,
+    setting: Setting = DEFAULT,
 ) -> IFCube:
     r"""Dechirped IF samples of one receiver in one frame, without noise.
 
@@ -120,6 +121,7 @@ def if_signal(
     first_block : resource block of the first reference chirp; by default that of the first transmission
     method : see `Method`
     noise_power : per complex sample [W], for "auto"; with 0 the `max_direct` strongest go direct
+    setting : of the gridded method: its grid, and whether the delays of the receive elements apply to the whole chirp
 
     Raises
     ------
@@ -148,11 +150,11 @@ def if_signal(
     if method == "exact":
         samples = exact(waveform, tones, filter_transition).astype(np.complex64)
     else:
-        samples = np.zeros(shape, np.complex64)
+        samples = np.empty(shape, np.complex64)
         alone = np.full(len(tones), method == "direct")
         if method == "auto":
             alone = _direct_paths(power, sight, samples.size, noise_power, max_direct)
-        add_gridded(samples, waveform, tones.select(~alone), filter_transition)
+        add_gridded(samples, waveform, tones.select(~alone), filter_transition, setting, fresh=True)
         add_direct(samples, waveform, tones.select(alone), filter_transition)
     return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
 
