@@ -102,6 +102,12 @@ def test_recovery_is_certain_where_coherence_says_so_and_fails_beyond_the_sample
     assert claims_recovery.united_error(60, 30, 1) < 1e-12  # rounding: the full DFT
 
 
+def test_the_rule_of_the_fall_back_ends_where_recovery_does():
+    """One path in a cell is sparse, sixteen of 40 samples are not. Planted bug: the noise taken for the paths."""
+    assert claims_recovery.judged_sparse(1, 5, 3) == 5
+    assert claims_recovery.judged_sparse(16, 5, 3) == 0
+
+
 def test_dependable_sparsity_ends_at_the_first_failure():
     low = [0.99, 0.96, 0.94, 0.97]
     table = pd.DataFrame({"levels": "a", "sparsity": [1, 2, 3, 4], "low": low})
@@ -164,7 +170,7 @@ def test_all_claims(tmp_path):
     from isac_rt.experiments.outcome import write
 
     outcome = claims.run(True, 20260, silent)
-    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 25
+    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 26
     judged = {v.claim: v.verdict for v in outcome.verdicts if " costs O(" not in v.claim}
     assert {c for c, v in judged.items() if v == "does not hold"} == {
         "The approximations that make the IF a product of range, Doppler and angle are negligible",

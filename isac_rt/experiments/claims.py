@@ -54,6 +54,7 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     several, found = claims_recovery.recovery(quick, seed, steps.of("recovery"))
     tables |= several
     verdicts.extend(found)
+    keep("fallback", claims_recovery.fallback(quick, seed))
     keep("latin", claims_recovery.latin(quick, seed))
     keep("cost", claims_cost.cost(quick, seed, steps.of("cost")))
     report = steps.of("blocks")

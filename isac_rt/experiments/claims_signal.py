@@ -250,14 +250,15 @@ def late_clock(quick: bool, seed: int, report) -> tuple[pd.DataFrame, tuple[Verd
         return "; ".join(f"{r.clock_offset_ns:.0f} ns: delay {proportion(r.delay_errors, r.delay_symbols)}, DPSK "
                          f"{proportion(r.dpsk_errors, r.dpsk_symbols)}" for r in part)  # fmt: skip
 
-    # each rate within four deviations of the rate without an offset, both being random
-    p = inside.delay_errors / inside.delay_symbols
-    spread = np.sqrt(2 * p.mean() * (1 - p.mean()) / inside.delay_symbols.iloc[0])
-    same = bool((np.abs(p - p.iloc[0]) <= 4 * spread).all())
+    same = True
+    for kind in ("delay", "dpsk"):  # each rate within four deviations of that without an offset, both being random
+        p = inside[f"{kind}_errors"] / inside[f"{kind}_symbols"]
+        spread = np.sqrt(2 * p.mean() * (1 - p.mean()) / inside[f"{kind}_symbols"].iloc[0])
+        same &= bool((np.abs(p - p.iloc[0]) <= 4 * spread).all())
     judged: Judgement = "holds under a condition" if biased < 0.05 and same else "does not hold"
     return table, (
         Verdict("A constant synchronisation delay biases the range and leaves the data alone", judged,
-                f"the range is off by c times the delay to within {biased:.3f} m; symbol error rates at {LATE_SNR:g} dB and 7 receive "
+                f"the range is off by c times the delay to within {biased * 1e3:.1f} mm; symbol error rates at {LATE_SNR:g} dB, 7 receive "
                 f"antennas: {rates(inside.itertuples())}; on condition that path and clock together stay below half of the range: "
                 f"{rates(table.iloc[len(OFFSETS):].itertuples())}, and no acquisition"),
     )  # fmt: skip
