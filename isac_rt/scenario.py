@@ -281,6 +281,9 @@ class Receivers(Node):
     velocity_method: Literal["auto", "omp", "latin_union", "conventional"] = "auto"
     """omp: the paper's, for sparse sampling. latin_union: all groups as one uniform sampling, for M = L_tx. conventional: the DFT over each
     antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the schedule and the groups received."""
+    refinement: Literal["grid", "local", "joint"] = "local"
+    """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the windowed spectra about each peak. joint: all
+    paths at once on the samples, at the Cramer-Rao bound; paths in one cell are told apart by direction (slower)."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Of one cell of the range-Doppler map."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)

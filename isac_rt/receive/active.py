@@ -11,6 +11,8 @@ from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.clutter_filter import remove_standing
 from isac_rt.receive.common import make_maps, sense
 from isac_rt.receive.in_clutter import sense_in_clutter
+from isac_rt.receive.joint import Frame
+from isac_rt.receive.separate import separate
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Reception
 from isac_rt.scenario import Receivers
@@ -45,9 +47,12 @@ def receive_active(
         found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
     else:
         found = sense_in_clutter(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter)
+    detections = found.detections
+    if settings.refinement == "joint":
+        detections = separate(Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections)[0]
     groups, chirps = payload.delay_symbols.shape
     return Reception(
-        detections=found.detections,
+        detections=detections,
         decoded=False,
         delay_symbols=np.full((groups, chirps), -1),
         transitions=np.full(payload.transitions.shape, -1),

@@ -29,6 +29,7 @@ from isac_rt.receive.estimate import (
     refine,
     standard_deviations,
     start_point,
+    to_delay,
 )
 from isac_rt.receive.types import Detections, Maps
 from isac_rt.scenario import Receivers
@@ -101,9 +102,9 @@ def sense(
     estimates = []
     for row, column in zip(rows, bins, strict=True):
         local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row), separate=conventional)
-        estimates.append(refine(local, *start_point(power, int(row), int(column), w)))
+        estimates.append(estimate_at(local, power, int(row), int(column), settings))
     snr = power[rows, bins] / level[rows, bins]
-    found = describe(estimates, snr, antennas, w, passes)
+    found = describe(estimates, snr, antennas, w, passes, on_grid=settings.refinement == "grid")
     return Sensed(estimates, found, power, float(np.median(power)), sparse)
 
 
@@ -130,15 +131,31 @@ def _confirmed_by_omp(
     return out
 
 
+def estimate_at(local: LocalSpectra, power: np.ndarray, row: int, column: int, settings: Receivers) -> Estimate:
+    """The estimate of a peak of the map: off the grid, or with `refinement: grid` the centre of its cell."""
+    w = local.waveform
+    if settings.refinement == "grid":
+        delay, rate = to_delay(row, column - w.num_chirps // 2, w)
+        return Estimate(delay, rate, local.respond(delay, rate))
+    return refine(local, *start_point(power, row, column, w))
+
+
 def describe(
-    estimates: list[Estimate], snr: np.ndarray, antennas: Antennas, waveform: Waveform, passes: int
+    estimates: list[Estimate],
+    snr: np.ndarray,
+    antennas: Antennas,
+    waveform: Waveform,
+    passes: int,
+    *,
+    on_grid: bool = False,
 ) -> Detections:
-    """Detections in ranges, velocities and direction cosines; what lies outside the field of view has no direction."""
+    """Detections in ranges, velocities and direction cosines; what lies outside the field of view has no direction. `on_grid`: of the
+    directions too the nearest grid point, eight to a beam."""
     count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
     limit = np.sin(antennas.half_view) if antennas.half_view < np.pi / 2 else 1.0
     for i, e in enumerate(estimates):
-        u = direction_cosines(e, antennas, waveform, passes)
+        u = direction_cosines(e, antennas, waveform, passes, on_grid=on_grid)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]
         std[i] = standard_deviations(snr[i] * e.channels.size, antennas, waveform, passes)
     return Detections(

@@ -219,7 +219,9 @@ def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.nd
     return t, r, place
 
 
-def direction_cosine(channels: np.ndarray, antennas: Antennas, waveform: Waveform, axis: int, virtual: bool) -> float:
+def direction_cosine(
+    channels: np.ndarray, antennas: Antennas, waveform: Waveform, axis: int, virtual: bool, *, on_grid: bool = False
+) -> float:
     """Direction cosine along one axis of the L from the channel responses, by maximising the beamformed power.
 
     An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle. Echoes (`virtual`) are combined
@@ -238,14 +240,16 @@ def direction_cosine(channels: np.ndarray, antennas: Antennas, waveform: Wavefor
 
     u = np.linspace(-limit, limit, 8 * np.unique(rx).size * (2 if virtual else 1) + 1)
     best = u[np.argmax(beam(u))]
-    for step in ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
+    for step in () if on_grid else ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
         low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))
         curve = low - 2 * mid + high
         best += np.clip(0.5 * (low - high) / curve * step if curve < 0 else step * np.sign(high - low), -2 * step, 2 * step)
     return float(best) if abs(best) <= 1 else float("nan")
 
 
-def direction_cosines(estimate: Estimate, antennas: Antennas, waveform: Waveform, passes: int) -> list[float]:
+def direction_cosines(
+    estimate: Estimate, antennas: Antennas, waveform: Waveform, passes: int, *, on_grid: bool = False
+) -> list[float]:
     """u_x and u_z of a detection.
 
     A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an element at r and a source at R, which
@@ -253,7 +257,7 @@ def direction_cosines(estimate: Estimate, antennas: Antennas, waveform: Waveform
     radius is shorter.
     """
     virtual, channels = passes == 2, estimate.channels
-    u = [direction_cosine(channels, antennas, waveform, axis, virtual) for axis in (0, 2)]
+    u = [direction_cosine(channels, antennas, waveform, axis, virtual, on_grid=on_grid) for axis in (0, 2)]
     radius = estimate.delay * SPEED_OF_LIGHT / passes
     if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
         return u
@@ -261,7 +265,7 @@ def direction_cosines(estimate: Estimate, antennas: Antennas, waveform: Waveform
     scale = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
     tx, rx = (scale * ((r**2).sum(1) - (r @ towards) ** 2) for r in (antennas.tx_positions, antennas.rx_positions))
     flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
-    return [direction_cosine(flat, antennas, waveform, axis, virtual) for axis in (0, 2)]
+    return [direction_cosine(flat, antennas, waveform, axis, virtual, on_grid=on_grid) for axis in (0, 2)]
 
 
 def standard_deviations(snr: float, antennas: Antennas, waveform: Waveform, passes: int) -> np.ndarray:

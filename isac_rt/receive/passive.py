@@ -11,9 +11,11 @@ from isac_rt.arrays import Antennas, Schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive.cfar import detect, threshold
-from isac_rt.receive.common import Sensed, describe, make_maps, num_looks, sense, velocity_method
+from isac_rt.receive.common import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
-from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point
+from isac_rt.receive.estimate import Estimate, LocalSpectra
+from isac_rt.receive.joint import Frame
+from isac_rt.receive.separate import separate
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario import Receivers
@@ -60,7 +62,8 @@ def receive_passive(
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        return _reception(cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps)
+        reception = _reception(cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps)
+        return _jointly(reception, Frame(cube, pilot.delay_symbols, pilot.phases, antennas, 1), settings)
     if prediction is None:
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
@@ -72,7 +75,18 @@ def receive_passive(
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
     found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
     detections, reference = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
-    return _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
+    reception = _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
+    return _jointly(reception, Frame(cube, symbols.raw, symbols.phases, antennas, 1), settings)
+
+
+def _jointly(reception: Reception, frame: Frame, settings: Receivers) -> Reception:
+    """With `joint` refinement all detections fitted at once, and the reference's power with them."""
+    if settings.refinement != "joint":
+        return reception
+    detections, power = separate(frame, reception.detections)
+    mine = power[detections.is_reference]
+    known = mine.size and np.isfinite(mine[0])
+    return replace(reception, detections=detections, reference_power=float(mine[0]) if known else reception.reference_power)
 
 
 def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Reception:
@@ -136,9 +150,9 @@ def _at_prediction(
         return no_detections(), None
     separate = velocity_method(settings, cube.schedule, w.num_tx) == "conventional"
     local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]), separate=separate)
-    estimate = refine(local, *start_point(found.power, int(rows[i]), int(columns[j]), w))
+    estimate = estimate_at(local, found.power, int(rows[i]), int(columns[j]), settings)
     snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
-    reference = describe([estimate], np.array([snr]), antennas, w, 1)
+    reference = describe([estimate], np.array([snr]), antennas, w, 1, on_grid=settings.refinement == "grid")
     d = found.detections
     apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
     apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
