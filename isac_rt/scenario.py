@@ -264,6 +264,24 @@ class Propagation(Node):
     leakage: Leakage = Leakage()
 
 
+class Accuracy(Node):
+    """How near to the full model a run has to come; what the scene then needs is decided link by link and frame by frame
+    (`isac_rt.fidelity`, `isac-rt plan`).
+
+    budget: what the keys below and propagation.weakest_path_db allow is left out. everything: nothing is left out, every frame is
+    traced. fastest: plane wavefronts, straight flight within a frame, weak paths up to the noise of a cell left out, few traces.
+    """
+
+    preset: Literal["budget", "everything", "fastest"] = "budget"
+    max_phase_error_rad: Positive = 0.05
+    """budget: most by which approximations together may turn the phase of a path, at any element and chirp."""
+    max_untraced_m: Annotated[float, Field(ge=0)] = 1.0
+    """budget: farthest that a UAV flies between two traced instants; 0: every frame is traced."""
+
+    def applies(self, name: str) -> bool:
+        return name == "preset" or self.preset == "budget"
+
+
 class Noise(Node):
     """link_budget: thermal noise and transmit power. snr: per-sample IF SNR of the reference path (the strongest target at
     the AT, the line of sight at a PT) as it would be unshadowed and in view."""
@@ -366,6 +384,7 @@ class Scenario(Node):
     access: Access = Access()
     city: City | None = None
     propagation: Propagation = Propagation()
+    accuracy: Accuracy = Accuracy()
     clutter: Clutter = Clutter()
     noise: Noise = Noise()
     receivers: Receivers = Receivers()

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
+from isac_rt.fidelity import Plan, Use, decisions, used
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
 from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
 from isac_rt.metrics import (
@@ -35,7 +36,6 @@ from isac_rt.metrics import (
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.propagation.expected import ClutterExpectation, ExpectedClutter, make_expectation
-from isac_rt.propagation.pathset import drop_weak
 from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import Reception
@@ -67,6 +67,9 @@ class Setup:
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
     timetable: Timetable
     connections: Connections
+    plan: Plan
+    uses: dict[tuple[int, Link], Use] = field(default_factory=dict)
+    """What the plan kept of the paths of each frame and link traced so far."""
     expectation: ClutterExpectation | None = None
     """What an active terminal's receiver predicts of its clutter from the mesh; None where its detector needs none."""
 
@@ -88,15 +91,19 @@ class Setup:
         return rise * noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
 
     def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """Poses and paths of a frame, interference between active terminals included; what is too weak to matter is left out."""
-        s, epoch = self.scenario, self.timetable.epoch(frame)
+        """Poses and paths of a frame, interference between active terminals included; what the plan leaves out is not there."""
+        poses, found = self.find(frame)
+        thinned = {link: self.plan.apply(p, self.noise_power(poses, link)) for link, p in found.items()}
+        self.uses.update({(frame, link): use for link, (_, use) in thinned.items()})
+        return poses, {link: paths for link, (paths, _) in thinned.items()}
+
+    def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
+        """Poses and all paths of a frame, however weak."""
+        epoch = self.timetable.epoch(frame)
         poses = self.swarm.poses(epoch)
         heard = self.timetable.links(frame)
         active, receivers = self.timetable.with_role("active", frame), dict.fromkeys(rx for _, rx in heard)
-        found = self.propagation.paths(poses, epoch, [(tx, rx) for tx in active for rx in receivers])
-        cells = self.waveform.num_samples * self.waveform.num_chirps
-        share = 10 ** (-s.propagation.weakest_path_db / 10) / (transmit_amplitude(s.noise) ** 2 * cells)
-        return poses, {link: drop_weak(p, share * self.noise_power(poses, link)) for link, p in found.items()}
+        return poses, self.propagation.paths(poses, epoch, [(tx, rx) for tx in active for rx in receivers])
 
     def transmission(self, active: str, frame: int, pose: Pose) -> Transmission:
         """What an active terminal sends in a frame."""
@@ -133,6 +140,7 @@ class Setup:
             start_time=self.timetable.start_time(frame, tx),
             filter_transition=self.scenario.radio.filter_transition_hz,
             noise_power=level,
+            method=self.plan.synthesis(sum(len(paths[name, rx]) for name in order)),
         )
         words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
         return add_noise(cube, level, words)
@@ -158,6 +166,8 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     swarm = Swarm.from_scenario(scenario)
     city = city_of(scenario)
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
+    timetable = Timetable(scenario, waveform, schedule)
+    plan = Plan(scenario, waveform, antennas, timetable, swarm)
     setup = Setup(
         scenario,
         waveform,
@@ -165,11 +175,12 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         schedule,
         swarm,
         city,
-        _propagation(scenario, waveform, antennas, city, store),
+        _propagation(scenario, waveform, antennas, city, plan.instants, store),
         FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
-        Timetable(scenario, waveform, schedule),
+        timetable,
         Connections(),
-        make_expectation(scenario, waveform, antennas, city),
+        plan,
+        expectation=make_expectation(scenario, waveform, antennas, city),
     )
     return _connected(setup)
 
@@ -186,7 +197,7 @@ def _connected(setup: Setup) -> Setup:
         setup.scenario, setup.waveform, setup.antennas, setup.schedule, scene, lambda link: setup.noise_power(first, link)
     )
     timetable = replace(setup.timetable, blocks=found.blocks(), refused=found.refused())
-    return replace(setup, timetable=timetable, connections=found)
+    return replace(setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable))
 
 
 def city_of(scenario: Scenario) -> City:
@@ -222,10 +233,15 @@ def path_content(scenario: Scenario) -> str:
     return json.dumps([tree, _city_digest(scenario), program_fingerprint()], sort_keys=True)
 
 
-def _propagation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, store: PathStore | None) -> Propagation:
+def _propagation(
+    scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, instants: tuple[float, ...], store: PathStore | None
+) -> Propagation:
+    def make() -> Propagation:
+        return make_propagation(scenario, waveform, antennas, city, instants)
+
     if store is None or scenario.propagation.model == "free_space":
-        return make_propagation(scenario, waveform, antennas, city)
-    return CachedPropagation(lambda: make_propagation(scenario, waveform, antennas, city), store, path_content(scenario))
+        return make()
+    return CachedPropagation(make, store, path_content(scenario))
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
@@ -532,8 +548,8 @@ def _fidelity(setup: Setup) -> dict[str, object]:
         "clutter": c.model,
         "rays": p.rays if traced else None,
         "clutter_rays": c.rays if c.model == "diffuse" else None,
-        "weakest_path_db": p.weakest_path_db,
-        "synthesis": "auto",
+        **decisions(setup.plan),
+        "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
         "paths_contradicted": setup.propagation.dropped,
         "city_faces": setup.city.num_faces,
     }

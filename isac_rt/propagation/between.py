@@ -104,6 +104,8 @@ class Between:
 
     def legs(self, local: Mapping[str, Pose], time: float) -> dict[Pair, LegSet]:
         """Legs of every pair at an instant of the run, for the poses at that instant."""
+        if not self._instants[0] - 1e-9 <= time <= self._instants[-1] + 1e-9:
+            return self._trace(time)  # before or after all frames: there is nothing to be between
         number = int(np.argmin(np.abs(self._instants - time)))
         if abs(self._instants[number] - time) < 1e-9:
             return self._traced(number)
