@@ -136,7 +136,9 @@ class Plan:
         chosen = self.scenario.first_blocks() if self.timetable.blocks is None else self.timetable.blocks
         blocks = list(chosen.values()) or [0]
         apart = max(blocks) - min(blocks) + w.num_groups - 1
-        return w.max_delay + self.scenario.radio.filter_transition_hz / w.slope + apart * w.group_spacing
+        last = self.timetable.epoch(self.scenario.frames)
+        clocks = 2 * max(abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last for u in self.scenario.swarm.values())
+        return w.max_delay + self.scenario.radio.filter_transition_hz / w.slope + apart * w.group_spacing + clocks
 
     @property
     def reach(self) -> float:
@@ -177,8 +179,13 @@ class Plan:
             plane_error=float(plane_error[plane].max(initial=0.0)),
             straight_error=float(straight_error[straight].max(initial=0.0)),
         )
-        radii = {name: np.where(plane, np.inf, getattr(kept, name)) for name in ("tx_radius", "rx_radius")}
-        return replace(kept, **radii, delay_accel=np.where(straight, 0.0, kept.delay_accel)), use
+        left = replace(
+            kept,
+            tx_radius=np.where(plane, np.inf, kept.tx_radius),
+            rx_radius=np.where(plane, np.inf, kept.rx_radius),
+            delay_accel=np.where(straight, 0.0, kept.delay_accel),
+        )
+        return left, use
 
 
 def frame_reach(waveform: Waveform) -> float:

@@ -140,7 +140,7 @@ class Setup:
             start_time=self.timetable.start_time(frame, tx),
             filter_transition=self.scenario.radio.filter_transition_hz,
             noise_power=level,
-            method=self.plan.synthesis(sum(len(paths[name, rx]) for name in order)),
+            method=self.plan.synthesis(sum(len(p) for _, p in links)),
         )
         words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
         return add_noise(cube, level, words)

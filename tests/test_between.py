@@ -116,7 +116,7 @@ def test_a_path_dies_where_its_wall_ends():
 
 def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
     """The line of sight of A to P crosses the plane y = 0 at x_A + (x_P - x_A) |y_A|/(|y_A| + y_P); a screen there from x = 2 on hides it.
-    Planted bug: rays tested from the first stop only."""
+    Planted bug: the answer of the rays not used (`seen` all true)."""
     corners = np.array([[2.0, 0, -20], [60, 0, -20], [60, 0, 40], [2, 0, 40]])
     material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
     city = City("screen", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (material,), np.zeros(3))

@@ -63,12 +63,13 @@ def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth:
     def padded(chain: np.ndarray) -> np.ndarray:
         return np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1)
 
-    legs = [part for _, part, _, _ in parts]
+    amplitudes, legs, faces, planes = zip(*parts, strict=True)
     points = [np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan) for p in legs]
-    names = ("length", "rate", "accel", "departure", "arrival")
-    joined = Legs(*(np.concatenate([getattr(p, name) for p in legs]) for name in names), np.concatenate(points))
-    faces, planes = (np.concatenate([padded(part[i]) for part in parts]) for i in (2, 3))
-    return LegSet(np.concatenate([part[0] for part in parts]), joined, faces, planes)
+    length, rate, accel = (np.concatenate([getattr(p, name) for p in legs]) for name in ("length", "rate", "accel"))
+    departure, arrival = (np.concatenate([getattr(p, name) for p in legs]) for name in ("departure", "arrival"))
+    joined = Legs(length, rate, accel, departure, arrival, np.concatenate(points))
+    chains = [np.concatenate([padded(chain) for chain in part]) for part in (faces, planes)]
+    return LegSet(np.concatenate(amplitudes), joined, chains[0], chains[1])
 
 
 class Between:
@@ -239,7 +240,9 @@ def _changes(chains: list[_Chains]) -> tuple[int, int]:
 
 def _stacked(poses: list[Pose], which: np.ndarray) -> Pose:
     """One row of position, velocity and acceleration per chain."""
-    return Pose(*(np.array([getattr(p, name) for p in poses])[which] for name in ("position", "velocity", "acceleration")), np.eye(3))
+    names = ("position", "velocity", "acceleration")
+    position, velocity, acceleration = (np.array([getattr(p, name) for p in poses])[which] for name in names)
+    return Pose(position, velocity, acceleration, np.eye(3))
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
