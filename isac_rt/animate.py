@@ -16,6 +16,8 @@ from isac_rt.figures import STYLE, range_doppler, scene_map, uav_colour
 from isac_rt.results import Results, ResultsError, write_bytes
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
+_STYLE = STYLE | {"figure.constrained_layout.use": False}
+_LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
 
 
 def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
@@ -47,11 +49,11 @@ def animate(results: Results, observer: int = 0, city: City | None = None) -> tu
     shown = [k for k in range(d.sizes["snapshot"]) if np.isfinite(d.map_power.values[k, observer]).any()]
     if len(shown) < 2:
         raise ResultsError(f"{len(shown)} frame(s) have maps of {d.observer.values[observer]}; run again with --snapshots 20 or more")
-    with matplotlib.rc_context(STYLE | {"figure.constrained_layout.use": False}):
+    with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11, 4.8), dpi=100)
-        left, right = figure.add_axes((0.06, 0.1, 0.4, 0.82)), figure.add_axes((0.55, 0.1, 0.43, 0.82))
+        left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
         scene_map(left, d, city)
-        for line in [*left.lines, *left.texts]:
+        for line in left.lines:
             line.set_alpha(0.25)
         moving = _Moving(left, d, observer)
 
@@ -61,8 +63,9 @@ def animate(results: Results, observer: int = 0, city: City | None = None) -> tu
             for ax in figure.axes[2:]:
                 ax.remove()  # the last map's colour bar
             right.clear()
-            right.set_position((0.55, 0.1, 0.43, 0.82))
-            range_doppler(right, d, k, observer)
+            right.set_position(_RIGHT)
+            with matplotlib.rc_context(_STYLE):
+                range_doppler(right, d, k, observer)
             return []
 
         return figure, FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
@@ -77,7 +80,7 @@ class _Moving:
         self._paths = [ax.plot([], [], color=uav_colour(dataset, u))[0] for u in range(count)]
         self._here = [ax.plot([], [], "o", color=uav_colour(dataset, u), mec="white")[0] for u in range(count)]
         (self._tracks,) = ax.plot([], [], "x", color="black", ms=9, mew=1.6, label=f"tracks of {dataset.observer.values[observer]}")
-        ax.legend(loc="lower right")
+        ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
 
     def show(self, frame: int) -> None:
         position = self._d.uav_position.values
@@ -86,7 +89,7 @@ class _Moving:
             here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
         found = tracked_positions(self._d, frame, self._observer)
         self._tracks.set_data(found[:, 0], found[:, 1])
-        self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s")
+        self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
 
 
 def write_animation(results: Results, file: str | Path, observer: int = 0, city: City | None = None, rate: float = 5.0) -> None:

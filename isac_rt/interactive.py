@@ -68,7 +68,8 @@ def scene_3d(city: City, swarm: Swarm, times: np.ndarray, time: float, paths: Ma
                          marker={"color": colour, "size": 6, "symbol": _SYMBOLS[uav.role]}, legendgroup=name, name=f"{name}, {uav.role}")
         )  # fmt: skip
     figure.update_layout(
-        scene={"aspectmode": "data", "xaxis_title": "east [m]", "yaxis_title": "north [m]", "zaxis_title": "up [m]"},
+        scene={"aspectmode": "data", "xaxis_title": "east [m]", "yaxis_title": "north [m]", "zaxis_title": "up [m]",
+               "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}}},
         margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0.01, "y": 0.99}, template="plotly_white",
     )  # fmt: skip
     return figure
@@ -85,7 +86,8 @@ def _mesh(city: City, tracks: np.ndarray, reach: float) -> dict[str, object]:
     i, j, k = index.reshape(-1, 3).T
     return {
         "x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "i": i, "j": j, "k": k, "intensity": points[:, 2],
-        "colorscale": "Greys_r", "showscale": False, "flatshading": True, "hoverinfo": "skip",
+        "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]], "showscale": False, "flatshading": True, "hoverinfo": "skip", "opacity": 0.75,
+        "lighting": {"ambient": 0.65, "diffuse": 0.6, "specular": 0.05},
     }  # fmt: skip
 
 
