@@ -50,6 +50,7 @@ from isac_rt.tracking import TrackSet
 from isac_rt.waveform import Waveform, waveform_of
 
 Progress = Callable[[int, int], None]
+Terminal = ActiveTerminal | PassiveTerminal
 
 
 @dataclass(frozen=True)
@@ -271,20 +272,22 @@ class _Heard:
     state: int
 
 
+def standard_terminal(setup: Setup, link: Link) -> Terminal:
+    """The receiver of a link as the scenario has it."""
+    s = setup.scenario
+    if link[0] == link[1]:
+        return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
+    order, amplitude = s.modulation.dpsk_order, transmit_amplitude(s.noise)
+    return PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude, groups=setup.timetable.groups(link))
+
+
 class _Observer:
     """One link's receiving terminal with its score."""
 
-    def __init__(self, setup: Setup, link: Link) -> None:
-        s = setup.scenario
-        self.link, self.setup, self.passes = link, setup, 2 if link[0] == link[1] else 1
+    def __init__(self, setup: Setup, link: Link, terminal: Terminal) -> None:
+        self.link, self.setup, self.terminal = link, setup, terminal
+        self.passes = 2 if link[0] == link[1] else 1
         self.groups = setup.timetable.groups(link)
-        self.terminal: ActiveTerminal | PassiveTerminal
-        if self.passes == 2:
-            self.terminal = ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
-        else:
-            amplitude = transmit_amplitude(s.noise)
-            order = s.modulation.dpsk_order
-            self.terminal = PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude, groups=self.groups)
         self.score = SensingScore(resolutions(setup.waveform, setup.antennas, self.passes))
         self.feedback = {"answers": 0, "corrections": 0}
 
@@ -319,7 +322,13 @@ class _Observer:
 
 
 def run(
-    scenario: Scenario, *, progress: Progress | None = None, setup: Setup | None = None, threads: int | None = None, snapshots: int = 3
+    scenario: Scenario,
+    *,
+    progress: Progress | None = None,
+    setup: Setup | None = None,
+    threads: int | None = None,
+    snapshots: int = 3,
+    terminal: Callable[[Setup, Link], Terminal] = standard_terminal,
 ) -> Results:
     """Simulate every frame of a scenario.
 
@@ -330,12 +339,13 @@ def run(
     setup : from `prepare`, if it is there already
     threads : receivers at work at once; None: as many as the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path ledger are kept
+    terminal : makes the receiver of a link; one of one's own is a subclass of `ActiveTerminal` or `PassiveTerminal` with another `receive`
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
-    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario, snapshots))
+    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario, snapshots), terminal)
     return flight.recorder.finish(
         **flight.figures(),
         materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in flight.setup.city.materials},
@@ -345,7 +355,7 @@ def run(
 
 def summarise(scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None) -> dict[str, Any]:
     """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
-    flight = _fly(scenario, None, setup, threads, set())
+    flight = _fly(scenario, None, setup, threads, set(), standard_terminal)
     return flight.recorder.summary(**flight.figures())
 
 
@@ -375,14 +385,21 @@ class _Flight:
         return (stages or {}) | {"feedback": told}
 
 
-def _fly(scenario: Scenario, progress: Progress | None, setup: Setup | None, threads: int | None, snapshots: set[int]) -> _Flight:
+def _fly(
+    scenario: Scenario,
+    progress: Progress | None,
+    setup: Setup | None,
+    threads: int | None,
+    snapshots: set[int],
+    terminal: Callable[[Setup, Link], Terminal],
+) -> _Flight:
     """Frame after frame; while the receivers work on one the next is traced."""
     clock, begin = _Clock(), time.perf_counter()
     with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
         with clock.stage("setup"):
             setup = setup or prepare(scenario)
             timetable = setup.timetable
-            observers = {link: _Observer(setup, link) for link in timetable.all_links}
+            observers = {link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links}
             recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
         waiting: tuple[_Frame, dict[Link, Future[_Heard]]] | None = None
         for number in range(scenario.frames):

@@ -80,10 +80,14 @@ class ActiveTerminal:
         self, cube: IFCube, payload: Payload, own_pose: Pose, time: float, *, clutter: ExpectedClutter | None = None, maps: bool = False
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal expects of its mesh there."""
-        reception = receive_active(cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps)
+        reception = self.receive(cube, payload, clutter, maps)
         self.tracker.predict(time)
         self.tracker.update(reception.detections, own_pose)
         return reception, self.tracker.snapshot(own_pose)
+
+    def receive(self, cube: IFCube, payload: Payload, clutter: ExpectedClutter | None, maps: bool) -> Reception:
+        """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
+        return receive_active(cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps)
 
 
 class PassiveTerminal:
@@ -130,7 +134,7 @@ class PassiveTerminal:
             self.reference.age += 1
         self._time = time
         self.tracker.predict(time)
-        reception = self._receive(cube, self._expect(own_pose) if modulated else None, modulated, maps)
+        reception = self.receive(cube, self._expect(own_pose) if modulated else None, modulated, maps)
         if reception.decoded:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
@@ -146,7 +150,8 @@ class PassiveTerminal:
             self.reference.state = _moved(self.reference.state, own_pose, -cells * self._cells[0])
             self._ends.clear()
 
-    def _receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
+    def receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
+        """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
         return receive_passive(
             cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, maps=maps
         )
@@ -220,7 +225,7 @@ class PassiveTerminal:
         before = self.reference.state
         self.reference.state = _moved(before, own, cells * self._cells[0])
         prediction = self._expect(own)
-        again = self._receive(cube, prediction, True, maps) if prediction else reception
+        again = self.receive(cube, prediction, True, maps) if prediction else reception
         self._ends.clear()
         if not again.decoded:
             self.reference.state = before

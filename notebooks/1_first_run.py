@@ -1,0 +1,57 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # A first run
+# A street canyon, traced at 77 GHz: one active terminal, one passive terminal that decodes, one target. `irt.run` does all
+# of it; the cells after it take one frame apart by hand.
+
+# %%
+import matplotlib.pyplot as plt
+
+import isac_rt as irt
+from isac_rt import figures
+
+scenario = irt.load("../scenes/street_canyon.yaml", frames=6)
+results = irt.run(scenario)
+results
+
+# %% [markdown]
+# Everything is in one labelled dataset. Paths by kind, summed over the frames:
+
+# %%
+results.dataset.path_count.sum("frame").to_pandas()
+
+# %% [markdown]
+# Plots take axes and return them. The swarm from above, and what the passive terminal followed:
+
+# %%
+setup = irt.prepare(scenario)
+figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4))
+figures.scene_map(left, results.dataset, setup.city)
+figures.over_time(right, results.dataset, 1, "range");
+
+# %% [markdown]
+# ## One frame by hand
+# Poses and paths of frame 4 at its middle:
+
+# %%
+poses, paths = setup.trace(4)
+paths["AT", "PT1"]
+
+# %% [markdown]
+# What the active terminal sends, what it receives of its own chirps, and what it makes of them:
+
+# %%
+sent = {"AT": setup.transmission("AT", 4, poses["AT"])}
+cube = setup.receive_samples(4, ("AT", "AT"), sent, paths, poses)
+cube
+
+# %%
+reception = irt.receive_active(cube, sent["AT"].payload, setup.antennas, scenario.receivers)
+reception.detections

@@ -1,0 +1,57 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # A receiver of one's own
+# A terminal is a class with a method `receive`: samples and public knowledge in, a `Reception` out. Replace it, and the rest of the run
+# (tracking, scoring, figures) stays.
+
+# %% [markdown]
+# Here an active terminal that keeps only what rises 17 dB above the median of its map.
+
+# %%
+from dataclasses import replace
+from tempfile import TemporaryDirectory
+
+import isac_rt as irt
+from isac_rt.receive import Detections
+
+
+class Cautious(irt.ActiveTerminal):
+    """Drops detections under 17 dB."""
+
+    def receive(self, cube, payload, clutter, maps):
+        found = super().receive(cube, payload, clutter, maps)
+        strong = found.detections.snr > 50
+        return replace(found, detections=Detections(**{name: value[strong] for name, value in vars(found.detections).items()}))
+
+
+def terminal(setup, link):
+    """The standard receiver for passive terminals, the cautious one for active ones."""
+    if link[0] != link[1]:
+        return irt.standard_terminal(setup, link)
+    s = setup.scenario
+    return Cautious(setup.waveform, setup.antennas, s.receivers, s.tracking)
+
+
+scenario = irt.load("../scenes/street_canyon.yaml", ["receivers.active_every_frames=1"], frames=6)
+for name, receiver in (("standard", irt.standard_terminal), ("cautious", terminal)):
+    own = irt.run(scenario, terminal=receiver).summary["terminals"]["AT"]
+    print(f"{name}: hit rate {own['hit_rate']:.2f}, false detections per frame {own['false_per_frame']:.1f}")
+
+# %% [markdown]
+# The samples can go elsewhere too: to a file, to SigMF, to another program.
+
+# %%
+setup = irt.prepare(scenario)
+poses, paths = setup.trace(4)
+sent = {"AT": setup.transmission("AT", 4, poses["AT"])}
+cube = setup.receive_samples(4, ("AT", "PT1"), sent, paths, poses)
+with TemporaryDirectory() as folder:
+    irt.save_cube(cube, f"{folder}/frame4.nc")
+    print(irt.load_cube(f"{folder}/frame4.nc"))

@@ -1,0 +1,41 @@
+"""The notebooks run, cell after cell, as they stand. Small as they are they take half a minute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent.parent / "notebooks"
+SOURCES = sorted(FOLDER.glob("*.py"))
+
+
+def test_there_are_notebooks():
+    assert len(SOURCES) >= 7
+
+
+@pytest.mark.sionna
+@pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)
+def test_a_notebook_runs(source, monkeypatch):
+    """Every code cell in one name space, as a kernel would; figures are drawn to nowhere."""
+    jupytext = pytest.importorskip("jupytext")
+    import matplotlib
+
+    matplotlib.use("Agg", force=True)
+    monkeypatch.chdir(FOLDER)
+    notebook = jupytext.read(source)
+    assert notebook.cells[0].cell_type == "markdown"
+    assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 3
+    space: dict[str, object] = {"__name__": "__main__"}
+    for number, cell in enumerate(notebook.cells):
+        if cell.cell_type == "code":
+            exec(compile(cell.source, f"{source.name}[{number}]", "exec"), space)
+
+
+@pytest.mark.slow
+@pytest.mark.sionna
+@pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)
+def test_a_notebook_runs_in_a_kernel(source):
+    """The same in Jupyter's own kernel."""
+    jupytext, nbclient = pytest.importorskip("jupytext"), pytest.importorskip("nbclient")
+    nbclient.NotebookClient(jupytext.read(source), timeout=600, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}).execute()
