@@ -154,7 +154,7 @@ class Waveform:
         return SPEED_OF_LIGHT / (passes * self.frame_duration * self.effective_carrier)
 
     def max_velocity(self, passes: int) -> float:
-        """Largest unambiguous |radial velocity| [m/s] of a full (Latin) slow-time sampling."""
+        """Largest unambiguous radial speed [m/s] of a full (Latin) slow-time sampling."""
         return SPEED_OF_LIGHT / (2 * passes * self.slot_duration * self.effective_carrier)
 
     @cached_property

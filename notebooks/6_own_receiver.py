@@ -12,7 +12,7 @@
 # (tracking, scoring, figures) stays.
 
 # %% [markdown]
-# Here an active terminal that keeps only what rises 17 dB above the median of its map.
+# Here an active terminal that keeps only what rises 14 dB above the median of its map.
 
 # %%
 from dataclasses import replace
@@ -23,11 +23,11 @@ from isac_rt.receive import Detections
 
 
 class Cautious(irt.ActiveTerminal):
-    """Drops detections under 17 dB."""
+    """Drops detections under 14 dB."""
 
     def receive(self, cube, payload, clutter, maps):
         found = super().receive(cube, payload, clutter, maps)
-        strong = found.detections.snr > 50
+        strong = found.detections.snr > 25
         return replace(found, detections=Detections(**{name: value[strong] for name, value in vars(found.detections).items()}))
 
 

@@ -85,7 +85,7 @@ class PathSet:
 
     @property
     def power(self) -> np.ndarray:
-        """(K,) |gain|^2."""
+        """(K,) ``|gain|^2``."""
         return np.abs(self.gain) ** 2
 
     def select(self, which: np.ndarray) -> PathSet:
