@@ -191,6 +191,8 @@ class Uav(Node):
     """By how much the clock is late at time 0: what the UAV sends arrives later by it, what it receives seems earlier."""
     clock_drift_ppm: Finite = 0.0
     """How much later it gets [us/s]; 0.01 ppm against another clock is 3 m/s of apparent velocity."""
+    body_radius_m: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.2
+    """ray_traced: of the opaque disc that shadows what passes behind it; 0: transparent. No body shadows its own paths and echoes."""
     resource_block: Annotated[int, Field(ge=0)] | None = None
     """First of the consecutive resource blocks, one per group, in which the UAV sends while it is active; null: the lowest that
     the active UAVs before it leave free."""

@@ -523,9 +523,10 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _direct_targets(paths: PathSet, names: list[str]) -> np.ndarray:
-    """Whether each UAV is reached without the city: the transmitter by the line of sight, the others by their echo."""
-    echo = {paths.target_names[i] for i in paths.target[paths.kind == PathKind.TARGET]}
-    sight = bool((paths.kind == PathKind.LINE_OF_SIGHT).any())
+    """Whether each UAV is reached straight, without the city: the transmitter by the line of sight, the others by their echo."""
+    straight = ~paths.bent
+    echo = {paths.target_names[i] for i in paths.target[straight & (paths.kind == PathKind.TARGET)]}
+    sight = bool((straight & (paths.kind == PathKind.LINE_OF_SIGHT)).any())
     return np.array([sight if name == paths.tx != paths.rx else name in echo for name in names])
 
 

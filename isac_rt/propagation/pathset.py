@@ -39,7 +39,8 @@ class PathSet:
     epoch : time of the middle of the frame [s]
     tx, rx : names of the terminals
     target_names : names that `target` indexes
-    points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own position included)
+    points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own position, and shadow edges round
+        which a path bends, included)
     faces : (K, B) int32 face of the city mesh at each point, -1 where there is none
     """
 
@@ -87,6 +88,11 @@ class PathSet:
     def power(self) -> np.ndarray:
         """(K,) ``|gain|^2``."""
         return np.abs(self.gain) ** 2
+
+    @property
+    def bent(self) -> np.ndarray:
+        """(K,) whether a path bends round a shadow edge: it has a point that is neither a bounce nor a UAV."""
+        return np.isfinite(self.points).all(axis=2).sum(axis=1) > self.bounces + (self.target >= 0)
 
     def select(self, which: np.ndarray) -> PathSet:
         """The paths that a mask or an index array chooses."""

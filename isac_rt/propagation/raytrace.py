@@ -3,7 +3,8 @@
 One solve per frame, from the terminals to every UAV, gives the legs of all links: terminal to terminal, terminal back to itself, and
 terminal to target. Of each leg only the chain of faces, its visibility and its complex amplitude (which holds no carrier
 phase) come from Sionna; length, rate, acceleration, directions and points are unfolded in float64 from the planes of
-the mesh. Sionna's float32 delays are off by up to a radian and more at this carrier.
+the mesh. Sionna's float32 delays are off by up to a radian and more at this carrier. Straight legs then bend round shadow edges, and
+the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
 
 Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point scatterer. Sionna's own
 RCS solver gives the same paths, but wants the bodies in the scene, where each shadows the terminal that carries it, and one
@@ -33,12 +34,16 @@ from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.city.scene import shared_scene
 from isac_rt.propagation.between import Between, LegSet, leg_set, pick
+from isac_rt.propagation.bodies import Bodies
 from isac_rt.propagation.clutter import ClutterField
 from isac_rt.propagation.diffuse import scatterer_phase
+from isac_rt.propagation.direct import past_edges_and_bodies
+from isac_rt.propagation.edges import ShadowEdges
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
+from isac_rt.propagation.visibility import Shadows
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose, Swarm
 from isac_rt.waveform import SPEED_OF_LIGHT
@@ -67,6 +72,7 @@ class RayTracer:
         self._handle = shared_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
+        self._edges = ShadowEdges(city, Shadows(self._handle.scene.mi_scene), wavelength)
         pinned = scenario.clutter.model == "field"
         self.field = ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength) if pinned else None
         """The scatterers on the city's surfaces."""
@@ -92,6 +98,8 @@ class RayTracer:
         if not all(np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all() for pose in local.values()):
             raise ValueError("a UAV's position or velocity is not finite")
         legs = self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
+        bodies = Bodies.of(self._scenario.swarm, local)
+        legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._wavelength)
         hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
         return {link: self._link(local, epoch, *link, legs, hits) for link in links}
 

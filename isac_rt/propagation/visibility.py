@@ -48,6 +48,14 @@ class Shadows:
             out[part] = ~np.asarray(self._scene.ray_test(ray))
         return out
 
+    def clear(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """(N,) whether nothing stands between points (N, 3) and points (N, 3)."""
+        span = ends - starts
+        length = np.linalg.norm(span, axis=1)
+        ray = mi.Ray3f(mi.Point3f(*_rows(starts)), mi.Vector3f(*_rows(span / np.maximum(length, 1e-9)[:, None])))
+        ray.maxt = mi.Float(length.astype(np.float32))  # type: ignore[assignment]
+        return ~np.asarray(self._scene.ray_test(ray))
+
 
 def _rows(vectors: np.ndarray) -> np.ndarray:
     """(3, N) float32 of (N, 3)."""
