@@ -13,8 +13,8 @@ LAMBDA = 299_792_458.0 / 77e9
 
 
 def test_knife_edge_is_the_complementary_error_function():
-    """F(nu) = erfc(nu sqrt(j pi / 2)) / 2, another form of the same integral; rounding. One half at the edge; the power in the shadow falls as
-    1/(2 pi^2 nu^2) and its loss is P.526's approximation, 6.9 + 20 log(sqrt((nu - 0.1)^2 + 1) + nu - 0.1) dB (eq. 31, stated for
+    """F(nu) = erfc(nu sqrt(j pi / 2)) / 2, another form of the same integral; rounding. One half at the edge; the power in the shadow
+    falls as 1/(2 pi^2 nu^2) and its loss is P.526's approximation, 6.9 + 20 log(sqrt((nu - 0.1)^2 + 1) + nu - 0.1) dB (eq. 31, stated for
     nu > -0.78; it is good to 0.3 dB there). Planted bug: the conjugate, as under exp(+jkd)."""
     nu = np.linspace(-8.3, 9.1, 517)
     exact = special.erfc(nu * np.sqrt(0.5j * np.pi)) / 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import special
 from test_clutter_coherence import crossing
-from test_clutter_field import METAL, rectangle
+from test_clutter_field import METAL, flown, rectangle
 from test_diffraction import chopped
 
 from isac_rt import scenario
@@ -84,7 +84,7 @@ def test_line_of_sight_and_echo_of_a_half_plane():
     """
     model, a = tracer(WALL), pose((-8.3, 0.0, -1.1))
     worst, dark = 0.0, 0
-    for h in np.linspace(-0.55, 1.6, 44):  # of the edge over the path
+    for h in np.linspace(-0.55, 1.6, 30):  # of the edge over the path
         top = (-1.1 * 47 / 78 + h) * 78 / 31  # z = -top lies so that the path passes h under the edge
         end = pose((9.1, 78.0, -top))
         d = np.linalg.norm(end.position - a.position)
@@ -104,7 +104,7 @@ def test_line_of_sight_and_echo_of_a_half_plane():
         worst = max(worst, abs(field(echo) / whole - expected**2))
         dark += nu > 0
         assert los.bent[0] == echo.bent[0] == (nu > 0)
-    assert 20 < dark < 40
+    assert 15 < dark < 28
     assert worst < 3e-3, worst
 
 
@@ -151,7 +151,7 @@ def test_nothing_is_switched_when_flying_round_a_corner():
 
 def test_bodies_shadow_what_is_behind_them_and_not_themselves():
     """U near the straight path from A to P, and P near that from A to U: the line of sight and the echo take a disc's factor, by strips, of
-    the body in between; the bodies at the ends of a leg, and those of radius 0, none. Planted bug: the echoing body shadows its own echo.
+    the body in between; the bodies at the ends of a leg, and those of radius 0, none. Planted bug: the Fresnel unit of the near end alone.
     """
     a, p, u = pose((0.4, -0.7, 0.3)), pose((3.1, 41.3, 1.9)), pose((1.77, 17.9, 1.15))
     d = np.linalg.norm(p.position - a.position)
@@ -172,3 +172,30 @@ def test_bodies_shadow_what_is_behind_them_and_not_themselves():
         assert abs(by_way_of_u[0].gain[0] / by_way_of_u[1].gain[0] - 1) < 1e-12
         by_way_of_p = [x["A", "A"].select(x["A", "A"].target == 1) for x in (paths, bare)]
         assert abs(by_way_of_p[0].gain[0] / by_way_of_p[1].gain[0] - factor**2) < 1e-6
+
+
+def test_clutter_behind_a_body_is_in_its_shadow():
+    """A body 8.3 m in front of A: each scatterer of a wall takes the disc's modulus on the way there and on the way back, by strips; the
+    terminal's own body none. Planted bug: one way only."""
+    city = rectangle((-20.0, 25.0, -9.0), (40.0, 0, 0), (0, 0, 22.0), METAL)
+    model, _ = flown(city, (0.3, -1.1, 0.9), (-9.0, -7.0, 2.2), cell_area_per_metre_m=0.2, smallest_cell_m2=0.05)
+    a, body = pose((0.3, -1.1, 0.9)), np.array([0.9, 7.1, 1.3])
+    bare = model.field.seen("A", "A", a, a, 0.0)
+    for names in (("U",), ("A", "U")):
+        bodies = Bodies(names, np.array([body, body])[: len(names)], np.full(len(names), 0.23))
+        if "A" in names:
+            bodies = Bodies(names, np.array([a.position, body]), bodies.radii)
+        seen = model.field.seen("A", "A", a, a, 0.0, bodies)
+        ratio, checked = seen.magnitude / bare.magnitude, 0
+        for i, point in enumerate(model.field.cells.points[bare.index]):
+            r = np.linalg.norm(point - a.position)
+            along = (body - a.position) @ (point - a.position) / r
+            off = np.sqrt(max(((body - a.position) ** 2).sum() - along**2, 0.0))
+            unit = np.sqrt(LAMBDA * along * (r - along) / (2 * r))
+            if off > 0.23 + 7 * unit:
+                assert ratio[i] == pytest.approx(1.0, rel=1e-6, abs=0)  # float32
+            elif off < 0.23 + 2.9 * unit:
+                assert ratio[i] == pytest.approx(abs(chopped(off / unit, 0.23 / unit)) ** 2, rel=0, abs=1e-5)
+                checked += 1
+        assert checked > 10
+        assert ratio.min() < 0.2

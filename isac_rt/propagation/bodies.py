@@ -51,17 +51,27 @@ class Bodies:
         out = np.ones(len(chain), complex)
         lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
         total, before = lengths.sum(axis=1), np.cumsum(lengths, axis=1) - lengths
+        for k in range(chain.shape[1] - 1):
+            self._shade(out, chain[:, k], chain[:, k + 1], before[:, k], total, wavelength, spared)
+        return out
+
+    def sight(self, place: np.ndarray, points: np.ndarray, distance: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
+        """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,) [m]."""
+        out = np.ones(len(points), complex)
+        self._shade(out, np.broadcast_to(place, points.shape), points, np.zeros(len(points)), distance, wavelength, spared)
+        return np.abs(out)
+
+    def _shade(self, out, starts, ends, before, total, wavelength: float, spared: Collection[str]) -> None:
+        """Multiply `out` by the factors of straight parts that begin `before` along paths of length `total`."""
         for name, place, radius in zip(self.names, self.places, self.radii, strict=True):
             if name in spared:
                 continue
-            for k in range(chain.shape[1] - 1):
-                path, off, along = _near(chain[:, k], chain[:, k + 1], before[:, k], total, place, radius, wavelength, LIT_REACH)
-                if path.size:
-                    far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
-                    unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
-                    nu, size = off / unit, radius / unit
-                    out[path] *= tapered(disc(nu, size), nu - size)
-        return out
+            path, off, along = _near(starts, ends, before, total, place, radius, wavelength, LIT_REACH)
+            if path.size:
+                far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
+                unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
+                nu, size = off / unit, radius / unit
+                out[path] *= tapered(disc(nu, size), nu - size)
 
 
 @numba.njit(cache=True, nogil=True)

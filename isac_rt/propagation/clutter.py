@@ -32,6 +32,7 @@ import numpy as np
 from isac_rt.arrays import Antennas
 from isac_rt.city.materials import VACUUM_PERMITTIVITY, Material
 from isac_rt.city.mesh import City
+from isac_rt.propagation.bodies import Bodies
 from isac_rt.propagation.cells import Cells, Density, cut
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
@@ -108,7 +109,7 @@ class ClutterField:
         self.num_candidates = num_candidates
         """Cells of the whole city, those that are never in sight included."""
         self._surfaces = surfaces(city, wavelength)
-        self._scale = wavelength / (4 * np.pi)
+        self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
     @classmethod
     def plan(cls, scenario: Scenario, city: City, scene: mi.Scene, wavelength: float) -> ClutterField:
@@ -133,8 +134,8 @@ class ClutterField:
         """Of the scatterers and of what is remembered of their sight."""
         return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
 
-    def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float) -> Seen:
-        """What is in sight of both ends of a link, poses in local coordinates."""
+    def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None) -> Seen:
+        """What is in sight of both ends of a link, poses in local coordinates; in the shadows of `bodies`, if given."""
         share = self.sight.share(tx, start, time)
         if tx != rx:
             share = share * self.sight.share(rx, end, time)
@@ -148,15 +149,21 @@ class ClutterField:
         _advance(index, share, c.points, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
                  self._scale, *motion, own, *out)  # type: ignore[call-arg]  # fmt: skip
         found = Seen(index, *out)
+        if bodies is not None:
+            there = bodies.sight(start.position, c.points[index], found.tx_radius, self._wavelength, (tx,))
+            back = there if own else bodies.sight(end.position, c.points[index], found.rx_radius, self._wavelength, (rx,))
+            found.magnitude[:] *= there * back
         lit = found.magnitude > 0
         if lit.all():
             return found
         parts = {id(a): a[lit] for a in vars(found).values()}
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
-    def paths(self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict) -> PathSet:
-        """The link's paths at ``common["epoch"]``; poses and points in local coordinates."""
-        seen = self.seen(tx, rx, start, end, common["epoch"])
+    def paths(
+        self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict, bodies: Bodies | None = None
+    ) -> PathSet:
+        """The link's paths at ``common["epoch"]``; poses, points and bodies in local coordinates."""
+        seen = self.seen(tx, rx, start, end, common["epoch"], bodies)
         elements = (
             antennas.element_gain(start.to_body(seen.departure))
             if tx == rx

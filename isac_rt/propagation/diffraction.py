@@ -2,8 +2,9 @@ r"""Fresnel diffraction in closed form: a knife edge and a disc.
 
 Both factors multiply the amplitude that the straight path would have, and take phases as exp(-jkd). Lengths across the path are
 counted in Fresnel units, :math:`\nu = h\sqrt{2(d_1+d_2)/(\lambda d_1 d_2)}` with d_1 and d_2 the distances to the ends of the path;
-one unit is 0.22 m in the middle of 100 m at 77 GHz. Scalar, small angles, one screen: the polarisation and the shape of what stands behind the
-edge (a wedge's angle, a rounded rim) are left out, which matters at bending angles beyond some degrees and losses beyond some 20 dB.
+one unit is 0.22 m in the middle of 100 m at 77 GHz. Scalar, small angles, one screen: the polarisation and the shape of what
+stands behind the edge (a wedge's angle, a rounded rim) are left out, which matters at bending angles beyond some degrees and
+losses beyond some 20 dB.
 
 References
 ----------

@@ -42,7 +42,10 @@ def past_edges_and_bodies(
 def direct_legs(
     poses: dict[str, Pose], pairs: list[tuple[str, str]], edges: ShadowEdges, bodies: Bodies, wavelength: float
 ) -> dict[tuple[str, str], Direct]:
-    """Amplitude (0 or 1,) and leg of every pair of bodies at different places; `points` (.., 1, 3) holds the edge of a bent leg, else NaN."""
+    """Amplitude (0 or 1,) and leg of every pair of bodies at different places.
+
+    `points` (.., 1, 3) of a leg holds the edge round which it bends, else NaN.
+    """
     apart = [(a, b) for a, b in pairs if np.linalg.norm(poses[b].position - poses[a].position) > 1e-9]
     starts, ends = (np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1))
     bends = edges.bends(starts, ends)

@@ -110,7 +110,7 @@ class ShadowEdges:
 
 @numba.njit(cache=True, nogil=True)
 def _near(start, span, wings, source, sink, reach):
-    """Detours [m] (of at most `reach`, shortest first), points on the edges and directions away from what they bound, of silhouette edges."""
+    """Of silhouette edges: detours [m] (of at most `reach`, shortest first), points on the edges, directions away from what they bound."""
     ahead = sink - source
     length = np.sqrt((ahead**2).sum())
     ahead = ahead / length

@@ -101,7 +101,7 @@ class RayTracer:
         bodies = Bodies.of(self._scenario.swarm, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._wavelength)
         hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
-        return {link: self._link(local, epoch, *link, legs, hits) for link in links}
+        return {link: self._link(local, epoch, *link, legs, hits, bodies) for link in links}
 
     def _legs_on_the_way(self, time: float) -> dict[tuple[str, str], LegSet]:
         """Legs traced at an instant of the run."""
@@ -198,7 +198,7 @@ class RayTracer:
             parts.append((amplitude[which][keep], pick(legs, keep), chain[keep], planes[keep]))
         return leg_set(parts, faces.shape[1])
 
-    def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict) -> PathSet:
+    def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies) -> PathSet:
         common = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
         parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
         for number, name in enumerate(self._names):
@@ -207,7 +207,7 @@ class RayTracer:
         if (tx, rx) in hits:
             parts.append(self._scattered(local[tx], local[rx], *hits[tx, rx], common))
         if self.field is not None:
-            parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common))
+            parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
         leakage = self._scenario.propagation.leakage
         if tx == rx and leakage.enabled:
             ahead = local[tx].rotation[:, 1][None]
