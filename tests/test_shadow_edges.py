@@ -84,7 +84,7 @@ def test_line_of_sight_and_echo_of_a_half_plane():
     """
     model, a = tracer(WALL), pose((-8.3, 0.0, -1.1))
     worst, dark = 0.0, 0
-    for h in np.linspace(-0.55, 1.6, 30):  # of the edge over the path
+    for h in np.linspace(-0.55, 1.6, 16):  # of the edge over the path
         top = (-1.1 * 47 / 78 + h) * 78 / 31  # z = -top lies so that the path passes h under the edge
         end = pose((9.1, 78.0, -top))
         d = np.linalg.norm(end.position - a.position)
@@ -104,7 +104,7 @@ def test_line_of_sight_and_echo_of_a_half_plane():
         worst = max(worst, abs(field(echo) / whole - expected**2))
         dark += nu > 0
         assert los.bent[0] == echo.bent[0] == (nu > 0)
-    assert 15 < dark < 28
+    assert 8 < dark < 15
     assert worst < 3e-3, worst
 
 
@@ -178,7 +178,7 @@ def test_clutter_behind_a_body_is_in_its_shadow():
     """A body 8.3 m in front of A: each scatterer of a wall takes the disc's modulus on the way there and on the way back, by strips; the
     terminal's own body none. Planted bug: one way only."""
     city = rectangle((-20.0, 25.0, -9.0), (40.0, 0, 0), (0, 0, 22.0), METAL)
-    model, _ = flown(city, (0.3, -1.1, 0.9), (-9.0, -7.0, 2.2), cell_area_per_metre_m=0.2, smallest_cell_m2=0.05)
+    model, _ = flown(city, (0.3, -1.1, 0.9), (-9.0, -7.0, 2.2), cell_area_per_metre_m=0.008, smallest_cell_m2=0.05)
     a, body = pose((0.3, -1.1, 0.9)), np.array([0.9, 7.1, 1.3])
     bare = model.field.seen("A", "A", a, a, 0.0)
     for names in (("U",), ("A", "U")):
