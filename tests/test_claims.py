@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from isac_rt.experiments import claims_access, claims_cost, claims_recovery, claims_signal
+from isac_rt.arrays import Antennas
+from isac_rt.experiments import claims_access, claims_angle, claims_cost, claims_recovery, claims_signal
 from isac_rt.metrics import binomial_interval
 from isac_rt.waveform import Waveform
 
@@ -155,6 +158,32 @@ def test_a_constant_offset_of_the_clock_is_a_range():
     assert count[0] == count[2] == 0 and count[1] == 360 and count[3] == 351
 
 
+def test_an_alias_of_the_velocity_turns_the_transmit_elements():
+    """At 0.5 to 0.9 of the limit scheme (a) takes an alias, a third of a cycle from antenna to antenna, and the beam moves; (b) does not.
+
+    Planted bug: velocities below a third of the limit."""
+    assert claims_angle.angle_hits("a", 3, 1) == (0, 0)
+    assert claims_angle.angle_hits("b", 3, 1) == (3, 3)
+
+
+def test_virtual_places_are_counted_and_gaps_seen():
+    """Planted bug: places counted without looking for gaps."""
+    full = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=2.2e-3)
+    assert claims_angle.virtual(full) == (18, 16)
+    # transmit elements rx_x = 8 spacings apart, but two receive elements are missing from the arm
+    gapped = SimpleNamespace(
+        tx_x=2, rx_x=6, num_tx=3, num_rx=13, spacing=2.2e-3, tx_positions=full.tx_positions, rx_positions=full.rx_positions[2:]
+    )
+    assert claims_angle.virtual(gapped)[1] == 0
+
+
+def test_a_change_of_antenna_turns_the_phase():
+    """The elements' distances in wavelengths are 4.6 and more, so that the turn is nearly uniform: 1 - 1/D of it spoils a symbol, to the
+    ripple of sinc(4.6 x 1.2) (0.06). Antenna by antenna nothing is spoilt. Planted bug: a whole symbol allowed."""
+    assert claims_angle.spatial_slips(8, 4000, 1) / 4000 == pytest.approx(7 / 8, abs=0.06)
+    assert claims_angle.antenna_order(1, 1) == (0, 117)
+
+
 def test_terminals_share_the_band_unless_in_one_block():
     """Others at +30 dB in other blocks cost nothing; at +6 dB in the same block they take the frame."""
     apart = claims_access.crowd({3: 30.0, 15: 30.0}, 1, 0.0, 1, "test")
@@ -170,7 +199,7 @@ def test_all_claims(tmp_path):
     from isac_rt.experiments.outcome import write
 
     outcome = claims.run(True, 20260, silent)
-    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 26
+    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 30
     judged = {v.claim: v.verdict for v in outcome.verdicts if " costs O(" not in v.claim}
     assert {c for c, v in judged.items() if v == "does not hold"} == {
         "The approximations that make the IF a product of range, Doppler and angle are negligible",

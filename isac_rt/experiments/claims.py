@@ -1,7 +1,8 @@
 """Claims of the text that have no figure, each with a number: `isac-rt reproduce claims`.
 
-Their parts: the signal and a late clock (`claims_signal`), compressed sensing (`claims_recovery`), complexity (`claims_cost`), and what
-terminals do with one another (`claims_access`). All but the complexities, which are processor times, repeat from the seed.
+Their parts: the signal and a late clock (`claims_signal`), antennas (`claims_angle`), compressed sensing (`claims_recovery`), complexity
+(`claims_cost`), and what terminals do with one another (`claims_access`). All but the complexities, which are processor times, repeat from
+the seed.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from isac_rt.experiments import claims_access, claims_cost, claims_recovery, claims_signal
+from isac_rt.experiments import claims_access, claims_angle, claims_cost, claims_recovery, claims_signal
 from isac_rt.experiments.outcome import Outcome, Progress, Verdict, blank, style
 
-_WEIGHTS = {"signal": 3, "late clock": 6, "recovery": 10, "cost": 14, "blocks": 32, "sharing": 6, "streams": 14, "stages": 5, "feedback": 4}
+_WEIGHTS = {
+    "signal": 3, "late clock": 6, "antennas": 8, "recovery": 10, "cost": 14, "blocks": 32, "sharing": 6, "streams": 14, "stages": 5,
+    "feedback": 4,
+}  # fmt: skip
 """About the seconds of each part of a quick run: steps of the progress."""
 
 
@@ -51,6 +55,7 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     keep("angles", claims_signal.angles())
     verdicts.append(claims_signal.beyond_half(seed))
     keep("late_clock", claims_signal.late_clock(quick, seed, steps.of("late clock")))
+    keep("antennas", claims_angle.antennas(quick, seed, steps.of("antennas")))
     several, found = claims_recovery.recovery(quick, seed, steps.of("recovery"))
     tables |= several
     verdicts.extend(found)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from isac_rt.arrays import Antennas
-from isac_rt.experiments.outcome import Judgement, Outcome, Progress, Verdict
+from isac_rt.experiments.outcome import Judgement, Outcome, Progress, Verdict, blank, style
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 SPACING_WAVELENGTHS = 0.5774
@@ -23,7 +24,26 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     rows = [row for terminal in ("AT", "PT") for row in entries(Waveform(), terminal)]
     progress(1, 1)
     settings = {"quick": quick, "seed": seed, "spacing_wavelengths": SPACING_WAVELENGTHS}
-    return Outcome("table1", "Table I", {"table1": pd.DataFrame(rows)}, None, tuple(_verdict(row) for row in rows), settings)
+    verdicts = tuple(_verdict(row) for row in rows)
+    return Outcome("table1", "Table I", {"table1": pd.DataFrame(rows)}, _figure(rows, verdicts), verdicts, settings)
+
+
+def _figure(rows: list[dict], verdicts: tuple[Verdict, ...]) -> Figure:
+    """The table with both columns of values, coloured by verdict."""
+    colours = {"holds": "#DDF2E9", "holds under a condition": "#FFF3D6", "does not hold": "#F9DCD3"}
+    cells = [[r["terminal"], r["quantity"], f"{r['paper']:.6g}", f"{r['ours']:.6g}", r["unit"], v.verdict]
+             for r, v in zip(rows, verdicts, strict=True)]  # fmt: skip
+    with style():
+        figure, axes = blank(size=(8.2, 5.0))
+        axes[0, 0].axis("off")
+        table = axes[0, 0].table(
+            cells, colLabels=["terminal", "quantity", "paper", "settings", "unit", "verdict"], cellLoc="left", loc="center",
+            colWidths=[0.1, 0.34, 0.14, 0.14, 0.06, 0.22], cellColours=[[colours[v.verdict]] * 6 for v in verdicts],
+        )  # fmt: skip
+        table.auto_set_font_size(False)
+        table.set_fontsize(8)
+        table.scale(1, 1.25)
+    return figure
 
 
 def entries(w: Waveform, terminal: str) -> list[dict]:
