@@ -39,7 +39,7 @@ def terminal(setup, link):
     return Cautious(setup.waveform, setup.antennas, s.receivers, s.tracking)
 
 
-scenario = irt.load("../scenes/street_canyon.yaml", ["receivers.active_every_frames=1"], frames=6)
+scenario = irt.load("../scenes/street_canyon.yaml", ["clutter.model=none", "modulation.acquisition_frames=1"], frames=4)
 for name, receiver in (("standard", irt.standard_terminal), ("cautious", terminal)):
     own = irt.run(scenario, terminal=receiver).summary["terminals"]["AT"]
     print(f"{name}: hit rate {own['hit_rate']:.2f}, false detections per frame {own['false_per_frame']:.1f}")
@@ -49,9 +49,9 @@ for name, receiver in (("standard", irt.standard_terminal), ("cautious", termina
 
 # %%
 setup = irt.prepare(scenario)
-poses, paths = setup.trace(4)
-sent = {"AT": setup.transmission("AT", 4, poses["AT"])}
-cube = setup.receive_samples(4, ("AT", "PT1"), sent, paths, poses)
+poses, paths = setup.trace(2)
+sent = {"AT": setup.transmission("AT", 2, poses["AT"])}
+cube = setup.receive_samples(2, ("AT", "PT1"), sent, paths, poses)
 with TemporaryDirectory() as folder:
-    irt.save_cube(cube, f"{folder}/frame4.nc")
-    print(irt.load_cube(f"{folder}/frame4.nc"))
+    irt.save_cube(cube, f"{folder}/frame2.nc")
+    print(irt.load_cube(f"{folder}/frame2.nc"))
