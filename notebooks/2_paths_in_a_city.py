@@ -16,7 +16,7 @@ import numpy as np
 
 import isac_rt as irt
 
-scenario = irt.load("../scenes/street_canyon.yaml", ["clutter.model=field"])
+scenario = irt.load("../scenes/street_canyon.yaml", ["clutter.model=field", "accuracy.preset=everything"])
 setup = irt.prepare(scenario)
 setup.city
 

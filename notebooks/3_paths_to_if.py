@@ -21,7 +21,7 @@ from isac_rt.payload import unmodulated
 
 scenario = irt.load(
     "../scenes/paper_swarm_consistent.yaml",
-    ["propagation.leakage.enabled=false", "radio.groups=1", "modulation.pilot_every_frames=null"],
+    ["accuracy.preset=everything", "propagation.leakage.enabled=false", "radio.groups=1", "modulation.pilot_every_frames=null"],
     frames=4,
 )
 setup = irt.prepare(scenario)

@@ -261,7 +261,7 @@ def start_client(folder: Path, out: Path, *options: str) -> subprocess.Popen:
                             stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
 
 
-def wait_for_points(out: Path, number: int, timeout: float = 60.0) -> list[Path]:
+def wait_for_points(out: Path, number: int, timeout: float = 240.0) -> list[Path]:
     end = time.monotonic() + timeout
     while len(found := list((out / "points").rglob("*.json"))) < number:
         assert time.monotonic() < end, "no progress"
