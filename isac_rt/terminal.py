@@ -218,7 +218,7 @@ class PassiveTerminal:
         numbers); two are asked for, over at most `EVIDENCE_FRAMES` frames, and none of the latter, which a second
         path in the cell would leave there.
         """
-        self._ends.append(_end_symbols(reception, self._groups, self._antennas.num_rx, self._waveform))
+        self._ends.append(_end_symbols(reception, self._groups, self._waveform))
         cells = slip_cells(np.concatenate(self._ends), self._waveform.num_delay_symbols)
         if cells == 0 or self.reference is None:
             return reception
@@ -234,12 +234,13 @@ class PassiveTerminal:
         return again
 
 
-def _end_symbols(reception: Reception, groups: Sequence[int] | None, num_rx: int, waveform: Waveform) -> np.ndarray:
+def _end_symbols(reception: Reception, groups: Sequence[int] | None, waveform: Waveform) -> np.ndarray:
     """Confident raw symbols of a frame near and beyond either end of the alphabet."""
     confidence = reception.delay_confidence if groups is None else reception.delay_confidence[list(groups)]
     raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
-    sure = confidence > stats.gamma(num_rx, scale=1 / num_rx).isf(SLIP_FALSE_RATE / searched)
+    looks = reception.confidence_looks
+    sure = confidence > stats.gamma(looks, scale=1 / looks).isf(SLIP_FALSE_RATE / searched)
     return raw[sure & ((raw < EXTRA_CELLS) | (raw > last - EXTRA_CELLS))]
 
 
@@ -275,6 +276,7 @@ def _without_reference(reception: Reception) -> Reception:
         delay_symbols=np.full_like(reception.delay_symbols, -1),
         transitions=np.full_like(reception.transitions, -1),
         bits=np.zeros(0, np.uint8),
+        soft_bits=np.zeros(0),
         raw_delay_symbols=np.zeros((0, reception.raw_delay_symbols.shape[1]), int),
         line_of_sight=False,
     )

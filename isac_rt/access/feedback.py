@@ -68,10 +68,11 @@ def summarise(reception: Reception, range_: float, range_std: float, num_rx: int
     Parameters
     ----------
     range_, range_std : of the line of sight as the terminal believes it [m]
-    num_rx : receive antennas, for the law of the confidences
+    num_rx : receive antennas, for the law of the confidences where the reception does not say it
     """
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
-    level = stats.gamma(num_rx, scale=1 / num_rx).isf(CONFIDENT_RATE / searched)
+    looks = reception.confidence_looks or num_rx
+    level = stats.gamma(looks, scale=1 / looks).isf(CONFIDENT_RATE / searched)
     r = reception
     sure = np.sort(r.raw_delay_symbols[_of_decided(r) > level]) if r.decoded else np.zeros(0, int)
     if sure.size < 2:

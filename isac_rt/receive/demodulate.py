@@ -31,6 +31,7 @@ class Symbols:
 
     `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a transition, the cosine-like share
     |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions from their symbols [rad].
+    `looks` receivers are added in power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
     """
 
     raw: np.ndarray
@@ -41,6 +42,8 @@ class Symbols:
     phase_spread: float
     phases: np.ndarray
     bits: np.ndarray
+    looks: int
+    soft_bits: np.ndarray | None = None
 
 
 def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
@@ -100,6 +103,7 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells:
         phase_spread=spread,
         phases=running_phases(transitions, cube.schedule, dpsk_order),
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
+        looks=cube.samples.shape[1],
     )
 
 
@@ -135,7 +139,7 @@ def decide_transitions(picked: np.ndarray, schedule: np.ndarray, num_tx: int, or
     return symbols, share, spread
 
 
-def moves_as_predicted(symbols: Symbols, num_rx: int, order: int) -> bool:
+def moves_as_predicted(symbols: Symbols, order: int) -> bool:
     """Whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
 
     The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole symbols of its Doppler, so that
@@ -144,5 +148,5 @@ def moves_as_predicted(symbols: Symbols, num_rx: int, order: int) -> bool:
     """
     anywhere = np.pi / order / np.sqrt(3)
     g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)
-    from_noise = np.sqrt((1 + 1 / (2 * g)) / (num_rx * g))
+    from_noise = np.sqrt((1 + 1 / (2 * g)) / (symbols.looks * g))
     return bool(from_noise > 0.6 * anywhere or symbols.phase_spread < 0.8 * anywhere)

@@ -10,6 +10,7 @@ import numpy as np
 from isac_rt.arrays import Antennas, Schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
+from isac_rt.receive.beams import demodulate_beams, usable_paths
 from isac_rt.receive.cfar import detect, threshold
 from isac_rt.receive.common import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
@@ -67,10 +68,13 @@ def receive_passive(
     if prediction is None:
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
-    symbols = demodulate(cube, prediction, dpsk_order, run_cells)
+    if settings.symbol_decision == "beams" and usable_paths(prediction).size:
+        symbols = demodulate_beams(cube, prediction, antennas, dpsk_order, run_cells)
+    else:
+        symbols = demodulate(cube, prediction, dpsk_order, run_cells)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
-    confident = np.median(symbols.delay_confidence) >= confidence_threshold(antennas.num_rx, cells, symbols.raw.size)
-    if not confident or not moves_as_predicted(symbols, antennas.num_rx, dpsk_order):
+    confident = np.median(symbols.delay_confidence) >= confidence_threshold(symbols.looks, cells, symbols.raw.size)
+    if not confident or not moves_as_predicted(symbols, dpsk_order):
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
     found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
@@ -201,5 +205,7 @@ def _reception(
         line_of_sight=reference is not None,
         reference_power=float("nan") if reference is None else _power(reference),
         maps=picture,
+        soft_bits=np.zeros(0) if symbols is None or symbols.soft_bits is None else symbols.soft_bits,
+        confidence_looks=0 if symbols is None else symbols.looks,
         sparse=None if found is None else found.sparse,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -116,6 +116,8 @@ class Reception:
     line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
     reference_power : mean power of the reference path per sample and receive antenna [W], NaN where there is none
     maps : Maps or None
+    soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or decided from powers
+    confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many exponentials; 0 when not decoded
     sparse : where the velocities came from sparse sampling with OMP, whether the scene was sparse enough for it
         (`isac_rt.receive.doppler.sparse_enough`); False advises the transmitter to fall back from a pseudo-random schedule to a
         conventional one. None elsewhere
@@ -132,6 +134,8 @@ class Reception:
     line_of_sight: bool
     reference_power: float
     maps: Maps | None = None
+    soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    confidence_looks: int = 0
     sparse: bool | None = None
 
     def __repr__(self) -> str:
