@@ -105,6 +105,16 @@ def test_recovery_is_certain_where_coherence_says_so_and_fails_beyond_the_sample
     assert claims_recovery.united_error(60, 30, 1) < 1e-12  # rounding: the full DFT
 
 
+def test_recovery_falls_as_coherence_rises():
+    """120 chirps shared by two to six antennas. Six tones: certain from 60 chirps (2 K ln P = 57), not from 20.
+
+    Planted bug: the schedule of three antennas for all."""
+    table, (verdict,) = claims_recovery.against_coherence(True, 4)
+    assert verdict.verdict == "holds under a condition"
+    assert (table.coherence.diff().dropna() > 0).all()
+    assert table.recovered.iloc[0] > 0.98 * 400 and table.recovered.iloc[-1] < 0.7 * 400
+
+
 def test_the_rule_of_the_fall_back_ends_where_recovery_does():
     """One path in a cell is sparse, sixteen of 40 samples are not. Planted bug: the noise taken for the paths."""
     assert claims_recovery.judged_sparse(1, 5, 3) == 5
@@ -199,7 +209,7 @@ def test_all_claims(tmp_path):
     from isac_rt.experiments.outcome import write
 
     outcome = claims.run(True, 20260, silent)
-    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 30
+    assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 31
     judged = {v.claim: v.verdict for v in outcome.verdicts if " costs O(" not in v.claim}
     assert {c for c, v in judged.items() if v == "does not hold"} == {
         "The approximations that make the IF a product of range, Doppler and angle are negligible",

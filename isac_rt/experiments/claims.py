@@ -59,6 +59,7 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     several, found = claims_recovery.recovery(quick, seed, steps.of("recovery"))
     tables |= several
     verdicts.extend(found)
+    keep("against_coherence", claims_recovery.against_coherence(quick, seed))
     keep("fallback", claims_recovery.fallback(quick, seed))
     keep("latin", claims_recovery.latin(quick, seed))
     keep("cost", claims_cost.cost(quick, seed, steps.of("cost")))

@@ -115,7 +115,8 @@ def _verdicts(found: list[Spectrum]) -> tuple[Verdict, ...]:
     a, b, c, d, united_c, united_d = (by[k] for k in (("a", False), ("b", False), ("c", False), ("d", False), ("c", True), ("d", True)))
 
     def text(s: Spectrum) -> str:
-        return f"({s.scheme}){' united' if s.united else ''} {s.unambiguous:.2f} m/s, highest sidelobe {s.sidelobe_db:.1f} dB"
+        level = round(s.sidelobe_db, 1) + 0.0  # no "-0.0"
+        return f"({s.scheme}){' united' if s.united else ''} {s.unambiguous:.2f} m/s, highest other peak {level:.1f} dB"
 
     # the spacing of the ambiguities is a whole number of bins, so that the ratio is exact
     gain = all(abs(s.unambiguous / a.unambiguous - 3) < 1e-9 for s in (b, d))
