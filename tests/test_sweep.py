@@ -254,11 +254,27 @@ if __name__ == "__main__":
 LONGER = SWEEP.replace("repetitions: 2", "repetitions: 5")
 
 
+_CLIENTS: list[subprocess.Popen] = []
+
+
+@pytest.fixture(autouse=True)
+def no_client_stays():
+    """A test that fails leaves no sweep running behind it."""
+    yield
+    while _CLIENTS:
+        try:
+            os.killpg(_CLIENTS.pop().pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+
+
 def start_client(folder: Path, out: Path, *options: str) -> subprocess.Popen:
     (folder / "client.py").write_text(CLIENT)
     command = [sys.executable, str(folder / "client.py"), "sweep", str(folder / "sweep.yaml"), "--out", str(out), *options]
-    return subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
+    made = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
+    _CLIENTS.append(made)
+    return made
 
 
 def wait_for_points(out: Path, number: int, timeout: float = 240.0) -> list[Path]:
