@@ -13,15 +13,17 @@ from isac_rt.gridding import DEFAULT, GRIDDED_ERROR, Setting, add_gridded
 from isac_rt.noise import add_white_noise
 from isac_rt.payload import Payload
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.separable import separable
 from isac_rt.swarm import Pose
 from isac_rt.synthesis import Tones, add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
-Method = Literal["auto", "exact", "direct", "gridded"]
+Method = Literal["auto", "exact", "direct", "gridded", "paper"]
 """exact: float64 per sample. direct: error 1e-6, cost ~ paths. gridded: error `GRIDDED_ERROR`, for many paths. auto: the
 paths whose gridding error, integrated coherently over the whole cube, could exceed the noise of a cell (amplitude^2 |gain|^2
 GRIDDED_ERROR^2 size > noise_power) go direct, the `max_direct` strongest of them at the most, and so does every line of
-sight; the rest are gridded. At most FEW_PATHS paths all go direct."""
+sight; the rest are gridded. At most FEW_PATHS paths all go direct. paper: the paper's separable model, for comparison
+(`isac_rt.separable`)."""
 FEW_PATHS = 10
 """Up to so many paths the direct method costs about as much as the transforms of the gridded one."""
 
@@ -147,8 +149,8 @@ def if_signal(
     _check_epochs(links, middle, waveform.slot_duration)
     tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas, middle, first_block)
     shape = (waveform.num_groups, rx_antennas.num_rx, waveform.num_chirps, waveform.num_samples)
-    if method == "exact":
-        samples = exact(waveform, tones, filter_transition).astype(np.complex64)
+    if method in ("exact", "paper"):
+        samples = {"exact": exact, "paper": separable}[method](waveform, tones, filter_transition).astype(np.complex64)
     else:
         samples = np.empty(shape, np.complex64)
         alone = np.full(len(tones), method == "direct")
