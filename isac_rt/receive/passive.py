@@ -141,7 +141,7 @@ def _at_prediction(
 ) -> tuple[Detections, Estimate | None]:
     """The reference within the gate, put first with its own estimate, and the other detections beside it."""
     w = cube.waveform
-    row, column = _predicted_cell(prediction, w)
+    row, column = predicted_cell(prediction, w)
     if not 0 <= row < found.power.shape[0]:
         return no_detections(), None
     rows = np.arange(max(row - GATE_CELLS, 0), min(row + GATE_CELLS + 1, found.power.shape[0]))
@@ -170,7 +170,7 @@ def _at_prediction(
     return everything, estimate
 
 
-def _predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
+def predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
     """Row and centred Doppler column where the reference is expected."""
     w = waveform
     doppler = prediction.velocity[0] / w.velocity_cell(1)
