@@ -66,17 +66,20 @@ def run(
     frames: Annotated[int | None, typer.Option("--frames", help="Simulate so many frames.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Replace the scenario's seed.")] = None,
     snapshots: Annotated[int, typer.Option("--snapshots", min=1, help="Frames of which maps and path ledger are kept.")] = 3,
+    check_budget: Annotated[
+        bool, typer.Option("--check-budget", help="Afterwards measure what was left out on sampled frames; into summary.json.")
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Simulate a scenario: results, summary, figures and a report."""
     loaded = _load(scenario, overrides, frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
     with _ending_soon_after_interrupt(folder):
-        _run(loaded, folder, snapshots)
+        _run(loaded, folder, snapshots, check_budget)
     _out().print(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/", soft_wrap=True)
 
 
-def _run(loaded: Scenario, folder: Path, snapshots: int) -> None:
+def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> None:
     from isac_rt.results import check_folder, save
 
     check_folder(folder)
@@ -87,6 +90,11 @@ def _run(loaded: Scenario, folder: Path, snapshots: int) -> None:
         budget = simulate.link_budgets(setup)
     _print_budget(budget)
     results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots), "frames", loaded.frames)
+    if check_budget:
+        from isac_rt.budget import check
+
+        with _err().status("measuring what was left out"):
+            results.summary["fidelity"]["checked"] = check(setup)
     save(results, folder)
     with _err().status("figures and report"):
         from isac_rt.figures import make_figures
@@ -94,6 +102,45 @@ def _run(loaded: Scenario, folder: Path, snapshots: int) -> None:
 
         write_report(results, folder, make_figures(results, folder, setup.city))
     _print_summary(results)
+
+
+@app.command()
+def plan(
+    scenario: ScenarioFile,
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    receivers: Annotated[bool, typer.Option("--receivers", help="Time the reception of one frame too.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """What a run will model, what it leaves out, and the estimated error and time of each; traces a few frames only."""
+    loaded = _load(scenario, overrides)
+    with _ending_soon_after_interrupt(Path()), _err().status("tracing a few frames"):
+        from isac_rt import simulate
+        from isac_rt.budget import make_plan
+
+        found = make_plan(simulate.prepare(loaded), receivers)
+    if json:
+        from json import dumps
+
+        typer.echo(dumps(found, indent=1))
+        return
+    _print_plan(found, loaded.frames)
+
+
+def _print_plan(found: dict[str, Any], frames: int) -> None:
+    """The plan of `isac_rt.budget.make_plan`."""
+    table = _table("", "link", "modelled", "left out", "error", "s/frame", justify="left")
+    for item in found["items"]:
+        value = item["estimate"]
+        error = "" if value is None else f"{value:.2g} {item['unit']}" if value else "none"
+        seconds = "" if item["seconds"] is None else f"{item['seconds']:.3f}"
+        table.add_row(item["what"], item["link"].replace("->", " to "), item["modelled"], item["left_out"], error, seconds)
+    _out().print(table)
+    settled = {"phase error at most [rad]": found["max_phase_error_rad"], "weakest [dB under the noise of a cell]": found["weakest_path_db"],
+               "reach [m]": found["reach_m"]}  # fmt: skip
+    said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
+    total = sum(found["seconds_per_frame"].values()) * frames
+    stages = ", ".join(found["seconds_per_frame"])
+    _out().print(f"preset {found['preset']}; {said}; about {total:.0f} s for {frames} frames of {stages}")
 
 
 @app.command()

@@ -149,6 +149,16 @@ class Plan:
         """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell, per watt of noise in a sample."""
         return transmit_amplitude(self.scenario.noise) ** 2 * self.waveform.num_samples * self.waveform.num_chirps
 
+    def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a range cell loses over the noise."""
+        over_noise = paths.power * self.cell_noise_gain() / noise_power
+        everything = self.preset == "everything"
+        heard = np.full(len(paths), True) if everything else paths.delay - motion(paths, self.waveform) <= self.longest_delay
+        always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
+        cell = np.floor(paths.delay / self.waveform.delay_step).astype(np.int64)
+        weak, left_out = faintest(np.where(heard & ~always, over_noise, np.inf), cell, self.weakest)
+        return heard, weak, left_out
+
     def apply(self, paths: PathSet, noise_power: float) -> tuple[PathSet, Use]:
         """What a link's frame needs of its paths.
 
@@ -158,12 +168,7 @@ class Plan:
         noise_power : of a sample at the receiver [W]
         """
         w = self.waveform
-        over_noise = paths.power * self.cell_noise_gain() / noise_power
-        everything = self.preset == "everything"
-        heard = np.full(len(paths), True) if everything else paths.delay - motion(paths, w) <= self.longest_delay
-        always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
-        cell = np.floor(paths.delay / w.delay_step).astype(np.int64)
-        weak, left_out = faintest(np.where(heard & ~always, over_noise, np.inf), cell, self.weakest)
+        heard, weak, left_out = self.chosen(paths, noise_power)
         kept = paths.select(heard & ~weak)
         plane_error, straight_error = plane_bound(kept, self.antennas, w), straight_bound(kept, w)
         plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
@@ -255,7 +260,7 @@ def standing(paths: PathSet, antennas: Antennas, waveform: Waveform, speed: floa
     nearest = np.minimum(paths.tx_radius, paths.rx_radius)
     finite = nearest[np.isfinite(nearest)]
     turning = float((k * r * speed * t / finite).max(initial=0.0))
-    flight = float((k * speed * np.abs(paths.delay_rate) * paths.delay * np.where(paths.kind == PathKind.LEAKAGE, 0, 1)).max(initial=0.0))
+    flight = float((k * speed * paths.delay).max(initial=0.0))
     return {"directions that turn within the frame": turning, "motion during the flight of light": flight}
 
 

@@ -359,6 +359,24 @@ def summarise(scenario: Scenario, *, setup: Setup | None = None, threads: int | 
     return flight.recorder.summary(**flight.figures())
 
 
+def stage_seconds(
+    setup: Setup, number: int, poses: dict[str, Pose], paths: dict[Link, PathSet], receive: bool
+) -> dict[Link, dict[str, float]]:
+    """Seconds of synthesis and, if asked for, reception of one frame on each link, by terminals that hear it as their first."""
+    out = {}
+    sent = {name: setup.transmission(name, number, poses[name]) for name in setup.timetable.with_role("active", number)}
+    frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), False)
+    for link in setup.timetable.links(number):
+        clock = _Clock()
+        if receive:
+            _Observer(setup, link).hear(frame, clock)
+        else:
+            with clock.stage("synthesis"):
+                setup.receive_samples(number, link, sent, paths, poses)
+        out[link] = {name: value for name, value in clock.seconds.items() if name == "synthesis" or (receive and name == "receive")}
+    return out
+
+
 @dataclass(frozen=True)
 class _Flight:
     """All frames of a run, recorded and scored."""

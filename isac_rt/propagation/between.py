@@ -102,6 +102,8 @@ class Between:
         """Instants traced so far."""
         self.changes: dict[int, tuple[int, int]] = {}
         """Legs that were born and that died between a traced instant, by its number, and the next."""
+        self.num_chains: dict[int, float] = {}
+        """Legs there were on average at these two instants."""
 
     def legs(self, local: Mapping[str, Pose], time: float) -> dict[Pair, LegSet]:
         """Legs of every pair at an instant of the run, for the poses at that instant."""
@@ -115,6 +117,7 @@ class Between:
         if self._interval[0] != after:
             self._interval = after, _chains(first, second)
             self.changes[after - 1] = _changes(self._interval[1])
+            self.num_chains[after - 1] = sum(c.in_first.sum() + c.in_second.sum() for c in self._interval[1]) / 2
         nearest_first = time - self._instants[after - 1] <= self._instants[after] - time
         found = [self._unfolded(chains, local, list(first), nearest_first) for chains in self._interval[1]]
         self._test(found)
