@@ -33,6 +33,7 @@ from isac_rt.metrics import (
     resolutions,
     truth_of,
 )
+from isac_rt.preflight import check_flights, check_memory
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.propagation.expected import ClutterExpectation, ExpectedClutter, make_expectation
@@ -165,9 +166,11 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
     swarm = Swarm.from_scenario(scenario)
-    city = city_of(scenario)
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
     timetable = Timetable(scenario, waveform, schedule)
+    check_memory(waveform, antennas, scenario, timetable)
+    check_flights(scenario, swarm, timetable)
+    city = city_of(scenario)
     plan = Plan(scenario, waveform, antennas, timetable, swarm)
     setup = Setup(
         scenario,

@@ -157,9 +157,8 @@ class _Finder(ast.NodeVisitor):
             self._add(node, "factor", start, old, str(node.value * 2))
 
 
-def mutants_of(file: str) -> list[Mutant]:
+def mutants_of(file: str, source: str) -> list[Mutant]:
     """Every mutant of a module of the package, but for its constants' own definitions (limits and thresholds are choices)."""
-    source = (ROOT / "isac_rt" / file).read_text()
     finder = _Finder(file, source)
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -171,10 +170,16 @@ class Copy:
     """A copy of the project in which one file at a time is changed."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder = folder / "changed"
+        self._whole = folder / "whole"
+        shutil.copytree(ROOT / "isac_rt", self._whole)
         for name in ("isac_rt", "tests", "scenes"):
-            shutil.copytree(ROOT / name, folder / name)
-        shutil.copy2(ROOT / "pyproject.toml", folder)
+            shutil.copytree(ROOT / name, self.folder / name)
+        shutil.copy2(ROOT / "pyproject.toml", self.folder)
+
+    def source(self, file: str) -> str:
+        """A file of the package as it was when the copy was made."""
+        return (self._whole / file).read_text()
 
     def run(self, file: str, source: str, command: list[str], limit: float) -> subprocess.CompletedProcess[str] | None:
         """Run a command with a file changed, and put it back; None if it takes too long."""
@@ -189,13 +194,13 @@ class Copy:
         except subprocess.TimeoutExpired:
             return None
         finally:
-            shutil.copy2(ROOT / "isac_rt" / file, target)
+            shutil.copy2(self._whole / file, target)
 
 
-def sampled(count: int, seed: int) -> list[Mutant]:
+def sampled(count: int, seed: int, copy: Copy) -> list[Mutant]:
     """So many mutants, the modules in turn, so that small ones are not forgotten."""
     rng = random.Random(seed)
-    pools = {file: mutants_of(file) for file in TESTS_OF}
+    pools = {file: mutants_of(file, copy.source(file)) for file in TESTS_OF}
     for pool in pools.values():
         rng.shuffle(pool)
     out: list[Mutant] = []
@@ -211,14 +216,14 @@ def check_sample(count: int, seed: int, report: Path | None) -> int:
     caught, rows = 0, []
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
-        for mutant in sampled(count, seed):
+        for mutant in sampled(count, seed, copy):
             begin = time.monotonic()
             tests = [f"tests/{name}.py" for name in TESTS_OF[mutant.file].split()]
             command = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", *tests]
-            done = copy.run(mutant.file, mutant.applied((ROOT / "isac_rt" / mutant.file).read_text()), command, LIMIT)
+            done = copy.run(mutant.file, mutant.applied(copy.source(mutant.file)), command, LIMIT)
             noticed = done is None or done.returncode != 0
             caught += noticed
-            line = (ROOT / "isac_rt" / mutant.file).read_text().splitlines()[mutant.line - 1].strip()
+            line = copy.source(mutant.file).splitlines()[mutant.line - 1].strip()
             rows.append({"file": mutant.file, "line": mutant.line, "kind": mutant.kind, "old": mutant.old, "new": mutant.new, "code": line,
                          "caught": noticed})  # fmt: skip
             word, change = "caught  " if noticed else "SURVIVED", f"{mutant.kind} {mutant.old} -> {mutant.new or 'nothing'}"
@@ -240,7 +245,7 @@ def check_planted(words: str) -> int:
             if words not in f"{one.group} {one.name}":
                 continue
             p = one.planted
-            source = (ROOT / "isac_rt" / p.file).read_text()
+            source = copy.source(p.file)
             if source.count(p.old) != 1:
                 wrong += 1
                 print(f"STALE    {one.name}: {p.file} holds {p.old!r} {source.count(p.old)} times", flush=True)

@@ -35,6 +35,7 @@ from isac_rt.city.mesh import City
 from isac_rt.city.scene import shared_scene
 from isac_rt.propagation.between import Between, LegSet, leg_set, pick
 from isac_rt.propagation.bodies import Bodies
+from isac_rt.propagation.clearance import Clearance
 from isac_rt.propagation.clutter import ClutterField
 from isac_rt.propagation.diffuse import scatterer_phase
 from isac_rt.propagation.direct import past_edges_and_bodies
@@ -80,6 +81,7 @@ class RayTracer:
         mirrors, rays = (self._normals, self._offsets), self._handle.scene.mi_scene
         self.between = Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength) if len(instants) > 1 else None
         """Legs from those of the traced instants; None: every frame is traced."""
+        self._clearance = Clearance(city)
         self.dropped = 0
         """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
         self.duplicates = 0
@@ -97,6 +99,7 @@ class RayTracer:
         local = {name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()}
         if not all(np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all() for pose in local.values()):
             raise ValueError("a UAV's position or velocity is not finite")
+        self._clearance.check({name: pose.position for name, pose in local.items()}, epoch)
         legs = self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
         bodies = Bodies.of(self._scenario.swarm, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._wavelength)

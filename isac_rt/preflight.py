@@ -1,0 +1,78 @@
+"""What is looked at before a run begins: whether it fits into memory, and whether its bodies keep apart."""
+
+from __future__ import annotations
+
+import itertools
+import os
+
+import numpy as np
+
+from isac_rt.arrays import Antennas
+from isac_rt.runtime import available_memory
+from isac_rt.scenario import NEAREST_M, Scenario
+from isac_rt.scenario_file import ScenarioError
+from isac_rt.swarm import Swarm
+from isac_rt.timetable import Timetable
+from isac_rt.waveform import Waveform
+
+SAMPLE_BYTES = 8
+RECORD_BYTES = 40
+"""Of a recorded symbol: decisions and confidences of both alphabets."""
+PROGRAM_BYTES = 4e8
+"""Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of scenes/paper_swarm.yaml."""
+MOST_EPOCHS = 20_000
+
+
+def memory_needed(waveform: Waveform, antennas: Antennas, frames: int, links: int, at_once: int) -> float:
+    """Estimate of a run's memory [bytes], the city's mesh and its clutter left out.
+
+    Each receiver at work holds its cube, a copy that it turns, the range spectra and the Doppler maps; each frame of a link leaves its
+    symbols behind.
+    """
+    w = waveform
+    chirps = w.num_groups * w.num_chirps
+    cube = chirps * antennas.num_rx * w.num_samples
+    maps = antennas.num_tx * antennas.num_rx * w.num_chirps * w.num_samples / 2
+    kept = frames * links * (chirps * RECORD_BYTES + w.bits_per_frame(16))
+    return PROGRAM_BYTES + SAMPLE_BYTES * min(links, at_once) * (2.5 * cube + maps) + kept
+
+
+def check_memory(waveform: Waveform, antennas: Antennas, scenario: Scenario, timetable: Timetable) -> None:
+    """Refuse a run that does not fit.
+
+    Raises
+    ------
+    ScenarioError  With the estimate and what is free.
+    """
+    free, links = available_memory(), len(timetable.all_links)
+    needed = memory_needed(waveform, antennas, scenario.frames, links, os.cpu_count() or 1)
+    if free is not None and needed > free:
+        raise ScenarioError(
+            f"{scenario.name}: the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are free; lower "
+            "radio.samples_per_chirp, radio.chirps_per_frame, array.rx_x, array.rx_z or frames"
+        )
+
+
+def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> None:
+    """Refuse flights on which two bodies meet, or on which the numbers run out of float64's range: at such a frame there are no
+    directions between them. Of very long runs every so manyth frame is looked at.
+
+    Raises
+    ------
+    ScenarioError
+    """
+    step = max(1, scenario.frames // MOST_EPOCHS)
+    epochs = np.array([timetable.epoch(frame) for frame in range(0, scenario.frames, step)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        places = {name: np.array([flight.pose(t).position for t in epochs]) for name, flight in swarm.trajectories.items()}
+    for name, way in places.items():
+        if not np.isfinite(way).all() or np.abs(way).max() > 1e12:
+            raise ScenarioError(f"swarm.{name}: flies beyond all bounds; lower its velocity, or the time between its waypoints")
+    for (a, first), (b, second) in itertools.combinations(places.items(), 2):
+        apart = np.linalg.norm(first - second, axis=1)
+        nearest = int(np.argmin(apart))
+        if apart[nearest] < NEAREST_M:
+            raise ScenarioError(
+                f"swarm.{b}: is {apart[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s (frame {nearest * step}), at least {NEAREST_M} m "
+                "are needed; change one of their flights"
+            )
