@@ -193,6 +193,7 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     count, size = vectors.shape
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
     gram = atoms.conj().T @ atoms
+    ridge = 1e-9 * size  # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient then
     first = vectors @ atoms.conj()
     correlation, support = first.copy(), np.zeros((count, 0), np.int64)
     solution = np.zeros((count, 0), np.complex128)
@@ -201,7 +202,7 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
         best = np.abs(correlation)
         best[rows[:, None], support] = -1
         support = np.concatenate([support, best.argmax(axis=1)[:, None]], axis=1)
-        inner = gram[support[:, :, None], support[:, None, :]]
+        inner = gram[support[:, :, None], support[:, None, :]] + ridge * np.eye(support.shape[1])
         solution = np.linalg.solve(inner, first[rows[:, None], support][..., None])[..., 0]
         correlation = first - np.einsum("vk,vkp->vp", solution, gram[support].conj())
     out = np.zeros((count, num_chirps), np.complex64)
