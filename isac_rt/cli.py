@@ -469,7 +469,7 @@ def _print_summary(results: Results) -> None:
 
 @contextmanager
 def _ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
-    """Make Ctrl-C end the process within `_GRACE` even inside a long native call, leaving no half-written file in `folder`.
+    """Make Ctrl-C and SIGTERM end the process within `_GRACE` even inside a long native call, leaving no half-written file in `folder`.
 
     Python runs its own handler only between byte codes; the wake-up pipe is written by the C handler at once, and a thread
     waits for it.
@@ -478,7 +478,7 @@ def _ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     os.set_blocking(send, False)
 
     def wait() -> None:
-        while (heard := os.read(receive, 1)) and heard[0] != signal.SIGINT:
+        while (heard := os.read(receive, 1)) and heard[0] not in (signal.SIGINT, signal.SIGTERM):
             pass
         os.close(receive)
         if not heard:
@@ -487,15 +487,25 @@ def _ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
         for unfinished in folder.rglob(f".*.{os.getpid()}.tmp"):
             unfinished.unlink(missing_ok=True)
         _say_interrupted()
-        os._exit(130)
+        os._exit(128 + heard[0])
 
     before = signal.set_wakeup_fd(send, warn_on_full_buffer=False)
+    default = signal.signal(signal.SIGTERM, _terminated)
     threading.Thread(target=wait, daemon=True).start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
+        signal.signal(signal.SIGTERM, default)
         os.close(send)
+
+
+class _Terminated(BaseException):
+    """SIGTERM: unwinds as Ctrl-C does, so that temporary files are taken away."""
+
+
+def _terminated(*_: Any) -> None:
+    raise _Terminated
 
 
 def _say_interrupted() -> None:
@@ -527,6 +537,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _say_interrupted()
         return 130
+    except _Terminated:
+        _say_interrupted()
+        return 128 + signal.SIGTERM
     except Exception as problem:
         if os.environ.get(DEBUG):
             traceback.print_exc()

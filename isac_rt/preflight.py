@@ -20,7 +20,7 @@ RECORD_BYTES = 40
 """Of a recorded symbol: decisions and confidences of both alphabets."""
 PROGRAM_BYTES = 4e8
 """Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of scenes/paper_swarm.yaml."""
-MOST_EPOCHS = 20_000
+MOST_EPOCHS = 4_000
 
 
 def memory_needed(waveform: Waveform, antennas: Antennas, frames: int, links: int, at_once: int) -> float:
@@ -73,6 +73,24 @@ def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Non
         nearest = int(np.argmin(apart))
         if apart[nearest] < NEAREST_M:
             raise ScenarioError(
-                f"swarm.{b}: is {apart[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s (frame {nearest * step}), at least {NEAREST_M} m "
-                "are needed; change one of their flights"
+                f"swarm.{b}: is {apart[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s (frame {nearest * step}), at least "
+                f"{NEAREST_M} m are needed; change one of their flights"
+            )
+
+
+def check_reference(scenario: Scenario, timetable: Timetable) -> None:
+    """Refuse a scenario whose noise or clutter refers to an echo that there is not.
+
+    Raises
+    ------
+    ScenarioError
+    """
+    if scenario.noise.model != "snr" and scenario.clutter.model != "rayleigh":
+        return
+    for name in dict.fromkeys(tx for tx, rx in timetable.all_links if tx == rx):
+        if not any(other != name and uav.rcs.model != "relative" for other, uav in scenario.swarm.items()):
+            key = "noise.model = snr" if scenario.noise.model == "snr" else "clutter.model = rayleigh"
+            raise ScenarioError(
+                f"{scenario.name}: {key} refers to the strongest echo at {name}, and there is no UAV with a cross-section of its own; "
+                "add one, or use another model"
             )

@@ -19,6 +19,7 @@ from pydantic import Field, PrivateAttr, field_validator
 
 from isac_rt.scenario_base import Finite, Fraction, Key, Node, Positive, Problem, Vector
 from isac_rt.scenario_clutter import Clutter
+from isac_rt.scenario_doubts import implausible
 
 
 def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> int:
@@ -31,7 +32,6 @@ NEAREST_M = 0.05
 """Two bodies nearer than this are one to the ray tracer."""
 FASTEST_MPS = 200.0
 FARTHEST_M = 1e5
-CARRIERS_HZ = (1e9, 1e12)
 
 
 class MaterialOverride(Node):
@@ -567,9 +567,7 @@ class Scenario(Node):
         for (a, first), (b, second) in itertools.combinations(self.first_blocks().items(), 2):
             if abs(first - second) < self.radio.groups:
                 yield Problem((("swarm", b, "resource_block"),), f"{b} and {a} send in the same resource blocks; shall they collide?")
-        low, high = CARRIERS_HZ
-        if not low <= self.radio.carrier_hz <= high:
-            yield Problem((("radio", "carrier_hz"),), f"{self.radio.carrier_hz:g} Hz is outside {low:g} to {high:g} Hz; is it in hertz?")
+        yield from implausible(self)
         for name, uav in self.swarm.items():
             if uav.waypoints is None:
                 speeds: list[tuple[Key, float]] = [(("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))]

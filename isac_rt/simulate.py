@@ -33,7 +33,7 @@ from isac_rt.metrics import (
     resolutions,
     truth_of,
 )
-from isac_rt.preflight import check_flights, check_memory
+from isac_rt.preflight import check_flights, check_memory, check_reference
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.propagation.expected import ClutterExpectation, ExpectedClutter, make_expectation
@@ -153,6 +153,8 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
     poses = setup.swarm.poses(setup.timetable.epoch(0))
     rows = []
     for tx, rx in setup.timetable.links(0):
+        if tx == rx and not setup.reference.has_target(tx):
+            continue
         amplitude = setup.reference.reference_amplitude(poses, tx, rx)
         name = rx if tx != rx else setup.reference.strongest_target(poses, tx)
         distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
@@ -170,6 +172,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     timetable = Timetable(scenario, waveform, schedule)
     check_memory(waveform, antennas, scenario, timetable)
     check_flights(scenario, swarm, timetable)
+    check_reference(scenario, timetable)
     city = city_of(scenario)
     plan = Plan(scenario, waveform, antennas, timetable, swarm)
     setup = Setup(
@@ -224,7 +227,8 @@ def _city_digest(scenario: Scenario) -> str:
     """Of the city's file, "" without one."""
     if scenario.city is None or scenario.city.file is None:
         return ""
-    return hashlib.sha256(scenario.city_path().read_bytes()).hexdigest()
+    with scenario.city_path().open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")

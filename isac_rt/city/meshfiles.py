@@ -10,15 +10,36 @@ from numpy.typing import NDArray
 from isac_rt import scenario
 from isac_rt.city.materials import CityError, MaterialUse, canonical_name
 from isac_rt.city.mesh import Surface
+from isac_rt.runtime import available_memory
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf")
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
+
+READING_FACTOR = 6
+"""Memory that reading a mesh takes, over the size of its file: text, arrays and their copies; measured 3 to 5."""
+
+
+def check_size(path: Path) -> None:
+    """Refuse a file that is too large to be read.
+
+    Raises
+    ------
+    CityError  With the estimate and what is free.
+    """
+    size, free = path.stat().st_size, available_memory()
+    if free is not None and READING_FACTOR * size > free:
+        raise CityError(
+            f"{path.name}: a file of {size / 1e9:.3g} GB takes about {READING_FACTOR * size / 1e9:.3g} GB of memory to read, "
+            f"{free / 1e9:.3g} GB are free; simplify it, or cut out the swarm's surroundings"
+        )
 
 
 def read_triangles(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices and triangles of a file that holds one mesh, untouched but for the triangulation of larger faces."""
     import trimesh
 
+    check_size(path)
     try:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
@@ -58,6 +79,7 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
 
     if path.suffix.lower() not in SUFFIXES:
         raise CityError(f"{path.name}: {path.suffix!r} is not a mesh format known here; use one of {', '.join(SUFFIXES)}")
+    check_size(path)
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise

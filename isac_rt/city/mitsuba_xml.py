@@ -139,7 +139,11 @@ def _geometry(reader: _Reader, shape: ET.Element) -> tuple[NDArray[np.float64], 
         node = shape.find("string[@name='filename']")
         if node is None:
             raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} has no filename; give it one")
-        file = reader.path.parent / (reader.text(node, "value") or "")
+        folder = reader.path.parent.resolve()
+        file = (folder / (reader.text(node, "value") or "")).resolve()
+        if not file.is_relative_to(folder):
+            name = reader.text(node, "value")
+            raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} wants {name}, outside the scene's folder; copy it there")
         if not file.is_file():
             raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} wants {reader.text(node, 'value')}, which is missing")
         return read_triangles(file)

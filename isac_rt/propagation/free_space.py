@@ -126,6 +126,10 @@ class FreeSpace:
             return float(friis_amplitude(self._wavelength, distance) * self._antennas.gain)
         return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self._antennas.gain
 
+    def has_target(self, tx: str) -> bool:
+        """Whether there is another UAV whose cross-section is its own."""
+        return any(name != tx and uav.rcs.model != "relative" for name, uav in self._uavs.items())
+
     def strongest_target(self, poses: dict[str, Pose], tx: str) -> str:
         """The UAV whose echo is the reference of a terminal's own link."""
         echoes = self._own_echoes(poses, tx)
