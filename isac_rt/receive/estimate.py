@@ -103,28 +103,31 @@ class LocalSpectra:
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its amplitude; of separate
         groups the mean, each antenna turned into the phase that it has in the first one."""
-        sets = self._match(delay, delay_rate)
+        sets = self._match(delay, delay_rate)[0]
         turn = np.exp(-1j * np.angle((sets * sets[0].conj()).sum(axis=2, keepdims=True)))
         return (sets * turn).mean(axis=0)
 
-    def _match(self, delay: float, delay_rate: float) -> np.ndarray:
+    def _match(self, delay: float, delay_rate: float) -> tuple[np.ndarray, np.ndarray]:
+        """Responses (sets, L_tx, L_rx) and the templates' energies (sets, L_tx, 1)."""
         out = np.zeros((self._sets * self.waveform.num_tx, self._data.shape[2]), np.complex128)
-        _match(self._data, self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out)
-        return out.reshape(self._sets, self.waveform.num_tx, -1)
+        energy = np.zeros(len(out))
+        _match(self._data, self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out, energy)
+        shape = self._sets, self.waveform.num_tx, -1
+        return out.reshape(shape), energy.reshape(shape)
 
     def power(self, delay: float, delay_rate: float) -> float:
-        """Power summed over the virtual channels: what the estimate maximises."""
-        out = self._match(delay, delay_rate)
-        return float((out.real**2 + out.imag**2).sum())
+        """Energy that the template explains, summed over the virtual channels: what the estimate maximises. At the ends of the range axis
+        part of a template lies outside, so that the amplitude alone would draw the estimate out."""
+        out, energy = self._match(delay, delay_rate)
+        return float(((out.real**2 + out.imag**2) * energy).sum())
 
 
 @njit(nogil=True, cache=True)
-def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out):  # pragma: no cover - compiled
-    """out[tx, rx] = sum of conj(template) * data over the energy of the template; `beat_cells`, `middle_phase` and
+def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energy):  # pragma: no cover - compiled
+    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`, `middle_phase` and
     `hann_response` in one loop, which a test holds against them."""
     carrier, slope, middle, duration, length, size = numbers
     chirps, rows, _ = data.shape
-    energy = np.zeros(out.shape[0])
     step = np.exp(2j * np.pi * (length / 2 / size))
     for i in range(chirps):
         tau = delay + delay_rate * time[i]
@@ -157,6 +160,7 @@ def start_point(
     """
     rows, num_bins = spectra_power.shape
     line = np.sqrt(spectra_power[[max(row - 1, 0), row, min(row + 1, rows - 1)], column])
+    line[[0, 2]] *= [row > 0, row < rows - 1]  # a neighbour that is not there decides nothing
     across = np.sqrt(spectra_power[row, [(column - 1) % num_bins, column, (column + 1) % num_bins]])
     cell, doppler = row + _hann_ratio(line), column - num_bins // 2 + _hann_ratio(across)
     return to_delay(cell, doppler, waveform)
