@@ -1,12 +1,13 @@
 # make demo   sets up what is missing and runs the main scenario
 # make test   sets up what is missing and runs the tests
 # make setup  only sets up .venv (and a libLLVM for the ray tracer); quick when it is done already
+# make mutation  plants errors and sees whether anything notices (an hour; docs/validation.md)
 # make lint   checks style and types;  make lock  renews requirements.lock;  make clean  removes what was built
 
 .DEFAULT_GOAL := setup
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
-.PHONY: setup venv backend test demo lint lock clean
+.PHONY: setup venv backend test demo mutation lint lock clean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-done
@@ -65,6 +66,10 @@ test: setup
 
 demo: setup
 	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm
+
+mutation: setup
+	@$(BIN)/python tests/mutation.py --planted
+	@$(BIN)/python tests/mutation.py --sample 60 --seed 1
 
 lint: venv
 	@$(BIN)/ruff check .

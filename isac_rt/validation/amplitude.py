@@ -256,6 +256,7 @@ def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
         "power *= 1 / np.pi",
     ),
     tracer=True,
+    quick=False,
 )
 def lambertian_wall() -> float:
     """Mean power that the clutter field of a wall of 120 m x 60 m returns, to its radar and to a second terminal."""

@@ -71,6 +71,7 @@ def paths_of_a_canyon_against_sionna() -> float:
         "allowed = bounces < (self._scenario.propagation.max_bounces",
     ),
     tracer=True,
+    quick=False,
 )
 def echoes_against_sionna() -> float:
     """Echo and ghosts of a target over floor and wall: the same paths with the same complex amplitudes."""

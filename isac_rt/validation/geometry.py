@@ -428,6 +428,7 @@ def reciprocity_of_folded_paths() -> float:
         "chain = faces[which][:, :count][:, ::-1]",
     ),
     tracer=True,
+    quick=False,
 )
 def every_path_of_a_box() -> float:
     """The ray tracer finds every path in a closed box up to two bounces, once each, and no other: a lattice of images."""

@@ -216,6 +216,7 @@ def _against_exact(method: str, counts: tuple[int, ...], w: Waveform = stage.SMA
         "quadratic = (f_c + slope * (u - tau)) * a + slope * b * (ts - b / 2)",
         "quadratic = (f_c + slope * (u - tau)) * a",
     ),
+    quick=False,
 )
 def direct_method() -> float:
     """The direct method over K = 1, 4, 30 paths, 0 to 30 m/s, with and without data."""
@@ -232,6 +233,7 @@ def direct_method() -> float:
         "_WIDTH = 6",
         "_WIDTH = 3",
     ),
+    quick=False,
 )
 def gridded_method() -> float:
     """The gridded method over K = 3, 40 and 200 paths anywhere in the passband, 0 to 30 m/s, with and without data."""

@@ -104,6 +104,7 @@ def _tracked(runs: int = 100, steps: int = 15) -> tuple[np.ndarray, np.ndarray]:
         "acceleration_std**2 * G @ G.T",
         "0.01 * acceleration_std**2 * G @ G.T",
     ),
+    quick=False,
 )
 def consistency_of_states() -> float:
     """Normalised estimation error squared (NEES) of tracks born from one detection, over 100 independent runs."""
@@ -120,6 +121,7 @@ def consistency_of_states() -> float:
         "return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))",
         "return Gaussian(x, _symmetric(A @ P @ A.T) / 4)",
     ),
+    quick=False,
 )
 def consistency_of_innovations() -> float:
     """Normalised innovation squared (NIS) of the same tracks."""
