@@ -81,7 +81,7 @@ def test_gain_of_beams_over_signal_to_noise():
             soft, hard = soft + information(beams.soft_bits, payload.bits) / 6, hard + binary(np.mean(beams.bits != payload.bits)) / 6
         (d0, p0), (d1, p1) = rates
         print(f"{snr_db:6d}  {d0:12.4f}, {d1:6.4f}  {p0:18.4f}, {p1:6.4f}  {soft:16.3f}, {hard:5.3f}")
-        assert d1 <= d0 and p1 <= p0 and soft >= hard - 1e-9
+        assert d1 <= d0 and p1 <= p0 and soft >= hard - 1e-5  # what a ratio of e^-15 costs where nothing is wrong
 
 
 def information(soft: np.ndarray, bits: np.ndarray) -> float:
