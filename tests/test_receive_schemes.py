@@ -138,7 +138,7 @@ def test_noise_does_not_make_a_scene_dense():
 def test_fall_back_pays_where_the_rule_asks_for_it(groups: int):
     """Hits of schemes (d) and (c) on the same scenes against the paths in a range row, with the share of frames called sparse: where
     the rule says sparse (d) loses nothing, where it says not (c) is at least as good. Run with -s for the table."""
-    w, trials = short(groups), 8
+    w, trials = short(groups), 24
     hits = np.zeros((2, 2))  # (sparse, scheme)
     paths_seen = np.zeros(2)
     print(f"\n{groups} group(s)\npaths  hit rate (d)  hit rate (c)  sparse")
