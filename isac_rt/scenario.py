@@ -304,9 +304,10 @@ class Receivers(Node):
     refinement: Literal["grid", "local", "joint"] = "local"
     """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the windowed spectra about each peak. joint: all
     paths at once on the samples, at the Cramer-Rao bound; paths in one cell are told apart by direction (slower)."""
-    symbol_decision: Literal["powers", "beams"] = "powers"
-    """How a PT reads symbols. powers: the receivers' powers added, the paper's. beams: receivers added in phase towards the tracked paths, the error
-    of the predicted velocity taken out, and a log-likelihood ratio for every bit."""
+    symbol_decision: Literal["powers", "profile", "beams"] = "powers"
+    """How a PT reads symbols. powers: the receivers' powers added, the paper's. profile: the same, delay symbols by correlation with the
+    range profile of the last unmodulated frame, in which clutter votes with the line of sight. beams: receivers added in phase towards
+    the tracked paths, the error of the predicted velocity taken out, and a log-likelihood ratio for every bit."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Of one cell of the range-Doppler map."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)

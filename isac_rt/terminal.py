@@ -23,6 +23,7 @@ from isac_rt.payload import Payload
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive import Detections, Prediction, Reception, receive_active, receive_passive
 from isac_rt.receive.demodulate import EXTRA_CELLS
+from isac_rt.receive.profile import learn_profile, reference_of
 from isac_rt.scenario import Receivers, Tracking
 from isac_rt.swarm import Pose
 from isac_rt.tracking import (
@@ -124,6 +125,7 @@ class PassiveTerminal:
         self.reference: Track | None = None
         self.slips_repaired = 0
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
+        self._profile: np.ndarray | None = None
 
     def step(
         self, cube: IFCube, own_pose: Pose, time: float, modulated: bool, *, maps: bool = False
@@ -139,6 +141,9 @@ class PassiveTerminal:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
             reception = _without_reference(reception)
+        if self._receivers.symbol_decision == "profile" and not modulated and reception.line_of_sight:
+            found = learn_profile(cube, reference_of(reception.detections))
+            self._profile = found if found.any() else None
         self._follow(reception, own_pose, modulated)
         if self.reference is not None and reception.line_of_sight:
             self.tracker.update(reception.detections, own_pose, self.reference.state)
@@ -153,7 +158,7 @@ class PassiveTerminal:
     def receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
         """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
         return receive_passive(
-            cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, maps=maps
+            cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, profile=self._profile, maps=maps
         )
 
     def _expect(self, own: Pose) -> Prediction | None:

@@ -24,7 +24,6 @@ TITLES = {
     "fig13": "Bit rate against transmit antennas (Fig. 13)",
     "fig14": "Hit rate against the baselines (Fig. 14)",
     "detectors": "Detectors in the clutter of a city's mesh",
-    "clutter": "Gaussian, Rayleigh and geometric clutter side by side",
     "claims": "Claims of the text that have no figure",
 }
 

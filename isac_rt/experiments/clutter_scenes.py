@@ -54,15 +54,23 @@ PLACES = {
 }
 
 
-def scenario(places: tuple[str, ...], seed: int, cell_area: float, power_dbm: float) -> Scenario:
+def scenario(places: tuple[str, ...], seed: int, cell_area: float, power_dbm: float, partners: float | None = None) -> Scenario:
     """Places of `PLACES` as active terminals that hover.
 
     Parameters
     ----------
     cell_area : largest area of a scatterer over its distance [m^2/m]
     power_dbm : of one antenna
+    partners : distance [m] of a passive terminal ahead of each over ground, NAME-pt; None: there are none
     """
-    uavs = {name: {"role": "active", "position_m": p.position, "boresight": p.boresight} for name, p in PLACES.items() if name in places}
+    uavs: dict[str, dict] = {}
+    for name in places:
+        uavs[name] = {"role": "active", "position_m": PLACES[name].position, "boresight": PLACES[name].boresight}
+    for name in places if partners else ():
+        p = PLACES[name]
+        flat = partners / np.hypot(*p.boresight[:2])
+        ahead = [p.position[0] + flat * p.boresight[0], p.position[1] + flat * p.boresight[1], p.position[2]]
+        uavs[f"{name}-pt"] = {"role": "passive", "position_m": ahead, "boresight": [-p.boresight[0], -p.boresight[1], p.boresight[2]]}
     return Scenario.model_validate(
         {
             "name": "places over Munich", "seed": seed, "frames": 4, "swarm": uavs, "array": {"element_gain_dbi": 10.0},

@@ -17,6 +17,7 @@ from isac_rt.ifsignal import IFCube
 from isac_rt.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.receive.clutter_filter import chirp_runs
 from isac_rt.receive.estimate import beat_cells, middle_phase
+from isac_rt.receive.profile import correlate
 from isac_rt.receive.spectrum import data_phase, window_length
 from isac_rt.receive.types import Prediction
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -58,7 +59,9 @@ def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
     return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
 
 
-def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells: int | None = None) -> Symbols:
+def demodulate(
+    cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells: int | None = None, profile: np.ndarray | None = None
+) -> Symbols:
     """Decide all symbols of a frame.
 
     Parameters
@@ -67,6 +70,8 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells:
     prediction : row 0 is the reference path; further rows vote with their predicted power
     dpsk_order : D
     run_cells : leave runs of so many occupied cells out of the decision (`isac_rt.receive.clutter_filter`); None: do not look
+    profile : (N,) power over noise in the cells from the reference on; given, the delay symbols are decided by correlation with it
+        (`isac_rt.receive.profile`), and predicted paths do not vote
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
@@ -88,7 +93,11 @@ def demodulate(cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells:
             power += one.real**2 + one.imag**2
         if run_cells is not None:
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
-        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others], w)
+        if profile is not None:
+            power = correlate(power, profile)
+        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others] if profile is None else [], w)
+        if profile is not None:  # next to the right symbol the template still overlaps itself: the mean of the rest is not the noise's
+            sure[m] = power.max(axis=1) / np.median(power, axis=1)
         picked[m] = np.take_along_axis(spectra, (raw[m] % w.num_samples)[None, :, None], axis=2)[..., 0]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     known = known_cycles(w, delays[0], rates[0], raw)

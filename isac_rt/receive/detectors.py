@@ -22,7 +22,7 @@ from isac_rt.arrays import Antennas, Schedule
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.adaptive import Beams, Scan, beams_of, map_factor, predicted, sampled, scan_threshold
 from isac_rt.receive.cfar import background, detect, row_factors, strong_lobes
-from isac_rt.receive.clutter_map import Channels, arm_channels, joint_channels, power_map
+from isac_rt.receive.clutter_map import Channels, Taper, arm_channels, joint_channels, power_map
 from isac_rt.receive.doppler import accumulate
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -58,6 +58,7 @@ def judge(
     delay_symbols: np.ndarray,
     settings: Receivers,
     clutter: ExpectedClutter | None = None,
+    taper: Taper | None = None,
 ) -> list[Judged]:
     """The verdict of the detector that the settings name, on frames that share their data and the expected clutter.
 
@@ -65,6 +66,7 @@ def judge(
     ----------
     frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
     clutter : what is expected; needed by map and angle_doppler
+    taper : how uncertain that is; None: `Taper()`
 
     Raises
     ------
@@ -82,13 +84,13 @@ def judge(
         return [_directed(parts, level, rate, None) for parts, level in zip(found, levels, strict=True)]
     if clutter is None:
         raise ValueError(f"receivers.clutter_detector {name} needs the clutter that the mesh predicts; give it, or use cfar")
-    expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols)
+    expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols, taper)
     noise = [noise_level(power, expected, looks) for power in powers]
     if name == "map":
         limits = [n * map_factor(expected / n, looks, rate) for n in noise]
         return [Judged(p / limit, n + expected, _nowhere(p)) for p, n, limit in zip(powers, noise, limits, strict=True)]
     wanted = np.fft.ifftshift(expected > LEAST * np.mean(noise), axes=1)
-    by_scan = [predicted(frames, c, b, noise, wanted, clutter, waveform, schedule, delay_symbols) for c, b in scans]
+    by_scan = [predicted(frames, c, b, noise, wanted, clutter, waveform, schedule, delay_symbols, taper) for c, b in scans]
     by_frame = [[(scan, b) for scan, (_, b) in zip(one, scans, strict=True)] for one in zip(*by_scan, strict=True)]
     return [_directed(parts, n + expected, rate, settings) for parts, n in zip(by_frame, noise, strict=True)]
 

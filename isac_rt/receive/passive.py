@@ -36,6 +36,7 @@ def receive_passive(
     modulated: bool,
     *,
     groups: Sequence[int] | None = None,
+    profile: np.ndarray | None = None,
     maps: bool = False,
 ) -> Reception:
     """Data symbols, bits and detections of one frame.
@@ -47,6 +48,7 @@ def receive_passive(
     modulated : whether the frame carries data (public)
     groups : that carry data for this terminal, None for all. It decodes these, and senses with these alone while there are
         data: what the others carry it does not know
+    profile : range profile with which the delay symbols are decided (`isac_rt.receive.profile`), None: by the strongest cell
     maps : also return pictures
 
     Returns
@@ -56,7 +58,8 @@ def receive_passive(
     otherwise, or nothing is found where the reference is expected, `line_of_sight` is False and all symbols are erased.
     """
     if groups is not None and modulated:
-        mine = receive_passive(cube.of_groups(groups), antennas, settings, dpsk_order, prediction, modulated, maps=maps)
+        part = cube.of_groups(groups)
+        mine = receive_passive(part, antennas, settings, dpsk_order, prediction, modulated, profile=profile, maps=maps)
         return _among_all(mine, groups, cube.waveform)
     w = cube.waveform
     if not modulated:
@@ -71,7 +74,7 @@ def receive_passive(
     if settings.symbol_decision == "beams" and usable_paths(prediction).size:
         symbols = demodulate_beams(cube, prediction, antennas, dpsk_order, run_cells)
     else:
-        symbols = demodulate(cube, prediction, dpsk_order, run_cells)
+        symbols = demodulate(cube, prediction, dpsk_order, run_cells, profile)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
     confident = np.median(symbols.delay_confidence) >= confidence_threshold(symbols.looks, cells, symbols.raw.size)
     if not confident or not moves_as_predicted(symbols, dpsk_order):
