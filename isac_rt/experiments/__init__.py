@@ -23,6 +23,7 @@ TITLES = {
     "fig12": "Symbol error rate of the delay symbols (Fig. 12)",
     "fig13": "Bit rate against transmit antennas (Fig. 13)",
     "fig14": "Hit rate against the baselines (Fig. 14)",
+    "clutter": "Gaussian, Rayleigh and geometric clutter side by side",
     "detectors": "Detectors in the clutter of a city's mesh",
     "claims": "Claims of the text that have no figure",
 }
