@@ -73,7 +73,7 @@ def statistics(clutter: ExpectedClutter, waveform: Waveform, amplitude: float, g
         "level_p10_db": float(np.quantile(level, 0.1)),
         "level_p90_db": float(np.quantile(level, 0.9)),
         "fourth_moment": float(2 * (part**2).mean() / part.mean() ** 2),
-        "level_correlation": float(np.corrcoef(part_db[:-1], part_db[1:])[0, 1]),
+        "level_correlation": float(np.corrcoef(part_db[:-1], part_db[1:])[0, 1]) if np.ptp(part_db) > 1e-6 else 1.0,
         **moments,
     }
 
