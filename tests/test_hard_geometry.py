@@ -51,7 +51,7 @@ def specular(paths: PathSet) -> PathSet:
 @pytest.mark.parametrize("height", [1e-3, 0.02, 0.3])
 def test_grazing_rays(height):
     """Two terminals just over the ground, 200 m apart: one reflection, its length to a nanometre; below a centimetre a warning.
-    Planted bug: offsets of the planes in float32."""
+    Written against: offsets of the planes in float32."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         paths = specular(found(GROUND, (0, 0, height), (200.3, 0, 1.3 * height)))
@@ -65,7 +65,7 @@ def test_grazing_rays(height):
 @pytest.mark.parametrize("gap", [0.0, 1e-3, 0.011, 0.05])
 def test_a_transmitter_close_to_a_wall_or_on_it(gap):
     """Sionna loses the reflection within a millimetre of a wall and sees through it on the wall itself. That is said, once, by name and
-    distance; from the clearance on all paths are there. Planted bug: no check, or one against the planes' infinite extent."""
+    distance; from the clearance on all paths are there. Written against: no check, or one against the planes' infinite extent."""
     model = stage.tracer(wall(), 1)
     poses = stage.swarm((11.3 - gap, 2.1, 9.7), (-3.3, 7.9, 8.8), FAR, moving=False)
     with warnings.catch_warnings(record=True) as said:
@@ -87,7 +87,7 @@ def test_a_transmitter_close_to_a_wall_or_on_it(gap):
 
 @pytest.mark.sionna
 def test_inside_a_closed_building_nothing_gets_in_or_out():
-    """Planted bug: none that is ours; Sionna is held to it."""
+    """Sionna is held to it."""
     city = load_city(tree.City(source="blocks", blocks_x=1, blocks_y=1), ".", 77e9, (0.0, 0.0, 5.0))
     inside, outside = (1.3, 2.1, 7.7), (33.1, 4.2, 8.8)
     assert len(found(city, inside, outside)) == 0
@@ -99,7 +99,7 @@ def test_inside_a_closed_building_nothing_gets_in_or_out():
 @pytest.mark.sionna
 def test_a_wall_seen_edge_on_and_slivers():
     """From within its own plane a wall neither reflects nor shadows; triangles without area are taken out and counted.
-    Planted bug: the area's limit taken to the first power of the length."""
+    Written against: the area's limit taken to the first power of the length."""
     edge_on = stage.rectangle((5.0, -20, 0), (0.0, 15, 0), (0, 0, 30), CONCRETE)
     paths = found(edge_on, (5.0, -31.0, 9.7), (5.0, 17.0, 8.8))
     assert paths.counts()["specular"] == 0
@@ -173,7 +173,7 @@ def flight(**places) -> Scenario:
 
 
 def test_two_bodies_at_one_point_are_refused_before_the_run():
-    """At the start by the scenario, later on by the check of the flights, with the time and the frame. Planted bug: only the start."""
+    """At the start by the scenario, later on by the check of the flights, with the time and the frame. Written against: only the start."""
     with pytest.raises(ValueError, match=r"at least 0\.05 m are needed"):
         flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 0.01, 9), (0, 0, 0)))
     meeting = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 20, 9), (0, -10.0, 0)))
@@ -205,7 +205,7 @@ def test_a_path_without_length_is_not_a_number_and_refused():
 
 @pytest.mark.sionna
 def test_a_vertical_link_with_vertical_polarisation():
-    """Exactly upright Sionna's line of sight has the opposite sign, at the pole of its polarisation; ours has not. Planted bug: the
+    """Exactly upright Sionna's line of sight has the opposite sign, at the pole of its polarisation; ours has not. Written against: the
     amplitude taken as Sionna gives it."""
     for x in (0.0, 0.013):
         paths = found(GROUND, (0, 0, 9.1), (x, 0, 31.3), bounces=0)

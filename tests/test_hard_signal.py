@@ -45,7 +45,7 @@ def prediction(length: float, rate: float) -> Prediction:
 
 @pytest.mark.parametrize("cell", [20.0, 20.25, 20.5, 21.0])
 def test_whole_and_half_cells(cell):
-    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Planted bug: the peak's neighbour on the wrong
+    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Written against: the peak's neighbour on the wrong
     side at a tie."""
     _, schedule, payload = stage.frame(w=W)
     length, rate = cell * W.range_cell(1), (cell - 13) * W.velocity_cell(1)
@@ -58,7 +58,7 @@ def test_whole_and_half_cells(cell):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_delay_at_all(method):
-    """A path of delay 0 is a constant: its gain in every sample. Planted bug: the phase of the window's start left in."""
+    """A path of delay 0 is a constant: its gain in every sample. Written against: the phase of the window's start left in."""
     one = Antennas(tx_x=2, tx_z=4, rx_x=2, rx_z=2, spacing=1e-12)
     w = SMALL
     sender = stage.sender(w, np.random.default_rng(5), False, pose=stage.pose((0, 0, 0)), antennas=one)
@@ -71,7 +71,7 @@ def test_no_delay_at_all(method):
 @pytest.mark.parametrize("delay", [-1.01, 1.01, 1.9, 3.7])
 def test_beyond_the_filter_there_is_nothing(method, delay):
     """Delays a skirt below 0 and a skirt beyond the passband, and far beyond. In another group's block such a path may be heard: here
-    there is one group. Planted bug: the skirt of twice the width."""
+    there is one group. Written against: the skirt of twice the width."""
     w = Waveform(num_samples=64, num_chirps=6, num_groups=1)
     skirt = 1.01 * stage.SKIRT / w.slope
     tau = -skirt if delay < 0 else delay * w.max_delay if delay > 1.5 else w.max_delay + skirt
@@ -81,7 +81,7 @@ def test_beyond_the_filter_there_is_nothing(method, delay):
 @pytest.mark.parametrize("speed", [16.0, -21.3, 44.9])
 def test_velocities_beyond_the_limit_are_aliases_of_a_known_span(speed):
     """An echo beyond the unambiguous velocity is reported one span off (30 m/s at the AT), at the right range but for the coupling of what
-    was aliased. Planted bug: bins from 0 to P."""
+    was aliased. Written against: bins from 0 to P."""
     _, schedule, payload = stage.frame(w=W)
     cube = stage.cube_of(W, schedule, payload, [(2 * 14.3, 2 * speed, 1.0)])
     found = receive_active(cube, payload, FEW, SETTINGS).detections
@@ -95,7 +95,7 @@ def test_velocities_beyond_the_limit_are_aliases_of_a_known_span(speed):
 
 @pytest.mark.parametrize("method", ["direct", "gridded", "auto"])
 def test_a_target_at_half_a_metre(method):
-    """Spherical waves over the whole array, against the exact model. Planted bug: plane waves."""
+    """Spherical waves over the whole array, against the exact model. Written against: plane waves."""
     found, truth = (samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8, 0.5), m, True) for m in (method, "exact"))
     plane = samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8), "exact", True)
     assert stage.relative(found, truth) < (GRIDDED_ERROR if method == "gridded" else COMPLEX64)
@@ -104,7 +104,7 @@ def test_a_target_at_half_a_metre(method):
 
 def test_one_path_80_db_above_another():
     """With the default method the weak path is right to a hundredth beside the strong one, among twelve (so that most are gridded).
-    Planted bug: the strongest gridded as well."""
+    Written against: the strongest gridded as well."""
     rng = np.random.default_rng(3)
     every = stage.random_paths(SMALL, rng, 14, SMALL.frame_duration / 2)
     gain = every.gain.copy()
@@ -118,7 +118,7 @@ def test_one_path_80_db_above_another():
 
 @pytest.mark.parametrize("times", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_million_paths(times):
-    """A thousand paths over and over, with a part of the gain each, are the thousand paths. Planted bug: an index of 16 bits.
+    """A thousand paths over and over, with a part of the gain each, are the thousand paths. Written against: an index of 16 bits.
 
     Rounding: sqrt(1e6) * 6e-8 of the largest partial sums, a few times the total, beside the method's own 1e-4 on both sides.
     """
@@ -132,7 +132,7 @@ def test_a_million_paths(times):
 
 
 def test_ten_thousand_paths_at_one_delay():
-    """Their sum is one path with the sum of the gains. Planted bug: equal frequencies counted once."""
+    """Their sum is one path with the sum of the gains. Written against: equal frequencies counted once."""
     rng = np.random.default_rng(2)
     gain = rng.normal(size=10_000) + 1j * rng.normal(size=10_000) + 0.3
     w = Waveform(num_samples=64, num_chirps=3, num_groups=1)
@@ -156,7 +156,7 @@ def test_denormal_and_zero_gains(method):
 
 @pytest.mark.parametrize(("size", "chirps", "tx"), [(90, 10, 5), (100, 21, 3), (250, 28, 4)])
 def test_sizes_that_are_no_powers_of_two(size, chirps, tx):
-    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is decoded. Planted bug: N/2 rounded up."""
+    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is decoded. Written against: N/2 rounded up."""
     w = Waveform(num_samples=size, num_chirps=chirps, num_tx=tx, num_groups=min(tx, 3))
     every = stage.random_paths(w, np.random.default_rng(size), 30, w.frame_duration / 2)
     truth = samples(w, every, "exact", True)

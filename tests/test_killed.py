@@ -59,15 +59,15 @@ sys.exit(main(["run", {scenario!r}, "--out", {out!r}]))
     ("how", "when"),
     [
         (signal.SIGTERM, "results.nc"),
-        (signal.SIGKILL, "summary.json"),
+        pytest.param(signal.SIGKILL, "summary.json", marks=pytest.mark.slow),
         pytest.param(signal.SIGINT, "results.nc", marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, "summary.json", marks=pytest.mark.slow),
         pytest.param(signal.SIGKILL, "results.nc", marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
-    """Each file is whole or absent; asked to end (SIGTERM, Ctrl-C) the run takes its unfinished file along. Seen to fail with SIGTERM left
-    Python's default, which leaves the hidden file."""
+    """Each file is whole or absent; asked to end (SIGTERM, Ctrl-C) the run takes its unfinished file along, which Python's own answer to
+    SIGTERM would leave."""
     scenario, out = tmp_path / "s.yaml", tmp_path / "o"
     scenario.write_text(to_yaml(fake_scenario()))
     program = PROGRAM.format(tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), pause=0.6)
@@ -95,7 +95,7 @@ def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
 def test_a_full_disk_is_one_message_and_leaves_nothing(code, tmp_path, monkeypatch):
-    """Planted bug: the temporary file left behind."""
+    """Written against: the temporary file left behind."""
     run = fake_run()
 
     def full(self, *_, **__):
@@ -153,14 +153,14 @@ def digest(run) -> str:
 
 
 def test_reruns_are_equal_bit_by_bit_whatever_the_threads():
-    """One, two and five receivers at work at once, and again. Planted bug: a generator shared by the receivers."""
+    """One, two and five receivers at work at once, and again. Written against: a generator shared by the receivers."""
     found = {digest(simulate.run(small(), threads=threads)) for threads in (1, 2, 5, 1)}
     assert len(found) == 1
     assert digest(simulate.run(small().model_copy(update={"seed": 2}))) not in found
 
 
 def test_versions_stand_in_the_results(tmp_path):
-    """Another version of a package is seen in the file and in the summary. Planted bug: versions taken when the module is written."""
+    """Another version of a package is seen in the file and in the summary. Written against: versions taken when the module is written."""
     import importlib.metadata
 
     run = fake_run()

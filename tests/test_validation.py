@@ -27,7 +27,7 @@ def a_case() -> float:
 
 
 def test_there_are_enough_cases_each_complete():
-    """Planted bug: a case without its reason."""
+    """Written against: a case without its reason."""
     assert len(CASES) >= 60
     assert len({c.name for c in CASES}) == len(CASES)
     for c in CASES:
@@ -41,7 +41,7 @@ def test_the_quick_selection_is_a_part_of_every_group():
 
 
 def test_truths_take_nothing_from_the_program():
-    """Planted bug: `from isac_rt.waveform import SPEED_OF_LIGHT` in truths.py."""
+    """Written against: `from isac_rt.waveform import SPEED_OF_LIGHT` in truths.py."""
     tree = ast.parse((PACKAGE / "truths.py").read_text())
     names = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
     names += [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
@@ -55,7 +55,7 @@ def test_nothing_is_taken_from_the_tests():
 
 
 def test_an_error_beyond_the_bound_a_nan_and_an_exception_fail():
-    """Planted bug: `not error > bound` lets NaN pass."""
+    """Written against: `not error > bound` lets NaN pass."""
     assert run_case(a_case).passed is True
     assert run_case(replace(a_case, bound=0.2)).passed is False
     assert run_case(replace(a_case, measure=lambda: math.nan)).passed is False
