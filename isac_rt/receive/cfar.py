@@ -156,6 +156,7 @@ def threshold(looks: int, false_alarm_rate: float, guard: tuple[int, int], train
     return _factor(looks, false_alarm_rate, guard, training, training[0], training[0])
 
 
+@lru_cache(maxsize=4096)
 def _factor(
     looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int], before: int, behind: int
 ) -> float:

@@ -16,9 +16,10 @@ from scipy import stats
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.receive.clutter_filter import chirp_runs
+from isac_rt.receive.doppler import add_power
 from isac_rt.receive.estimate import beat_cells, middle_phase
 from isac_rt.receive.profile import correlate
-from isac_rt.receive.spectrum import data_phase, window_length
+from isac_rt.receive.spectrum import data_phase, tones, window_length
 from isac_rt.receive.types import Prediction
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
@@ -84,13 +85,12 @@ def demodulate(
     shape = cube.schedule.shape
     raw, sure = np.empty(shape, np.int64), np.empty(shape)
     picked = np.empty((shape[0], cube.samples.shape[1], shape[1]), np.complex128)
-    fast = np.arange(w.num_samples)
     for m in range(shape[0]):
-        turn = np.exp(-2j * np.pi * ((beats[m][:, None] * fast / w.num_samples) % 1.0)).astype(np.complex64)
+        turn = tones(-beats[m] / w.num_samples, w.num_samples)
         spectra = scipy.fft.fft(cube.samples[m] * turn, axis=-1, workers=1, overwrite_x=True)
         power = np.zeros(spectra.shape[1:], np.float32)
         for one in spectra:
-            power += one.real**2 + one.imag**2
+            add_power(power, one)
         if run_cells is not None:
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
         if profile is not None:

@@ -8,6 +8,7 @@ Doppler bins are centred: bin 0 of the output is -P/2. Receding is positive.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from isac_rt.arrays import Schedule, is_latin
 from isac_rt.waveform import Waveform
@@ -56,10 +57,21 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, de
     times = slow_times(waveform, delay_symbols)
     for tx in range(waveform.num_tx):
         sent = schedule == tx
-        united = np.concatenate([spectra[m][..., sent[m]] for m in range(num_groups)], axis=-1)
+        groups, chirps = np.nonzero(sent)
+        united = np.empty((num_rx * num_rows, chirps.size), np.complex64)
+        _unite(spectra.reshape(-1), (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), num_chirps, united)
         operator = union_operator(waveform, times[sent]) if full else correlation_operator(waveform, times[sent])
-        np.matmul(united.reshape(-1, united.shape[-1]), operator.T, out=out[tx].reshape(-1, num_chirps))
+        np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
     return out
+
+
+@njit(nogil=True, cache=True)
+def _unite(flat, places, num_chirps, out):  # pragma: no cover - compiled
+    """out[i, s] = flat[i P + places[s]]; unsigned, so that no index is checked for its sign."""
+    for i in range(out.shape[0]):
+        first = np.uint64(i * num_chirps)
+        for s in range(out.shape[1]):
+            out[i, s] = flat[first + places[s]]
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
@@ -85,11 +97,19 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
     return (analyse @ (slow_window(waveform)[:, None] * resample)).astype(np.complex64)
 
 
+@njit(nogil=True, cache=True)
+def add_power(power, values):  # pragma: no cover - compiled
+    """power += |values|^2 of two matrices, float32 and complex64."""
+    for i in range(power.shape[0]):
+        for j in range(power.shape[1]):
+            power[i, j] += values[i, j].real ** 2 + values[i, j].imag ** 2
+
+
 def accumulate(maps: np.ndarray) -> np.ndarray:
     """Mean power over the virtual channels, Doppler centred: (rows, P) float32."""
     power = np.zeros(maps.shape[-2:], np.float32)
     for channel in maps.reshape(-1, *maps.shape[-2:]):
-        power += channel.real**2 + channel.imag**2
+        add_power(power, channel)
     return np.fft.fftshift(power, axes=-1) / (maps.shape[0] * maps.shape[1])
 
 

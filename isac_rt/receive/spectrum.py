@@ -37,6 +37,29 @@ def hann(position: np.ndarray, length: float) -> np.ndarray:
     return np.where(inside, np.sin(np.pi * position / length) ** 2, 0.0)
 
 
+def _windows(num_samples: int, starts: np.ndarray, length: float) -> np.ndarray:
+    """`hann` of sample n less each start: (P, N) float32, with sines of sums made of few sines."""
+    places, out = np.arange(num_samples) * (2 * np.pi / length), np.empty((len(starts), num_samples), np.float32)
+    _fill_windows(starts.astype(np.float64), np.cos(places), np.sin(places), length, out)
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _fill_windows(starts, cosine, sine, length, out):  # pragma: no cover - compiled
+    for p in range(out.shape[0]):
+        c, s = np.cos(starts[p] * 2 * np.pi / length), np.sin(starts[p] * 2 * np.pi / length)
+        for n in range(out.shape[1]):
+            inside = starts[p] <= n <= starts[p] + length
+            out[p, n] = 0.5 - 0.5 * (c * cosine[n] + s * sine[n]) if inside else 0.0
+
+
+def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
+    """exp(j 2 pi f n) for n = 0 .. N-1: (..., N) complex64, each a product of two phasors reduced in float64."""
+    coarse, fine = np.arange(0, num_samples, 32), np.arange(32)
+    start, step = (np.exp(2j * np.pi * (frequency[..., None] * n % 1.0)) for n in (coarse, fine))
+    return (start[..., :, None] * step[..., None, :]).reshape(*frequency.shape, -1)[..., :num_samples].astype(np.complex64)
+
+
 def data_phase(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
     """f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2/2 [cycles mod 1], float64."""
     w = waveform
@@ -64,22 +87,23 @@ def clean_spectrum(cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, 
     shift = shift_of(w, delay_symbols)
     out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
     for m in range(num_groups):
-        window = hann(np.arange(num_samples)[None, :] - shift[m][:, None], window_length(w)).astype(np.float32)
+        window = _windows(num_samples, shift[m], window_length(w))
         factor = phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, delay_symbols[m]))
-        step = np.exp(2j * np.pi * shift[m] / num_samples)
+        turn = factor.astype(np.complex64)[:, None] * tones(shift[m] / num_samples, num_rows)
         for rx in range(num_rx):
             spectrum = scipy.fft.fft(samples[m, rx] * window, axis=1, workers=1, overwrite_x=True)
-            _gather(spectrum, delay_symbols[m].astype(np.int64), factor, step, out[m, rx])
+            _gather(spectrum, delay_symbols[m].astype(np.int64), turn, out[m, rx])
     return out
 
 
 @njit(nogil=True, cache=True)
-def _gather(spectrum, symbols, factor, step, out):  # pragma: no cover - compiled
-    """out[k, p] = spectrum[p, (k + D_p) mod N] * factor_p * step_p^k."""
+def _gather(spectrum, symbols, turn, out):  # pragma: no cover - compiled
+    """out[k, p] = spectrum[p, (k + D_p) mod N] * turn[p, k], some rows at a time so that what is written stays in the cache."""
     num_rows, num_chirps = out.shape
     num_samples = spectrum.shape[1]
-    for p in range(num_chirps):
-        turn = factor[p]
-        for k in range(num_rows):
-            out[k, p] = np.complex64(spectrum[p, (k + symbols[p]) % num_samples] * turn)
-            turn *= step[p]
+    for first in range(0, num_rows, 32):
+        for p in range(num_chirps):
+            at = (first + symbols[p]) % num_samples
+            for k in range(first, min(first + 32, num_rows)):
+                out[k, p] = spectrum[p, at] * turn[p, k]
+                at = at + 1 if at + 1 < num_samples else 0

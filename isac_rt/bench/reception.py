@@ -1,0 +1,93 @@
+"""Cost of a full reception of one frame (M = 3) at the active and at the passive terminal, over the number of paths that are seen.
+
+The frame is made by the program's own synthesis: the strongest path some 13 dB over the noise of a sample, each further one 2 dB weaker.
+`error` is that of the estimated ranges of all paths in range cells (RMS over those that have a detection within two cells); beside it
+are the floor of the transforms alone and the memory that was allocated at most, in cubes.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+
+from isac_rt.arrays import Antennas, pseudo_random_schedule
+from isac_rt.bench.measure import cpu_seconds, floor_seconds
+from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
+from isac_rt.payload import Payload, random_payload
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.active import receive_active
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.types import Detections, Prediction
+from isac_rt.scenario import Receivers
+from isac_rt.swarm import Pose, attitude
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+
+SIZES = (1, 4, 8)
+QUICK_SIZES = (4,)
+_DPSK = 8
+
+
+def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
+    """A noisy cube of `count` paths at whole path lengths from 40 m on, and what a PT would expect of the first."""
+    rng, w = np.random.default_rng(count), Waveform()
+    antennas = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
+    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
+    schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
+    payload = random_payload(w, schedule, _DPSK, rng)
+    sender = Transmission(name="A", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
+    length, speed = 40.0 + 9.37 * np.arange(count), rng.uniform(-8, 8, count)
+    across = rng.uniform(-0.4, 0.4, (count, 2))
+    u = np.stack([across[:, 0], np.sqrt(1 - (across**2).sum(1)), across[:, 1]], axis=1)
+    paths = make_paths(
+        epoch=w.frame_duration / 2, tx="A", rx="B", gain=10 ** (-np.arange(count) / 10) * np.exp(1j * np.arange(count)),
+        delay=length / SPEED_OF_LIGHT, delay_rate=speed / SPEED_OF_LIGHT, delay_accel=np.zeros(count), departure=u, arrival=u,
+        tx_radius=np.inf, rx_radius=np.inf, kind=PathKind.TARGET,
+    )  # fmt: skip
+    cube = if_signal(w, [(sender, paths)], pose, antennas, start_time=0.0, filter_transition=0.4e6, method="direct")
+    cube = add_noise(cube, 0.05, np.array([3, count], np.uint32))
+    one = np.ones(1)
+    prediction = Prediction(range=length[:1], velocity=speed[:1], direction=u[:1, [0, 2]], range_std=0.05 * one,
+                            velocity_std=0.05 * one, weight=one)  # fmt: skip
+    return cube, payload, antennas, prediction
+
+
+def _range_error(found: Detections, count: int, passes: int) -> float | None:
+    """RMS of the range errors in cells, over the paths with a detection within two cells of them; None without any."""
+    cell = Waveform().range_cell(passes)
+    truth = (40.0 + 9.37 * np.arange(count)) / passes
+    if not len(found):
+        return None
+    off = np.abs(found.range[None, :] - truth[:, None]).min(axis=1) / cell
+    near = off[off < 2]
+    return float(np.sqrt((near**2).mean())) if near.size else None
+
+
+def _peak_cubes(work: Callable[[], object], cube: IFCube) -> float:
+    tracemalloc.start()
+    work()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / cube.samples.nbytes
+
+
+def rows(quick: bool) -> list[dict[str, object]]:
+    """Rows of the benchmark (`isac_rt.bench`): cost in floors of AT and PT receptions."""
+    out: list[dict[str, object]] = []
+    repeats, settings = 3 if quick else 7, Receivers()
+    for size in QUICK_SIZES if quick else SIZES:
+        cube, payload, antennas, prediction = _frame(size)
+        floor = floor_seconds(cube.samples.shape, repeats)
+        jobs: list[tuple[str, int, Callable[[], Detections]]] = [
+            ("active terminal (DCA-SPE)", 2, lambda c=cube, p=payload, a=antennas: receive_active(c, p, a, settings).detections),
+            ("passive terminal (J-SPEDD)", 1,
+             lambda c=cube, a=antennas, q=prediction: receive_passive(c, a, settings, _DPSK, q, True).detections),
+        ]  # fmt: skip
+        for method, passes, work in jobs:
+            seconds = cpu_seconds(work, repeats)
+            out.append({"kind": "reception", "method": method, "size": size, "unit": "paths", "error": _range_error(work(), size, passes),
+                        "error_of": "RMS range error in cells", "cost": seconds / floor, "seconds": seconds, "floor_s": floor,
+                        "oracle": False, "job": "one frame, M = 3, full reception",
+                        "memory_cubes": _peak_cubes(work, cube)})  # fmt: skip
+    return out
