@@ -48,11 +48,31 @@ def test_distribution_and_tails():
     assert stats.kstest(z.real[:COUNT].astype(float), "norm").pvalue > 1e-6
     assert stats.kstest(np.angle(z[:COUNT]) / np.pi, stats.uniform(-1, 2).cdf).pvalue > 1e-6
     for level in (3, 4, 4.5, 5):
-        expected = 2 * stats.norm.sf(level) * parts.size
-        low, high = stats.poisson.interval(1 - 1e-6, expected)
-        assert low <= (np.abs(parts) > level).sum() <= high
+        _assert_tail((np.abs(parts) > level).sum(), level, parts.size)
     edges = stats.norm.ppf(np.linspace(0, 1, 101))
     assert stats.chisquare(np.histogram(parts, edges)[0]).pvalue > 1e-6
+
+
+def _assert_tail(beyond, level, count):
+    low, high = stats.poisson.interval(1 - 1e-6, 2 * stats.norm.sf(level) * count)
+    assert low <= beyond <= high
+
+
+@pytest.mark.slow
+def test_tails_to_five_and_a_half_sigma():
+    """In 2^29 real numbers 20 are expected beyond 5.5 sigma. Planted bug: the uniform of the logarithm cut at 2^-20 (5.3 sigma)."""
+    beyond, blocks, size = {5.0: 0, 5.25: 0, 5.5: 0}, 64, 1 << 22
+    z, key = np.empty(size, np.complex64), seed_sequence(7, "noise", "far tails").generate_state(2)
+    for block in range(blocks):
+        z[:] = 0
+        add_white_noise(z, 2.0, key, block * size)
+        parts = z.view(np.float32)
+        far = np.abs(parts[np.abs(parts) > 5])
+        for level in beyond:
+            beyond[level] += int((far > level).sum())
+    for level, found in beyond.items():
+        _assert_tail(found, level, 2 * blocks * size)
+    assert beyond[5.5] > 5
 
 
 @pytest.mark.parametrize("shift", [1, 2, 1024, 122880])
