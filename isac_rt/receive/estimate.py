@@ -91,7 +91,7 @@ class LocalSpectra:
         self._sets = w.num_groups if separate else 1
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
-        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1)).reshape(schedule.size, rows.shape[2], -1)
+        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1), np.complex64).reshape(schedule.size, rows.shape[2], -1)
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         self._tx = np.ascontiguousarray((schedule + own).ravel())
