@@ -85,14 +85,14 @@ _LOOKS = {
 
 def _figure(curves: dict[str, Curve], closed: dict[str, np.ndarray]) -> Figure:
     with style():
-        figure, axes = blank(size=(6.8, 5.0))
+        figure, axes = blank(size=(8.6, 5.0))
         ax = axes[0, 0]
         for p, label in zip(closed.values(), ("theory, exact prediction", None), strict=True):
             ax.plot(SNR_DB, p, color="k", lw=0.9, label=label)
         for i, (name, (look, label)) in enumerate(_LOOKS.items()):
             draw_rate(ax, curves[name], look, f"C{i % 10}", label)
         ax.set(xlabel="SNR per sample and antenna [dB]", ylabel="delay symbol error rate", yscale="log", ylim=(3e-4, 1.5), xlim=(-36, -18))
-        ax.legend(fontsize=6.5, loc="lower left")
+        ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
