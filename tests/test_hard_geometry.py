@@ -114,7 +114,7 @@ def test_a_wall_seen_edge_on_and_slivers():
 def test_coincident_walls_reflect_once_or_twice_but_never_more(apart):
     """Two sheets of different triangles in one place are one mirror; half a millimetre apart the nearer one is what is seen."""
     one = wall()
-    other = np.array([[11.3, -20, 0], [11.3, 20, 0], [11.3, 20, 30], [11.3, -20, 30], [11.3, 1, 14]]) + [apart, 0, 0]
+    other = np.array([[11.3, -20, 0], [11.3, 20, 0], [11.3, 20, 30], [11.3, -20, 30], [11.3, 1, 14]]) + np.array([apart, 0, 0])
     faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], np.int32)
     mesh = City("twice", np.concatenate([one.vertices, other]), np.concatenate([one.faces, faces + 4]).astype(np.int32),
                 np.zeros(6, np.int16), (CONCRETE,), np.zeros(3))  # fmt: skip

@@ -45,8 +45,8 @@ def prediction(length: float, rate: float) -> Prediction:
 
 @pytest.mark.parametrize("cell", [20.0, 20.25, 20.5, 21.0])
 def test_whole_and_half_cells(cell):
-    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Written against: the peak's neighbour on the wrong
-    side at a tie."""
+    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Written against: the peak's neighbour on
+    the wrong side at a tie."""
     _, schedule, payload = stage.frame(w=W)
     length, rate = cell * W.range_cell(1), (cell - 13) * W.velocity_cell(1)
     cube = stage.cube_of(W, schedule, payload, [(length, rate, 1.0)])

@@ -230,8 +230,8 @@ def direct_method() -> float:
     why="the error that the method states (isac_rt.gridding.GRIDDED_ERROR)",
     planted=(
         "gridding.py",
-        "_WIDTH = 6",
-        "_WIDTH = 3",
+        "cycles = element * (carrier - splat(slope / 2) * element)",
+        "cycles = element * (carrier - splat(slope) * element)",
     ),
     quick=False,
 )
