@@ -367,6 +367,36 @@ def _validate(cases: list[Any]) -> list[Any]:
 
 
 @app.command()
+def bench(
+    stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...", help="synthesis receive trace clutter end-to-end.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes only.")] = False,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where tables and figures go.")] = Path("runs/bench"),
+    json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows to a file too.")] = None,
+) -> None:
+    """Speed against error, method by method, in floors of the same run."""
+    from isac_rt.bench import report
+    from isac_rt.results import check_folder, write_text
+
+    chosen = stages or report.stages()
+    if unknown := [name for name in chosen if name not in report.stages()]:
+        raise InputProblem(f"{', '.join(unknown)}: no such stage; choose from {', '.join(report.stages())}")
+    check_folder(out)
+    with _ending_soon_after_interrupt(out):
+        found = _with_progress(lambda moved: report.measure(list(dict.fromkeys(chosen)), quick, moved), "stages", len(chosen))
+        files = report.write(found, out)
+        if json is not None:
+            from json import dumps
+
+            write_text(json, dumps(found, indent=1) + "\n")
+    table = _table("method", "size", "cost [floors]", "error")
+    for row in found["rows"]:
+        error = "" if row["error"] is None else f"{row['error']:.2g}"
+        table.add_row(f"{row['kind']}: {row['method']}", f"{row['size']:,} {row.get('unit', '')}", f"{row['cost']:.3g}", error)
+    _out().print(table)
+    _out().print(f"in {out}: {', '.join(file.name for file in files)}", soft_wrap=True)
+
+
+@app.command()
 def doctor() -> None:
     """Back end, LLVM, memory, threads, and what to install."""
     from isac_rt.runtime import doctor as look

@@ -1,0 +1,131 @@
+"""Tables and figures of the benchmarks: speed against error, and cost against size with its growth."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isac_rt.bench import STAGES
+from isac_rt.provenance import versions
+
+Row = Mapping[str, Any]
+
+
+def stages() -> list[str]:
+    """Stages whose measurements are there."""
+    return [name for name, module in STAGES.items() if importlib.util.find_spec(f"isac_rt.bench.{module}") is not None]
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    model = ""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    except OSError:
+        model = platform.processor()
+    return {"processor": model or platform.machine(), "cores": os.cpu_count(), "platform": platform.platform(), "versions": versions()}
+
+
+def measure(names: Sequence[str], quick: bool, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+    """All rows of some stages, with the machine and the growth of every curve."""
+    rows: list[dict[str, Any]] = []
+    for done, name in enumerate(names):
+        rows += importlib.import_module(f"isac_rt.bench.{STAGES[name]}").rows(quick)
+        if progress:
+            progress(done + 1, len(names))
+    return {"machine": machine(), "quick": quick, "rows": rows, "growth": growth(rows)}
+
+
+def curves(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
+    """Rows by kind, method and unit, sorted by size."""
+    out: dict[tuple[str, str, str], list[Row]] = {}
+    for row in sorted(rows, key=lambda r: r["size"]):
+        out.setdefault((row["kind"], row["method"], row.get("unit", "")), []).append(row)
+    return out
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """Slope of log cost over log size by least squares: 1 is linear growth."""
+    return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
+
+
+def growth(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Exponent of every curve of two sizes or more."""
+    out = []
+    for (kind, method, unit), of in curves(rows).items():
+        if len({row["size"] for row in of}) > 1:
+            value = exponent([r["size"] for r in of], [r["cost"] for r in of])
+            out.append({"kind": kind, "method": method, "unit": unit, "exponent": round(value, 2)})
+    return out
+
+
+def markdown(found: Mapping[str, Any]) -> str:
+    """The tables of `measure`."""
+    m = found["machine"]
+    text = [f"Machine: {m['processor']}, {m['cores']} cores, {m['platform']}. Cost in floors of the same run (CPU time).", ""]
+    for kind in dict.fromkeys(row["kind"] for row in found["rows"]):
+        text += [f"## {kind}", "", "| method | size | cost [floors] | CPU s | floor [s] | error | of |", "|---|---|---|---|---|---|---|"]
+        for (of_kind, method, unit), rows in curves(found["rows"]).items():
+            if of_kind == kind:
+                text += [_line(method, unit, row) for row in rows]
+        text.append("")
+    text += ["## Growth of cost with size", "", "| stage | method | size | exponent |", "|---|---|---|---|"]
+    text += [f"| {g['kind']} | {g['method']} | {g['unit']} | {g['exponent']} |" for g in found["growth"]]
+    return "\n".join(text) + "\n"
+
+
+def _line(method: str, unit: str, row: Row) -> str:
+    error = "" if row["error"] is None else "oracle" if row.get("oracle") else f"{row['error']:.2g}"
+    seconds = row.get("seconds", row["cost"] * row["floor_s"])
+    return (f"| {method} | {row['size']:,} {unit} | {row['cost']:.3g} | {seconds:.3g} | {row['floor_s']:.3g} | {error} "
+            f"| {row.get('error_of', 'samples')} |")  # fmt: skip
+
+
+def write(found: Mapping[str, Any], folder: Path) -> list[Path]:
+    """bench.json, bench.md and one figure per stage."""
+    from isac_rt.results import write_text
+
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / "bench.json", folder / "bench.md"]
+    write_text(files[0], json.dumps(found, indent=1) + "\n")
+    write_text(files[1], markdown(found))
+    for kind in dict.fromkeys(row["kind"] for row in found["rows"]):
+        files.append(figure(found, kind, folder / f"{kind}.png"))
+    return files
+
+
+def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
+    """Cost against error and against size of one stage; the oracle is marked, the floor is the line at one."""
+    import matplotlib.pyplot as plt
+
+    with plt.rc_context({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3}):
+        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), layout="constrained")
+        for (of_kind, method, unit), rows in curves(found["rows"]).items():
+            if of_kind != kind:
+                continue
+            cost = [row["cost"] for row in rows]
+            oracle = any(row.get("oracle") for row in rows)
+            error = [max(row["error"] or 0.0, 1e-8) for row in rows]
+            marker = "*" if oracle else "o"
+            (line,) = right.loglog([r["size"] for r in rows], cost, marker=marker, label=f"{method} ({unit})" if unit else method)
+            if not oracle or max(error) > 1e-8:
+                left.loglog(error, cost, ls="none", marker=marker, color=line.get_color())
+        for axis in (left, right):
+            axis.axhline(1.0, color="k", lw=1, ls=":")
+            axis.set_ylabel("cost [floors]")
+        left.set_xlabel("error (1e-8 and less at the edge)")
+        right.set_xlabel("size")
+        right.legend(fontsize=6)
+        canvas.suptitle(f"{kind}: {found['machine']['processor']}; star: oracle; dotted: floor")
+        canvas.savefig(file, dpi=130)
+        plt.close(canvas)
+    return file
