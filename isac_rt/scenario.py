@@ -298,9 +298,10 @@ class Noise(Node):
 class Receivers(Node):
     """How terminals detect and demodulate."""
 
-    velocity_method: Literal["auto", "omp", "latin_union", "conventional"] = "auto"
-    """omp: the paper's, for sparse sampling. latin_union: all groups as one uniform sampling, for M = L_tx. conventional: the DFT over each
-    antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the schedule and the groups received."""
+    velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
+    """omp: the paper's, for sparse sampling. pursuit: OMP off the grid, path by path. latin_union: all groups as one uniform sampling, for
+    M = L_tx. conventional: the DFT over each antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the
+    schedule and the groups received."""
     refinement: Literal["grid", "local", "joint"] = "local"
     """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the windowed spectra about each peak. joint: all
     paths at once on the samples, at the Cramer-Rao bound; paths in one cell are told apart by direction (slower)."""

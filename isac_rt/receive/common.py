@@ -31,6 +31,7 @@ from isac_rt.receive.estimate import (
     start_point,
     to_delay,
 )
+from isac_rt.receive.pursuit import pursue
 from isac_rt.receive.types import Detections, Maps
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -54,7 +55,7 @@ def use_omp(settings: Receivers, schedule: Schedule, num_tx: int) -> bool:
     return velocity_method(settings, schedule, num_tx) == "omp"
 
 
-def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Literal["omp", "latin_union", "conventional"]:
+def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Literal["omp", "pursuit", "latin_union", "conventional"]:
     """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT where its chirps are equally
     spaced, as in a conventional schedule; OMP elsewhere."""
     if settings.velocity_method != "auto":
@@ -81,6 +82,9 @@ def sense(
 ) -> Sensed:
     """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose `delay_symbols` were removed."""
     w, method = waveform, velocity_method(settings, schedule, waveform.num_tx)
+    if method == "pursuit":
+        paths, ratio, power = pursue(spectra, w, schedule, delay_symbols, antennas, settings, passes)
+        return Sensed(paths, describe(paths, ratio, antennas, w, passes), power, float(np.median(power)))
     conventional = method == "conventional"
     if conventional:
         power = conventional_power(spectra, w, schedule)
