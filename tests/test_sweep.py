@@ -339,16 +339,16 @@ def test_whoever_is_killed_at_a_random_moment(folder, trial):
         target.send_signal(signal.SIGKILL)
         done_before = {f: f.stat().st_mtime_ns for f in (out / "points").rglob("*.json")}
         if victim == "one":
-            assert client.wait(timeout=120) == 0
+            assert client.wait(timeout=480) == 0
         else:
-            code = client.wait(timeout=120)
+            code = client.wait(timeout=480)
             assert code != 0
             if victim == "scheduler":
                 assert code == 1 and "start the same command again" in client.stderr.read()
                 running["scheduler"] = scheduler()
                 running |= {"one": worker(), "two": worker()}
             again = start_client(folder, out, "--scheduler", address)
-            assert again.wait(timeout=120) == 0, again.stderr.read()
+            assert again.wait(timeout=480) == 0, again.stderr.read()
         assert all(f.stat().st_mtime_ns == stamp for f, stamp in done_before.items())
     finally:
         for process in running.values():
