@@ -63,7 +63,8 @@ def as_markdown(verdicts: Sequence[Verdict]) -> str:
                 cells = (c.name, c.claim + note, c.truth, failed + found, f"{shown(c.bound)} {c.unit}", c.why, f"{v.seconds:.1f}")
                 lines.append("| " + " | ".join(_cell(str(x)) for x in cells) + " |")
         lines.append("")
-    lines += ["### Planted bugs", "", "The bug with which a case is to fail; `python tests/mutation.py --planted` plants them and looks.", ""]
+    lines += ["### Planted bugs", ""]
+    lines += ["The bug with which a case is to fail; `python tests/mutation.py --planted` plants them and looks.", ""]
     lines += ["| case | file | instead of | planted |", "|---|---|---|---|"]
     for v in verdicts:
         p = v.case.planted
