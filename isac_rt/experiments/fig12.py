@@ -96,10 +96,10 @@ def _figure(curves: dict[str, Curve], closed: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def draw_rate(ax, curve: Curve, look: str, colour: str, label: str) -> None:
-    """A rate with its intervals; points without events are not drawn."""
+def draw_rate(ax, curve: Curve, look: str, colour: str, label: str, zeros: bool = False) -> None:
+    """A rate with its intervals; `zeros`: points without events too, which a logarithmic axis cannot show."""
     t = curve.table()
-    t = t[t.events > 0]
+    t = t if zeros else t[t.events > 0]
     ax.errorbar(t.snr_db, t.rate, [t.rate - t.low, t.high - t.rate], fmt=look, color=colour, label=label, capsize=1.5, elinewidth=0.6)
 
 

@@ -87,7 +87,7 @@ def _figure(curves: dict[str, Curve]) -> Figure:
         figure, axes = blank(1, 2, size=(10.5, 4.6), sharey=True)
         for ax, looks in zip(axes[0], (_LEFT, _RIGHT), strict=True):
             for i, (name, (look, label)) in enumerate(looks.items()):
-                draw_rate(ax, curves[name], look, f"C{i}", label)
+                draw_rate(ax, curves[name], look, f"C{i}", label, zeros=True)
             ax.set(xlabel="SNR per sample and antenna [dB]", ylim=(-0.02, 1.03))
             ax.legend(fontsize=6.5)
         axes[0, 0].set_ylabel("hit rate")
