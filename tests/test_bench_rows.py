@@ -9,7 +9,6 @@ from isac_rt.gridding import GRIDDED_ERROR
 
 
 def test_errors_of_the_synthesis_are_as_stated():
-    """Planted bug: the narrowband reference with the elements' phases conjugated."""
     found = synthesis.errors()
     assert set(found) == {"direct", *(name for name, _ in synthesis.GRIDS)}
     assert found["direct"] < 1e-6

@@ -25,7 +25,6 @@ SETTINGS = [DEFAULT, ACCURATE, Setting(1.25, 6, False), Setting(1.25, 10, True),
 
 @pytest.mark.parametrize("size", [1280, 1536, 2048, 90, 4])
 def test_transform_of_rows(size):
-    """Planted bug: the fifth-roots' sines exchanged."""
     rng = np.random.default_rng(size)
     rows = (rng.normal(size=(size, 16)) + 1j * rng.normal(size=(size, 16))).astype(np.complex64)
     table = aligned((size + 1) * ROW)
@@ -44,7 +43,6 @@ def test_a_size_with_another_factor_is_refused():
 
 
 def test_cosine_and_sine():
-    """Planted bug: the last term of the sine's series left out."""
     cycles = np.linspace(-0.55, 0.55, 16 * 1000).astype(np.float32)
     c, s = np.empty_like(cycles), np.empty_like(cycles)
 
@@ -100,8 +98,7 @@ def relative(found, truth):
 @pytest.mark.parametrize("setting", SETTINGS, ids=str)
 @pytest.mark.parametrize("count", [1, 16, 37])
 def test_kernel_is_the_plain_loop(setting, count):
-    """Rounding of float32 apart. Planted bugs: the last path of a block that is not full left out; births ignored; a skirt taken for
-    the passband; the real and the imaginary part of the slope's strength exchanged."""
+    """Rounding of float32 apart."""
     w, tones = scene(count, np.random.default_rng(count), num_samples=180, num_chirps=9)
     plain = np.zeros((w.num_groups, 15, w.num_chirps, w.num_samples), np.complex128)
     add_plain(plain, w, tones, SKIRT, setting)
@@ -109,7 +106,6 @@ def test_kernel_is_the_plain_loop(setting, count):
 
 
 def test_many_paths_go_several_chirps_at_a_time():
-    """Planted bug: all chirps of a pass on one grid."""
     w, tones = scene(4100, np.random.default_rng(2), num_samples=96, num_chirps=5, num_tx=5)
     halves = [gridded(w, tones.select(np.arange(4100) % 2 == i), DEFAULT) for i in (0, 1)]
     assert relative(gridded(w, tones, DEFAULT), halves[0] + halves[1]) < 2e-6  # rounding
@@ -127,7 +123,7 @@ def test_error_of_the_narrowband_model(setting, bound):
 
 @pytest.mark.parametrize(("setting", "bound"), [(Setting(1.25, 6, True), 3e-4), (DEFAULT, 1e-4), (ACCURATE, 3e-5)])
 def test_error_of_the_full_model(setting, bound):
-    """Up to |u| = 0.87. Planted bug: the elements' turn a hundredth too great. Without the wideband term the error is above 1 %."""
+    """Up to |u| = 0.87. Without the wideband term the error is above 1 %."""
     w, tones = scene(40, np.random.default_rng(22), num_chirps=3)
     truth = exact(w, tones, SKIRT)
     assert relative(gridded(w, tones, setting), truth) < bound

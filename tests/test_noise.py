@@ -60,7 +60,7 @@ def _assert_tail(beyond, level, count):
 
 @pytest.mark.slow
 def test_tails_to_five_and_a_half_sigma():
-    """In 2^29 real numbers 20 are expected beyond 5.5 sigma. Planted bug: the uniform of the logarithm cut at 2^-20 (5.3 sigma)."""
+    """In 2^29 real numbers 20 are expected beyond 5.5 sigma."""
     beyond, blocks, size = {5.0: 0, 5.25: 0, 5.5: 0}, 64, 1 << 22
     z, key = np.empty(size, np.complex64), seed_sequence(7, "noise", "far tails").generate_state(2)
     for block in range(blocks):
