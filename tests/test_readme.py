@@ -14,7 +14,7 @@ from isac_rt.cli import main
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = [line.split("#")[0].strip() for line in re.findall(r"^    (isac-rt .*)$", TEXT, re.MULTILINE)]
-LONG = ("sweep", "munich", "paper_swarm", "street_canyon.yaml")
+LONG = ("sweep", "munich", "paper_swarm", "street_canyon.yaml", "validate")
 """Parts of commands that take more than seconds."""
 
 
