@@ -28,7 +28,9 @@ TESTS_OF = {
     "payload.py": "test_payload test_receive_data",
     "arrays.py": "test_arrays test_ifsignal",
     "synthesis.py": "test_ifsignal",
-    "gridding.py": "test_ifsignal",
+    "gridding.py": "test_ifsignal test_gridding",
+    "lanefft.py": "test_gridding",
+    "separable.py": "test_separable",
     "ifsignal.py": "test_ifsignal",
     "noise.py": "test_noise",
     "linkbudget.py": "test_linkbudget",
@@ -42,6 +44,14 @@ TESTS_OF = {
     "propagation/visibility.py": "test_clutter_coherence test_clutter_field",
     "propagation/elements.py": "test_propagation",
     "propagation/diffuse.py": "test_raytrace_scenes",
+    "propagation/between.py": "test_between",
+    "propagation/mirrors.py": "test_between",
+    "propagation/bodies.py": "test_diffraction test_shadow_edges",
+    "propagation/diffraction.py": "test_diffraction",
+    "propagation/direct.py": "test_shadow_edges test_diffraction",
+    "propagation/edges.py": "test_shadow_edges test_diffraction",
+    "propagation/expected.py": "test_clutter_detectors",
+    "propagation/expectation.py": "test_clutter_detectors",
     "receive/active.py": "test_receive_detection",
     "receive/cfar.py": "test_receive_detection",
     "receive/clutter_filter.py": "test_clutter_filter",
@@ -51,9 +61,17 @@ TESTS_OF = {
     "receive/estimate.py": "test_receive_detection test_receive_data",
     "receive/passive.py": "test_receive_data",
     "receive/spectrum.py": "test_receive_data test_receive_detection",
+    "receive/joint.py": "test_receive_joint",
+    "receive/separate.py": "test_receive_joint",
+    "receive/beams.py": "test_receive_beams",
+    "receive/pursuit.py": "test_receive_pursuit",
+    "receive/profile.py": "test_profile_decision",
+    "receive/adaptive.py": "test_clutter_detectors",
+    "receive/clutter_map.py": "test_clutter_detectors",
+    "receive/detectors.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
-COMPILED_FROM = {"synthesis.py": ("gridding",)}
+COMPILED_FROM = {"synthesis.py": ("gridding",), "lanefft.py": ("gridding",)}
 """Modules whose compiled code holds another one's; its cache does not know that the other changed."""
 LIMIT = 400
 """Seconds for the tests of one mutant; who does not end by then has been noticed."""
