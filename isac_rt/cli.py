@@ -426,8 +426,9 @@ def new(
     """Write a commented scenario to start from, over a street canyon or over one's own buildings, and the schema for editors."""
     from isac_rt.starter import write_starter
 
-    for made in write_starter(file, footprints):
-        _out().print(f"{made}", soft_wrap=True)
+    files, notes = write_starter(file, footprints)
+    for line in [*files, *notes]:
+        _out().print(f"{line}", soft_wrap=True)
 
 
 @app.command()

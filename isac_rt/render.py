@@ -164,11 +164,11 @@ def _line(ax: Axes, corners: np.ndarray, view: View, depth: np.ndarray, colour: 
 def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mapping[str, Pose], view: View, depth: np.ndarray) -> list[Line2D]:
     """Every kind in its colour: the scattering points of diffuse paths, the strongest of the others as lines."""
     count = dict.fromkeys(PathKind, 0)
-    for (tx, rx), p in paths.items():
-        for kind in PathKind:
+    for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
+        colour = KIND_COLOURS[kind.name.lower()]
+        for (tx, rx), p in paths.items():
             which = np.flatnonzero(p.kind == kind)
             count[kind] += which.size
-            colour = KIND_COLOURS[kind.name.lower()]
             if kind == PathKind.DIFFUSE and which.size:
                 points = p.points[which].reshape(-1, 3)
                 points = points[np.isfinite(points).all(axis=1)]
@@ -176,8 +176,9 @@ def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mappi
                 flat = view.project(points)
                 ax.plot(flat[:, 0], flat[:, 1], ".", color=colour, ms=2.6, alpha=0.8, mew=0)
             elif kind != PathKind.LEAKAGE:
+                width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
                 for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
-                    _line(ax, polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, 1.0, 0.85)
+                    _line(ax, polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, width, 0.85)
     drawn = [k for k in PathKind if count[k] and k != PathKind.LEAKAGE]
     return [Line2D([], [], color=KIND_COLOURS[k.name.lower()], label=f"{words(k.name.lower())} ({count[k]})") for k in drawn]
 
