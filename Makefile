@@ -62,7 +62,7 @@ apt = { command -v apt-get >/dev/null && { as_root=; [ "$$(id -u)" -eq 0 ] || as
   $$as_root env DEBIAN_FRONTEND=noninteractive apt-get -y -qq -o=Dpkg::Use-Pty=0 $(1) >/dev/null; }; }
 
 test: setup
-	@$(BIN)/python -m pytest -q --durations=10
+	@$(BIN)/python -m pytest -q --durations=10 --numprocesses 2 --dist loadfile
 
 demo: setup
 	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm

@@ -39,7 +39,7 @@ fake = types.ModuleType("isac_rt.simulate")
 fake.prepare = lambda s: types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(s),
                                                timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))
 fake.link_budgets = lambda setup: []
-fake.run = lambda s, setup, progress: fake_run(s)
+fake.run = lambda s, **_: fake_run(s)
 import isac_rt
 sys.modules["isac_rt.simulate"] = isac_rt.simulate = fake
 whole = isac_rt.results._atomically
