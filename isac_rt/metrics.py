@@ -95,20 +95,30 @@ def associate(truths: Sequence[Truth], estimates: np.ndarray, resolution: np.nda
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if inside[i, j]]
 
 
-def explain(detections: Detections, paths: PathSet, waveform: Waveform, passes: int) -> tuple[np.ndarray, np.ndarray]:
+class Explanation(NamedTuple):
+    """What caused each of Q detections; -1 where no path is near (a false alarm or a sidelobe).
+
+    kind : (Q,) int8 `PathKind`
+    target : (Q,) int16 index into the set's target names, -1 also where no UAV is involved
+    order : (Q,) int16 interactions with the city, 0 of a direct path
+    face : (Q,) int32 face of the city's mesh that the path meets first, -1 also where it meets none
+    """
+
+    kind: np.ndarray
+    target: np.ndarray
+    order: np.ndarray
+    face: np.ndarray
+
+
+def explain(detections: Detections, paths: PathSet, waveform: Waveform, passes: int) -> Explanation:
     """Which path caused each detection: the strongest within one cell of it in range and in velocity.
 
     Paths are compared where the receiver sees them: velocity modulo the unambiguous span.
-
-    Returns
-    -------
-    kind, target : (Q,) int8 `PathKind` and (Q,) int16 index into the set's target names; -1 where no path is near
-    (a false alarm or a sidelobe), target -1 also where no UAV is involved
     """
     path_range = SPEED_OF_LIGHT * paths.delay / passes
     path_velocity = SPEED_OF_LIGHT * paths.delay_rate / passes
     span, power = 2 * waveform.max_velocity(passes), paths.power
-    kind, target = np.full(len(detections), -1, np.int8), np.full(len(detections), -1, np.int16)
+    out = Explanation(*(np.full(len(detections), -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)))
     for q in range(len(detections)):
         off = detections.velocity[q] - path_velocity
         off -= span * np.round(off / span)
@@ -118,8 +128,10 @@ def explain(detections: Detections, paths: PathSet, waveform: Waveform, passes: 
         )
         if near.size:
             strongest = near[np.argmax(power[near])]
-            kind[q], target[q] = paths.kind[strongest], paths.target[strongest]
-    return kind, target
+            out.kind[q], out.target[q], out.order[q] = paths.kind[strongest], paths.target[strongest], paths.bounces[strongest]
+            met = paths.faces[strongest][paths.faces[strongest] >= 0]
+            out.face[q] = met[0] if met.size else -1
+    return out
 
 
 @dataclass(frozen=True)

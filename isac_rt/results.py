@@ -84,7 +84,7 @@ class ObserverRecord:
     in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
-    detection_kind, detection_target : (Q,) what explains each detection: a `PathKind` or -1, a UAV index or -1
+    detection_kind, detection_target, detection_order, detection_face : (Q,) what explains each detection, as `metrics.Explanation` says
     symbols : what was sent to it and became of it
     num_false : detections that no path explains
     slips : symbols decided outside their alphabet
@@ -103,6 +103,8 @@ class ObserverRecord:
     state: int
     detection_kind: np.ndarray
     detection_target: np.ndarray
+    detection_order: np.ndarray
+    detection_face: np.ndarray
     symbols: SymbolCount = SymbolCount()
     num_false: int = 0
     slips: int = 0
@@ -367,6 +369,7 @@ class _Builder:
                 "range": d.range, "velocity": d.velocity, "u_x": d.direction[:, 0], "u_z": d.direction[:, 1], "snr": d.snr,
                 "range_std": d.std[:, 0], "velocity_std": d.std[:, 1], "u_x_std": d.std[:, 2], "u_z_std": d.std[:, 3],
                 "is_reference": d.is_reference, "kind": s.record.detection_kind, "target": s.record.detection_target,
+                "order": s.record.detection_order, "face": s.record.detection_face,
             }))  # fmt: skip
         self.ragged("det", "detection", rows, {
             "range": (float, "m", "range of the detection; one way at the AT, path length at a PT"),
@@ -380,6 +383,8 @@ class _Builder:
             "is_reference": (bool, _DIMENSIONLESS, "line of sight at a PT"),
             "kind": (np.int8, _DIMENSIONLESS, "kind of the path that explains it, -1: none"),
             "target": (np.int16, _DIMENSIONLESS, "index of the UAV that explains it, -1: none"),
+            "order": (np.int16, _DIMENSIONLESS, "interactions with the city of the path that explains it, 0: direct, -1: no path"),
+            "face": (np.int32, _DIMENSIONLESS, "first face of the city's mesh on the path that explains it, -1: none"),
         })  # fmt: skip
 
     def tracks(self) -> None:

@@ -499,8 +499,8 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
     direct = _direct_targets(paths, names)
     seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
     targets = [t for i in seen if (t := truth[i]) is not None]
-    kind, target = explain(reception.detections, paths, setup.waveform, observer.passes)
-    observer.score.add(targets, reception.detections, heard.tracks, kind)
+    explained = explain(reception.detections, paths, setup.waveform, observer.passes)
+    observer.score.add(targets, reception.detections, heard.tracks, explained.kind)
     d, t = reception.detections, heard.tracks
     detected = np.column_stack([d.range, d.velocity, d.direction])
     tracked = np.column_stack([t.range, t.velocity, t.direction])
@@ -525,10 +525,9 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
             id=t.ids, range=t.range, velocity=t.velocity, u_x=t.direction[:, 0], u_z=t.direction[:, 1], confirmed=t.confirmed, uav=followed
         ),
         state=heard.state,
-        detection_kind=kind,
-        detection_target=target,
+        **{f"detection_{name}": value for name, value in explained._asdict().items()},
         symbols=count_symbols(frame.sent[tx].payload, reception, observer.groups) if observer.passes == 1 else SymbolCount(),
-        num_false=int((stray & (kind < 0)).sum()),
+        num_false=int((stray & (explained.kind < 0)).sum()),
         slips=int(((raw < 0) | (raw >= setup.waveform.num_delay_symbols)).sum()),
         reference_snr=_reference_snr(setup, frame, paths),
     )

@@ -95,7 +95,8 @@ def test_association_is_one_to_one_and_gated():
 
 
 def test_explain_takes_the_strongest_near_path():
-    """Strongest within a cell, velocity modulo the unambiguous span, -1 where none is near; planted bug: the nearest path."""
+    """Strongest within a cell, velocity modulo the unambiguous span, -1 where none is near; planted bug: the nearest path.
+    The face is the first that the path meets, whether a UAV's point comes before it or not; planted bug: the first column of the faces."""
     passes, span = 2, 2 * WAVEFORM.max_velocity(2)
     delays = np.array([20.0, 20.2, 33.0, 47.0]) * passes / SPEED_OF_LIGHT
     rates = np.array([1.0, 1.1, span + 3.0, 0.0]) * passes / SPEED_OF_LIGHT
@@ -107,15 +108,19 @@ def test_explain_takes_the_strongest_near_path():
         arrival=np.tile([0.0, 1.0, 0.0], (4, 1)),
         kind=np.array([PathKind.TARGET, PathKind.SPECULAR, PathKind.GHOST, PathKind.DIFFUSE]),
         target=np.array([0, -1, 2, -1]),
+        bounces=np.array([0, 1, 2, 1]),
+        faces=np.array([[-1, -1, -1], [41, -1, -1], [-1, 17, 5], [8, -1, -1]]),
+        points=np.zeros((4, 3, 3)),
         epoch=0.1,
         tx="AT",
         rx="AT",
         target_names=("a", "b", "c"),
     )
     found = detections([[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]])
-    kind, target = explain(found, paths, WAVEFORM, passes)
+    kind, target, order, face = explain(found, paths, WAVEFORM, passes)
     assert kind.tolist() == [PathKind.SPECULAR, PathKind.GHOST, -1, PathKind.TARGET]
     assert target.tolist() == [-1, 2, -1, 0]
+    assert order.tolist() == [1, 2, -1, 0] and face.tolist() == [41, 17, -1, -1]
 
 
 def reception(payload, delay, transitions, bits, decoded=True) -> Reception:

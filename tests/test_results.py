@@ -77,6 +77,7 @@ def test_what_was_recorded_is_found_by_name(run):
     assert np.array_equal(d.det_range.values[of], o.reception.detections.range)
     assert d.symbol_errors.values[3, here["observer"]].tolist() == [30, 90, 180] and d.symbol_erased.values[3, here["observer"], 1] == 45
     assert d.det_kind.values[of].tolist() == [1, 3, -1]
+    assert d.det_order.values[of].tolist() == [0, 1, -1] and d.det_face.values[of].tolist() == [-1, 70123, -1]
     for k, kind in enumerate(KINDS):
         assert d.path_count.sel(kind=kind).values[4, here["observer"]] == (o.paths.kind == k).sum()
     assert set(d.path_frame.values) == {2}
