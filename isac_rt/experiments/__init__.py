@@ -25,6 +25,7 @@ TITLES = {
     "fig14": "Hit rate against the baselines (Fig. 14)",
     "clutter": "Gaussian, Rayleigh and geometric clutter side by side",
     "detectors": "Detectors in the clutter of a city's mesh",
+    "ghosts": "Ghost tracks in a street and a geometric test of them",
     "claims": "Claims of the text that have no figure",
 }
 

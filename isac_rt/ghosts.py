@@ -1,0 +1,153 @@
+"""Which tracks of a terminal are ghosts, by geometry: the terminal knows its own pose and the city's mesh, and nothing of the truth.
+
+A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is enough to make it suspect:
+
+- Is it one of the echoes that a nearer track must have over one wall? There (straight) and back (over the wall), the reverse, or both over
+  the wall: their ranges, rates and directions follow from the source's state and the wall's plane. An echo over a wall is always longer
+  than the direct one, and so weaker; being farther stands here for being weaker.
+- Does it lie behind a surface of the mesh? No UAV there could be seen straight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isac_rt.city.mesh import City
+from isac_rt.swarm import Pose
+from isac_rt.tracking import TrackSet
+
+SMALLEST_WALL = 20.0
+"""Area of a plane's faces together [m^2] below which it is not taken for a mirror."""
+DEVIATIONS = 3.0
+"""How many standard deviations a track may be off."""
+RESOLUTION_SHARE = 0.5
+"""Share of the resolution that it may be off besides: echoes that share a cell pull each other's estimates."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """A mesh as a terminal uses it, in world coordinates."""
+
+    city: City
+
+    @cached_property
+    def mirrors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Largest face (W,), unit normal (W, 3) and offset n.x (W,) [m] of the planes of `SMALLEST_WALL` and more."""
+        plane, areas = self.city.plane_of_face, self.city.areas
+        total = np.bincount(plane, weights=areas)
+        members = [np.flatnonzero(plane == p) for p in np.flatnonzero(total >= SMALLEST_WALL)]
+        faces = np.array([m[np.argmax(areas[m])] for m in members], int)
+        normals = self.city.normals[faces]
+        return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
+
+    def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Faces (n,) that the open segment between two points (3,) crosses."""
+        a, b, c = np.moveaxis(self.city.corners, 1, 0)
+        start, span = start - self.city.origin, end - start
+        normal = np.cross(b - a, c - a)
+        slope = normal @ span
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (normal * (a - start)).sum(1) / slope
+            point = start + share[:, None] * span
+            inside = [(np.cross(q - p, point - p) * normal).sum(1) >= 0 for p, q in ((a, b), (b, c), (c, a))]
+        return np.flatnonzero((slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside))
+
+    def reflects(self, face: int, start: np.ndarray, end: np.ndarray) -> bool:
+        """Whether the segment from a mirror image to an end (3,) goes through one of the faces in the face's plane."""
+        plane = self.city.plane_of_face
+        return bool((plane[self.blocking(start, end)] == plane[face]).any())
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """What the test says of K tracks.
+
+    Attributes
+    ----------
+    mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1: none does
+    source : (K,) int64 id of that nearer track, -1: none
+    order : (K,) int8 bounces off that wall: 1 on one of the two ways, 2 on both, 0: none
+    behind : (K,) int32 face that hides the place of the track, -1: it is in sight
+    """
+
+    mirrored: np.ndarray
+    source: np.ndarray
+    order: np.ndarray
+    behind: np.ndarray
+
+    @property
+    def suspect(self) -> np.ndarray:
+        """(K,) bool"""
+        return (self.mirrored >= 0) | (self.behind >= 0)
+
+
+def suspicion(tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, velocity_period: float) -> Suspicion:
+    """Hold the tracks of an active terminal (its own echoes) against the mesh.
+
+    Parameters
+    ----------
+    tracks : TrackSet of the active terminal
+    own : its pose
+    walls : the mesh
+    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `metrics.resolutions`
+    velocity_period : span of velocities that the Doppler tells apart [m/s]
+    """
+    count = len(tracks)
+    out = Suspicion(np.full(count, -1, np.int32), np.full(count, -1), np.zeros(count, np.int8), np.full(count, -1, np.int32))
+    measured = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
+    for k in range(count):
+        out.behind[k] = _hidden_by(tracks.mean[k, :3], tracks.covariance[k, :3, :3], own, walls, resolution[0])
+    for s in np.flatnonzero(tracks.confirmed & (out.behind < 0)):
+        for face, order, echo in echoes(tracks.mean[s], own, walls):
+            off = measured - echo
+            off[:, 1] -= velocity_period * np.round(off[:, 1] / velocity_period)
+            allowed = DEVIATIONS * np.hypot(tracks.std, tracks.std[s]) + RESOLUTION_SHARE * resolution
+            hit = (np.abs(off) <= allowed).all(axis=1) & (tracks.range > tracks.range[s]) & (out.mirrored < 0)
+            out.mirrored[hit], out.source[hit], out.order[hit] = face, tracks.ids[s], order
+    return out
+
+
+def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, np.ndarray]]:
+    """What a body shows of itself over each single wall: (face, order, (4,) range, range rate, u_x, u_z).
+
+    `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on both ways the echo is the image's. Over it
+    on one way two equal waves arrive, from the body and from the image, at the mean of the two ranges; where the virtual array, which adds
+    the phases of both ways, points then is left open: at the body, at the image or midway.
+    """
+    position, velocity = state[:3] + own.position, state[3:] + own.velocity
+    faces, normals, offsets = walls.mirrors
+    out = []
+    direct = _leg(position, velocity, own)
+    for face, n, d in zip(faces.tolist(), normals, offsets, strict=True):
+        if (n @ position - d) * (n @ own.position - d) <= 0:
+            continue  # the wall stands between the two
+        image = position - 2 * (n @ position - d) * n
+        if not walls.reflects(face, own.position, image):
+            continue
+        mirrored = _leg(image, velocity - 2 * (n @ velocity) * n, own)
+        middle = (direct + mirrored) / 2
+        out += [(face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)]
+        out += [(face, 2, mirrored)]
+    return out
+
+
+def _leg(position: np.ndarray, velocity: np.ndarray, own: Pose) -> np.ndarray:
+    """(4,) distance, its rate, u_x and u_z."""
+    offset = position - own.position
+    distance = np.linalg.norm(offset)
+    body = own.to_body(offset / distance)
+    return np.array([distance, offset @ (velocity - own.velocity) / distance, body[0], body[2]])
+
+
+def _hidden_by(place: np.ndarray, covariance: np.ndarray, own: Pose, walls: Walls, range_resolution: float) -> int:
+    """The face that a place, relative to the terminal, lies behind by more than it may be off; -1: none."""
+    for face in walls.blocking(own.position, own.position + place):
+        n = walls.city.normals[face]
+        origin = walls.city.plane_offsets[face] + n @ walls.city.origin
+        depth = abs(n @ (own.position + place) - origin)
+        if depth > DEVIATIONS * np.sqrt(n @ covariance @ n) + RESOLUTION_SHARE * range_resolution:
+            return int(face)
+    return -1

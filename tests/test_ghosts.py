@@ -1,0 +1,154 @@
+"""The geometric ghost test: echoes over walls against shortest ways, places behind walls against trimesh, tracks by what explains them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+
+from isac_rt.city.mesh import City
+from isac_rt.experiments.ghosts import explained_tracks, run, verdicts, whole_tracks
+from isac_rt.ghosts import Walls, echoes, suspicion
+from isac_rt.swarm import Pose
+from isac_rt.tracking import Gaussian, Track, track_set
+
+ORIGIN = np.array([310.7, -120.3, 41.9])
+RESOLUTION = np.array([0.25, 0.249, 0.108, 0.108])
+PERIOD = 28.6
+WALL_X = 11.3
+"""The wall's plane x = 11.3 m in local coordinates; it stands from y = 2 to 40 and z = -6 to 13."""
+OWN = Pose(ORIGIN + [1.7, -3.1, 4.2], np.array([0.6, 5.1, -0.2]), np.zeros(3), np.eye(3))
+BODY = np.array([4.6, 24.7, 6.9, -1.3, -2.2, 0.4])
+"""Local position and velocity of a body before the wall."""
+
+
+def wall() -> City:
+    corners = np.array([[WALL_X, 2.0, -6.0], [WALL_X, 40.0, -6.0], [WALL_X, 40.0, 13.0], [WALL_X, 2.0, 13.0]])
+    return City("wall", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (), ORIGIN.copy())
+
+
+def track(number: int, place: np.ndarray, velocity: np.ndarray) -> Track:
+    """A confirmed track at a local place, known to a few centimetres and decimetres per second."""
+    state = Gaussian(np.concatenate([place + ORIGIN, velocity]), np.diag([4e-4] * 3 + [1e-2] * 3))
+    return Track(number, state, 50.0, confirmed=True)
+
+
+def length(start: np.ndarray, end: np.ndarray, over_wall: bool) -> float:
+    """Way between two points, local; over the wall by least time: the shortest of all ways that touch its plane, found numerically."""
+    if not over_wall:
+        return float(np.linalg.norm(end - start))
+    from scipy.optimize import minimize
+
+    def way(yz: np.ndarray) -> float:
+        touch = np.array([WALL_X, *yz])
+        return float(np.linalg.norm(touch - start) + np.linalg.norm(end - touch))
+
+    return float(minimize(way, (start[1:] + end[1:]) / 2, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 4000}).fun)
+
+
+def test_echoes_over_a_wall_are_the_shortest_ways_that_touch_it():
+    """Range and rate of orders 1 and 2 against ways found by minimising their length (1e-8 m: the minimiser's),
+    rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step). Planted bugs: the image's velocity not mirrored; the origin left out of the plane."""
+    state = BODY - np.concatenate([OWN.position - ORIGIN, OWN.velocity])
+    found = echoes(state, OWN, Walls(wall()))
+    assert [order for _, order, _ in found] == [1, 1, 1, 2]
+    h = 1e-3
+
+    def ranges(t: float) -> dict[int, float]:
+        own, body = OWN.position - ORIGIN + t * OWN.velocity, BODY[:3] + t * BODY[3:]
+        over, straight = length(own, body, True), length(own, body, False)
+        return {1: (over + straight) / 2, 2: over}
+
+    now, before, after = ranges(0.0), ranges(-h), ranges(h)
+    for _, order, echo in found:
+        assert echo[0] == pytest.approx(now[order], abs=1e-8)
+        assert echo[1] == pytest.approx((after[order] - before[order]) / (2 * h), abs=1e-3)
+
+
+def test_no_echo_where_the_wall_ends_or_stands_between():
+    """The mirror point of a body at y = -20 lies at y < 2, off the wall; a body behind the wall has no echo over it.
+    Planted bug: the plane taken for endless."""
+    own = np.concatenate([OWN.position - ORIGIN, OWN.velocity])
+    assert echoes(np.array([4.6, -20.0, 6.9, 0, 0, 0]) - own, OWN, Walls(wall())) == []
+    assert echoes(np.array([15.0, 24.7, 6.9, 0, 0, 0]) - own, OWN, Walls(wall())) == []
+
+
+def test_blocked_segments_are_those_of_trimesh():
+    """300 random segments against trimesh's ray caster. Planted bug: the segment taken for an endless ray."""
+    city, rng = wall(), np.random.default_rng(7)
+    mesh = trimesh.Trimesh(city.vertices, city.faces, process=False)
+    starts, ends = rng.uniform([-5, -10, -10], [20, 50, 20], (2, 300, 3))
+    for a, b in zip(starts, ends, strict=True):
+        places, _, _ = mesh.ray.intersects_location([a], [b - a])
+        expected = any(np.linalg.norm(p - a) < np.linalg.norm(b - a) for p in places)
+        assert bool(Walls(city).blocking(a + ORIGIN, b + ORIGIN).size) is expected
+
+
+def test_ghosts_are_suspected_and_bodies_are_not():
+    """A body, its image behind the wall, an echo over one way seen in the body's own direction (so before the wall), and another body
+    of the same range and rate as that echo but elsewhere. Planted bugs: directions not compared; only the image looked for."""
+    body, own = BODY[:3], OWN.position - ORIGIN
+    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    image_velocity = BODY[3:] * [-1, 1, 1]
+    mean = (np.linalg.norm(body - own) + np.linalg.norm(image - own)) / 2
+    ahead = (body - own) / np.linalg.norm(body - own)
+    half = own + mean * ahead
+    rates = [float((p - own) / np.linalg.norm(p - own) @ (v - OWN.velocity)) for p, v in ((body, BODY[3:]), (image, image_velocity))]
+    half_velocity = OWN.velocity + ahead * np.mean(rates)
+    aside = np.array([-0.6, 0.8, 0.0])
+    beside, beside_velocity = own + mean * aside, OWN.velocity + aside * np.mean(rates)
+    tracks = [track(3, body, BODY[3:]), track(5, image, image_velocity), track(6, half, half_velocity), track(8, beside, beside_velocity)]
+    found = suspicion(track_set(tracks, OWN), OWN, Walls(wall()), RESOLUTION, PERIOD)
+    assert found.suspect.tolist() == [False, True, True, False]
+    assert found.order.tolist() == [0, 2, 1, 0] and found.source.tolist() == [-1, 3, 3, -1]
+    assert (found.behind >= 0).tolist() == [False, True, False, False]
+    alone = suspicion(track_set(tracks[2:], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD)
+    assert not alone.suspect.any()
+
+
+def test_a_place_just_behind_a_wall_is_in_doubt_as_far_as_it_is_unsure():
+    """0.4 m behind the wall with 2 cm of deviation: suspect; with 30 cm, not. Planted bug: the deviation left out."""
+    behind = track(1, np.array([WALL_X + 0.4, 24.0, 5.0]), np.zeros(3))
+    unsure = replace(behind, state=Gaussian(behind.state.mean, np.diag([0.09] * 3 + [1e-2] * 3)))
+    for one, expected in ((behind, True), (unsure, False)):
+        assert suspicion(track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD).suspect.tolist() == [expected]
+
+
+def test_tracks_are_counted_by_what_explains_them():
+    """A UAV's track, two ghosts of which the test sees one, and one of a wall: 2 of 4 without the test, 1 of 3 with it. Planted bug:
+    the rate with the test over all tracks."""
+    rows = []
+    for number, (uav, kind, order, suspect) in enumerate([(2, 1, 0, False), (-1, 2, 1, True), (-1, 2, 2, False), (-1, 3, 1, False)]):
+        rows += [(f, 0, number, uav, kind, order, 7 + number, suspect) for f in range(4)]
+    rows.append((4, 0, 1, -1, -1, -1, -1, False))
+    tracks = whole_tracks(pd.DataFrame(rows, columns=["frame", "observer", "id", "uav", "kind", "order", "face", "suspect"]))
+    assert tracks.what.tolist() == ["uav", "ghost", "ghost", "other"]
+    assert tracks.order.tolist() == [-1, 1, 2, -1] and tracks.face.tolist() == [-1, 8, 9, -1]
+    said = verdicts(tracks)[1].finding
+    assert "(2 of 4)" in said and "(1 of 3)" in said and "(0 of 1)" in said
+
+
+def test_a_track_has_its_own_detections_explanation():
+    """The fake run's track lies on the first detection of PT1 and of the AT, a UAV's echo. Planted bug: detections of another observer."""
+    from fake_run import fake_run
+
+    d = fake_run().dataset
+    rows = explained_tracks(d, np.array([40.0, 40.0, 1, 1]), 1e6)
+    assert len(rows) == d.track_id.size
+    for row in rows.itertuples():
+        mine = (d.det_frame.values == row.frame) & (d.det_observer.values == row.observer)
+        off = np.hypot(d.det_range.values[mine] - d.track_range.values[row.Index],
+                       d.det_velocity.values[mine] - d.track_velocity.values[row.Index])  # fmt: skip
+        assert row.kind == d.det_kind.values[mine][np.argmin(off)]
+
+
+@pytest.mark.slow
+def test_the_street_has_ghosts_and_the_test_finds_them():
+    """Three flights: every ghost track has a wall and an order, most are suspect, and no UAV's track is lost."""
+    tracks = run(True, 20260, lambda _done, _all: None).tables["tracks"]
+    ghosts = tracks[tracks.what == "ghost"]
+    assert len(ghosts) and (ghosts.order > 0).all() and (ghosts.face >= 0).all()
+    assert ghosts.suspect.mean() > 0.5 and not tracks[tracks.what == "uav"].suspect.any()
