@@ -117,11 +117,12 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
             error = [max(row["error"] or 0.0, 1e-8) for row in rows]
             marker = "*" if oracle else "o"
             (line,) = right.loglog([r["size"] for r in rows], cost, marker=marker, label=f"{method} ({unit})" if unit else method)
-            if not oracle or max(error) > 1e-8:
+            if rows[0]["error"] is not None and (not oracle or max(error) > 1e-8):
                 left.loglog(error, cost, ls="none", marker=marker, color=line.get_color())
         for axis in (left, right):
             axis.axhline(1.0, color="k", lw=1, ls=":")
             axis.set_ylabel("cost [floors]")
+            _whole_decades(axis)
         left.set_xlabel("error (1e-8 and less at the edge)")
         right.set_xlabel("size")
         right.legend(fontsize=6)
@@ -129,3 +130,13 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
         canvas.savefig(file, dpi=130)
         plt.close(canvas)
     return file
+
+
+def _whole_decades(axis: Any) -> None:
+    """Limits at powers of ten with labels there only, so that neighbours do not look far apart nor labels run into each other."""
+    from matplotlib.ticker import NullFormatter
+
+    axis.set_xscale("log")
+    for one, limits, move in ((axis.xaxis, axis.get_xlim(), axis.set_xlim), (axis.yaxis, axis.get_ylim(), axis.set_ylim)):
+        move(10 ** np.floor(np.log10(limits[0])), 10 ** np.ceil(np.log10(limits[1])))
+        one.set_minor_formatter(NullFormatter())

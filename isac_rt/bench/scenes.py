@@ -34,3 +34,10 @@ def town(uavs: int = 3, blocks: int = 2, frames: int = 9, **changes: Any) -> Sce
         "accuracy": {"max_untraced_m": 1e6},
     } | changes  # fmt: skip
     return Scenario.model_validate(tree)
+
+
+def alone(**changes: Any) -> Scenario:
+    """The active terminal of `town` with nothing else in the air."""
+    s = town(2, **changes)
+    tree = s.model_dump(mode="json", exclude_unset=True)
+    return Scenario.model_validate(tree | {"swarm": {"AT": tree["swarm"]["AT"]}})
