@@ -108,7 +108,7 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
     import matplotlib.pyplot as plt
 
     with plt.rc_context({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3}):
-        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), layout="constrained")
+        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 4.4), layout="constrained")
         for (of_kind, method, unit), rows in curves(found["rows"]).items():
             if of_kind != kind:
                 continue
@@ -125,7 +125,7 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
             _whole_decades(axis)
         left.set_xlabel("error (1e-8 and less at the edge)")
         right.set_xlabel("size")
-        right.legend(fontsize=6)
+        canvas.legend(fontsize=6.5, loc="outside lower center", ncols=3)
         canvas.suptitle(f"{kind}: {found['machine']['processor']}; star: oracle; dotted: floor")
         canvas.savefig(file, dpi=130)
         plt.close(canvas)
