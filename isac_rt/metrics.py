@@ -5,7 +5,7 @@ The only module besides the simulation itself that knows the truth; no receiver 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -357,8 +357,3 @@ def binomial_interval(successes: float, trials: float, confidence: float = 0.95)
     low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
     high = float(beta.ppf(1 - tail, successes + 1, trials - successes)) if successes < trials else 1.0
     return low, high
-
-
-def total_symbols(counts: Iterable[SymbolCount]) -> SymbolCount:
-    """Pool the frames of a link or the links of a terminal."""
-    return sum(counts, SymbolCount())

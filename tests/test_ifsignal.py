@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import mixed_chirps
 
 from isac_rt.arrays import Antennas, pseudo_random_schedule
 from isac_rt.gridding import GRIDDED_ERROR
@@ -15,7 +16,6 @@ from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.swarm import Pose, attitude
 from isac_rt.synthesis import exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
-from oracles import mixed_chirps
 
 C = SPEED_OF_LIGHT
 START = 3.217

@@ -21,7 +21,6 @@ from isac_rt.metrics import (
     gospa,
     resolutions,
     summary_block,
-    total_symbols,
     truth_of,
 )
 from isac_rt.payload import random_payload, unmodulated
@@ -154,7 +153,7 @@ def test_symbol_counts():
     assert lost == SymbolCount(24, 24, 24, 18, 18, 18, p.bits.size, p.bits.size, 0, 1)
     pilot = unmodulated(SMALL)
     assert count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False)) == SymbolCount()
-    block = summary_block("passive", SensingScore(RESOLUTION), total_symbols([one, lost]), duration=0.1)
+    block = summary_block("passive", SensingScore(RESOLUTION), one + lost, duration=0.1)
     assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(21 / 36)
     assert block["ber"] == pytest.approx((4 + p.bits.size) / (2 * p.bits.size))
     assert block["erased"] == pytest.approx((1 + 24 + 18) / 84)

@@ -9,7 +9,7 @@ from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
-from isac_rt.propagation.pathset import PathKind, drop_weak, make_paths
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario import Rcs, Uav
 from isac_rt.swarm import Pose, attitude
@@ -452,13 +452,3 @@ def test_free_space_is_reciprocal_and_knows_no_place():
         for name in names:
             assert getattr(other, name) == near(getattr(here, name), 1e-10)
     assert back.departure == pytest.approx(here.arrival, abs=1e-13)
-
-
-def test_weak_paths_of_the_city_are_dropped_and_no_others():
-    kinds = list(PathKind)
-    u = directions(len(kinds))
-    paths = make_paths(
-        gain=np.full(len(kinds), 1e-6), delay=np.arange(len(kinds)) * 1e-8, departure=u, arrival=u, kind=kinds, epoch=0.0, tx="A", rx="A"
-    )
-    assert set(drop_weak(paths, 1.1e-12).kind) == {PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE}
-    assert len(drop_weak(paths, 0.9e-12)) == len(kinds)

@@ -9,13 +9,14 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import stats
 
+from isac_rt.arrays import conventional_schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive import receive_active
 from isac_rt.receive.cfar import (
-    detect_chirps,
     background,
     detect,
+    detect_chirps,
     greatest_of_factor,
     hann_envelope,
     independent_cells,
@@ -24,7 +25,7 @@ from isac_rt.receive.cfar import (
     threshold,
     without_sidelobes,
 )
-from isac_rt.receive.common import sense, use_omp
+from isac_rt.receive.common import sense, velocity_method
 from isac_rt.receive.doppler import accumulate, channel_maps, correlation_operator, omp, slow_times, slow_window, union_operator
 from isac_rt.receive.estimate import (
     LocalSpectra,
@@ -121,10 +122,11 @@ def test_omp_recovers_three_tones_beyond_the_unambiguous_velocity_of_one_antenna
 
 def test_method_follows_the_schedule():
     _, schedule, _ = frame()
-    assert not use_omp(SETTINGS, schedule, 3)
-    assert use_omp(SETTINGS, schedule[:2], 3)
-    assert use_omp(Receivers(velocity_method="omp"), schedule, 3)
-    assert not use_omp(Receivers(velocity_method="latin_union"), schedule, 3)
+    assert velocity_method(SETTINGS, schedule, 3) == "latin_union"
+    assert velocity_method(SETTINGS, schedule[:2], 3) == "omp"
+    assert velocity_method(SETTINGS, conventional_schedule(2, 120, 3), 3) == "conventional"
+    assert velocity_method(Receivers(velocity_method="omp"), schedule, 3) == "omp"
+    assert velocity_method(Receivers(velocity_method="latin_union"), schedule[:2], 3) == "latin_union"
 
 
 # --- CFAR

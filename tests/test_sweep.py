@@ -21,7 +21,7 @@ from isac_rt.metrics import binomial_interval
 from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.scenario_file import ScenarioError, load
 from isac_rt.simulate import prepare, summarise
-from isac_rt.sweep import Outcomes, assemble, load_sweep, open_sweep, run_sweep, status
+from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, status
 from isac_rt.sweep.execute import Job, run_job
 
 ROOT = Path(__file__).parents[1]

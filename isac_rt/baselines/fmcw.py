@@ -17,6 +17,7 @@ from isac_rt.arrays import Antennas, Schedule, conventional_schedule
 from isac_rt.baselines.tdm import sense_tdm
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload, unmodulated
+from isac_rt.receive.cfar import first_row
 from isac_rt.receive.estimate import to_delay
 from isac_rt.receive.types import Detections
 from isac_rt.scenario import Receivers
@@ -39,7 +40,7 @@ def receive_fmcw(cube: IFCube, antennas: Antennas, settings: Receivers) -> Detec
     w, schedule = cube.waveform, np.asarray(cube.schedule[0])
     if not np.array_equal(schedule[: -w.num_tx], schedule[w.num_tx :]):
         raise ValueError("receive_fmcw needs antennas in turn (fmcw_frame); this schedule is pseudo-random")
-    first = int(np.ceil(settings.min_range_m / w.range_cell(2)))
+    first = first_row(settings, w.range_cell(2))
     times = np.arange(w.num_chirps) * w.slot_duration
     spectra = fmcw_spectra(cube.samples[0])
     return sense_tdm(spectra, schedule, times, lambda cell, bin_: to_delay(cell, bin_, w), w, antennas, settings, first)

@@ -33,6 +33,7 @@ from scipy import stats
 
 from isac_rt.arrays import Antennas
 from isac_rt.baselines.tdm import sense_tdm
+from isac_rt.receive.cfar import first_row
 from isac_rt.receive.types import Detections
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -211,7 +212,7 @@ def receive_loradar(
     """Range (one way), velocity and direction of the echoes of a terminal's own symbols."""
     w = system.waveform
     spectra, times = loradar_spectra(frame, system, compensation)
-    first = int(np.ceil(settings.min_range_m / system.range_cell))
+    first = first_row(settings, system.range_cell)
     return sense_tdm(spectra, frame.schedule, times, partial(loradar_delay, system), w, antennas, settings, first)
 
 

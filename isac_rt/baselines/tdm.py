@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from isac_rt.arrays import Antennas
-from isac_rt.receive.cfar import detect, peaks, without_sidelobes
+from isac_rt.receive.cfar import detect, strongest_peaks
 from isac_rt.receive.common import describe
 from isac_rt.receive.doppler import accumulate
 from isac_rt.receive.estimate import Estimate
@@ -72,9 +72,7 @@ def sense_tdm(
     looks = antennas.num_tx * antennas.num_rx
     above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
     above[:first_row] = False
-    rows, columns = peaks(power, above, settings.cluster_cells)
-    keep = without_sidelobes(rows, columns, power, power.shape[1], SIDELOBES)
-    rows, columns = rows[keep][: settings.max_detections], columns[keep][: settings.max_detections]
+    rows, columns = strongest_peaks(power, above, settings, SIDELOBES)
     estimates = [estimate_tdm(maps, power, int(r), int(c), schedule, times, convert, w) for r, c in zip(rows, columns, strict=True)]
     return describe(estimates, power[rows, columns] / level[rows, columns], antennas, w, 2)
 

@@ -7,14 +7,13 @@ there and not the very points that scatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
-from isac_rt.propagation.pathset import PathSet
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose
 from isac_rt.waveform import Waveform
@@ -46,28 +45,6 @@ class ExpectedClutter:
     def select(self, which: np.ndarray) -> ExpectedClutter:
         """The scatterers that a mask or an index array chooses."""
         return ExpectedClutter(*(a[which] for a in vars(self).values()))
-
-    def louder(self, decibels: float) -> ExpectedClutter:
-        """The same clutter with all powers raised."""
-        return replace(self, power=self.power * 10 ** (decibels / 10))
-
-
-def expected_of(paths: PathSet, amplitude: float, start: Pose, end: Pose) -> ExpectedClutter:
-    """Paths as independent scatterers, each with its own power as the mean.
-
-    Parameters
-    ----------
-    paths : of the city alone, at the epoch of the frame
-    amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
-    start, end : poses of transmitter and receiver
-    """
-    return ExpectedClutter(
-        paths.delay,
-        paths.delay_rate,
-        amplitude**2 * paths.power,
-        start.to_body(paths.departure),
-        end.to_body(paths.arrival),
-    )
 
 
 def joined(parts: list[ExpectedClutter]) -> ExpectedClutter:

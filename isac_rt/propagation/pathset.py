@@ -178,9 +178,3 @@ def merge(parts: list[PathSet]) -> PathSet:
         if isinstance(values[0], np.ndarray):
             stacked[f.name] = np.concatenate(values)
     return replace(first, **stacked)
-
-
-def drop_weak(paths: PathSet, floor: float) -> PathSet:
-    """Leave out paths of the city and ghosts whose |gain|^2 is under `floor`; line of sight, echoes and leakage always stay."""
-    always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
-    return paths.select(always | (paths.power >= floor))

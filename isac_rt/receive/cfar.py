@@ -12,6 +12,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage, optimize, stats
 
+from isac_rt.scenario import Receivers
+
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 """Correlation of the powers of cells one and two apart along a Hann-windowed axis."""
 
@@ -182,6 +184,18 @@ def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple
     rows, bins = np.nonzero(above & (power == largest))
     order = np.argsort(-power[rows, bins], kind="stable")
     return rows[order], bins[order]
+
+
+def strongest_peaks(power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float) -> tuple[np.ndarray, np.ndarray]:
+    """(row, bin) of the peaks that are no sidelobes of a stronger one (`without_sidelobes`), at most `max_detections`."""
+    rows, bins = peaks(power, above, settings.cluster_cells)
+    keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[: settings.max_detections]
+    return rows[keep], bins[keep]
+
+
+def first_row(settings: Receivers, range_cell: float) -> int:
+    """Row of a map in which the search begins; `range_cell` in metres."""
+    return int(np.ceil(settings.min_range_m / range_cell))
 
 
 def hann_envelope(distance: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import scipy.fft
 
 from isac_rt.arrays import Antennas, Schedule, is_latin
 from isac_rt.ifsignal import IFCube
-from isac_rt.receive.cfar import detect, detect_chirps, peaks, without_sidelobes
+from isac_rt.receive.cfar import detect, detect_chirps, first_row, strongest_peaks
 from isac_rt.receive.doppler import (
     UNION_FLOOR,
     accumulate,
@@ -50,11 +50,6 @@ class Sensed:
     sparse: bool | None = None
 
 
-def use_omp(settings: Receivers, schedule: Schedule, num_tx: int) -> bool:
-    """Whether the method is OMP."""
-    return velocity_method(settings, schedule, num_tx) == "omp"
-
-
 def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Literal["omp", "pursuit", "latin_union", "conventional"]:
     """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT where its chirps are equally
     spaced, as in a conventional schedule; OMP elsewhere."""
@@ -92,7 +87,7 @@ def sense(
         power = accumulate(channel_maps(spectra, w, schedule, delay_symbols))
     looks = num_looks(settings, schedule, antennas)
     above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
-    above[: int(np.ceil(settings.min_range_m / w.range_cell(passes)))] = False
+    above[: first_row(settings, w.range_cell(passes))] = False
     sparse = None
     if conventional:
         above[:, ~own_bins(w)] = False
@@ -100,9 +95,7 @@ def sense(
         noise = float(np.median(power)) / window_gain(w, schedule)
         sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, w, schedule)
         above &= _confirmed_by_omp(spectra, above, level, w, schedule)
-    rows, bins = peaks(power, above, settings.cluster_cells)
-    keep = without_sidelobes(rows, bins, power, w.num_chirps, UNION_FLOOR)
-    rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
+    rows, bins = strongest_peaks(power, above, settings, UNION_FLOOR)
     estimates = []
     for row, column in zip(rows, bins, strict=True):
         local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row), separate=conventional)

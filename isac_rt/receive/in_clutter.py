@@ -10,7 +10,7 @@ import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
 from isac_rt.propagation.expected import ExpectedClutter
-from isac_rt.receive.cfar import peaks, without_sidelobes
+from isac_rt.receive.cfar import first_row, strongest_peaks
 from isac_rt.receive.clutter_map import joint_channels, steering
 from isac_rt.receive.common import Sensed, describe
 from isac_rt.receive.detectors import judge
@@ -48,10 +48,8 @@ def sense_in_clutter(
     power = accumulate(maps)
     judged = judge([maps], w, antennas, schedule, delay_symbols, settings, clutter)[0]
     ratio = judged.ratio.copy()
-    ratio[: int(np.ceil(settings.min_range_m / w.range_cell(2)))] = 0
-    rows, bins = peaks(ratio, ratio > 1, settings.cluster_cells)
-    keep = without_sidelobes(rows, bins, ratio, w.num_chirps, UNION_FLOOR)
-    rows, bins = rows[keep][: settings.max_detections], bins[keep][: settings.max_detections]
+    ratio[: first_row(settings, w.range_cell(2))] = 0
+    rows, bins = strongest_peaks(ratio, ratio > 1, settings, UNION_FLOOR)
     found, towards = [], judged.cosines[rows, bins]
     for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
         kind = BeamSpectra if np.isfinite(cosines).all() else LocalSpectra

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import detect, first_row
 from isac_rt.receive.doppler import accumulate, channel_maps
 from isac_rt.receive.estimate import (
     Estimate,
@@ -56,7 +56,7 @@ def pursue(
     passes : 2 for echoes, 1 at a PT
     """
     w, left = waveform, spectra.copy()
-    looks, first = antennas.num_tx * antennas.num_rx, int(np.ceil(settings.min_range_m / w.range_cell(passes)))
+    looks, first = antennas.num_tx * antennas.num_rx, first_row(settings, w.range_cell(passes))
     power = accumulate(channel_maps(left, w, schedule, delay_symbols))
     whole = power.copy()
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder

@@ -20,8 +20,6 @@ from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 START = 3.217
 ORIGIN = np.zeros((1, 3))
-PASSBAND = 1e-6
-"""Paths of these cases lie in the middle of the passband, where the filter is 1."""
 
 
 # ---- numbers of the frame
