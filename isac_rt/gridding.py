@@ -9,7 +9,8 @@ delay of each receive element need no second transform:
     z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
 
 with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the frequency sent tau earlier), c the
-mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa x). The narrowband model has theta_l = 0.
+mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa x). A cubic setting has a fourth set for x^3 - 3/5 x, of strength
+theta_l (jq - theta_l^2/6), and theta_l (1 - theta_l^2/10 + jq kappa) with x. The narrowband model has theta_l = 0.
 """
 
 from __future__ import annotations
@@ -36,25 +37,30 @@ class Setting:
     oversampling : grid points per sample, at least
     width : grid points per path, 2 to 16, even
     wideband : delays of the receive elements applied to the whole chirp (to second order), not to its middle alone
+    cubic : the third order in x too, of a wideband setting
     """
 
     oversampling: float
     width: int
     wideband: bool
+    cubic: bool = False
 
 
 DEFAULT = Setting(1.5, 6, True)
 """For runs: error below `GRIDDED_ERROR`."""
 GRIDDED_ERROR = 1e-4
 """Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see tests/test_ifsignal.py)."""
-ACCURATE = Setting(1.5, 8, True)
-"""Error below 2e-6 of the narrowband model (`wideband` off), 3e-5 of the full one at 15 m/s: the third order in x is missing."""
+ACCURATE = Setting(1.5, 8, True, True)
+"""Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square of the speed."""
+ACCURATE_ERROR = 5e-6
 _MANY = 4000  # paths that no longer stay in the second-level cache beside the grid; they are read once for several chirps
 _TOGETHER = 3
 _MARGIN = LANES  # rows beyond the grid
+_STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
 _FIELDS = 3  # float64 of a path before its transmit elements' delays
-_ONE, _HALF, _SIXTH = np.float32(1), np.float32(0.5), np.float32(1 / 6)
+_ONE, _HALF, _SIXTH, _TENTH = np.float32(1), np.float32(0.5), np.float32(1 / 6), np.float32(1 / 10)
 _SKEW = np.float32(4 / 15)  # x (x^2 - 1/3) is nearest to 4/15 x
+_MEAN_CUBE = 3 / 5  # and x^3 to 3/5 x
 _BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on the grid
 
 
@@ -63,13 +69,13 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
 
     A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2, weights such that
-    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c for the three sets, x = -N/2 .. N/2 scaled to
-    [-1, 1]. Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
+    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c, j (x^3 - 3/5 x) for the four sets, x = -N/2 .. N/2
+    scaled to [-1, 1]. Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
 
     Returns
     -------
     grid : G, number of grid frequencies
-    polynomials : (3, degree + 1, WIDTH) float32, highest power first
+    polynomials : (4, degree + 1, WIDTH) float32, highest power first
     deconvolution : (N,) float32, D at x = n - N//2
     """
     half, degree = num_samples // 2, width + 2
@@ -79,7 +85,8 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
     steps = np.arange(width) - (width - 1) / 2
     basis = np.exp(2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None]))
     scaled = x / half
-    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 - mean_square(num_samples) + 0j], axis=1)
+    skew = scaled**3 - _MEAN_CUBE * scaled
+    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 - mean_square(num_samples) + 0j, 1j * skew], axis=1)
     beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * width
     bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / width) ** 2, 0, None)))
     for _ in range(12):
@@ -87,7 +94,7 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
         deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
         fits = [_real_least_squares(deconvolution[:, None] * b, goals) for b in basis]
         bell = np.array([f[:, 0] for f in fits])
-    polynomials = np.array([np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(3)])
+    polynomials = np.array([np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(4)])
     return grid, polynomials.astype(np.float32), deconvolution[:num_samples].astype(np.float32)
 
 
@@ -143,8 +150,8 @@ def _gate(work, table, at, life, f, w, time, symbol):
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _weigh(work, scratch, poly, width, degree, wideband):
-    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the three sets as they are."""
+def _weigh(work, scratch, poly, width, degree, wideband, cubic):
+    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as they are."""
     r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
     set_size = (degree + 1) * width
     for j in range(width):
@@ -155,13 +162,18 @@ def _weigh(work, scratch, poly, width, degree, wideband):
             if wideband:
                 v1 = v1 * r + splat(poly[set_size + d * width + j])
         if wideband:
-            store(scratch, 48 * j, v0)
-            store(scratch, 48 * j + 16, v1)
-            store(scratch, 48 * j + 32, v2)
+            store(scratch, _STEP * j, v0)
+            store(scratch, _STEP * j + 16, v1)
+            store(scratch, _STEP * j + 32, v2)
         else:
             bent = q * v2
-            store(scratch, 48 * j, c * v0 - s * bent)
-            store(scratch, 48 * j + 16, s * v0 + c * bent)
+            store(scratch, _STEP * j, c * v0 - s * bent)
+            store(scratch, _STEP * j + 16, s * v0 + c * bent)
+        if cubic:
+            v3 = splat(poly[3 * set_size + j])
+            for d in range(1, degree + 1):
+                v3 = v3 * r + splat(poly[3 * set_size + d * width + j])
+            store(scratch, _STEP * j + 48, v3)
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
@@ -170,7 +182,7 @@ def _spread(grid, base, places, scratch, count, width, steer, k):
     for i in range(count):
         at = base + int(places[i]) * ROW
         ar, ai = load(steer, k), load(steer, k + 16)
-        for j in range(i, i + 48 * width, 48):
+        for j in range(i, i + _STEP * width, _STEP):
             c, s = splat(scratch[j]), splat(scratch[j + 16])
             store(grid, at, load(grid, at) + c * ar - s * ai)
             store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
@@ -178,27 +190,55 @@ def _spread(grid, base, places, scratch, count, width, steer, k):
         k += 32
 
 
+@njit(nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _centred(steer, work, i, k):
+    """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary), theta and q."""
+    ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
+    c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
+    pr, pi = c * ar - s * ai, c * ai + s * ar
+    square = late * late
+    cosine, sine = splat(_ONE) - square * splat(_HALF), late - late * square * splat(_SIXTH)
+    return pr * cosine + pi * sine, pi * cosine - pr * sine, theta, splat(work[48 + i])
+
+
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
 def _spread_wideband(grid, base, places, scratch, count, width, steer, k, work, centre):
     """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
         at = base + int(places[i]) * ROW
-        ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
-        c, s, q, late = splat(work[16 + i]), splat(work[32 + i]), splat(work[48 + i]), theta * splat(work[64 + i])
-        pr, pi = c * ar - s * ai, c * ai + s * ar
-        square = late * late
-        cosine, sine = splat(_ONE) - square * splat(_HALF), late - late * square * splat(_SIXTH)
-        er, ei = pr * cosine + pi * sine, pi * cosine - pr * sine
+        er, ei, theta, q = _centred(steer, work, i, k)
         minus = theta * theta * splat(-_HALF)
         gr, gi = minus * er - q * ei, minus * ei + q * er
         bow = minus * splat(centre)
         skew = q * splat(_SKEW)
         br, bi = theta * (er - skew * ei), theta * (ei + skew * er)
         er, ei = er + bow * er, ei + bow * ei
-        for j in range(i, i + 48 * width, 48):
+        for j in range(i, i + _STEP * width, _STEP):
             u, v, w = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32])
             store(grid, at, load(grid, at) + u * er + v * br + w * gr)
             store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi + w * gi)
+            at += ROW
+        k += 48
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread_cubic(grid, base, places, scratch, count, width, steer, k, work, centre):
+    """The same to the third order: strengths of 1, j x, x^2 - c and j (x^3 - 3/5 x)."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        er, ei, theta, q = _centred(steer, work, i, k)
+        square = theta * theta
+        minus = square * splat(-_HALF)
+        gr, gi = minus * er - q * ei, minus * ei + q * er
+        third = square * splat(-_SIXTH)
+        tr, ti = theta * (third * er - q * ei), theta * (third * ei + q * er)
+        bow, skew, less = minus * splat(centre), q * splat(_SKEW), splat(_ONE) - square * splat(_TENTH)
+        br, bi = theta * (less * er - skew * ei), theta * (less * ei + skew * er)
+        er, ei = er + bow * er, ei + bow * ei
+        for j in range(i, i + _STEP * width, _STEP):
+            u, v, w, x = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32]), splat(scratch[j + 48])
+            store(grid, at, (load(grid, at) + u * er + v * br) + (w * gr + x * tr))
+            store(grid, at + 16, (load(grid, at + 16) + u * ei + v * bi) + (w * gi + x * ti))
             at += ROW
         k += 48
 
@@ -243,11 +283,11 @@ def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolutio
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _chirps(out, shape, first_channel, chirps, together, w, half, centre, width, wideband, poly, deconvolution, radices, twiddles, rows,
-            table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, grid, work, scratch, tile):  # fmt: skip
+def _chirps(out, shape, first_channel, chirps, together, w, half, centre, width, wideband, cubic, poly, deconvolution, radices,
+            twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, grid, work, scratch, tile):  # fmt: skip
     """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
     _, num_rx, num_chirps, num_samples = shape
-    groups, size, low, degree = send.shape[1], rows.shape[0], width // 2 - 1, poly.shape[0] // (3 * width) - 1
+    groups, size, low, degree = send.shape[1], rows.shape[0], width // 2 - 1, poly.shape[0] // (4 * width) - 1
     channels, per_block = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1)
     top, skirt = w[7] / w[1], w[8] / w[1]
     cut = top + skirt
@@ -268,8 +308,10 @@ def _chirps(out, shape, first_channel, chirps, together, w, half, centre, width,
                 _prepare(work, places, table, at, tx, factor, 32 * b, w, time, delay, send[q, source, p], half, centre, size)
                 if blocks[b, 3] or bounds[b, 0] + delay < 0 or bounds[b, 1] + delay > top:
                     _gate(work, table, at, life, 32 * b, w, time, delay)
-                _weigh(work, scratch, poly, width, degree, wideband)
-                if wideband:
+                _weigh(work, scratch, poly, width, degree, wideband, cubic)
+                if cubic:
+                    _spread_cubic(grid, g * stride, places, scratch, count, width, steer, b * 16 * 48, work, np.float32(centre))
+                elif wideband:
                     _spread_wideband(grid, g * stride, places, scratch, count, width, steer, b * 16 * 48, work, np.float32(centre))
                 else:
                     _spread(grid, g * stride, places, scratch, count, width, steer, b * 16 * 32)
@@ -347,7 +389,7 @@ def add_gridded(
 ) -> None:
     """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and 15 elements of the L).
 
-    Left out: the joint curvature `Tones.cross`; the third order of the wideband term. A path lives in whole chirps. Runs
+    Left out: the joint curvature `Tones.cross`; with `DEFAULT` the third order of the wideband term. A path lives in whole chirps. Runs
     in one thread without the interpreter's lock; the result depends on nothing but the arguments.
 
     Parameters
@@ -364,13 +406,14 @@ def add_gridded(
     size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
     radices, twiddles, rows = plan(size)
     half, together = w.num_samples // 2, _TOGETHER if b.path.size > _MANY else 1
-    buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(48 * setting.width), aligned(512)
+    buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(_STEP * setting.width), aligned(512)
     chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(w.num_samples)
     for first in range(0, samples.shape[1], LANES):
         steer = _steering(w, t.rx_delay[b.path, first : first + LANES], setting.wideband)
         _chirps(samples.reshape(-1).view(np.float32), samples.shape, first, chirps, together, numbers(w, transition), float(half), centre,
-                setting.width, setting.wideband, poly.ravel(), deconvolution, radices, twiddles, rows, b.table, b.factor, b.life,
-                b.blocks, b.bounds, steer.ravel(), t.symbol_delay, t.send, t.antenna, fresh, *buffers)  # fmt: skip
+                setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(), deconvolution, radices, twiddles, rows,
+                b.table, b.factor, b.life, b.blocks, b.bounds, steer.ravel(), t.symbol_delay, t.send, t.antenna, fresh,
+                *buffers)  # fmt: skip
 
 
 def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT) -> None:
@@ -395,9 +438,11 @@ def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition:
             z = gain * t.factor[k] * t.send[q, source, p] * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
             turn, lag = 2 * np.pi * bend * half**2, tau / (w.sample_interval * half)
             cell, r = divmod(frequency % 1 * size, 1)
-            one, x, square = (np.polyval(poly[i], r - 0.5) for i in range(3))
+            one, x, square, cube = (np.polyval(poly[i], r - 0.5) for i in range(4))
             slant = theta[k] if setting.wideband else np.zeros_like(theta[k])
-            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(x, slant * (1 + 4j / 15 * turn))
+            third = slant if setting.cubic else np.zeros_like(slant)
+            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(x, slant * (1 - third**2 / 10 + 4j / 15 * turn))
+            strengths += np.outer(cube, third * (1j * turn - third**2 / 6))
             strengths += np.outer(square, 1j * turn - slant**2 / 2)
             strengths = strengths * steer[k] * np.exp(-1j * lag * slant)
             np.add.at(grid, (int(cell) + steps) % size, z * strengths)

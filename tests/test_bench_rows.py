@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from isac_rt.bench import REQUIRED, reception, synthesis
-from isac_rt.gridding import GRIDDED_ERROR
+from isac_rt.gridding import ACCURATE_ERROR, GRIDDED_ERROR
 
 
 def test_errors_of_the_synthesis_are_as_stated():
@@ -15,7 +15,7 @@ def test_errors_of_the_synthesis_are_as_stated():
     assert max(found.values()) < 3e-4
     assert found["gridded wideband, 1.5 N, width 6"] < GRIDDED_ERROR
     assert found["gridded narrowband, 1.5 N, width 8"] < 5e-6
-    assert found["gridded wideband, 1.5 N, width 8"] < 3e-5
+    assert found["gridded wideband, cubic, 1.5 N, width 8"] < ACCURATE_ERROR
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 
 from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.gridding import ACCURATE, DEFAULT, Setting, add_gridded, add_plain
+from isac_rt.gridding import ACCURATE, ACCURATE_ERROR, DEFAULT, Setting, add_gridded, add_plain
 from isac_rt.ifsignal import Transmission, _tones
 from isac_rt.lanefft import ROW, plan, transform
 from isac_rt.payload import random_payload
@@ -20,7 +20,7 @@ from isac_rt.synthesis import exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 SKIRT = 0.41e6
-SETTINGS = [DEFAULT, ACCURATE, Setting(1.25, 6, False), Setting(1.25, 10, True), Setting(2.0, 4, False)]
+SETTINGS = [DEFAULT, ACCURATE, Setting(1.25, 6, False), Setting(1.25, 10, True, True), Setting(2.0, 4, False)]
 
 
 @pytest.mark.parametrize("size", [1280, 1536, 2048, 90, 4])
@@ -121,9 +121,10 @@ def test_error_of_the_narrowband_model(setting, bound):
     assert relative(gridded(w, tones, setting), narrowband(w, tones)) < bound
 
 
-@pytest.mark.parametrize(("setting", "bound"), [(Setting(1.25, 6, True), 3e-4), (DEFAULT, 1e-4), (ACCURATE, 3e-5)])
+@pytest.mark.parametrize(("setting", "bound"), [(Setting(1.25, 6, True), 3e-4), (DEFAULT, 1e-4), (ACCURATE, ACCURATE_ERROR)])
 def test_error_of_the_full_model(setting, bound):
-    """Up to |u| = 0.87. Without the wideband term the error is above 1 %."""
+    """Up to |u| = 0.87. Without the wideband term the error is above 1 %. Planted bug: the fourth set's strength without jq, which only
+    the bound of ACCURATE sees."""
     w, tones = scene(40, np.random.default_rng(22), num_chirps=3)
     truth = exact(w, tones, SKIRT)
     assert relative(gridded(w, tones, setting), truth) < bound

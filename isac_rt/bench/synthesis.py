@@ -33,7 +33,7 @@ GRIDS = (
     ("gridded narrowband, 1.5 N, width 8", replace(ACCURATE, wideband=False)),
     ("gridded wideband, 1.25 N, width 6", Setting(1.25, 6, True)),
     ("gridded wideband, 1.5 N, width 6", DEFAULT),
-    ("gridded wideband, 1.5 N, width 8", ACCURATE),
+    ("gridded wideband, cubic, 1.5 N, width 8", ACCURATE),
 )
 
 
