@@ -117,7 +117,7 @@ def _save(moving: FuncAnimation, temporary: Path, suffix: str, writer: str, rate
     """Writers go by the suffix, which a temporary name does not have."""
     named = temporary.with_name(temporary.name + suffix)
     try:
-        moving.save(named, writer=writers[writer](fps=rate))
+        moving.save(named, writer=writers[writer](fps=rate))  # type: ignore[arg-type]  # a rate need not be whole
         named.replace(temporary)
     finally:
         named.unlink(missing_ok=True)

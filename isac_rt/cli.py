@@ -559,7 +559,7 @@ def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> No
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    warnings.showwarning = _say_warning
+    warnings.showwarning = _say_warning  # type: ignore[assignment]
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="isac-rt", standalone_mode=False)
         if status == 130:  # what typer makes of Ctrl-C

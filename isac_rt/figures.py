@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -25,7 +27,7 @@ KIND_MARKERS = {"line_of_sight": "s", "target": "o", "ghost": "D", "specular": "
 UNEXPLAINED = "#8C8C8C"
 UAV_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
-STYLE = {
+STYLE: dict[Any, Any] = {
     "figure.dpi": 110, "figure.constrained_layout.use": True, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False,
     "axes.grid": True, "grid.color": "#E4E4E4", "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.titlesize": 10,
     "axes.titlelocation": "left", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.4,
@@ -79,7 +81,7 @@ def _footprints(ax: Axes, city: City) -> None:
     top = max(float(np.quantile(height, 0.98) - height.min()), 1.0)
     shade = 0.96 - 0.42 * np.clip((height - height.min()) / top, 0, 1)
     colours = np.repeat(shade[:, None], 3, axis=1)
-    patches = PolyCollection(triangles[order][:, :, :2], facecolors=colours[order], edgecolors="face", linewidths=0.6, zorder=0)
+    patches = PolyCollection(list(triangles[order][:, :, :2]), facecolors=colours[order], edgecolors="face", linewidths=0.6, zorder=0)
     patches.set_rasterized(True)
     ax.add_collection(patches)
 
@@ -218,6 +220,7 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
     ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
     if ax.get_legend_handles_labels()[0]:
         for handle in ax.legend(loc="best", ncols=2).legend_handles:
+            assert handle is not None
             handle.set(markersize=5, alpha=1)
     return ax
 
@@ -331,7 +334,7 @@ def make_figures(results: Results, folder: str | Path, city: City | None = None)
     with matplotlib.rc_context(STYLE):
         for name, figure in _all(results, city):
             file = Path(folder) / "figures" / f"{name}.png"
-            write_bytes(file, lambda temporary, f=figure: f.savefig(temporary, format="png", metadata={"Software": None}))
+            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
             written.append(file)
     return written
 
@@ -381,6 +384,6 @@ def make_sweep_figures(dataset: xr.Dataset, figures: Iterable[tuple[str, str, st
             figure, axes = _figure(1, 1, 4.4)
             sweep_curves(axes[0, 0], dataset, quantity, against, by)
             file = Path(folder) / "figures" / f"{quantity}_{against}{f'_{by}' if by else ''}.png"
-            write_bytes(file, lambda temporary, f=figure: f.savefig(temporary, format="png", metadata={"Software": None}))
+            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
             written.append(file)
     return written

@@ -142,7 +142,7 @@ def from_sionna(paths: rt.Paths, carrier_frequency: float, *, transmitter: int =
     end = receiver, transmitter
 
     def flat(values: Any, dtype: type = np.float64) -> np.ndarray:
-        array = np.asarray(values, dtype)
+        array: np.ndarray = np.asarray(values, dtype)
         if array.ndim == 5:  # antennas are apart: the first of each
             array = array[:, 0, :, 0]
         return array[end]

@@ -31,12 +31,12 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     twiddles : float32, for each stage of length L and radix r: exp(+j 2 pi i k/L), i < L/r, k = 1 .. r-1 (real, imaginary)
     order : (size,) int64, the row that holds output k
     """
-    rest, radices = size, []
+    left, radices = size, []
     for r in (5, 3, 4, 2):
-        while rest % r == 0:
+        while left % r == 0:
             radices.append(r)
-            rest //= r
-    if rest != 1:
+            left //= r
+    if left != 1:
         raise ValueError(f"a lane transform of {size} rows: only factors 2, 3 and 5 can be done")
     parts, order, length, rest = [np.zeros(0, np.complex64)], np.zeros(size, np.int64), size, np.arange(size)
     for r in radices:

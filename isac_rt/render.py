@@ -158,7 +158,7 @@ def _line(ax: Axes, corners: np.ndarray, view: View, depth: np.ndarray, colour: 
     flat = view.project(points)[:, :2]
     hidden = is_hidden((points[1:] + points[:-1]) / 2, view, depth)
     pieces = np.stack([flat[:-1], flat[1:]], axis=1)
-    ax.add_collection(LineCollection(pieces, colors=colour, linewidths=width, alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha))
+    ax.add_collection(LineCollection(list(pieces), colors=colour, linewidths=width, alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha))
 
 
 def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mapping[str, Pose], view: View, depth: np.ndarray) -> list[Line2D]:
@@ -201,7 +201,7 @@ def _draw_swarm(ax: Axes, swarm: Swarm, times: np.ndarray, time: float, view: Vi
         ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
         big = 15 if uav.role == "active" else 8
         ax.plot(foot[0, 0], foot[0, 1], ROLE_MARKERS[uav.role], color=colour, ms=big, mec="white", mew=1.1, zorder=8)
-        ax.annotate(name, foot[0, :2], xytext=(8, 7), textcoords="offset points", color=colour, fontweight="bold", fontsize=10, zorder=9,
+        ax.annotate(name, (foot[0, 0], foot[0, 1]), xytext=(8, 7), textcoords="offset points", color=colour, fontweight="bold", fontsize=10, zorder=9,
                     bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8})  # fmt: skip
         legend.append(Line2D([], [], color=colour, marker=ROLE_MARKERS[uav.role], ls="none", label=f"{name}, {uav.role}"))
     return legend

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -151,12 +152,12 @@ class Recorder:
     waveform: Waveform
     timetable: Timetable
     states: Sequence[str]
-    _frames: list[FrameRecord] = field(default_factory=list)
+    _frames: list[_SlimFrame] = field(default_factory=list)
 
     def add(self, record: FrameRecord) -> None:
         """Append the next frame. Of frames that are no snapshots the paths are counted and let go."""
         rows = {name: _slim(o, record.snapshot) for name, o in record.observers.items()}
-        self._frames.append(FrameRecord(**{**vars(record), "observers": rows}))
+        self._frames.append(_SlimFrame(**{**vars(record), "observers": rows}))
 
     def finish(
         self,
@@ -202,17 +203,16 @@ class Recorder:
             mine = [link for link in self.timetable.all_links if link[1] == name]
             received = [c for link in mine if (c := symbols[link]) is not None]
             roles = self.timetable.roles_taken(name)
-            role = roles[0] if len(roles) == 1 else roles
             pooled = sum(received, SymbolCount()) if received else None
-            terminals[name] = summary_block(role, pool([scores[link] for link in mine]), pooled, duration)
-        counted = sum((o.counts for f in frames for o in f.observers.values()), np.zeros(len(KINDS), int))
+            terminals[name] = summary_block(roles[0] if len(roles) == 1 else roles, pool([scores[link] for link in mine]), pooled, duration)
+        of_kind = sum((o.counts for f in frames for o in f.observers.values()), np.zeros(len(KINDS), int))
         return {
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "frames": len(frames),
             "terminals": terminals,
             "links": links,
-            "paths": {kind: int(n) for kind, n in zip(KINDS, counted, strict=True)},
+            "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
             "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
             "fidelity": dict(fidelity),
             "access": None if access is None else dict(access),
@@ -237,7 +237,19 @@ class _Slim:
     ledger: PathSet | None
 
 
-def _slim(o: ObserverRecord, snapshot: bool) -> Any:
+@dataclass(frozen=True, kw_only=True)
+class _SlimFrame:
+    """A `FrameRecord` of such observers."""
+
+    frame: int
+    time: float
+    modulated: bool
+    poses: Mapping[str, Pose]
+    observers: Mapping[str, _Slim]
+    snapshot: bool
+
+
+def _slim(o: ObserverRecord, snapshot: bool) -> _Slim:
     kind, power = o.paths.kind, o.paths.power
     counts = np.bincount(kind, minlength=len(KINDS))
     total = np.bincount(kind, weights=power, minlength=len(KINDS))
@@ -261,7 +273,7 @@ class _Builder:
     waveform: Waveform
     timetable: Timetable
     states: tuple[str, ...]
-    frames: list[FrameRecord]
+    frames: list[_SlimFrame]
     out: dict[str, xr.Variable] = field(default_factory=dict)
 
     @property
@@ -324,7 +336,7 @@ class _Builder:
         meaning = {"truth": "true", "detected": "detected", "tracked": "tracked"}
         for group, word in meaning.items():
             for name, (units, _) in MEASURES.items():
-                values = self.over(lambda s, g=group, n=name: getattr(getattr(s.record, g), n), none, float)
+                values = self.over(attrgetter(f"record.{group}.{name}"), none, float)
                 self.put(f"{group}_{name}", dims, values, units, f"{word} {name} of the UAV, seen by the observer")
         self.put("in_view", dims, self.over(lambda s: s.record.in_view, no, bool), _DIMENSIONLESS, "UAV inside the field of view")
         self.put("shadowed", dims, self.over(lambda s: s.record.shadowed, no, bool), _DIMENSIONLESS, "UAV hidden by the city")
@@ -347,11 +359,11 @@ class _Builder:
         self.put("slips", two, self.over(lambda s: s.record.slips, 0, np.int32), _DIMENSIONLESS, "symbols decided outside their alphabet")
         self.put("path_count", [*two, "kind"], self.over(lambda s: s.counts, zero, np.int32), _DIMENSIONLESS, "number of paths")
         self.put("path_power", [*two, "kind"], self.over(lambda s: s.power, zero, float), _DIMENSIONLESS, "sum of |gain|^2 of the paths")
-        for name, text in (("errors", "wrong or undecided"), ("erased", "undecided"), ("total", "sent to the observer")):
-            values = self.over(lambda s, n=name: _by_symbol(s.record.symbols)[n], np.zeros(3), np.int64)
-            self.put(f"symbol_{name}", [*two, "symbol"], values, _DIMENSIONLESS, f"symbols, {text}")
+        symbols = self.over(lambda s: _by_symbol(s.record.symbols), np.zeros((3, 3)), np.int64)
+        for i, (name, text) in enumerate((("errors", "wrong or undecided"), ("erased", "undecided"), ("total", "sent to the observer"))):
+            self.put(f"symbol_{name}", [*two, "symbol"], symbols[:, :, i], _DIMENSIONLESS, f"symbols, {text}")
 
-    def ragged(self, prefix: str, dim: str, rows: list[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]) -> None:
+    def ragged(self, prefix: str, dim: str, rows: Sequence[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]) -> None:
         """Flat columns over `dim` with the frame and the observer of every row; a column is (dtype, unit, meaning)."""
         count = [len(next(iter(r[2].values()))) for r in rows]
         index = np.repeat(np.array([r[:2] for r in rows], np.int32).reshape(-1, 2), count, axis=0)
@@ -434,13 +446,13 @@ class _Builder:
                  "cells that the one-dimensional CFAR finds, chirp by chirp")  # fmt: skip
 
 
-def _by_symbol(c: SymbolCount) -> dict[str, tuple[int, int, int]]:
-    """Counts in the order of `SYMBOLS`."""
-    return {
-        "errors": (c.delay_errors, c.dpsk_errors, c.bit_errors),
-        "erased": (c.delay_erased, c.dpsk_erased, c.bits_total - c.bits_decoded),
-        "total": (c.delay_total, c.dpsk_total, c.bits_total),
-    }
+def _by_symbol(c: SymbolCount) -> tuple[tuple[int, int, int], ...]:
+    """Errors, erased and total, each in the order of `SYMBOLS`."""
+    return (
+        (c.delay_errors, c.dpsk_errors, c.bit_errors),
+        (c.delay_erased, c.dpsk_erased, c.bits_total - c.bits_decoded),
+        (c.delay_total, c.dpsk_total, c.bits_total),
+    )
 
 
 PATH_COLUMNS: dict[str, tuple] = {
@@ -469,7 +481,7 @@ def _path_columns(p: PathSet) -> dict[str, np.ndarray]:
     return columns
 
 
-def _atomically(file: Path, write: Callable[[Path], None]) -> None:
+def _atomically(file: Path, write: Callable[[Path], object]) -> None:
     """Have `write` make a file under a temporary name beside `file`, then put it in place whole; or raise and leave nothing."""
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
@@ -491,7 +503,7 @@ def write_text(file: Path, text: str) -> None:
     _atomically(Path(file), lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
-def write_bytes(file: Path, write: Callable[[Path], None]) -> None:
+def write_bytes(file: Path, write: Callable[[Path], object]) -> None:
     """A file made by `write(temporary path)` that appears whole or not at all."""
     _atomically(Path(file), write)
 
@@ -565,7 +577,7 @@ def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, sce
     column("transmitter", lambda p: np.full(len(p), p.tx, object), object, _DIMENSIONLESS, "transmitting terminal")
     column("receiver", lambda p: np.full(len(p), p.rx, object), object, _DIMENSIONLESS, "receiving terminal")
     for name, (dtype, units, text) in PATH_COLUMNS.items():
-        column(name, lambda p, n=name: _path_columns(p)[n], dtype, units, text)
+        put(name, ["path"], [np.asarray(_path_columns(p)[name], dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
     carrier = scenario.radio.carrier_hz
     column("doppler", lambda p: -carrier * p.delay_rate, float, "Hz", "Doppler shift at the carrier, positive closing")
     column("tx_radius", lambda p: p.tx_radius, float, "m", "radius of curvature of the wavefront at the transmitter")

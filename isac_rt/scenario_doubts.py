@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import reduce
 from typing import Any
 
 from isac_rt.scenario_base import Key, Problem
@@ -38,9 +39,7 @@ PLAUSIBLE_RCS = (-90.0, 70.0)
 def implausible(scenario: Any) -> Iterator[Problem]:
     """What of a scenario lies outside the plausible."""
     for key, (low, high, unit) in PLAUSIBLE.items():
-        value = scenario
-        for name in key:
-            value = getattr(value, name, None)
+        value = reduce(lambda at, name: getattr(at, str(name), None), key, scenario)
         if isinstance(value, int | float) and not low <= value <= high:
             yield Problem((key,), f"{value:g} is outside {low:g} to {high:g}; is it in {unit}?")
     low, high = PLAUSIBLE_RCS

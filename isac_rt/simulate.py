@@ -501,13 +501,13 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
     targets = [t for i in seen if (t := truth[i]) is not None]
     explained = explain(reception.detections, paths, setup.waveform, observer.passes)
     observer.score.add(targets, reception.detections, heard.tracks, explained.kind)
-    d, t = reception.detections, heard.tracks
+    d, tracks = reception.detections, heard.tracks
     detected = np.column_stack([d.range, d.velocity, d.direction])
-    tracked = np.column_stack([t.range, t.velocity, t.direction])
-    sure = np.flatnonzero(t.confirmed | t.is_reference)
+    tracked = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
+    sure = np.flatnonzero(tracks.confirmed | tracks.is_reference)
     to_detection = associate(targets, detected, observer.score.resolution)
     to_track = [(i, int(sure[j])) for i, j in associate(targets, tracked[sure], observer.score.resolution)]
-    followed = np.full(len(t), -1)
+    followed = np.full(len(tracks), -1)
     followed[[j for _, j in to_track]] = [seen[i] for i, _ in to_track]
     stray = np.ones(len(d), bool)
     stray[[j for _, j in to_detection]] = False
@@ -522,7 +522,8 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
         in_view=in_view,
         shadowed=in_view & ~direct,
         tracks=TrackTable(
-            id=t.ids, range=t.range, velocity=t.velocity, u_x=t.direction[:, 0], u_z=t.direction[:, 1], confirmed=t.confirmed, uav=followed
+            id=tracks.ids, range=tracks.range, velocity=tracks.velocity, u_x=tracks.direction[:, 0], u_z=tracks.direction[:, 1],
+            confirmed=tracks.confirmed, uav=followed,
         ),
         state=heard.state,
         **{f"detection_{name}": value for name, value in explained._asdict().items()},

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -313,7 +314,7 @@ def save_capture(
         "transmit_amplitude": transmit_amplitude,
         "active": payloads is not None,
     }
-    arrays = {"samples": np.stack([c.samples for c in cubes]), "schedule": cubes[0].schedule}
+    arrays: dict[str, Any] = {"samples": np.stack([c.samples for c in cubes]), "schedule": cubes[0].schedule}
     arrays |= {"start": np.array([c.start_time for c in cubes]), "time": np.array(times), "modulated": np.array(modulated)}
     for name in ("position", "velocity", "acceleration", "rotation"):
         arrays[f"own_{name}"] = np.stack([getattr(p, name) for p in own_poses])
@@ -322,7 +323,7 @@ def save_capture(
     np.savez(path, public=np.array(json.dumps(public)), **arrays)
 
 
-def replay(path: Path | str) -> dict[str, np.ndarray]:
+def replay(path: Path | str) -> dict[str, Any]:
     """Run a terminal on a capture alone: detections, symbols, bits and tracks of every frame, as flat named arrays."""
     with np.load(path) as file:
         data = {name: file[name] for name in file.files}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -116,7 +117,7 @@ def _of_samples(setup: Setup, floor: float, repeats: int) -> list[dict[str, obje
         kept = paths.select(~faintest(share, cell, limit)[0]) if limit else paths
         method = f"samples, {limit:g} of a cell's power left out" if limit else "samples of all"
         error = float(np.linalg.norm(samples(kept) - truth) / np.linalg.norm(truth)) if limit else 0.0
-        seconds = cpu_seconds(lambda some=kept: samples(some), repeats)
+        seconds = cpu_seconds(partial(samples, kept), repeats)
         out.append({"kind": "clutter", "method": method, "size": len(kept), "unit": "scatterers", "error": error, "oracle": not limit,
                     "error_of": "samples", "cost": seconds / floor, "seconds": seconds, "floor_s": floor})  # fmt: skip
     return out

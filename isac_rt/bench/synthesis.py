@@ -8,6 +8,7 @@ nothing removed: "narrowband" rows against the model whose receive elements only
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -109,11 +110,11 @@ def rows(quick: bool) -> list[dict[str, object]]:
         links = job.paths(size)
         times = repeats if size <= 10_000 else 1
         if size <= MOST_DIRECT:
-            add("direct", size, "paths", cpu_seconds(lambda k=links: job.samples(k, "direct"), times), error["direct"])
+            add("direct", size, "paths", cpu_seconds(partial(job.samples, links, "direct"), times), error["direct"])
         if size == SIZES[0]:
-            add("exact", size, "paths", cpu_seconds(lambda k=links: job.samples(k, "exact"), 1, 0), 0.0, oracle=True)
+            add("exact", size, "paths", cpu_seconds(partial(job.samples, links, "exact"), 1, 0), 0.0, oracle=True)
         for name, setting in GRIDS:
-            seconds = cpu_seconds(lambda k=links, s=setting: job.samples(k, "gridded", s), times)
+            seconds = cpu_seconds(partial(job.samples, links, "gridded", setting), times)
             add(name, size, "paths", seconds, error[name])
     cube = np.zeros(shape, np.complex64)
     words = np.array([1, 2], np.uint32)

@@ -24,7 +24,7 @@ from isac_rt.baselines.loradar import Compensation, loradar_delay, loradar_spect
 from isac_rt.baselines.tdm import doppler_maps, estimate_tdm
 from isac_rt.experiments.montecarlo import Counts
 from isac_rt.experiments.symbols import PLACE, RANGE_ERROR_CELLS, VELOCITY_ERROR, paper_antennas
-from isac_rt.ifsignal import IFCube, Transmission, if_signal
+from isac_rt.ifsignal import IFCube, Method, Transmission, if_signal
 from isac_rt.payload import Payload, random_payload
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.propagation.statistical import rayleigh_cells
@@ -148,7 +148,7 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
     )  # fmt: skip
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
     sent = Transmission(name="AT", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
-    method = "auto" if case.clutter else "direct"
+    method: Method = "auto" if case.clutter else "direct"
     return if_signal(w, [(sent, paths)], pose, antennas, start_time=0.0, filter_transition=4e5, method=method, max_direct=1)
 
 

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -142,7 +143,7 @@ class Curve:
         return crossing(self.snr_db, self.events.sum(axis=0), total, level), float(low), float(high)
 
 
-def _savez(file: Path, arrays: dict[str, np.ndarray]) -> None:
+def _savez(file: Path, arrays: dict[str, Any]) -> None:
     with open(file, "wb") as out:  # given a name savez would append ".npz" to it
         np.savez(out, **arrays)
 

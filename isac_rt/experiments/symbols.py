@@ -18,7 +18,7 @@ import scipy.fft
 from isac_rt.arrays import Antennas, pseudo_random_schedule
 from isac_rt.experiments.montecarlo import Counts, Curve, Precision, sample
 from isac_rt.experiments.outcome import Progress
-from isac_rt.ifsignal import Transmission, if_signal
+from isac_rt.ifsignal import Method, Transmission, if_signal
 from isac_rt.payload import Payload, running_phases
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.statistical import rayleigh_cells
@@ -106,10 +106,10 @@ def draw_frame(link: Link, seed: int, index: int) -> Frame:
         if link.profile:
             lengths, weights = np.append(lengths, ranges), np.append(weights, np.abs(amplitudes) ** 2)
     payload = Payload(np.zeros(0, np.uint8), symbols, np.zeros(shape, int), np.ones((1, w.num_chirps), complex))
-    tx = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude([0, 1, 0]))
-    rx = Pose(length * direction, np.zeros(3), np.zeros(3), attitude([0, -1, 0]))
+    tx = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0, 1, 0])))
+    rx = Pose(length * direction, np.zeros(3), np.zeros(3), attitude(np.array([0, -1, 0])))
     sent = Transmission(name="AT", pose=tx, antennas=antennas, schedule=schedule, payload=payload)
-    method = "auto" if link.clutter else "direct"
+    method: Method = "auto" if link.clutter else "direct"
     cube = if_signal(
         w, [(sent, paths)], rx, antennas, start_time=0.0, filter_transition=0.05 * w.sampling_rate, method=method, max_direct=1
     )

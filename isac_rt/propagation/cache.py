@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -92,9 +93,9 @@ class CachedPropagation:
     content : all that the model's paths depend on but the instant and the links, as text
     """
 
-    def __init__(self, make: Callable, store: PathStore, content: str) -> None:
+    def __init__(self, make: Callable[[], Any], store: PathStore, content: str) -> None:
         self._make, self._store, self._content = make, store, content
-        self._model = None
+        self._model: Any = None
         self.dropped = 0
 
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
@@ -114,9 +115,10 @@ class CachedPropagation:
         return found[0]
 
 
-def _pack(paths: Paths, dropped: int) -> dict[str, np.ndarray]:
+def _pack(paths: Paths, dropped: int) -> dict[str, Any]:
     """Flat arrays of path sets; what is no array goes into a JSON text."""
-    out, about = {}, []
+    out: dict[str, Any] = {}
+    about = []
     for i, p in enumerate(paths.values()):
         about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
         out |= {f"{i}/{f.name}": value for f in fields(p) if isinstance(value := getattr(p, f.name), np.ndarray)}

@@ -142,7 +142,7 @@ class ClutterField:
         index = np.flatnonzero(share).astype(np.int32)
         count, own = index.size, tx == rx
         radius, departure = np.empty(count), np.empty((count, 3))
-        out = [np.empty(count, np.float32), np.empty(count), np.empty(count), np.empty(count, np.float32), radius]
+        out: list[np.ndarray] = [np.empty(count, np.float32), np.empty(count), np.empty(count), np.empty(count, np.float32), radius]
         out += [radius, departure, departure] if own else [np.empty(count), departure, np.empty((count, 3))]
         s, c = self._surfaces, self.cells
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from isac_rt.arrays import Antennas
@@ -14,14 +16,12 @@ from isac_rt.swarm import Pose
 from isac_rt.waveform import SPEED_OF_LIGHT
 
 
-def friis_amplitude(wavelength: float, distance: np.ndarray | float) -> np.ndarray | float:
+def friis_amplitude(wavelength: float, distance: Any) -> Any:
     """lambda / (4 pi d), isotropic ends."""
     return wavelength / (4 * np.pi * distance)
 
 
-def radar_amplitude(
-    wavelength: float, cross_section: np.ndarray | float, there: np.ndarray | float, on: np.ndarray | float
-) -> np.ndarray | float:
+def radar_amplitude(wavelength: float, cross_section: Any, there: Any, on: Any) -> Any:
     """sqrt(lambda^2 sigma / ((4 pi)^3 r1^2 r2^2)), isotropic ends: the bistatic radar equation."""
     return wavelength * np.sqrt(cross_section / (4 * np.pi) ** 3) / (there * on)
 

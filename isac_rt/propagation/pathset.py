@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -168,7 +169,7 @@ def merge(parts: list[PathSet]) -> PathSet:
         width = [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2)
         return np.pad(a, width, constant_values=fill)
 
-    stacked = {}
+    stacked: dict[str, Any] = {}
     for f in fields(first):
         values = [getattr(p, f.name) for p in parts]
         if f.name == "points":

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -202,13 +203,14 @@ class RayTracer:
         return leg_set(parts, faces.shape[1])
 
     def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies) -> PathSet:
-        common = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
+        common: dict[str, Any] = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
         parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
         for number, name in enumerate(self._names):
             if name not in (tx, rx):
                 parts.append(self._by_way_of(local, tx, rx, name, number, legs, common))
         if (tx, rx) in hits:
-            parts.append(self._scattered(local[tx], local[rx], *hits[tx, rx], common))
+            amplitude, face, point = hits[tx, rx]
+            parts.append(self._scattered(local[tx], local[rx], amplitude, face, point, common))
         if self.field is not None:
             parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
         leakage = self._scenario.propagation.leakage

@@ -13,6 +13,8 @@ tau_D is in it, and whoever follows the phase from chirp to chirp has to count t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.fft
 from numba import njit
@@ -26,7 +28,7 @@ def window_length(waveform: Waveform) -> float:
     return waveform.num_samples - shift_of(waveform, waveform.num_delay_symbols)
 
 
-def shift_of(waveform: Waveform, delay_symbol: np.ndarray | int) -> np.ndarray | float:
+def shift_of(waveform: Waveform, delay_symbol: Any) -> Any:
     """s_D, the data delay in samples."""
     return np.asarray(delay_symbol) * waveform.delay_step * waveform.sampling_rate
 

@@ -8,7 +8,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -80,7 +80,7 @@ class Axis(_Free):
         assert self.values is not None
         return {str(self.key): self.values[index]}
 
-    def labels(self) -> list[float] | list[int] | list[str]:
+    def labels(self) -> Sequence[float] | Sequence[str]:
         """The coordinate along the axis: the numbers of its key (the first of a zip), else words."""
         if self.list is not None:
             return [*self.list]

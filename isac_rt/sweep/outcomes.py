@@ -86,7 +86,8 @@ def status(folder: Path | str) -> Status:
     """Count the outcomes in a sweep's folder; at most 20 errors are kept."""
     outcomes = Outcomes(Path(folder))
     plan = outcomes.definition()
-    done, failed, errors = 0, 0, []
+    done, failed = 0, 0
+    errors: list[tuple[tuple[int, ...], str]] = []
     for point in plan.points():
         outcome = outcomes.read(point.key)
         if outcome is None:
