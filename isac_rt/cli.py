@@ -89,7 +89,9 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
         setup = simulate.prepare(loaded)
         budget = simulate.link_budgets(setup)
     _print_budget(budget)
-    results = _with_progress(lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots), "frames", loaded.frames)
+    results = _with_progress(
+        lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots), "frames", loaded.frames
+    )
     if check_budget:
         from isac_rt.budget import check
 
@@ -135,8 +137,11 @@ def _print_plan(found: dict[str, Any], frames: int) -> None:
         seconds = "" if item["seconds"] is None else f"{item['seconds']:.3f}"
         table.add_row(item["what"], item["link"].replace("->", " to "), item["modelled"], item["left_out"], error, seconds)
     _out().print(table)
-    settled = {"phase error at most [rad]": found["max_phase_error_rad"], "weakest [dB under the noise of a cell]": found["weakest_path_db"],
-               "reach [m]": found["reach_m"]}  # fmt: skip
+    settled = {
+        "phase error at most [rad]": found["max_phase_error_rad"],
+        "weakest [dB under the noise of a cell]": found["weakest_path_db"],
+        "reach [m]": found["reach_m"],
+    }
     said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
     total = sum(found["seconds_per_frame"].values()) * frames
     stages = ", ".join(found["seconds_per_frame"])
@@ -155,7 +160,7 @@ def paths(
     _check_frame(loaded, frame)
     with _ending_soon_after_interrupt(out.parent), _err().status("tracing"):
         from isac_rt import simulate
-        from isac_rt.results import write_ledger
+        from isac_rt.interchange import write_ledger
 
         found = simulate.trace(loaded, frame)
         write_ledger(found, out, loaded)
@@ -404,7 +409,9 @@ def doctor() -> None:
     checks = look()
     table = _table("", "found", "to do", justify="left")
     for check in checks:
-        table.add_row(f"[green]ok[/] {check.name}" if check.ok else f"[red]no[/] {check.name}", check.found, "" if check.ok else check.remedy)
+        table.add_row(
+            f"[green]ok[/] {check.name}" if check.ok else f"[red]no[/] {check.name}", check.found, "" if check.ok else check.remedy
+        )
     _out().print(table)
     if not all(check.ok for check in checks):
         raise typer.Exit(2)
@@ -456,7 +463,9 @@ def animate(
 
 def _check_frame(scenario: Scenario, frame: int) -> None:
     if frame >= scenario.frames:
-        raise InputProblem(f"--frame {frame}: {scenario.name} has frames 0 to {scenario.frames - 1}; choose one of these or set frames higher")
+        raise InputProblem(
+            f"--frame {frame}: {scenario.name} has frames 0 to {scenario.frames - 1}; choose one of these or set frames higher"
+        )
 
 
 def _with_progress(work: Any, what: str, steps: int | None = None) -> Any:

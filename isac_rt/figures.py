@@ -209,13 +209,17 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
     """Power of every path in the ledger of the snapshot frames against its path length ("delay") or rate ("doppler")."""
     mine = dataset.path_observer.values == observer
-    x = dataset.path_delay.values * SPEED_OF_LIGHT if against == "delay" else -dataset.attrs["carrier_hz"] * dataset.path_delay_rate.values / 1e3
+    x = (
+        dataset.path_delay.values * SPEED_OF_LIGHT
+        if against == "delay"
+        else -dataset.attrs["carrier_hz"] * dataset.path_delay_rate.values / 1e3
+    )
     for k in (4, 3, 2, 5, 1, 0):
         at = mine & (dataset.path_kind.values == k)
         if at.any():
-            name = KINDS[k]
-            ax.plot(x[at], dataset.path_power_db.values[at], KIND_MARKERS[name], ms=2.5 if name == "diffuse" else 5, ls="none",
-                    color=KIND_COLOURS[name], alpha=0.5 if name == "diffuse" else 0.9, mew=0, label=f"{words(name)} ({at.sum()})")  # fmt: skip
+            name, many = KINDS[k], KINDS[k] == "diffuse"
+            ax.plot(x[at], dataset.path_power_db.values[at], KIND_MARKERS[name], ms=2.5 if many else 5, ls="none",
+                    color=KIND_COLOURS[name], alpha=0.5 if many else 0.9, mew=0, label=f"{words(name)} ({at.sum()})")  # fmt: skip
     ax.set(xlabel="path length [m]" if against == "delay" else "Doppler shift [kHz] (closing is positive)", ylabel="path gain [dB]")
     ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
     if ax.get_legend_handles_labels()[0]:
@@ -249,7 +253,9 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
         here = _processed(dataset, o)
         with np.errstate(divide="ignore", invalid="ignore"):
             snr = 10 * np.log10(here.reference_snr.values)
-        ax.plot(here.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name)
+        ax.plot(
+            here.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name
+        )
     ax.set(xlabel="time [s]", ylabel="SNR of the reference path [dB]")
     ax.legend(loc="best")
     return ax

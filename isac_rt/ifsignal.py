@@ -76,7 +76,8 @@ class IFCube:
     def __repr__(self) -> str:
         groups, antennas, chirps, size = self.samples.shape
         rms = float(np.sqrt(np.mean(np.abs(self.samples) ** 2)))
-        return f"<IFCube {groups} groups x {antennas} antennas x {chirps} chirps x {size} samples at {self.start_time:.4f} s, RMS {rms:.2e} sqrt(W)>"
+        shape = f"{groups} groups x {antennas} antennas x {chirps} chirps x {size} samples"
+        return f"<IFCube {shape} at {self.start_time:.4f} s, RMS {rms:.2e} sqrt(W)>"
 
     def of_groups(self, groups: Sequence[int]) -> IFCube:
         """What a receiver of these groups alone has."""

@@ -26,7 +26,9 @@ MOST_LINES = 400
 _SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 
 
-def scene_3d(city: City, swarm: Swarm, times: np.ndarray, time: float, paths: Mapping[tuple[str, str], PathSet], reach: float = 150.0) -> Figure:
+def scene_3d(
+    city: City, swarm: Swarm, times: np.ndarray, time: float, paths: Mapping[tuple[str, str], PathSet], reach: float = 150.0
+) -> Figure:
     """The scene as a Plotly figure; kinds of path and UAVs can be switched off in its legend.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Files and objects that others read: IF cubes as NetCDF and SigMF, path sets from Sionna, detections for Stone Soup.
+"""Files and objects that others read: path ledgers and IF cubes as NetCDF, cubes as SigMF, Sionna's path sets, detections for Stone Soup.
 
 SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interchange]`).
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import importlib
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,9 @@ import xarray as xr
 
 from isac_rt.ifsignal import IFCube
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.results import ResultsError, write_bytes
+from isac_rt.provenance import provenance
+from isac_rt.results import DIMENSIONLESS, KINDS, PATH_COLUMNS, ResultsError, path_columns, write_bytes, write_dataset
+from isac_rt.scenario import Scenario
 from isac_rt.waveform import Waveform
 
 if TYPE_CHECKING:
@@ -26,6 +29,48 @@ if TYPE_CHECKING:
 
 EXTRA = "pip install 'isac_rt[interchange]'"
 _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
+
+
+def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario) -> None:
+    """Write the path ledger of one frame, all links, as NetCDF.
+
+    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront radii, the transmitter and
+    receiver of each, interaction points (path, bounce, axis) [m] and faces of the city mesh (path, bounce).
+
+    Raises
+    ------
+    ResultsError  If the file cannot be written.
+    """
+    depth = max((p.faces.shape[1] for p in paths.values()), default=0)
+    names = next((p.target_names for p in paths.values() if p.target_names), ())
+    out: dict[str, xr.Variable] = {}
+
+    def put(name: str, dims: Sequence[str], parts: list[np.ndarray], empty: np.ndarray, units: str, text: str) -> None:
+        out[name] = xr.Variable(dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text})
+
+    def column(name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str) -> None:
+        put(name, ["path"], [np.asarray(get(p), dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
+
+    column("transmitter", lambda p: np.full(len(p), p.tx, object), object, DIMENSIONLESS, "transmitting terminal")
+    column("receiver", lambda p: np.full(len(p), p.rx, object), object, DIMENSIONLESS, "receiving terminal")
+    for name, (dtype, units, text) in PATH_COLUMNS.items():
+        put(name, ["path"], [np.asarray(path_columns(p)[name], dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
+    carrier = scenario.radio.carrier_hz
+    column("doppler", lambda p: -carrier * p.delay_rate, float, "Hz", "Doppler shift at the carrier, positive closing")
+    column("tx_radius", lambda p: p.tx_radius, float, "m", "radius of curvature of the wavefront at the transmitter")
+    column("rx_radius", lambda p: p.rx_radius, float, "m", "radius of curvature of the wavefront at the receiver")
+
+    def pad(a: np.ndarray, fill: float) -> np.ndarray:
+        return np.pad(a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill)
+
+    put("points", ["path", "bounce", "axis"], [pad(p.points, np.nan) for p in paths.values()], np.zeros((0, depth, 3)), "m",
+        "interaction points in world axes, NaN where there is none")  # fmt: skip
+    put("faces", ["path", "bounce"], [pad(p.faces, -1) for p in paths.values()], np.zeros((0, depth), np.int32), DIMENSIONLESS,
+        "face of the city mesh at each point, -1 where there is none")  # fmt: skip
+    out["kind_name"] = xr.Variable(["kind"], np.array(KINDS, object), {"units": DIMENSIONLESS, "long_name": "name of each kind of path"})
+    out["target_name"] = xr.Variable(["uav"], np.array(names, object), {"units": DIMENSIONLESS, "long_name": "name that target indexes"})
+    epoch = next((p.epoch for p in paths.values()), np.nan)
+    write_dataset(xr.Dataset(out, attrs={**provenance(scenario), "epoch_s": epoch}), Path(file))
 
 
 def cube_dataset(cube: IFCube) -> xr.Dataset:
@@ -107,7 +152,9 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
     made.add_capture(0, metadata={"core:frequency": w.carrier_frequency})
     for p in range(w.num_chirps):
         senders = " ".join(str(int(row[p])) for row in cube.schedule)
-        made.add_annotation(p * w.num_samples, w.num_samples, metadata={"core:label": f"chirp {p}", "core:comment": f"transmit antennas {senders}"})
+        made.add_annotation(
+            p * w.num_samples, w.num_samples, metadata={"core:label": f"chirp {p}", "core:comment": f"transmit antennas {senders}"}
+        )
     made.validate()
     write_bytes(meta, lambda temporary: temporary.write_text(made.dumps(), encoding="utf-8"))
     return data, meta
@@ -129,8 +176,8 @@ def read_sigmf(file: str | Path) -> IFCube:
 def from_sionna(paths: rt.Paths, carrier_frequency: float, *, transmitter: int = 0, receiver: int = 0, epoch: float = 0.0) -> PathSet:
     """The paths of one link from a Sionna RT `Paths` object, for the signal model here.
 
-    Sionna's delays are float32: at 100 m they are good to some 10 um, 0.1 rad of phase at 77 GHz, and the phases of two paths against each other
-    no better. Doppler shifts are Sionna's; accelerations are zero, wavefronts plane.
+    Sionna's delays are float32: at 100 m they are good to some 10 um, 0.1 rad of phase at 77 GHz, and the phases of two paths
+    against each other no better. Doppler shifts are Sionna's; accelerations are zero, wavefronts plane.
 
     Parameters
     ----------

@@ -134,7 +134,9 @@ def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, 
     level = normal[..., 2:] > 0.9
     base = np.where(level & (points[..., 2:] < floor), _GROUND, np.where(normal[..., 2:] > 0.25, _ROOF, _WALL))
     light = 0.66 + 0.06 * normal[..., 2] + 0.07 * (normal @ view.axes[0]) + 0.28 * np.clip(normal @ SUN, 0, 1) * lit
-    step = np.abs(np.diff(np.where(seen, depth, 1e4), axis=1, prepend=1e4)) + np.abs(np.diff(np.where(seen, depth, 1e4), axis=0, prepend=1e4))
+    step = np.abs(np.diff(np.where(seen, depth, 1e4), axis=1, prepend=1e4)) + np.abs(
+        np.diff(np.where(seen, depth, 1e4), axis=0, prepend=1e4)
+    )
     turn = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(np.diff(normal, axis=0, prepend=0), axis=-1)
     edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (turn > 0.5), 0.72, 1.0)
     picture[seen] = (base * (light * edge)[..., None])[seen]
@@ -161,7 +163,9 @@ def _line(ax: Axes, corners: np.ndarray, view: View, depth: np.ndarray, colour: 
     ax.add_collection(LineCollection(list(pieces), colors=colour, linewidths=width, alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha))
 
 
-def _draw_paths(ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mapping[str, Pose], view: View, depth: np.ndarray) -> list[Line2D]:
+def _draw_paths(
+    ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mapping[str, Pose], view: View, depth: np.ndarray
+) -> list[Line2D]:
     """Every kind in its colour: the scattering points of diffuse paths, the strongest of the others as lines."""
     count = dict.fromkeys(PathKind, 0)
     for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
@@ -201,8 +205,8 @@ def _draw_swarm(ax: Axes, swarm: Swarm, times: np.ndarray, time: float, view: Vi
         ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
         big = 15 if uav.role == "active" else 8
         ax.plot(foot[0, 0], foot[0, 1], ROLE_MARKERS[uav.role], color=colour, ms=big, mec="white", mew=1.1, zorder=8)
-        ax.annotate(name, (foot[0, 0], foot[0, 1]), xytext=(8, 7), textcoords="offset points", color=colour, fontweight="bold", fontsize=10, zorder=9,
-                    bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8})  # fmt: skip
+        ax.annotate(name, (foot[0, 0], foot[0, 1]), xytext=(8, 7), textcoords="offset points", color=colour, fontweight="bold",
+                    fontsize=10, zorder=9, bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8})  # fmt: skip
         legend.append(Line2D([], [], color=colour, marker=ROLE_MARKERS[uav.role], ls="none", label=f"{name}, {uav.role}"))
     return legend
 

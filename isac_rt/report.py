@@ -21,7 +21,8 @@ _CAPTIONS = {
     "scene": ("The scene", "The swarm from above. The darker a face of the city, the higher it lies."),
     "range_doppler": (
         "Range and Doppler",
-        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. Marks are detections, by the kind of the strongest ray-traced path within one cell; "
+        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. Marks are detections, by the kind of the "
+        "strongest ray-traced path within one cell; "
         "white circles are where the truth puts the UAVs in view, detected or not. A passive terminal measures path lengths: "
         "reflectors stand at transmitter to UAV to receiver.",
     ),
@@ -29,12 +30,22 @@ _CAPTIONS = {
         "Equivalent range",
         "What the receiver sees before it removes the data: each chirp's delay symbol moves every path by the same number of cells.",
     ),
-    "tracks": ("Tracks against truth", "Seen from one terminal. Estimates are drawn at the UAV they were associated with after the fact; the receiver does not know it."),
-    "errors": ("Errors", "Distribution of errors of associated estimates; the number of them in brackets. A UAV that is never found has no error here."),
+    "tracks": (
+        "Tracks against truth",
+        "Seen from one terminal. Estimates are drawn at the UAV they were associated with after the fact; the receiver does not know it.",
+    ),
+    "errors": (
+        "Errors",
+        "Distribution of errors of associated estimates; the number of them in brackets. A UAV that is never found has no error here.",
+    ),
     "paths": ("Paths", "Every path of the snapshot frames. Gain holds antenna elements and reflections, not the transmit power."),
     "decoding": ("Data", "Errors among the data symbols of every frame; frames without a decision count as lost in the tables."),
-    "link": ("Links over time", "Above, the reference path: the strongest target at the active terminal, the line of sight at a passive one. Below, what arrives by each kind of path."),
-}  # fmt: skip
+    "link": (
+        "Links over time",
+        "Above, the reference path: the strongest target at the active terminal, the line of sight at a passive one. Below, what arrives "
+        "by each kind of path.",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -63,7 +74,18 @@ def per_terminal(summary: Mapping[str, Any]) -> Table:
     rows = []
     for name, s in summary["links"].items():
         rate = None if s["bit_rate_bps"] is None else s["bit_rate_bps"] / 1e3
-        values = (s["ser_delay"], s["ser_dpsk"], s["ber"], s["erased"], s["bits"], rate, s["hit_rate"], s["matched"], s["matched_tracked"], s["false_per_frame"])
+        values = (
+            s["ser_delay"],
+            s["ser_dpsk"],
+            s["ber"],
+            s["erased"],
+            s["bits"],
+            rate,
+            s["hit_rate"],
+            s["matched"],
+            s["matched_tracked"],
+            s["false_per_frame"],
+        )
         rows.append((name.replace("->", " to "), s["role"], *map(number, values)))
     return Table(columns, rows)
 
@@ -110,7 +132,7 @@ def _title(key: str) -> str:
 def _html(table: Table) -> Markup:
     head = "".join(f"<th>{html.escape(c)}</th>" for c in table.columns)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in table.rows)
-    return Markup(f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')  # noqa: S704 - escaped above
+    return Markup(f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')  # escaped above
 
 
 def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
@@ -153,7 +175,9 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
         timing=Table(("Stage", "Seconds"), [(k, number(v)) for k, v in s["timing_s"].items()]),
-        versions=Table(("Package", "Version"), [*s["versions"].items(), ("commit", d.attrs["commit"] or DASH), ("platform", d.attrs["platform"])]),
+        versions=Table(
+            ("Package", "Version"), [*s["versions"].items(), ("commit", d.attrs["commit"] or DASH), ("platform", d.attrs["platform"])]
+        ),
         scenario_yaml=d.attrs["scenario"],
     )
     file = Path(folder) / "report.html"

@@ -106,7 +106,7 @@ class ObserverRecord:
     detection_target: np.ndarray
     detection_order: np.ndarray
     detection_face: np.ndarray
-    symbols: SymbolCount = SymbolCount()
+    symbols: SymbolCount = field(default_factory=SymbolCount)
     num_false: int = 0
     slips: int = 0
     reference_snr: float = np.nan
@@ -137,10 +137,9 @@ class Results:
         def say(value: float | None, form: str) -> str:
             return "-" if value is None else format(value, form)
 
-        lines = [
-            f"  {name}: hit rate {say(block['hit_rate'], '.2f')}, delay SER {say(block['ser_delay'], '.2e')}, DPSK SER {say(block['ser_dpsk'], '.2e')}"
-            for name, block in self.summary["terminals"].items()
-        ]
+        kinds = {"hit_rate": ("hit rate", ".2f"), "ser_delay": ("delay SER", ".2e"), "ser_dpsk": ("DPSK SER", ".2e")}
+        blocks = self.summary["terminals"].items()
+        lines = [f"  {name}: " + ", ".join(f"{words} {say(b[key], form)}" for key, (words, form) in kinds.items()) for name, b in blocks]
         return "\n".join([f"<Results of {self.scenario.name}: {self.summary['frames']} frames, seed {self.summary['seed']}", *lines]) + ">"
 
 
@@ -170,7 +169,8 @@ class Recorder:
         link_budget: Sequence[Mapping[str, Any]] = (),
     ) -> Results:
         """The results of the frames so far. `scores` holds every link's sensing; `timing` [s] goes into the summary only, as does what
-        became of the stages before the data (`access`); `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the dataset."""
+        became of the stages before the data (`access`); `materials` and `link_budget` (rows of a table) are kept as JSON attributes of
+        the dataset."""
         dataset = _Builder(self.scenario, self.waveform, self.timetable, tuple(self.states), self._frames).dataset()
         dataset.attrs |= {
             **provenance(self.scenario),
@@ -262,7 +262,7 @@ def errors_of(dataset: xr.Dataset, group: str, name: str) -> np.ndarray:
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 
 
-_DIMENSIONLESS = "1"
+DIMENSIONLESS = "1"
 
 
 @dataclass
@@ -310,24 +310,26 @@ class _Builder:
 
     def frame_values(self) -> None:
         names = list(self.scenario.swarm)
-        self.put("frame", ["frame"], np.array([f.frame for f in self.frames], np.int64), _DIMENSIONLESS, "index of the frame")
-        self.put("observer", ["observer"], np.array(self.observers, object), _DIMENSIONLESS, "link, by its receiver where that is enough")
-        self.put("uav", ["uav"], np.array(names, object), _DIMENSIONLESS, "unmanned aerial vehicle")
-        self.put("role", ["uav"], np.array([self.scenario.swarm[n].role for n in names], object), _DIMENSIONLESS, "role of the UAV at the start")
-        self.put("kind", ["kind"], np.array(KINDS, object), _DIMENSIONLESS, "kind of path")
-        self.put("symbol", ["symbol"], np.array(SYMBOLS, object), _DIMENSIONLESS, "kind of symbol")
-        self.put("axis", ["axis"], np.array(list("xyz"), object), _DIMENSIONLESS, "world axis: east, north, up")
-        self.put("body_axis", ["body_axis"], np.array(["right", "boresight", "up"], object), _DIMENSIONLESS, "body axis")
+        self.put("frame", ["frame"], np.array([f.frame for f in self.frames], np.int64), DIMENSIONLESS, "index of the frame")
+        self.put("observer", ["observer"], np.array(self.observers, object), DIMENSIONLESS, "link, by its receiver where that is enough")
+        self.put("uav", ["uav"], np.array(names, object), DIMENSIONLESS, "unmanned aerial vehicle")
+        self.put(
+            "role", ["uav"], np.array([self.scenario.swarm[n].role for n in names], object), DIMENSIONLESS, "role of the UAV at the start"
+        )
+        self.put("kind", ["kind"], np.array(KINDS, object), DIMENSIONLESS, "kind of path")
+        self.put("symbol", ["symbol"], np.array(SYMBOLS, object), DIMENSIONLESS, "kind of symbol")
+        self.put("axis", ["axis"], np.array(list("xyz"), object), DIMENSIONLESS, "world axis: east, north, up")
+        self.put("body_axis", ["body_axis"], np.array(["right", "boresight", "up"], object), DIMENSIONLESS, "body axis")
         self.put("time", ["frame"], np.array([f.time for f in self.frames], float), "s", "time of the middle of the frame")
-        self.put("modulated", ["frame"], np.array([f.modulated for f in self.frames], bool), _DIMENSIONLESS, "the frame carries data")
+        self.put("modulated", ["frame"], np.array([f.modulated for f in self.frames], bool), DIMENSIONLESS, "the frame carries data")
         for i, end in enumerate(("transmitter", "receiver")):
             ends = np.array([link[i] for link in self.timetable.labels], object)
-            self.put(end, ["observer"], ends, _DIMENSIONLESS, f"{end} of the observer's link")
+            self.put(end, ["observer"], ends, DIMENSIONLESS, f"{end} of the observer's link")
         for name, units in (("position", "m"), ("velocity", "m s-1"), ("acceleration", "m s-2")):
             values = np.array([[getattr(f.poses[n], name) for n in names] for f in self.frames], float).reshape(-1, len(names), 3)
             self.put(f"uav_{name}", ["frame", "uav", "axis"], values, units, f"{name} of the UAV in world axes")
         turned = np.array([[f.poses[n].rotation for n in names] for f in self.frames], float).reshape(-1, len(names), 3, 3)
-        self.put("uav_attitude", ["frame", "uav", "axis", "body_axis"], turned, _DIMENSIONLESS, "body axes of the UAV in world axes")
+        self.put("uav_attitude", ["frame", "uav", "axis", "body_axis"], turned, DIMENSIONLESS, "body axes of the UAV in world axes")
 
     def uav_values(self) -> None:
         count = len(self.scenario.swarm)
@@ -338,37 +340,39 @@ class _Builder:
             for name, (units, _) in MEASURES.items():
                 values = self.over(attrgetter(f"record.{group}.{name}"), none, float)
                 self.put(f"{group}_{name}", dims, values, units, f"{word} {name} of the UAV, seen by the observer")
-        self.put("in_view", dims, self.over(lambda s: s.record.in_view, no, bool), _DIMENSIONLESS, "UAV inside the field of view")
-        self.put("shadowed", dims, self.over(lambda s: s.record.shadowed, no, bool), _DIMENSIONLESS, "UAV hidden by the city")
+        self.put("in_view", dims, self.over(lambda s: s.record.in_view, no, bool), DIMENSIONLESS, "UAV inside the field of view")
+        self.put("shadowed", dims, self.over(lambda s: s.record.shadowed, no, bool), DIMENSIONLESS, "UAV hidden by the city")
 
     def counts(self) -> None:
         two, zero = ["frame", "observer"], np.zeros(len(KINDS))
-        self.put("processed", two, self.over(lambda s: True, False, bool), _DIMENSIONLESS, "the observer processed the frame")
-        self.put("state", two, self.over(lambda s: s.record.state, -1, np.int8), _DIMENSIONLESS, "state of the terminal, -1: not processed",
+        self.put("processed", two, self.over(lambda s: True, False, bool), DIMENSIONLESS, "the observer processed the frame")
+        self.put("state", two, self.over(lambda s: s.record.state, -1, np.int8), DIMENSIONLESS, "state of the terminal, -1: not processed",
                  flag_values=np.arange(len(self.states), dtype=np.int8), flag_meanings=" ".join(self.states))  # fmt: skip
         for name, text, get in (
             ("decoded", "data symbols were decided", lambda s: s.record.reception.decoded),
             ("line_of_sight", "the receiver says that it sees its reference path", lambda s: s.record.reception.line_of_sight),
         ):
-            self.put(name, two, self.over(get, False, bool), _DIMENSIONLESS, text)
+            self.put(name, two, self.over(get, False, bool), DIMENSIONLESS, text)
         power = self.over(lambda s: s.record.reception.reference_power, np.nan, float)
         self.put("reference_power", two, power, "W", "mean power of the reference path per sample and antenna, as received")
-        self.put("reference_snr", two, self.over(lambda s: s.record.reference_snr, np.nan, float), _DIMENSIONLESS,
+        self.put("reference_snr", two, self.over(lambda s: s.record.reference_snr, np.nan, float), DIMENSIONLESS,
                  "SNR of the reference path per sample and antenna before processing, linear")  # fmt: skip
-        self.put("num_false", two, self.over(lambda s: s.record.num_false, 0, np.int32), _DIMENSIONLESS, "detections that no path explains")
-        self.put("slips", two, self.over(lambda s: s.record.slips, 0, np.int32), _DIMENSIONLESS, "symbols decided outside their alphabet")
-        self.put("path_count", [*two, "kind"], self.over(lambda s: s.counts, zero, np.int32), _DIMENSIONLESS, "number of paths")
-        self.put("path_power", [*two, "kind"], self.over(lambda s: s.power, zero, float), _DIMENSIONLESS, "sum of |gain|^2 of the paths")
+        self.put("num_false", two, self.over(lambda s: s.record.num_false, 0, np.int32), DIMENSIONLESS, "detections that no path explains")
+        self.put("slips", two, self.over(lambda s: s.record.slips, 0, np.int32), DIMENSIONLESS, "symbols decided outside their alphabet")
+        self.put("path_count", [*two, "kind"], self.over(lambda s: s.counts, zero, np.int32), DIMENSIONLESS, "number of paths")
+        self.put("path_power", [*two, "kind"], self.over(lambda s: s.power, zero, float), DIMENSIONLESS, "sum of |gain|^2 of the paths")
         symbols = self.over(lambda s: _by_symbol(s.record.symbols), np.zeros((3, 3)), np.int64)
         for i, (name, text) in enumerate((("errors", "wrong or undecided"), ("erased", "undecided"), ("total", "sent to the observer"))):
-            self.put(f"symbol_{name}", [*two, "symbol"], symbols[:, :, i], _DIMENSIONLESS, f"symbols, {text}")
+            self.put(f"symbol_{name}", [*two, "symbol"], symbols[:, :, i], DIMENSIONLESS, f"symbols, {text}")
 
-    def ragged(self, prefix: str, dim: str, rows: Sequence[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]) -> None:
+    def ragged(
+        self, prefix: str, dim: str, rows: Sequence[tuple[int, int, Mapping[str, np.ndarray]]], columns: Mapping[str, tuple]
+    ) -> None:
         """Flat columns over `dim` with the frame and the observer of every row; a column is (dtype, unit, meaning)."""
         count = [len(next(iter(r[2].values()))) for r in rows]
         index = np.repeat(np.array([r[:2] for r in rows], np.int32).reshape(-1, 2), count, axis=0)
-        self.put(f"{prefix}_frame", [dim], index[:, 0], _DIMENSIONLESS, "position along the dimension frame")
-        self.put(f"{prefix}_observer", [dim], index[:, 1], _DIMENSIONLESS, "position along the dimension observer")
+        self.put(f"{prefix}_frame", [dim], index[:, 0], DIMENSIONLESS, "position along the dimension frame")
+        self.put(f"{prefix}_observer", [dim], index[:, 1], DIMENSIONLESS, "position along the dimension observer")
         for name, (dtype, units, text) in columns.items():
             parts = [np.asarray(r[2][name], dtype) for r in rows]
             self.put(f"{prefix}_{name}", [dim], np.concatenate(parts) if parts else np.zeros(0, dtype), units, text)
@@ -386,33 +390,34 @@ class _Builder:
         self.ragged("det", "detection", rows, {
             "range": (float, "m", "range of the detection; one way at the AT, path length at a PT"),
             "velocity": (float, "m s-1", "rate of the range, positive receding"),
-            "u_x": (float, _DIMENSIONLESS, "direction cosine along the body's X axis"),
-            "u_z": (float, _DIMENSIONLESS, "direction cosine along the body's Z axis"),
-            "snr": (float, _DIMENSIONLESS, "SNR of the range-Doppler cell, linear"),
+            "u_x": (float, DIMENSIONLESS, "direction cosine along the body's X axis"),
+            "u_z": (float, DIMENSIONLESS, "direction cosine along the body's Z axis"),
+            "snr": (float, DIMENSIONLESS, "SNR of the range-Doppler cell, linear"),
             "range_std": (float, "m", "standard deviation of the range"),
             "velocity_std": (float, "m s-1", "standard deviation of the velocity"),
-            "u_x_std": (float, _DIMENSIONLESS, "standard deviation of u_x"), "u_z_std": (float, _DIMENSIONLESS, "standard deviation of u_z"),
-            "is_reference": (bool, _DIMENSIONLESS, "line of sight at a PT"),
-            "kind": (np.int8, _DIMENSIONLESS, "kind of the path that explains it, -1: none"),
-            "target": (np.int16, _DIMENSIONLESS, "index of the UAV that explains it, -1: none"),
-            "order": (np.int16, _DIMENSIONLESS, "interactions with the city of the path that explains it, 0: direct, -1: no path"),
-            "face": (np.int32, _DIMENSIONLESS, "first face of the city's mesh on the path that explains it, -1: none"),
+            "u_x_std": (float, DIMENSIONLESS, "standard deviation of u_x"),
+            "u_z_std": (float, DIMENSIONLESS, "standard deviation of u_z"),
+            "is_reference": (bool, DIMENSIONLESS, "line of sight at a PT"),
+            "kind": (np.int8, DIMENSIONLESS, "kind of the path that explains it, -1: none"),
+            "target": (np.int16, DIMENSIONLESS, "index of the UAV that explains it, -1: none"),
+            "order": (np.int16, DIMENSIONLESS, "interactions with the city of the path that explains it, 0: direct, -1: no path"),
+            "face": (np.int32, DIMENSIONLESS, "first face of the city's mesh on the path that explains it, -1: none"),
         })  # fmt: skip
 
     def tracks(self) -> None:
         rows = [(i, j, vars(s.record.tracks)) for i, j, s in self.records()]
         self.ragged("track", "track", rows, {
-            "id": (np.int32, _DIMENSIONLESS, "number of the track, unique at its observer"), "range": (float, "m", "range of the track"),
+            "id": (np.int32, DIMENSIONLESS, "number of the track, unique at its observer"), "range": (float, "m", "range of the track"),
             "velocity": (float, "m s-1", "radial velocity of the track, positive receding"),
-            "u_x": (float, _DIMENSIONLESS, "direction cosine along the body's X axis"),
-            "u_z": (float, _DIMENSIONLESS, "direction cosine along the body's Z axis"),
-            "confirmed": (bool, _DIMENSIONLESS, "the track is confirmed"),
-            "uav": (np.int16, _DIMENSIONLESS, "index of the UAV that it follows, -1: none"),
+            "u_x": (float, DIMENSIONLESS, "direction cosine along the body's X axis"),
+            "u_z": (float, DIMENSIONLESS, "direction cosine along the body's Z axis"),
+            "confirmed": (bool, DIMENSIONLESS, "the track is confirmed"),
+            "uav": (np.int16, DIMENSIONLESS, "index of the UAV that it follows, -1: none"),
         })  # fmt: skip
 
     def ledger(self) -> None:
         kept = [(i, j, s.ledger) for i, j, s in self.records() if s.ledger is not None]
-        rows = [(i, j, {**_path_columns(p), "target": self._uav_index(p)}) for i, j, p in kept]
+        rows = [(i, j, {**path_columns(p), "target": self._uav_index(p)}) for i, j, p in kept]
         self.ragged("path", "path", rows, PATH_COLUMNS)
 
     def _uav_index(self, paths: PathSet) -> np.ndarray:
@@ -423,8 +428,8 @@ class _Builder:
 
     def maps(self) -> None:
         shots = [i for i, f in enumerate(self.frames) if any(s.record.reception.maps is not None for s in f.observers.values())]
-        found = [(k, j, s.record.reception.maps) for k, i in enumerate(shots)
-                 for j, o in enumerate(self.observers) if (s := self.frames[i].observers.get(o)) and s.record.reception.maps is not None]  # fmt: skip
+        place = {i: k for k, i in enumerate(shots)}
+        found = [(place[i], j, maps) for i, j, s in self.records() if (maps := s.record.reception.maps) is not None]
         rows, doppler = (max((m.range_doppler.shape[a] for _, _, m in found), default=0) for a in (0, 1))
         cells, chirps = (max((m.equivalent_range.shape[a] for _, _, m in found), default=0) for a in (0, 1))
         head = (len(shots), len(self.observers))
@@ -436,13 +441,13 @@ class _Builder:
             equivalent[k, j, : m.equivalent_range.shape[0], : m.equivalent_range.shape[1]] = m.equivalent_range
             marked[k, j, : m.equivalent_range.shape[0], : m.equivalent_range.shape[1]] = m.equivalent_detections
             ranges[j, : m.range_axis.size], speeds[j, : m.velocity_axis.size] = m.range_axis, m.velocity_axis
-        self.put("snapshot_frame", ["snapshot"], np.array(shots, np.int32), _DIMENSIONLESS, "position along the dimension frame")
+        self.put("snapshot_frame", ["snapshot"], np.array(shots, np.int32), DIMENSIONLESS, "position along the dimension frame")
         self.put("map_power", ["snapshot", "observer", "row", "doppler"], power, "W", "range-Doppler map, accumulated over antennas")
         self.put("map_range", ["observer", "row"], ranges, "m", "range of the map's rows")
         self.put("map_velocity", ["observer", "doppler"], speeds, "m s-1", "velocity of the map's columns")
         self.put("map_equivalent_range", ["snapshot", "observer", "cell", "chirp"], equivalent, "W0.5",
                  "magnitude over range cell and chirp before data removal")  # fmt: skip
-        self.put("map_equivalent_detections", ["snapshot", "observer", "cell", "chirp"], marked, _DIMENSIONLESS,
+        self.put("map_equivalent_detections", ["snapshot", "observer", "cell", "chirp"], marked, DIMENSIONLESS,
                  "cells that the one-dimensional CFAR finds, chirp by chirp")  # fmt: skip
 
 
@@ -456,23 +461,24 @@ def _by_symbol(c: SymbolCount) -> tuple[tuple[int, int, int], ...]:
 
 
 PATH_COLUMNS: dict[str, tuple] = {
-    "gain_re": (float, _DIMENSIONLESS, "real part of the complex gain without carrier phase"),
-    "gain_im": (float, _DIMENSIONLESS, "imaginary part of the complex gain without carrier phase"),
+    "gain_re": (float, DIMENSIONLESS, "real part of the complex gain without carrier phase"),
+    "gain_im": (float, DIMENSIONLESS, "imaginary part of the complex gain without carrier phase"),
     "power_db": (float, "dB", "|gain|^2"),
     "delay": (float, "s", "delay at the middle of the frame"),
-    "delay_rate": (float, _DIMENSIONLESS, "rate of the delay"),
+    "delay_rate": (float, DIMENSIONLESS, "rate of the delay"),
     "delay_accel": (float, "s-1", "second derivative of the delay"),
-    **{f"departure_{a}": (float, _DIMENSIONLESS, f"{a} of the unit vector along the first segment, world axes") for a in "xyz"},
-    **{f"arrival_{a}": (float, _DIMENSIONLESS, f"{a} of the unit vector towards where the wave comes from, world axes") for a in "xyz"},
-    "kind": (np.int8, _DIMENSIONLESS, "kind of path, an index into the dimension kind"),
-    "target": (np.int16, _DIMENSIONLESS, "index of the UAV involved, -1: none"),
-    "bounces": (np.int16, _DIMENSIONLESS, "interactions with the city"),
+    **{f"departure_{a}": (float, DIMENSIONLESS, f"{a} of the unit vector along the first segment, world axes") for a in "xyz"},
+    **{f"arrival_{a}": (float, DIMENSIONLESS, f"{a} of the unit vector towards where the wave comes from, world axes") for a in "xyz"},
+    "kind": (np.int8, DIMENSIONLESS, "kind of path, an index into the dimension kind"),
+    "target": (np.int16, DIMENSIONLESS, "index of the UAV involved, -1: none"),
+    "bounces": (np.int16, DIMENSIONLESS, "interactions with the city"),
     "begin": (float, "s", "start of the path's life since the middle of the frame"),
     "end": (float, "s", "end of the path's life since the middle of the frame"),
 }
 
 
-def _path_columns(p: PathSet) -> dict[str, np.ndarray]:
+def path_columns(p: PathSet) -> dict[str, np.ndarray]:
+    """The columns `PATH_COLUMNS` of a path set."""
     with np.errstate(divide="ignore"):
         power_db = 10 * np.log10(p.power)
     columns = {"gain_re": p.gain.real, "gain_im": p.gain.imag, "power_db": power_db}
@@ -508,9 +514,12 @@ def write_bytes(file: Path, write: Callable[[Path], object]) -> None:
     _atomically(Path(file), write)
 
 
-def _write_dataset(dataset: xr.Dataset, file: Path) -> None:
+def write_dataset(dataset: xr.Dataset, file: Path) -> None:
+    """A NetCDF file, compressed, that appears whole or not at all."""
     encoding = {
-        name: {"zlib": True, "complevel": 4, "shuffle": True} for name, v in dataset.variables.items() if v.dtype != object and v.ndim and v.size
+        name: {"zlib": True, "complevel": 4, "shuffle": True}
+        for name, v in dataset.variables.items()
+        if v.dtype != object and v.ndim and v.size
     }
     _atomically(file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding))
 
@@ -523,7 +532,7 @@ def save(results: Results, folder: str | Path) -> None:
     ResultsError  If the folder cannot be written.
     """
     folder = Path(folder)
-    _write_dataset(results.dataset, folder / FILE)
+    write_dataset(results.dataset, folder / FILE)
     write_text(folder / "scenario.yaml", to_yaml(results.scenario, folder))
     write_text(folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n")
 
@@ -552,42 +561,3 @@ def load(folder: str | Path) -> Results:
     except (OSError, ValueError) as problem:
         raise ResultsError(f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote") from problem
     return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))
-
-
-def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario) -> None:
-    """Write the path ledger of one frame, all links, as NetCDF.
-
-    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront radii, the transmitter and
-    receiver of each, interaction points (path, bounce, axis) [m] and faces of the city mesh (path, bounce).
-
-    Raises
-    ------
-    ResultsError  If the file cannot be written.
-    """
-    depth = max((p.faces.shape[1] for p in paths.values()), default=0)
-    names = next((p.target_names for p in paths.values() if p.target_names), ())
-    out: dict[str, xr.Variable] = {}
-
-    def put(name: str, dims: Sequence[str], parts: list[np.ndarray], empty: np.ndarray, units: str, text: str) -> None:
-        out[name] = xr.Variable(dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text})
-
-    def column(name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str) -> None:
-        put(name, ["path"], [np.asarray(get(p), dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
-
-    column("transmitter", lambda p: np.full(len(p), p.tx, object), object, _DIMENSIONLESS, "transmitting terminal")
-    column("receiver", lambda p: np.full(len(p), p.rx, object), object, _DIMENSIONLESS, "receiving terminal")
-    for name, (dtype, units, text) in PATH_COLUMNS.items():
-        put(name, ["path"], [np.asarray(_path_columns(p)[name], dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
-    carrier = scenario.radio.carrier_hz
-    column("doppler", lambda p: -carrier * p.delay_rate, float, "Hz", "Doppler shift at the carrier, positive closing")
-    column("tx_radius", lambda p: p.tx_radius, float, "m", "radius of curvature of the wavefront at the transmitter")
-    column("rx_radius", lambda p: p.rx_radius, float, "m", "radius of curvature of the wavefront at the receiver")
-    pad = lambda a, fill: np.pad(a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill)  # noqa: E731
-    put("points", ["path", "bounce", "axis"], [pad(p.points, np.nan) for p in paths.values()], np.zeros((0, depth, 3)), "m",
-        "interaction points in world axes, NaN where there is none")  # fmt: skip
-    put("faces", ["path", "bounce"], [pad(p.faces, -1) for p in paths.values()], np.zeros((0, depth), np.int32), _DIMENSIONLESS,
-        "face of the city mesh at each point, -1 where there is none")  # fmt: skip
-    out["kind_name"] = xr.Variable(["kind"], np.array(KINDS, object), {"units": _DIMENSIONLESS, "long_name": "name of each kind of path"})
-    out["target_name"] = xr.Variable(["uav"], np.array(names, object), {"units": _DIMENSIONLESS, "long_name": "name that target indexes"})
-    epoch = next((p.epoch for p in paths.values()), np.nan)
-    _write_dataset(xr.Dataset(out, attrs={**provenance(scenario), "epoch_s": epoch}), Path(file))

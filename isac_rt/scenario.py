@@ -213,7 +213,7 @@ class Uav(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.resource_block is not None and self.role != "active":
-            said = f"has no meaning for a UAV that is {self.role} at the start (who takes over the active role takes over its blocks); remove it"
+            said = f"has no meaning for a UAV that is {self.role} at the start (who takes over the role takes over its blocks); remove it"
             yield Problem((("resource_block",), ("role",)), said)
         if self.waypoints is None and self.position_m is None:
             yield Problem((("position_m",),), "missing: a UAV needs either position_m or waypoints")
@@ -303,8 +303,8 @@ class Receivers(Node):
     M = L_tx. conventional: the DFT over each antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the
     schedule and the groups received."""
     refinement: Literal["grid", "local", "joint"] = "local"
-    """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the windowed spectra about each peak. joint: all
-    paths at once on the samples, at the Cramer-Rao bound; paths in one cell are told apart by direction (slower)."""
+    """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the windowed spectra about each peak.
+    joint: all paths at once on the samples, at the Cramer-Rao bound; paths in one cell are told apart by direction (slower)."""
     symbol_decision: Literal["powers", "profile", "beams"] = "powers"
     """How a PT reads symbols. powers: the receivers' powers added, the paper's. profile: the same, delay symbols by correlation with the
     range profile of the last unmodulated frame, in which clutter votes with the line of sight. beams: receivers added in phase towards
@@ -503,7 +503,7 @@ class Scenario(Node):
             said = "feedback compares ranges of two terminals, which need the same clock; leave it out, or take external or two_round"
             yield Problem((("access", "feedback"), ("access", "synchronisation")), said)
         if self.access.establish and self.role_changes:
-            said = "the stages are gone through once, before the first frame, and a change of roles would need them again; leave one of the two out"
+            said = "the stages are gone through once, before the first frame; a change of roles needs them again; leave one of the two out"
             yield Problem((("access", "establish"), ("role_changes",)), said)
         for name, groups in self.modulation.streams.items():
             stream: Key = ("modulation", "streams", name)

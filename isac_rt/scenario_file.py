@@ -323,7 +323,12 @@ class _Complaints:
 
 
 def _plain_words(message: str) -> str:
-    message = message.split(", unable to parse")[0].replace("Input should be", "must be").replace("Tuple should have", "must have").replace("'", "")
+    message = (
+        message.split(", unable to parse")[0]
+        .replace("Input should be", "must be")
+        .replace("Tuple should have", "must have")
+        .replace("'", "")
+    )
     return message.replace("must be a valid ", "must be a ").replace("a integer", "an integer").replace("tuple", "list")
 
 

@@ -2,9 +2,9 @@ r"""The paper's separable IF model, for comparison only: what its receivers assu
 
 .. math:: \beta_p\,\bar g\,e^{j2\pi f_c(\tau_0 + \tau_l)}\,e^{j2\pi n(f_\tau + f_D[p])/N}\,e^{j2\pi f_c\dot\tau p\bar T}
 
-with tau_0 the delay at the frame's start, f_tau = alpha T tau_0 and f_D the data in range cells, tau_l the elements' delays at the carrier
-alone. Left out (notes, section 2): Doppler within a chirp, migration, the groups' offsets in time, the elements' delay of the modulation, and
-the four phases that data turn. The relative RMS against the exact model is 0.042 at 0.5 m/s and 0.91 at 15 m/s for an echo,
+with tau_0 the delay at the frame's start, f_tau = alpha T tau_0 and f_D the data in range cells, tau_l the elements' delays at the
+carrier alone. Left out (notes, section 2): Doppler within a chirp, migration, the groups' offsets in time, the elements' delay of the
+modulation, and the four phases that data turn. The relative RMS against the exact model is 0.042 at 0.5 m/s and 0.91 at 15 m/s for an echo,
 and 1 once there are data.
 """
 

@@ -54,7 +54,8 @@ BELIEVED_CELLS = (0.15, 0.3)
 """A reference off its prediction by more cells of range or of velocity than these, and four deviations, is not believed: a second path in
 the same cell pulls the estimate, and the track, if it followed, would soon misread the symbols. It coasts instead."""
 MOST_CELLS = 0.4
-"""However uncertain the prediction, a reference farther off in range is not believed: two equal paths a cell apart are found in their middle."""
+"""However uncertain the prediction, a reference farther off in range is not believed: two equal paths a cell apart are found in
+their middle."""
 ANCHOR_CELLS = 0.75
 """A pilot off by more than this has found another cell: the track starts anew from it."""
 PATIENCE = 25

@@ -434,7 +434,7 @@ class Tracker:
         s = self.settings
         track.age += 1
         track.missed = 0 if hit else track.missed + 1
-        track.recent = (track.recent + [hit])[-s.confirm_window :]
+        track.recent = [*track.recent, hit][-s.confirm_window :]
         track.confirmed = track.confirmed or sum(track.recent) >= s.confirm_hits
 
     def _dead(self, track: Track) -> bool:

@@ -128,7 +128,9 @@ def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Result
         recorder.add(record)
         for name, o in record.observers.items():
             t = o.truth
-            truth = Truth(t.range[2], t.velocity[2], *o.reception.detections.direction[0], t.azimuth[2], t.elevation[2]) if detections else None
+            truth = (
+                Truth(t.range[2], t.velocity[2], *o.reception.detections.direction[0], t.azimuth[2], t.elevation[2]) if detections else None
+            )
             scores["AT", name].add([truth] if truth else [], o.reception.detections, kinds=o.detection_kind)
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
     return recorder.finish(scores=scores, timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)

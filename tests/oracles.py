@@ -11,7 +11,8 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0
     """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long double).
 
     `start_time` is that of the first reference chirp, which is sent in resource block `block` of its slot. Times are counted
-    from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are placed as points: a path with a radius comes from (goes to) a point at this distance; a line of sight joins two elements.
+    from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are placed as points: a path
+    with a radius comes from (goes to) a point at this distance; a line of sight joins two elements.
     """
     ld = np.longdouble
     period = ld(1) / ld(w.sampling_rate)

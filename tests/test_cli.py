@@ -147,9 +147,9 @@ def test_doctor_says_what_to_do_and_fails_with_2(capsys, monkeypatch):
 
 def test_help_loads_nothing_heavy():
     """Seen to fail with `import numpy` at the top of cli.py."""
-    program = ("import sys; from isac_rt.cli import main; main(['--help']); "
-               "print([m for m in ('numpy', 'xarray', 'matplotlib', 'pydantic', 'mitsuba') if m in sys.modules], file=sys.stderr)")  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True)
+    heavy = ("numpy", "xarray", "matplotlib", "pydantic", "mitsuba")
+    code = f"import sys; from isac_rt.cli import main; main(['--help']); print([m for m in {heavy} if m in sys.modules], file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stderr.strip() == "[]" and "doctor" in done.stdout
 
 

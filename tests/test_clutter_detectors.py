@@ -33,7 +33,9 @@ def scatterers(count: int, seed: int, ranges: tuple[float, float], speed: float 
     forward = np.array([0.6, np.sqrt(1 - 0.45), 0.3])
     rates = [-2 * speed * forward @ np.array([a, np.sqrt(1 - a * a - b * b), b]) for a, b in u]
     powers = rng.uniform(0.2, 2.0, count)
-    return [Path(length, rate, np.sqrt(p), tuple(c), tuple(c)) for length, rate, p, c in zip(lengths, rates, powers, u.tolist(), strict=True)]
+    return [
+        Path(length, rate, np.sqrt(p), tuple(c), tuple(c)) for length, rate, p, c in zip(lengths, rates, powers, u.tolist(), strict=True)
+    ]
 
 
 def expected(paths: list[Path]) -> ExpectedClutter:

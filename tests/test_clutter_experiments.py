@@ -57,7 +57,8 @@ def test_symbols_without_clutter_have_the_known_error_rate():
 
 
 def test_run_and_weeding():
-    """45 equal cells and a weak floor: their mean is found, the floor is weeded, the run is not. Planted bug: mean over the whole profile."""
+    """45 equal cells and a weak floor: their mean is found, the floor is weeded, the run is not.
+    Planted bug: mean over the whole profile."""
     ranges = np.arange(1, 400) * W.range_cell(2)
     gains = np.where((np.arange(1, 400) >= 100) & (np.arange(1, 400) < 145), 3.0, 0.01)
     paths = resting(ranges, gains, 2, 0.0, np.array([0.0, 1.0, 0.0]))

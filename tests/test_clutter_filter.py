@@ -54,7 +54,9 @@ def test_what_stands_still_is_removed_and_what_moves_is_not():
     still = clutter_paths(2, 10.0, 3, 25.0)
     target = [Path(2 * 24.3, 2 * 5.1, 1.0, (0.2, 0.1), (0.2, 0.1))]
     row = round(24.3 / w.range_cell(2))
-    alone, both = (clean_spectrum(cube(w, schedule, payload, p, FEW), payload.delay_symbols, payload.phases, 256) for p in (target, still + target))
+    alone, both = (
+        clean_spectrum(cube(w, schedule, payload, p, FEW), payload.delay_symbols, payload.phases, 256) for p in (target, still + target)
+    )
     bare = clean_spectrum(cube(w, schedule, payload, still, FEW), payload.delay_symbols, payload.phases, 256)
     before = np.abs(bare[..., row, :]).max()
     rows = remove_standing(bare, schedule, 15)

@@ -131,7 +131,8 @@ def test_draws_repeat_from_the_seed_and_by_frame_or_once():
 
 
 def test_gaussian_clutter_is_noise_beside_the_noise():
-    """A link's noise power with clutter 3.2 dB over the thermal noise, in both noise models; exact. Planted bug: the clutter instead of the sum."""
+    """A link's noise power with clutter 3.2 dB over the thermal noise, in both noise models; exact.
+    Planted bug: the clutter instead of the sum."""
     for model in ("snr", "link_budget"):
         levels = []
         for clutter in (["clutter.model=none"], ["clutter.model=gaussian", "clutter.clutter_to_noise_db=3.2"]):

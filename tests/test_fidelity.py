@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -207,8 +208,8 @@ def test_frames_are_traced_as_seldom_as_the_flight_allows():
         places = np.array([[p.position for p in plan.swarm.poses(plan.timetable.epoch(f)).values()] for f in range(a, b + 1)])
         return float(np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0).max())
 
-    assert all(flown(a, b) <= 1.7 for a, b in zip(frames, frames[1:], strict=False))
-    assert all(flown(a, b + 1) > 1.7 for a, b in zip(frames, frames[1:-1], strict=False))
+    assert all(flown(a, b) <= 1.7 for a, b in pairwise(frames))
+    assert all(flown(a, b + 1) > 1.7 for a, b in pairwise(frames[:-1]))
     assert plan_of("munich_swarm.yaml", "accuracy.max_untraced_m=0").instants == ()
     assert plan_of("paper_swarm.yaml").instants == ()
 

@@ -53,7 +53,10 @@ def test_range_doppler_marks_detections_and_truth_where_they_are(run):
     ax = range_doppler(Figure().subplots(), run.dataset, 0, 0)
     lines = {line.get_label(): line for line in ax.get_lines()}
     truth = lines["UAV in view (truth)"]
-    assert truth.get_ydata()[0] == run.dataset.truth_range.values[2, 0, 2] and truth.get_xdata()[0] == run.dataset.truth_velocity.values[2, 0, 2]
+    assert (
+        truth.get_ydata()[0] == run.dataset.truth_range.values[2, 0, 2]
+        and truth.get_xdata()[0] == run.dataset.truth_velocity.values[2, 0, 2]
+    )
     assert {"target (1)", "specular (1)", "unexplained (1)"} <= set(lines)
     shown = np.asarray(ax.images[0].get_array())
     assert np.unravel_index(shown.argmax(), shown.shape) == (17, 60) and shown.max() > 30 and abs(np.median(shown)) < 1e-4

@@ -20,7 +20,7 @@ RESOLUTION = np.array([0.25, 0.249, 0.108, 0.108])
 PERIOD = 28.6
 WALL_X = 11.3
 """The wall's plane x = 11.3 m in local coordinates; it stands from y = 2 to 40 and z = -6 to 13."""
-OWN = Pose(ORIGIN + [1.7, -3.1, 4.2], np.array([0.6, 5.1, -0.2]), np.zeros(3), np.eye(3))
+OWN = Pose(ORIGIN + np.array([1.7, -3.1, 4.2]), np.array([0.6, 5.1, -0.2]), np.zeros(3), np.eye(3))
 BODY = np.array([4.6, 24.7, 6.9, -1.3, -2.2, 0.4])
 """Local position and velocity of a body before the wall."""
 
@@ -46,12 +46,15 @@ def length(start: np.ndarray, end: np.ndarray, over_wall: bool) -> float:
         touch = np.array([WALL_X, *yz])
         return float(np.linalg.norm(touch - start) + np.linalg.norm(end - touch))
 
-    return float(minimize(way, (start[1:] + end[1:]) / 2, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 4000}).fun)
+    return float(
+        minimize(way, (start[1:] + end[1:]) / 2, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 4000}).fun
+    )
 
 
 def test_echoes_over_a_wall_are_the_shortest_ways_that_touch_it():
     """Range and rate of orders 1 and 2 against ways found by minimising their length (1e-8 m: the minimiser's),
-    rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step). Planted bugs: the image's velocity not mirrored; the origin left out of the plane."""
+    rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step).
+    Planted bugs: the image's velocity not mirrored; the origin left out of the plane."""
     state = BODY - np.concatenate([OWN.position - ORIGIN, OWN.velocity])
     found = echoes(state, OWN, Walls(wall()))
     assert [order for _, order, _ in found] == [1, 1, 1, 2]

@@ -59,8 +59,8 @@ def test_a_cube_comes_back_from_sigmf_and_another_reader_finds_a_sample(cube, tm
     theirs.validate()
     read = theirs.read_samples()
     assert read.shape == (12 * 64, 15)
-    m, l, p, n = 2, 3, 7, 41
-    assert read[p * 64 + n, m * 5 + l] == cube.samples[m, l, p, n]
+    m, rx, p, n = 2, 3, 7, 41
+    assert read[p * 64 + n, m * 5 + rx] == cube.samples[m, rx, p, n]
     assert theirs.get_global_field("core:sample_rate") == W.sampling_rate
     assert theirs.get_captures()[0]["core:frequency"] == W.carrier_frequency
     assert len(theirs.get_annotations()) == 12

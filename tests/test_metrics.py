@@ -212,7 +212,7 @@ def test_gospa_closed_forms():
     Planted bug: c^2 instead of c^2/2 for a missed target."""
     c, x = 5.0, np.array([[1.3, 2.7, 0.4], [11.1, 3.3, 7.9]])
     assert gospa(x, x[::-1], c).distance == 0.0
-    assert gospa(x[:1], x[:1] + [3.0, 0.0, 4.0 - 1e-9], c).distance == pytest.approx(5.0)
+    assert gospa(x[:1], x[:1] + np.array([3.0, 0.0, 4.0 - 1e-9]), c).distance == pytest.approx(5.0)
     assert gospa(x[:1], x[:1] + 100.0, c) == pytest.approx((5.0, 0.0, 12.5, 12.5))
     assert gospa(x, np.zeros((0, 3)), c).distance == pytest.approx(np.sqrt(2 * 12.5))
     assert gospa(np.zeros((0, 3)), np.zeros((0, 3)), c).distance == 0.0

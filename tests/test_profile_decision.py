@@ -45,7 +45,8 @@ def test_the_profile_reads_what_the_strongest_cell_does_not(snr_db: float):
 
 
 def test_profile_is_the_cells_power_over_noise():
-    """The reference and a path 3 cells behind it: N times their SNR in their cells, next to nothing far away. Planted bug: cells counted from range 0."""
+    """The reference and a path 3 cells behind it: N times their SNR in their cells, next to nothing far away.
+    Planted bug: cells counted from range 0."""
     w, schedule, _ = frame(waveform=SHORT)
     _, expected = scene(5)
     paths = [Path(11.31, 0.0, 0.3), Path(11.31 + 3 * w.range_cell(1), 0.0, 0.2)]

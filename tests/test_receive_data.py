@@ -58,7 +58,9 @@ def test_receivers_import_nothing_that_knows_the_truth():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [f"{node.module}.{a.name}" for a in node.names] if isinstance(node, ast.ImportFrom) else []
             for name in names:
-                assert name == allowed or not any(word in name for word in ("swarm", "propagation", "PathSet", "Transmission", "simulate")), name
+                assert name == allowed or not any(
+                    word in name for word in ("swarm", "propagation", "PathSet", "Transmission", "simulate")
+                ), name
 
 
 @pytest.mark.parametrize("cell", [0.61, 22.5, 137.28, 401.93])

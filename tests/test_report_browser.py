@@ -45,8 +45,9 @@ def report(tmp_path_factory) -> Path:
 def test_the_report_renders(report, width):
     """On a phone's width and on a desk's: every figure drawn, nothing fetched, no error, no sideways scrolling, letters of 12 pixels or
     more. Planted bug: an image by its file's name."""
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={width},900", "--enable-logging=stderr",
-               f"--user-data-dir={report.parent / 'profile'}", "--virtual-time-budget=3000", "--dump-dom", report.as_uri()]  # fmt: skip
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={width},900",
+               "--enable-logging=stderr", f"--user-data-dir={report.parent / 'profile'}", "--virtual-time-budget=3000",
+               "--dump-dom", report.as_uri()]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "CONSOLE" not in done.stderr

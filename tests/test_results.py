@@ -12,13 +12,14 @@ from fake_run import TIMING, fake_recorder, fake_records, fake_run, fake_scenari
 
 from isac_rt import provenance
 from isac_rt.arrays import antennas_of
+from isac_rt.interchange import write_ledger
 from isac_rt.metrics import SensingScore, resolutions
-from isac_rt.results import KINDS, ResultsError, check_folder, errors_of, load, save, write_ledger
+from isac_rt.results import KINDS, ResultsError, check_folder, errors_of, load, save
 from isac_rt.scenario_file import to_yaml
 from isac_rt.waveform import waveform_of
 
-TERMINAL_KEYS = {"counts", "role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased", "matched",
-                 "matched_tracked", "false_per_frame", "clutter_per_frame"}  # fmt: skip
+TERMINAL_KEYS = {"counts", "role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased",
+                 "matched", "matched_tracked", "false_per_frame", "clutter_per_frame"}  # fmt: skip
 RMSE_KEYS = {"range_m", "velocity_mps", "azimuth_deg", "elevation_deg"}
 ROUNDING = 1e-12
 """Differences of numbers around 30 in float64, a few operations each."""

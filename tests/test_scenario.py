@@ -81,11 +81,23 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         (BASE + "city: {source: mesh, file: no.ply}\n", "s.yaml:4: city.file = no.ply: no such file"),
         (BASE + "city: {source: munich}\n", "must be builtin, mitsuba, mesh, footprints, canyon or blocks"),
         (BASE + "  A b: {role: target, position_m: [9, 9, 9]}\n", "s.yaml:4: swarm.A b: a UAV's name may hold letters, digits"),
-        (BASE + "  B: {role: target, position_m: [9, 9, 9], resource_block: 3}\n", "resource_block = 3: has no meaning for a UAV that is target"),
-        (BASE + "  B: {role: active, position_m: [9, 9, 9], resource_block: 17}\n", "B would need the resource blocks 17 to 19; a slot has 19 (0 to 18)"),
-        (BASE + "role_changes: [{frame: 7, from_uav: PT1, to_uav: PT1}]\n", "role_changes.0.from_uav = PT1: PT1 is passive; name a UAV that is active then"),
+        (
+            BASE + "  B: {role: target, position_m: [9, 9, 9], resource_block: 3}\n",
+            "resource_block = 3: has no meaning for a UAV that is target",
+        ),
+        (
+            BASE + "  B: {role: active, position_m: [9, 9, 9], resource_block: 17}\n",
+            "B would need the resource blocks 17 to 19; a slot has 19 (0 to 18)",
+        ),
+        (
+            BASE + "role_changes: [{frame: 7, from_uav: PT1, to_uav: PT1}]\n",
+            "role_changes.0.from_uav = PT1: PT1 is passive; name a UAV that is active then",
+        ),
         (BASE + "role_changes: [{frame: 7, from_uav: AT, to_uav: X}]\n", "role_changes.0.to_uav = X: X is not in the swarm"),
-        (BASE + "role_changes: [{frame: 100, from_uav: AT, to_uav: PT1}]\n", "must be after 0 (the change before it) and below the number of frames, 100"),
+        (
+            BASE + "role_changes: [{frame: 100, from_uav: AT, to_uav: PT1}]\n",
+            "must be after 0 (the change before it) and below the number of frames, 100",
+        ),
         (BASE + "modulation: {streams: {AT: [0]}}\n", "modulation.streams.AT = [0]: is never a passive terminal"),
         (BASE + "modulation: {streams: {PT1: [0, 3]}}\n", "needs one group or more of 0 to 2 (radio.groups = 3), each once"),
         (BASE + "  B: {role: target, position_m: [0, 5.3, 1.04]}\n", "PT1 and B are 0.04 m apart at the start"),

@@ -57,6 +57,6 @@ def test_data_make_it_wrong_altogether():
 
 
 def test_the_elements_are_narrowband():
-    """Off boresight, at rest: the transmit elements turn the carrier alone, some per cent from the truth (notes: 2 to 3 % at 30 to 60 degrees for
-    the whole array). Planted bug: the carrier's turn of a transmit element doubled."""
+    """Off boresight, at rest: the transmit elements turn the carrier alone, some per cent from the truth (notes: 2 to 3 % at 30 to
+    60 degrees for the whole array). Planted bug: the carrier's turn of a transmit element doubled."""
     assert 1e-3 < misfit(2, 0.0, False, aside=(0.43, -0.31)) < 0.05

@@ -136,11 +136,16 @@ def test_too_many_points_are_counted_and_refused(folder, capsys):
     assert "3 a x 2 b x 20 repetitions are 120 points, more than 100; shorten" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text, said", [("scenario: no.yaml\naxes: {a: {key: frames, values: [4]}}\n", "scenario = no.yaml: the base scenario cannot"),
-                                        ("", "s.yaml: is empty; a sweep needs a scenario and axes")])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("scenario: no.yaml\naxes: {a: {key: frames, values: [4]}}\n", "scenario = no.yaml: the base scenario cannot"),
+        ("", "s.yaml: is empty; a sweep needs a scenario and axes"),
+    ],
+)
 def test_a_sweep_without_a_base_is_refused(folder, text, said):
     (folder / "s.yaml").write_text(text)
-    with pytest.raises(ScenarioError, match="no.yaml|empty") as caught:
+    with pytest.raises(ScenarioError, match=r"no\.yaml|empty") as caught:
         load_sweep(folder / "s.yaml")
     assert said in str(caught.value)
 
@@ -175,7 +180,9 @@ def test_the_dataset_holds_each_points_summary(folder):
         block = summarise(s)["links"]["A->P1"]
         here = d.sel(snr=-31, order=8, repetition=repetition, link="A->P1")
         assert float(here.ser_delay) == block["ser_delay"]
-        assert np.array_equal(float(here.rmse_range_m), np.nan if block["rmse"]["range_m"] is None else block["rmse"]["range_m"], equal_nan=True)
+        assert np.array_equal(
+            float(here.rmse_range_m), np.nan if block["rmse"]["range_m"] is None else block["rmse"]["range_m"], equal_nan=True
+        )
         errors, total = errors + block["counts"]["ser_delay"][0], total + block["counts"]["ser_delay"][1]
     low, high = binomial_interval(errors, total)
     here = d.sel(snr=-31, order=8, link="A->P1")

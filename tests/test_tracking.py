@@ -142,7 +142,9 @@ def test_filter_against_the_joint_posterior():
     R = np.diag(np.array([0.31, 0.27, 2.2e-7, 1.9e-7]) ** 2)
     intervals, sigma = [0.11, 0.07, 0.19, 0.13], 3.7
     h0, scale = measure(origin, own), np.array([0.5, 0.5, 0.5, 5.0, 5.0, 5.0])
-    H = np.stack([(measure(origin + s * d, own) - measure(origin - s * d, own)) / (2 * s) for s, d in zip(scale, np.eye(6), strict=True)], 1)
+    H = np.stack(
+        [(measure(origin + s * d, own) - measure(origin - s * d, own)) / (2 * s) for s, d in zip(scale, np.eye(6), strict=True)], 1
+    )
 
     x = prior.mean + np.linalg.cholesky(prior.covariance) @ rng.standard_normal(6)
     g, zs, Fs, Qs = prior, [], [], []
@@ -152,7 +154,7 @@ def test_filter_against_the_joint_posterior():
         x = F @ x + np.kron([dt**2 / 2, dt], sigma * rng.standard_normal(3))
         z = measure(x, own) + np.sqrt(np.diag(R)) * rng.standard_normal(4)
         g = update(predict(g, dt, sigma), z, R, own)
-        zs, Fs, Qs = zs + [z], Fs + [F], Qs + [Q]
+        zs, Fs, Qs = [*zs, z], [*Fs, F], [*Qs, Q]
 
     # joint Gaussian of (x_1..x_n) a priori, then conditioned on all measurements at once
     n = len(intervals)

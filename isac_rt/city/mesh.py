@@ -71,7 +71,9 @@ class City:
 
     def __repr__(self) -> str:
         size = np.ptp(self.vertices, axis=0) if self.num_faces else np.zeros(3)
-        return f"<City {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} m, {len(self.materials)} materials>"
+        return (
+            f"<City {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} m, {len(self.materials)} materials>"
+        )
 
     @property
     def num_faces(self) -> int:

@@ -100,7 +100,9 @@ class CachedPropagation:
 
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
         """As the model's own, bit for bit."""
-        where = {name: [p.position.tolist(), p.velocity.tolist(), p.acceleration.tolist(), p.rotation.tolist()] for name, p in poses.items()}
+        where = {
+            name: [p.position.tolist(), p.velocity.tolist(), p.acceleration.tolist(), p.rotation.tolist()] for name, p in poses.items()
+        }
         text = json.dumps([self._content, epoch, links, where])
         key = hashlib.sha256(text.encode()).hexdigest()
         found = self._store.get(key)
