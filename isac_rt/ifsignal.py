@@ -14,12 +14,13 @@ from isac_rt.noise import add_white_noise
 from isac_rt.payload import Payload
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.separable import separable
+from isac_rt.simd import cube_memory
 from isac_rt.swarm import Pose
 from isac_rt.synthesis import Tones, add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 Method = Literal["auto", "exact", "direct", "gridded", "paper"]
-"""exact: float64 per sample. direct: error 1e-6, cost ~ paths. gridded: error `GRIDDED_ERROR`, for many paths. auto: the
+"""exact: float64 per sample. direct: error 1e-6 (float32 sums), cost ~ paths. gridded: error `GRIDDED_ERROR`, for many paths. auto: the
 paths whose gridding error, integrated coherently over the whole cube, could exceed the noise of a cell (amplitude^2 |gain|^2
 GRIDDED_ERROR^2 size > noise_power) go direct, the `max_direct` strongest of them at the most, and so does every line of
 sight; the rest are gridded. At most FEW_PATHS paths all go direct. paper: the paper's separable model, for comparison
@@ -153,12 +154,13 @@ def if_signal(
     if method in ("exact", "paper"):
         samples = {"exact": exact, "paper": separable}[method](waveform, tones, filter_transition).astype(np.complex64)
     else:
-        samples = np.empty(shape, np.complex64)
+        samples = cube_memory(shape)
         alone = np.full(len(tones), method == "direct")
         if method == "auto":
             alone = _direct_paths(power, sight, samples.size, noise_power, max_direct)
-        add_gridded(samples, waveform, tones.select(~alone), filter_transition, setting, fresh=True)
-        add_direct(samples, waveform, tones.select(alone), filter_transition)
+        if not alone.all():
+            add_gridded(samples, waveform, tones.select(~alone), filter_transition, setting, fresh=True)
+        add_direct(samples, waveform, tones.select(alone), filter_transition, fresh=bool(alone.all()))
     return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
 
 

@@ -14,9 +14,9 @@ from isac_rt.ifsignal import Transmission, _tones
 from isac_rt.lanefft import ROW, plan, transform
 from isac_rt.payload import random_payload
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.simd import aligned, cos_sin, load, store
+from isac_rt.simd import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.swarm import Pose, attitude
-from isac_rt.synthesis import exact
+from isac_rt.synthesis import add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 SKIRT = 0.41e6
@@ -58,6 +58,37 @@ def test_cosine_and_sine():
     assert np.abs(c + 1j * s.astype(float) - truth).max() < 1.5e-6  # the double angle amplifies roundings of 6e-8
 
 
+def test_cosine_and_sine_for_the_direct_method():
+    """Planted bug: the last two terms of the cosine left out."""
+    cycles = np.linspace(-0.5, 0.5, 16 * 1000)
+    c, s = np.empty(cycles.size, np.float32), np.empty(cycles.size, np.float32)
+
+    @njit
+    def run(cycles, c, s):
+        for i in range(0, cycles.size, 16):
+            a, b = cos_sin_exact(load(cycles, i))
+            store(c, i, a)
+            store(s, i, b)
+
+    run(cycles, c, s)
+    truth = np.exp(2j * np.pi * cycles)
+    assert np.abs(c.astype(float) - truth.real).max() < 3.1e-8  # half an ulp below 1, and 1e-10
+    assert np.abs(s.astype(float) - truth.imag).max() < 3.1e-8
+
+
+def test_memory_is_lent_again_only_when_nothing_refers_to_it():
+    """Planted bug: memory kept for the next when the first array goes, whatever views are left."""
+    shape = (2, 3, 5, 7)
+    first = cube_memory(shape)
+    where, view = first.ctypes.data, first[1]
+    del first
+    second = cube_memory(shape)
+    assert second.ctypes.data != where
+    del view
+    assert cube_memory(shape).ctypes.data == where
+    assert cube_memory((2, 3, 5, 8)).shape == (2, 3, 5, 8)
+
+
 def scene(count, rng, speed=15.0, view=60.0, **change):
     """Paths in the field of view, |u| up to 0.87, of one sender with data; and the tones at a full L of 15 elements."""
     w = replace(Waveform(), **({"num_chirps": 6} | change))
@@ -89,6 +120,19 @@ def narrowband(w, tones):
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
     turn = np.exp(2j * np.pi * (middle * tones.rx_delay - w.slope * tones.rx_delay**2 / 2))
     return sum(exact(w, one.select(np.array([k])), SKIRT) * turn[k][None, :, None, None] for k in range(len(tones)))
+
+
+@pytest.mark.parametrize(("speed", "samples"), [(15.0, 1024), (60.0, 1024), (15.0, 90)])
+def test_error_of_the_direct_method(speed, samples):
+    """Against float64: roundings of float32 products, 4e-8 each, and the square of what turns within sixteen samples (1e-7 at 60 m/s).
+    Planted bug: `cross` counted from the first of the sixteen samples."""
+    w, tones = scene(5, np.random.default_rng(9), speed=speed, num_chirps=3, num_samples=samples)
+    found = np.full((w.num_groups, 15, w.num_chirps, w.num_samples), 7j, np.complex64)
+    add_direct(found, w, tones, SKIRT, fresh=True)
+    assert relative(found, exact(w, tones, SKIRT)) < 2e-7
+    again = found.copy()
+    add_direct(again, w, tones, SKIRT)
+    assert relative(again, 2 * found) < 1e-7
 
 
 def relative(found, truth):

@@ -245,8 +245,8 @@ def gridded_method() -> float:
     why="never worse than its parts; the strongest paths and lines of sight go direct",
     planted=(
         "ifsignal.py",
-        "add_direct(samples, waveform, tones.select(alone), filter_transition)",
-        "add_direct(samples, waveform, tones.select(alone[::-1]), filter_transition)",
+        "add_direct(samples, waveform, tones.select(alone), filter_transition,",
+        "add_direct(samples, waveform, tones.select(alone[::-1]), filter_transition,",
     ),
 )
 def automatic_choice() -> float:
