@@ -3,8 +3,10 @@
     python tests/mutation.py --planted [WORDS]        plant each case's bug of `isac-rt validate`; the case must fail
     python tests/mutation.py --sample 60 --seed 1     plant sampled sign, factor, index and unit errors; the tests must fail
 
-Both work on a copy in a temporary folder. --planted takes about ten minutes, --sample half a minute per mutant on 2 cores. The exit status
-is 1 if a planted bug goes unnoticed, or if less than 90 % of the sample is caught.
+Both work on a copy in a temporary folder. --planted takes about ten minutes. --sample first runs the tests once to see which of them call
+which function (--record FILE keeps that for the next time), then tries each mutant on those that call its function, the quick ones first,
+and on the module's other tests if those pass. The exit status is 1 if a planted bug goes unnoticed, or if less than 90 % of the
+sample is caught.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -74,7 +79,12 @@ TESTS_OF = {
 COMPILED_FROM = {"synthesis.py": ("gridding",), "lanefft.py": ("gridding",)}
 """Modules whose compiled code holds another one's; its cache does not know that the other changed."""
 LIMIT = 400
-"""Seconds for the tests of one mutant; who does not end by then has been noticed."""
+"""Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by then has been noticed."""
+EXCUSED = [
+    ("propagation/diffuse.py", "state = state + (bits[:, axis] + np.uint64(1))", "", "a word of a hash: another mixes as well"),
+    ("receive/estimate.py", "move = step * np.sign([gx, gy])", "* -> /", "a product with a sign is the quotient"),
+]
+"""Mutants (file, part of the line, change or "" for any, reason) that are not sampled: nothing that could be called wrong follows."""
 
 
 @dataclass(frozen=True)
@@ -194,60 +204,163 @@ class Copy:
         for name in ("isac_rt", "tests", "scenes"):
             shutil.copytree(ROOT / name, self.folder / name)
         shutil.copy2(ROOT / "pyproject.toml", self.folder)
+        self.environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join([str(self.folder), str(self.folder / "tests"), os.environ.get("PYTHONPATH", "")]),
+            "PYTHONDONTWRITEBYTECODE": "1",  # two changes of one length within a second would look alike
+        }
 
     def source(self, file: str) -> str:
         """A file of the package as it was when the copy was made."""
         return (self._whole / file).read_text()
 
-    def run(self, file: str, source: str, command: list[str], limit: float) -> subprocess.CompletedProcess[str] | None:
-        """Run a command with a file changed, and put it back; None if it takes too long."""
+    def keep_compiled(self) -> None:
+        """Take what has been compiled by now as that of the unchanged files."""
+        for compiled in (self.folder / "isac_rt").rglob("*.nb?"):
+            kept = self._whole / compiled.relative_to(self.folder / "isac_rt")
+            kept.parent.mkdir(exist_ok=True)
+            shutil.copy2(compiled, kept)
+
+    @contextmanager
+    def changed(self, file: str, source: str) -> Iterator[None]:
+        """A file changed, and put back with what was compiled from it."""
         target = self.folder / "isac_rt" / file
         target.write_text(source)
-        for name in COMPILED_FROM.get(file, ()):
-            for compiled in (target.parent / "__pycache__").glob(f"{name}.*.nb?"):
-                compiled.unlink()
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(self.folder), os.environ.get("PYTHONPATH", "")])}
+        names = (target.stem, *COMPILED_FROM.get(file, ()))
+        self._forget(target.parent / "__pycache__", names)
         try:
-            return subprocess.run(command, cwd=self.folder, env=environment, capture_output=True, text=True, timeout=limit)
-        except subprocess.TimeoutExpired:
-            return None
+            yield
         finally:
             shutil.copy2(self._whole / file, target)
+            self._forget(target.parent / "__pycache__", names)
+            for name in names:
+                for compiled in ((self._whole / file).parent / "__pycache__").glob(f"{name}.*.nb?"):
+                    shutil.copy2(compiled, target.parent / "__pycache__")
+
+    @staticmethod
+    def _forget(folder: Path, names: tuple[str, ...]) -> None:
+        for name in names:
+            for compiled in folder.glob(f"{name}.*.nb?"):
+                compiled.unlink()
+
+    def run(self, file: str, source: str, command: list[str], limit: float) -> subprocess.CompletedProcess[str] | None:
+        """Run a command with a file changed; None if it takes too long."""
+        with self.changed(file, source):
+            try:
+                return subprocess.run(command, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=limit)
+            except subprocess.TimeoutExpired:
+                return None
+
+
+@dataclass(frozen=True)
+class Record:
+    """Which tests call which function, from `mutation_record`: `called` by "file:first line", `seconds` of each test."""
+
+    called: dict[str, list[str]]
+    seconds: dict[str, float]
+
+    @staticmethod
+    def made(copy: Copy, kept: Path | None) -> Record:
+        """Of the unchanged copy, from a file or by running all tests of the map."""
+        out = kept or copy.folder / "record.json"
+        if not out.exists():
+            names = sorted({name for names in TESTS_OF.values() for name in names.split()})
+            command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "mutation_record"]
+            environment = copy.environment | {"RECORD": str(out.absolute())}
+            subprocess.run([*command, *(f"tests/{n}.py" for n in names)], cwd=copy.folder, env=environment, check=True)
+        copy.keep_compiled()
+        return Record(**json.loads(out.read_text()))
+
+    def stages(self, mutant: Mutant, source: str) -> list[list[str]]:
+        """The tests that call the mutant's function, and the module's others, quick ones first; what is compiled is called unseen."""
+        first, last = next((f for f in _functions(source) if f[0] <= mutant.line <= f[1]), (mutant.line, mutant.line))
+        callers = {t for line in range(first, last + 1) for t in self.called.get(f"{mutant.file}:{line}", ())} & set(self.seconds)
+        files = tuple(f"tests/{name}.py::" for name in TESTS_OF[mutant.file].split())
+        others = {t for t in self.seconds if t.startswith(files)} - callers
+        return [sorted(some, key=self.seconds.__getitem__) for some in (callers, others) if some]
+
+
+@lru_cache
+def _functions(source: str) -> list[tuple[int, int]]:
+    """First and last line of all functions and methods."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef | ast.Module):
+            for one in node.body:
+                if isinstance(one, ast.FunctionDef):
+                    found.append((min([one.lineno, *(d.lineno for d in one.decorator_list)]), one.end_lineno or 0))
+    return found
 
 
 def sampled(count: int, seed: int, copy: Copy) -> list[Mutant]:
     """So many mutants, the modules in turn, so that small ones are not forgotten."""
     rng = random.Random(seed)
-    pools = {file: mutants_of(file, copy.source(file)) for file in TESTS_OF}
+    pools = {file: [m for m in mutants_of(file, copy.source(file)) if not excused(m, copy.source(file))] for file in TESTS_OF}
     for pool in pools.values():
         rng.shuffle(pool)
     out: list[Mutant] = []
     while len(out) < count and any(pools.values()):
-        for pool in pools.values():
-            if pool and len(out) < count:
-                out.append(pool.pop())
+        for file in rng.sample(list(pools), len(pools)):
+            if pools[file] and len(out) < count:
+                out.append(pools[file].pop())
     return sorted(out, key=lambda m: (m.file, m.line))
 
 
-def check_sample(count: int, seed: int, report: Path | None) -> int:
-    """Plant a sample; print what is not caught."""
-    caught, rows = 0, []
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Copy(Path(folder))
-        for mutant in sampled(count, seed, copy):
-            begin = time.monotonic()
-            tests = [f"tests/{name}.py" for name in TESTS_OF[mutant.file].split()]
-            command = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", *tests]
-            done = copy.run(mutant.file, mutant.applied(copy.source(mutant.file)), command, LIMIT)
-            noticed = done is None or done.returncode != 0
-            caught += noticed
-            line = copy.source(mutant.file).splitlines()[mutant.line - 1].strip()
-            rows.append({"file": mutant.file, "line": mutant.line, "kind": mutant.kind, "old": mutant.old, "new": mutant.new, "code": line,
-                         "caught": noticed})  # fmt: skip
-            word, change = "caught  " if noticed else "SURVIVED", f"{mutant.kind} {mutant.old} -> {mutant.new or 'nothing'}"
-            print(f"{word} {mutant.file}:{mutant.line} {change}  in  {line}  ({time.monotonic() - begin:.0f} s)", flush=True)
-            if report:
-                report.write_text(json.dumps(rows, indent=1) + "\n")
+def excused(mutant: Mutant, source: str) -> str | None:
+    """Why a mutant is not to be caught."""
+    line, change = source.splitlines()[mutant.line - 1].strip(), f"{mutant.old} -> {mutant.new}"
+    return next((why for file, code, what, why in EXCUSED if file == mutant.file and code in line and what in ("", change)), None)
+
+
+class Server:
+    """`mutation_server.py` in a copy."""
+
+    def __init__(self, copy: Copy) -> None:
+        self._log = copy.folder / "pytest.log"
+        command = [sys.executable, str(copy.folder / "tests" / "mutation_server.py")]
+        self._process = subprocess.Popen(
+            command, cwd=copy.folder, env=copy.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def outcome(self, tests: list[str], limit: float) -> tuple[str, str]:
+        """"passed", "failed" or "too long", and the first test that failed."""
+        assert self._process.stdin and self._process.stdout
+        arguments = ["-q", "-x", "--no-header", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
+        self._process.stdin.write(json.dumps({"arguments": arguments, "limit": limit, "log": str(self._log)}) + "\n")
+        self._process.stdin.flush()
+        status = int(self._process.stdout.readline())
+        said = [line for line in self._log.read_text(errors="replace").splitlines() if line.startswith(("FAILED", "ERROR"))]
+        return {0: "passed", -1: "too long"}.get(status, "failed"), said[0].split(" - ")[0].partition(" ")[2] if said else ""
+
+    def end(self) -> None:
+        """Let it go."""
+        assert self._process.stdin
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def check_sample(mutants: list[Mutant], copy: Copy, record: Record, report: Path | None) -> int:
+    """Plant mutants one by one; print what is not caught."""
+    caught, rows, server, sound = 0, [], Server(copy), set[str]()
+    for mutant in mutants:
+        begin, outcome, by = time.monotonic(), "passed", ""
+        source = copy.source(mutant.file)
+        with copy.changed(mutant.file, mutant.applied(source)):
+            for tests in record.stages(mutant, source):
+                outcome, by = server.outcome(tests, LIMIT + 4 * sum(record.seconds[t] for t in tests))
+                if outcome != "passed":
+                    break
+        if by not in sound and outcome == "failed":  # what failed has to pass where nothing is changed
+            assert server.outcome([by] if by else record.stages(mutant, source)[0], 10 * LIMIT)[0] == "passed", f"{by} fails by itself"
+            sound.add(by)
+        caught += outcome != "passed"
+        line = source.splitlines()[mutant.line - 1].strip()
+        rows.append({"file": mutant.file, "line": mutant.line, "kind": mutant.kind, "old": mutant.old, "new": mutant.new, "code": line,
+                     "outcome": outcome, "by": by})  # fmt: skip
+        word, change = {"passed": "SURVIVED", "failed": "caught  "}.get(outcome, outcome), f"{mutant.kind} {mutant.old} -> {mutant.new}"
+        print(f"{word} {mutant.file}:{mutant.line} {change}  in  {line}  ({time.monotonic() - begin:.0f} s) {by}", flush=True)
+        if report:
+            report.write_text(json.dumps(rows, indent=1) + "\n")
+    server.end()
     print(f"{caught} of {len(rows)} caught")
     return 0 if caught >= 0.9 * len(rows) else 1
 
@@ -285,12 +398,19 @@ def main() -> int:
     parser.add_argument("--planted", nargs="?", const="", metavar="WORDS")
     parser.add_argument("--sample", type=int, default=0, metavar="COUNT")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", metavar="WORDS", help="of the sample, the files with these words in their name")
+    parser.add_argument("--record", type=Path, help="which tests call which function; made if it is not there")
     parser.add_argument("--report", type=Path, help="JSON of the sample")
     arguments = parser.parse_args()
     if arguments.planted is not None:
         return check_planted(arguments.planted)
     if arguments.sample:
-        return check_sample(arguments.sample, arguments.seed, arguments.report)
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Copy(Path(folder))
+            mutants = sampled(arguments.sample, arguments.seed, copy)
+            if arguments.only:
+                mutants = [m for m in mutants if arguments.only in m.file]
+            return check_sample(mutants, copy, Record.made(copy, arguments.record), arguments.report)
     parser.print_help()
     return 2
 

@@ -270,6 +270,84 @@ def test_each_scatterer_against_an_oracle(name):
             assert (seen.tx_radius[i], seen.rx_radius[i]) == (pytest.approx(r1, rel=1e-14, abs=0), pytest.approx(r2, rel=1e-14, abs=0))
 
 
+# ---- what a terminal expects of it
+
+
+def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
+    """A terminal's own copy of the mesh and its pose; isotropic elements of 0 dBi."""
+    from isac_rt.city.scene import shared_scene
+    from isac_rt.propagation.expectation import MeshExpectation
+
+    tree = {
+        "frames": 40,
+        "swarm": {"A": {"role": "active", "position_m": list(at), "velocity_mps": list(speed), "boresight": [0.6, 0.8, 0]}},
+        "city": {"source": "canyon"},
+        "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
+        "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
+        "clutter": {"model": "field"},
+    }
+    s = scenario.Scenario.model_validate(tree)
+    w = waveform_of(s)
+    scene = shared_scene(city, w.carrier_frequency).scene.mi_scene
+    return MeshExpectation(s, city, scene, antennas_of(s, w), w.wavelength), Swarm.from_scenario(s).poses(0.0)["A"]
+
+
+@pytest.mark.sionna
+def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_say():
+    """Power as the field's own test takes it, times the transmit power; rates of points at rest; a wrong level, a wrong velocity, and a mesh
+    whose faces lie off along their normals: all points of a face agree on how far, by the distance to the moved points. Planted bugs: amplitude
+    for power; a level in amplitudes' decibels; the velocity's error with the other sign; the face's error taken along the ray."""
+    from isac_rt.propagation.expectation import Mistakes
+
+    city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
+    at, speed, amplitude = np.array([1.3, 28.3, 2.1]), np.array([3.7, -8.1, 1.9]), 0.37
+    copy, pose = expectation(city, speed, at)
+    plain = copy.clutter("A", pose, 0.0, amplitude)
+    truth = amplitude**2 * lambertian_wall(at, at, 0.43)
+    assert abs(10 * np.log10(plain.power.sum() / truth)) < 0.02  # as for the field
+    length = C / 2 * plain.delay
+    towards = pose.to_world(plain.departure)
+    points = at + length[:, None] * towards
+    assert points[:, 1] == pytest.approx(50.0, abs=1e-9) and np.array_equal(plain.departure, plain.arrival)
+    assert plain.delay_rate * C == pytest.approx(-2 * towards @ speed, rel=0, abs=1e-9)
+    error = (0.31, -0.17, 0.23)
+    wrong = copy.clutter("A", pose, 0.0, amplitude, Mistakes(velocity=error, level_db=3.1))
+    assert wrong.power == pytest.approx(10**0.31 * plain.power, rel=1e-6, abs=0)
+    assert (wrong.delay_rate - plain.delay_rate) * C == pytest.approx(-2 * towards @ error, rel=0, abs=1e-9)
+    moved = copy.clutter("A", pose, 0.0, amplitude, Mistakes(mesh_std=0.02, seed=5))
+    off = (moved.delay - plain.delay) * C / 2
+    n = np.array([0.0, 1.0, 0.0])  # of either side: the sign is the face's
+    along = off / (towards @ n)
+    values = np.unique(np.round(along, 7))
+    assert len(values) == 2 and (np.abs(values) < 5 * 0.02).all()  # two faces
+    after = np.linalg.norm(points + along[:, None] * n - at, axis=1) - length
+    assert off == pytest.approx(after, abs=(2 * np.abs(values).max()) ** 2 / length.min())  # second order of the distance
+
+
+@pytest.mark.sionna
+def test_knots_of_a_flight_and_their_blend():
+    """A straight flight has its knots evenly along it, ends included, and a B-spline reproduces a straight line: the weighted knots are the
+    place. Planted bugs: the last piece of the way left out; knots counted from the one behind."""
+    from isac_rt.propagation.visibility import KNOT_SPACING, Flight
+
+    start, speed, duration, origin = np.array([1.7, -3.1, 8.9]), np.array([3.3, 7.1, -0.7]), 1.83, np.array([0.4, 0.2, -0.3])
+    tree = {"swarm": {"A": {"role": "active", "position_m": list(start), "velocity_mps": list(speed)}}}
+    flight = Flight(Swarm.from_scenario(scenario.Scenario.model_validate(tree)).trajectories["A"], duration, origin)
+    way = np.linalg.norm(speed) * duration
+    count = int(np.ceil(way / KNOT_SPACING))
+    even = start - origin + np.linspace(0, duration, count + 1)[:, None] * speed
+    assert flight.knots.shape == even.shape
+    assert flight.knots == pytest.approx(even, abs=1e-9)  # rounding
+    for time in np.linspace(0, duration, 38):
+        weights = flight.blend(time)
+        assert sum(weights.values()) == pytest.approx(1, abs=1e-12)
+        inside = 3.1 * way / count < time * np.linalg.norm(speed) < way - 3.1 * way / count
+        if inside:
+            place = sum(g * flight.knots[k] for k, g in weights.items())
+            assert place == pytest.approx(start - origin + time * speed, abs=1e-9)
+        assert all(np.linalg.norm(flight.knots[k] - (start - origin + time * speed)) < 3.01 * way / count for k, g in weights.items() if g > 0)
+
+
 @pytest.mark.sionna
 def test_both_ends_on_one_side():
     """A wall between two terminals scatters back to each and nothing across. Planted bug: both cosines taken absolute."""

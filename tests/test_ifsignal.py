@@ -257,6 +257,30 @@ def test_auto_is_more_accurate_where_a_path_is_strong():
     assert relative(synthesise(w, links, "gridded"), truth) > 1e-2 * GRIDDED_ERROR * np.sqrt(40)
 
 
+@pytest.mark.parametrize("method", ["exact", "gridded"])
+def test_the_epoch_is_only_where_the_polynomial_is_written(method):
+    """Paths said for another instant, delays expanded about it by hand, and births counted from it, give the same samples. Accelerations of
+    1e6 m/s^2 so that their square shows: 0.3 mm. Planted bugs: the acceleration's half left out or subtracted; the rate not moved; births not."""
+    w, rng = SMALL, np.random.default_rng(14)
+    accel = rng.normal(size=9) * 1e6 / C
+    born = np.where(np.arange(9) % 3 == 1, 0.13 * w.frame_duration, -np.inf)
+    dies = np.where(np.arange(9) % 3 == 2, 0.21 * w.frame_duration, np.inf)
+    links = [(sender(w, rng), paths(w, rng, 9, delay_accel=accel, begin=born, end=dies))]
+    shift = 0.83 * w.slot_duration
+    s = links[0][1]
+    other = replace(
+        s,
+        epoch=s.epoch + shift,
+        delay=s.delay + s.delay_rate * shift + s.delay_accel * shift**2 / 2,
+        delay_rate=s.delay_rate + s.delay_accel * shift,
+        begin=s.begin - shift,
+        end=s.end - shift,
+    )
+    change = np.abs(s.delay_accel).max() * shift**2 / 2 * w.carrier_frequency
+    assert change > 1e-2  # cycles
+    assert relative(synthesise(w, [(links[0][0], other)], method), synthesise(w, links, method)) < 2 * COMPLEX64
+
+
 def test_a_wrong_epoch_is_refused():
     w, rng = SMALL, np.random.default_rng(12)
     late = replace(paths(w, rng, 2), epoch=START)

@@ -66,6 +66,18 @@ def test_beams_read_what_powers_lose():
     assert errors(beams, payload)[1] < errors(powers, payload)[1] - 0.2
 
 
+@pytest.mark.parametrize("decided", [demodulate, demodulate_beams])
+def test_confidence_in_a_flat_spectrum_is_one(decided):
+    """One sample that is not zero has the same power in every cell: peak and mean of the other cells are equal. Planted bug: the mean taken
+    over one cell fewer."""
+    payload, clean = link(*ALONE)
+    impulse = np.zeros_like(clean.samples)
+    impulse[..., 77] = 0.37 - 0.81j
+    arguments = (ANTENNAS, ORDER) if decided is demodulate_beams else (ORDER,)
+    sure = decided(replace(clean, samples=impulse), NEAR, *arguments).delay_confidence
+    assert sure == pytest.approx(np.ones(sure.shape), abs=1e-4)  # float32 phasors; one cell of 136 is 7e-3
+
+
 @pytest.mark.slow
 def test_gain_of_beams_over_signal_to_noise():
     """Both decisions on the same samples; run with -s for the table."""

@@ -12,7 +12,7 @@ from receiver_cubes import ANTENNAS, frame
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.receive.joint import Frame, JointPath, fit, tone_sums
+from isac_rt.receive.joint import Frame, JointPath, element_delays, fit, tone_sums
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
 
@@ -46,6 +46,22 @@ def test_sums_of_a_tone():
         assert np.abs(s0 - tone @ np.ones(size)).max() < series * size
         assert np.abs(1j * s1 - tone @ n).max() < series * size**2
         assert np.abs(s2 - tone @ n**2).max() < series * size**3
+
+
+def test_elements_hear_a_spherical_wave():
+    """Against the distance from a source point; the formula leaves out the cube of element over radius (7 mm, 3 m: 4e-9 m at most), the
+    derivative is its central difference. Planted bugs: curvature of the other sign in the delay; in the derivative; half the curvature."""
+    positions, u, radius = ANTENNAS.rx_positions, np.array([0.41, -0.33]), 3.17
+    source = radius * np.array([u[0], np.sqrt(1 - u @ u), u[1]])
+    exact = (np.linalg.norm(source - positions, axis=1) - radius) / C
+    delay, slope = element_delays(positions, u, radius)
+    cube = np.linalg.norm(positions, axis=1).max() ** 3 / radius**2
+    assert np.abs(delay - exact).max() * C < cube
+    assert np.abs(positions).max() ** 2 / radius > 30 * cube  # the curvature is seen
+    step = 1e-4
+    for i, by in enumerate(np.eye(2) * step):
+        difference = (element_delays(positions, u + by, radius)[0] - element_delays(positions, u - by, radius)[0]) / (2 * step)
+        assert slope[i] == pytest.approx(difference, rel=1e-9, abs=1e-21)  # quadratic in u: only rounding
 
 
 @pytest.mark.parametrize(("passes", "snr_db"), [(2, 10.0), (1, -8.0)])
@@ -163,11 +179,13 @@ def test_one_path_and_noise_are_not_split():
 
 
 def test_grid_refinement_is_the_cell():
-    """The paper's estimate: multiples of the cells. Planted bug: refined all the same."""
+    """The paper's estimate: multiples of the cells, the one that holds the path. Planted bugs: refined all the same; bins counted from the
+    other end of the Doppler axis."""
     w, schedule, payload = frame(waveform=LONGER)
     clean = samples(w, schedule, payload, FEW, np.array(NEAR), 2)
     d = receive_active(noisy(w, schedule, clean, 10.0, 1), payload, FEW, Receivers(refinement="grid")).detections
     bins = d.velocity[0] / w.velocity_cell(2)
     beat = d.range[0] / w.range_cell(2) + bins * w.sampled_duration / w.frame_duration
     assert abs(bins - round(bins)) < 1e-9 and abs(beat - round(beat)) < 1e-9  # rounding
-    assert abs(d.range[0] - NEAR[0]) < w.range_cell(2) and np.abs(d.direction[0] - LOS[2:4]).max() < 0.1
+    assert abs(d.range[0] - NEAR[0]) < w.range_cell(2) and abs(d.velocity[0] - NEAR[1]) < w.velocity_cell(2)
+    assert np.abs(d.direction[0] - LOS[2:4]).max() < 0.1
