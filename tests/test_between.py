@@ -44,6 +44,23 @@ def tracer(s: scenario.Scenario, city: City, instants=()):
     return RayTracer(s, city, antennas_of(s, w), w.wavelength, w.carrier_frequency, instants)
 
 
+def test_sets_of_chains_are_padded_with_minus_one():
+    """What `PathSet` promises of faces where there is none, and NaN for their points. Planted bug: padded with another number."""
+    from isac_rt.propagation.between import leg_set
+    from isac_rt.propagation.geometry import Legs
+
+    def some(count: int, depth: int) -> tuple:
+        legs = Legs(np.ones(count), np.ones(count), np.ones(count), np.ones((count, 3)), np.ones((count, 3)), np.ones((count, depth, 3)))
+        chain = 7 + np.arange(count * depth).reshape(count, depth)
+        return np.ones(count, complex), legs, chain, 2 * chain
+
+    joined = leg_set([some(2, 1), some(1, 3)], 3)
+    assert joined.faces.tolist() == [[7, -1, -1], [8, -1, -1], [7, 8, 9]]
+    assert joined.planes.tolist() == [[14, -1, -1], [16, -1, -1], [14, 16, 18]]
+    assert joined.bounces.tolist() == [1, 1, 3]
+    assert np.isnan(joined.legs.points[:2, 1:]).all() and (joined.legs.points[:, 0] == 1).all()
+
+
 def keyed(paths: PathSet) -> dict[tuple, int]:
     """Paths by kind, target, number of bounces and length to a micrometre."""
     rows = zip(paths.kind, paths.target, paths.bounces, np.round(paths.delay * 3e14), strict=True)

@@ -294,9 +294,10 @@ def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
 
 @pytest.mark.sionna
 def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_say():
-    """Power as the field's own test takes it, times the transmit power; rates of points at rest; a wrong level, a wrong velocity, and a mesh
-    whose faces lie off along their normals: all points of a face agree on how far, by the distance to the moved points. Planted bugs: amplitude
-    for power; a level in amplitudes' decibels; the velocity's error with the other sign; the face's error taken along the ray."""
+    """Power as the field's own test takes it, times the transmit power; rates of points at rest; a wrong level, a wrong velocity, and a
+    mesh whose faces lie off along their normals: all points of a face agree on how far, by the distance to the moved points. Planted
+    bugs: amplitude for power; a level in amplitudes' decibels; the velocity's error with the other sign; the face's error taken along
+    the ray."""
     from isac_rt.propagation.expectation import Mistakes
 
     city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
@@ -345,7 +346,8 @@ def test_knots_of_a_flight_and_their_blend():
         if inside:
             place = sum(g * flight.knots[k] for k, g in weights.items())
             assert place == pytest.approx(start - origin + time * speed, abs=1e-9)
-        assert all(np.linalg.norm(flight.knots[k] - (start - origin + time * speed)) < 3.01 * way / count for k, g in weights.items() if g > 0)
+        away = [np.linalg.norm(flight.knots[k] - (start - origin + time * speed)) for k, g in weights.items() if g > 0]
+        assert max(away) < 3.01 * way / count
 
 
 @pytest.mark.sionna

@@ -47,7 +47,7 @@ def slowly(file, write):
     def writing(temporary):
         temporary.write_text("half")
         print(file.name, flush=True)
-        time.sleep({pause})
+        time.sleep(300 if file.name == {when!r} else 0)
         write(temporary)
     whole(file, writing)
 isac_rt.results._atomically = slowly
@@ -70,7 +70,7 @@ def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
     SIGTERM would leave."""
     scenario, out = tmp_path / "s.yaml", tmp_path / "o"
     scenario.write_text(to_yaml(fake_scenario()))
-    program = PROGRAM.format(tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), pause=0.6)
+    program = PROGRAM.format(tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), when=when)
     child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert child.stdout is not None
     while (line := child.stdout.readline()) and line.strip() != when:

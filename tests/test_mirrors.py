@@ -87,8 +87,8 @@ def test_the_vertical_field():
 
 
 def test_conductors_turn_the_field_about_their_normals():
-    """Over a conductor the reflected field is 2 (n.E) n - E whatever the polarisation: chains of one to three walls in any attitude, and back
-    along the normal. Planted bugs: the incident field's frame for the reflected wave; TM with the other sign; length left out."""
+    """Over a conductor the reflected field is 2 (n.E) n - E whatever the polarisation: chains of one to three walls in any attitude, and
+    back along the normal. Planted bugs: the incident field's frame for the reflected wave; TM with the other sign; length left out."""
     rng, walls = np.random.default_rng(7), []
     for _ in range(3):
         n = rng.standard_normal(3)

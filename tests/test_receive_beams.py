@@ -8,11 +8,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
+from scipy import special, stats
 
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import gray_bits
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.beams import demodulate_beams
+from isac_rt.receive.beams import _likelihood, demodulate_beams
 from isac_rt.receive.demodulate import demodulate
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -70,12 +71,30 @@ def test_beams_read_what_powers_lose():
 def test_confidence_in_a_flat_spectrum_is_one(decided):
     """One sample that is not zero has the same power in every cell: peak and mean of the other cells are equal. Planted bug: the mean taken
     over one cell fewer."""
-    payload, clean = link(*ALONE)
+    _, clean = link(*ALONE)
     impulse = np.zeros_like(clean.samples)
     impulse[..., 77] = 0.37 - 0.81j
     arguments = (ANTENNAS, ORDER) if decided is demodulate_beams else (ORDER,)
     sure = decided(replace(clean, samples=impulse), NEAR, *arguments).delay_confidence
     assert sure == pytest.approx(np.ones(sure.shape), abs=1e-4)  # float32 phasors; one cell of 136 is 7e-3
+
+
+def test_likelihood_of_cells_knows_the_noise_and_the_signal():
+    """Drawn cells: 39 of noise and one with the path in it. The noise's power within its statistics, the SNR that the median of |a + n|^2
+    (a non-central chi-square) gives less the noise's own share, and ln I_0 of the definition. Planted bugs: that share added; the median
+    taken for the mean; amplitude for power in the argument."""
+    rng, g, noise, draws = np.random.default_rng(12), 23.7, 0.37, 40000
+    spectra = np.sqrt(noise / 2) * (rng.standard_normal((1, draws, 40)) + 1j * rng.standard_normal((1, draws, 40)))
+    spectra[..., 7] += np.sqrt(g * noise) * np.exp(2j * np.pi * rng.random(draws))
+    found, snr, likelihood = _likelihood(spectra)
+    cells = 40 * draws
+    median = np.log(2 * 39 / 38)  # of the noise's exponential: half of 40 cells lie below, the path's above
+    assert found == pytest.approx(noise * median / np.log(2), rel=5 / np.sqrt(cells) / np.log(2))
+    expected = stats.ncx2(2, 2 * g).median() / 2 * noise / found - 1
+    assert snr == pytest.approx(expected, abs=5 * np.sqrt(2 * g) * 1.26 / np.sqrt(draws))
+    some = likelihood[0, :50]
+    truth = np.log(special.iv(0, 2 * np.sqrt(snr * np.abs(spectra[0, :50]) ** 2 / found)))
+    assert some == pytest.approx(truth, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from scipy import stats
 from isac_rt.arrays import conventional_schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
-from isac_rt.receive import receive_active
+from isac_rt.receive import receive_active, receive_passive
 from isac_rt.receive.cfar import (
     background,
     detect,
@@ -34,6 +34,7 @@ from isac_rt.receive.estimate import (
     hann_response,
     middle_phase,
     refine,
+    standard_deviations,
     start_point,
 )
 from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
@@ -225,6 +226,17 @@ def test_sidelobes_are_told_from_targets():
 # --- estimates
 
 
+def test_sidelobes_lie_round_the_ends_of_the_doppler_axis():
+    """What is told from what does not change when all bins are turned round: a lobe three rows and bins from a strong path, beyond the end
+    of the axis too, is one; the same power further off is a target. Planted bug: bins apart not counted round the end."""
+    rows, bins, size = np.array([50, 53, 53]), np.array([2, 5, 42]), 120
+    for turn in range(0, size, 7):
+        power = np.ones((100, size))
+        at = (bins + turn) % size
+        power[rows, at] = [1e6, 2e6 * hann_envelope(3.0) ** 2, 1.9e6 * hann_envelope(3.0) ** 2]
+        assert without_sidelobes(rows, at, power, size, 1e-9).tolist() == [True, False, True]
+
+
 def test_compiled_match_is_the_template():
     """Planted bugs: Doppler without the data delay, phase at the first sample, window's transform about its start."""
     w, schedule, _ = frame()
@@ -313,6 +325,61 @@ def test_standard_deviations_match_the_scatter():
         std = d.std[0]
     scatter = np.sqrt(np.mean(np.square(errors), axis=0))
     assert (scatter / std > 0.35).all() and (scatter / std < 2.2).all()
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_pictures_hold_the_first_groups_mean_power_and_their_axes(passes: int):
+    """The equivalent range map by its definition, and a path of the frame where the axes say. Planted bugs: divided by the chirps; speed
+    of the other sign, of one pass for two."""
+    w, schedule, _ = frame(waveform=Waveform(num_samples=256))
+    length, rate = passes * 40.3 * w.range_cell(passes), passes * 17.2 * w.velocity_cell(passes)
+    pilot = unmodulated(w)
+    signal = cube(w, schedule, pilot, [Path(length, rate)], FEW, noise=0.3)
+    maps = sense_pictures(signal, pilot, passes)
+    truth = np.sqrt((np.abs(np.fft.fft(signal.samples[0].astype(complex), axis=2)) ** 2).mean(axis=0).T)
+    assert maps.equivalent_range == pytest.approx(truth, rel=1e-4, abs=0)
+    row, column = np.unravel_index(maps.range_doppler.argmax(), maps.range_doppler.shape)
+    assert abs(maps.range_axis[row] - length / passes) < 0.6 * w.range_cell(passes)
+    assert abs(maps.velocity_axis[column] - rate / passes) < 0.6 * w.velocity_cell(passes)
+
+
+def sense_pictures(signal: IFCube, pilot, passes: int):
+    if passes == 2:
+        return receive_active(signal, pilot, FEW, SETTINGS, maps=True).maps
+    return receive_passive(signal, FEW, SETTINGS, 8, None, False, maps=True).maps
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_stated_deviations_are_the_bound_of_a_tone(passes: int):
+    """Fisher information of a tone's frequency on each axis by differences, with all the SNR on range and velocity, Hann's loss of 2 there,
+    and each arm's share on its direction; the floors at high SNR. Planted bugs: the loss taken twice; the receivers' aperture alone for
+    an echo; the share of the other arm."""
+    w, few, snr = Waveform(), replace(ANTENNAS, rx_x=5, rx_z=3), 37.3
+    stated = standard_deviations(snr, few, w, passes)
+    x = np.linspace(-0.5, 0.5, 20001)  # the share of the axis: its frequency is in cells
+    tone = 1 / np.sqrt(2 * snr * np.mean((2 * np.pi * x) ** 2))
+    assert stated[0] == pytest.approx(np.sqrt(2) * tone * w.range_cell(passes), rel=1e-3, abs=0)
+    assert stated[1] == pytest.approx(np.sqrt(2) * tone * w.velocity_cell(passes), rel=1e-3, abs=0)
+    k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
+    for i, (axis, receivers, senders) in enumerate(((0, range(5), range(2)), (2, range(4, 7), range(1, 3)))):
+        if passes == 2:
+            places = np.array([few.rx_positions[r, axis] + few.tx_positions[t, axis] for r in receivers for t in senders])
+        else:
+            places = np.array([few.rx_positions[r, axis] for r in receivers for _ in range(3)])
+        information = 2 * snr * len(places) / (3 * 7) * k**2 * places.var()
+        assert stated[2 + i] == pytest.approx(1 / np.sqrt(information), rel=1e-9, abs=0)
+    floors = [2e-3 * w.range_cell(passes), 4e-3 * w.velocity_cell(passes), 2e-4, 2e-4]
+    assert standard_deviations(1e9, few, w, passes) == pytest.approx(floors)
+    assert (standard_deviations(0.1, few, w, passes) == standard_deviations(1.0, few, w, passes)).all()
+
+
+def test_the_active_terminal_reports_no_symbols():
+    """`Reception` says -1 for what was not decided, at the symbols' shapes. Planted bugs: another number."""
+    w, schedule, payload = frame(waveform=Waveform(num_samples=256))
+    r = receive_active(cube(w, schedule, payload, [Path(30.0, 2.0)], FEW), payload, FEW, SETTINGS)
+    assert (r.delay_symbols == -1).all() and r.delay_symbols.shape == payload.delay_symbols.shape
+    assert (r.transitions == -1).all() and r.transitions.shape == payload.transitions.shape
+    assert not r.decoded and not r.bits.size and not r.delay_confidence.any() and not r.transition_confidence.any()
 
 
 @pytest.mark.parametrize(
