@@ -55,7 +55,6 @@ TESTS_OF = {
     "propagation/diffraction.py": "test_diffraction",
     "propagation/direct.py": "test_shadow_edges test_diffraction",
     "propagation/edges.py": "test_shadow_edges test_diffraction",
-    "propagation/expected.py": "test_clutter_detectors",
     "propagation/expectation.py": "test_clutter_field",
     "receive/active.py": "test_receive_detection",
     "receive/cfar.py": "test_receive_detection",

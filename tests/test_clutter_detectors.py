@@ -10,15 +10,13 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import stats
 
-from isac_rt.propagation.expected import ExpectedClutter, expected_of, joined
-from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive import receive_active
 from isac_rt.receive.adaptive import Matched, beams_of, expected_count, like_exponential, map_factor, sampled, scan_threshold
 from isac_rt.receive.clutter_map import Taper, arm_channels, covariances, joint_channels, power_map, steering
 from isac_rt.receive.doppler import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
-from isac_rt.swarm import Pose, attitude
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
@@ -49,28 +47,6 @@ def expected(paths: list[Path]) -> ExpectedClutter:
 def maps_of(w: Waveform, schedule, payload, paths: list[Path], antennas, rows: int, noise: float = 0.0, seed: int = 0) -> np.ndarray:
     one = cube(w, schedule, payload, paths, antennas, noise, seed)
     return channel_maps(clean_spectrum(one, payload.delay_symbols, payload.phases, rows), w, schedule, payload.delay_symbols)
-
-
-def test_paths_as_expected_clutter():
-    """Powers in watts and directions in each body's axes. Planted bugs: the transmit power divided by; the two bodies exchanged."""
-    rng = np.random.default_rng(3)
-    u = rng.standard_normal((2, 4, 3))
-    u /= np.linalg.norm(u, axis=2, keepdims=True)
-    gain = rng.standard_normal((4, 2)) @ np.array([1, 1j])
-    fields = {"delay": rng.uniform(1e-8, 1e-7, 4), "delay_rate": rng.uniform(-1e-7, 1e-7, 4), "delay_accel": np.zeros(4)}
-    ends = {"tx_radius": np.full(4, np.inf), "rx_radius": np.full(4, np.inf)}
-    paths = make_paths(
-        gain=gain, departure=u[0], arrival=u[1], kind=PathKind.DIFFUSE, epoch=0.0, tx="A", rx="B", **fields, **ends
-    )
-    a, b = (Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array(y))) for y in ([0.3, 1.1, -0.2], [-0.7, 0.4, 0.1]))
-    found = expected_of(paths, 0.37, a, b)
-    assert found.power == pytest.approx(0.37**2 * np.abs(gain) ** 2, rel=1e-12, abs=0)
-    assert np.array_equal(found.delay, paths.delay) and np.array_equal(found.delay_rate, paths.delay_rate)
-    for i in range(4):
-        assert found.departure[i] == pytest.approx(a.rotation.T @ u[0, i], abs=1e-12)
-        assert found.arrival[i] == pytest.approx(b.rotation.T @ u[1, i], abs=1e-12)
-    both = joined([found, found.louder(2.3)])
-    assert len(both) == 8 and both.power[4:] == pytest.approx(10**0.23 * found.power, rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize(("ranges", "bound"), [((8.0, 26.0), 0.06), ((36.0, 52.0), 0.1)])
