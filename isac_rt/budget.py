@@ -259,7 +259,9 @@ def _plane_error(setup: Setup, poses: dict[str, Pose], link: Link, raw: PathSet,
 def _flight_error(setup: Setup, frame: int, link: Link, kept: PathSet) -> float:
     """Largest phase by which the kept delays differ at the ends of the frame from those over the true positions there [rad]."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
-    moving = kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & ((kept.kind != PathKind.DIFFUSE) | (kept.faces >= 0).any(axis=1)))
+    # clutter by way of a mirror flies like a farther scatterer: one bounce is the worse case
+    there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
+    moving = kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
     if not len(moving):
         return 0.0
     drift = []

@@ -48,6 +48,9 @@ class Clutter(Node):
     """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m]."""
     smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
     """field: cells of this area are cut no further, however near."""
+    mirrors: Annotated[int, Field(ge=0, le=64)] = 0
+    """field: walls, roofs and grounds per terminal, the strongest, by way of which each scatterer is lit and heard as well (two bounces);
+    0: one bounce."""
 
     def applies(self, name: str) -> bool:
         if name == "centre_m" and self.centre != "drawn":
@@ -67,6 +70,6 @@ CLUTTER_KEYS: dict[str, frozenset[str]] = {
         {"level_db", "level_of", "cells", "centre", "centre_m", "place", "direction", "cell_correlation", "redraw"}
     ),
     "diffuse": frozenset({"rays"}),
-    "field": frozenset({"cell_area_per_metre_m", "smallest_cell_m2"}),
+    "field": frozenset({"cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
 }
 """Keys that each clutter model understands, beside model; the others may stand and are not written back."""

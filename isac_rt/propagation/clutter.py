@@ -10,7 +10,8 @@ S is the material's scattering coefficient, Gamma the slab's reflection (ITU-R P
 parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is kept: what comes in vertical goes
 out vertical, as with Sionna's default. Gamma belongs to the way in, so the two directions of a link differ a little.
 
-One bounce. Delay, rate, acceleration and directions are float64 closed forms of the point and the poses.
+One bounce; `twice` adds a mirror before or after it. Delay, rate, acceleration and directions are float64 closed forms of the
+point and the poses.
 Import only after `isac_rt.runtime.activate()`.
 
 References
@@ -108,7 +109,7 @@ class ClutterField:
         self.cells = cells
         self.num_candidates = num_candidates
         """Cells of the whole city, those that are never in sight included."""
-        self._surfaces = surfaces(city, wavelength)
+        self.surfaces = surfaces(city, wavelength)
         self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
     @classmethod
@@ -144,7 +145,7 @@ class ClutterField:
         radius, departure = np.empty(count), np.empty((count, 3))
         out: list[np.ndarray] = [np.empty(count, np.float32), np.empty(count), np.empty(count), np.empty(count, np.float32), radius]
         out += [radius, departure, departure] if own else [np.empty(count), departure, np.empty((count, 3))]
-        s, c = self._surfaces, self.cells
+        s, c = self.surfaces, self.cells
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
         _advance(index, share, c.points, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
                  self._scale, *motion, own, *out)  # type: ignore[call-arg]  # fmt: skip

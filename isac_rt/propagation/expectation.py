@@ -12,9 +12,10 @@ import numpy as np
 
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
-from isac_rt.propagation.clutter import ClutterField
+from isac_rt.propagation.clutter import ClutterField, Seen
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.expected import ExpectedClutter
+from isac_rt.propagation.expected import ExpectedClutter, joined
+from isac_rt.propagation.twice import TwoBounces
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose
@@ -43,8 +44,9 @@ class MeshExpectation:
     """Expected clutter along the flights of one scenario."""
 
     def __init__(self, scenario: Scenario, city: City, scene: mi.Scene, antennas: Antennas, wavelength: float) -> None:
-        own = int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])
-        self._field = ClutterField.plan(scenario.model_copy(update={"seed": own}), city, scene, wavelength)
+        own = scenario.model_copy(update={"seed": int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])})
+        self._field = ClutterField.plan(own, city, scene, wavelength)
+        self._twice = TwoBounces.plan(own, city, self._field, wavelength) if scenario.clutter.mirrors else None
         self._city, self._antennas = city, antennas
 
     def __len__(self) -> int:
@@ -61,14 +63,39 @@ class MeshExpectation:
         """
         wrong = mistakes or Mistakes()
         local = replace(pose, position=pose.position - self._city.origin, velocity=pose.velocity + np.array(wrong.velocity))
-        seen = self._field.seen(name, name, local, local, time)
+        error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
+        once = self._field.seen(name, name, local, local, time)
+        parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
+        for part in [] if self._twice is None else self._twice.seen(name, name, local, local, time):
+            n, s = part.mirror.normal, part.seen
+            met = s.departure if part.before else s.arrival
+            turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
+            there, back = (turned, s.arrival) if part.before else (s.departure, turned)
+            moved = 2 * error[part.mirror.faces[0]] * (met @ n)
+            parts.append(self._expected(s, there, back, error, amplitude, local, moved))
+        return joined(parts).louder(wrong.level_db)
+
+    def _expected(
+        self,
+        seen: Seen,
+        there: np.ndarray,
+        back: np.ndarray,
+        error: np.ndarray,
+        amplitude: float,
+        local: Pose,
+        moved: np.ndarray | float = 0.0,
+    ) -> ExpectedClutter:
+        """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the scatterers, on faces that are each in error,
+        and ways made longer by `moved` as a mirror is in error [m]."""
         elements = element_amplitude(self._antennas, local, local, seen.departure, seen.arrival)
-        length = seen.length
-        if wrong.mesh_std > 0:
-            error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
-            face = self._field.cells.face[seen.index]
-            length = length + 2 * error[face] * (self._city.normals[face] * seen.departure).sum(axis=1)
-        power = (amplitude * seen.magnitude * elements) ** 2 * 10 ** (wrong.level_db / 10)
-        body = local.to_body(seen.departure)
+        face = self._field.cells.face[seen.index]
+        length = seen.length + moved + error[face] * (self._city.normals[face] * (there + back)).sum(axis=1)
+        power = (amplitude * seen.magnitude * elements) ** 2
         some = power > 0
-        return ExpectedClutter(length[some] / SPEED_OF_LIGHT, seen.rate[some] / SPEED_OF_LIGHT, power[some], body[some], body[some])
+        return ExpectedClutter(
+            length[some] / SPEED_OF_LIGHT,
+            seen.rate[some] / SPEED_OF_LIGHT,
+            power[some],
+            local.to_body(seen.departure)[some],
+            local.to_body(seen.arrival)[some],
+        )

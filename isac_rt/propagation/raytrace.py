@@ -45,6 +45,7 @@ from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
+from isac_rt.propagation.twice import TwoBounces
 from isac_rt.propagation.visibility import Shadows
 from isac_rt.scenario import Scenario
 from isac_rt.swarm import Pose, Swarm
@@ -78,6 +79,9 @@ class RayTracer:
         pinned = scenario.clutter.model == "field"
         self.field = ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength) if pinned else None
         """The scatterers on the city's surfaces."""
+        twice = scenario.clutter.mirrors > 0
+        self.twice = TwoBounces.plan(scenario, city, self.field, wavelength) if self.field is not None and twice else None
+        """The same scatterers by way of mirrors."""
         self._trajectories = Swarm.from_scenario(scenario).trajectories
         mirrors, rays = (self._normals, self._offsets), self._handle.scene.mi_scene
         self.between = Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength) if len(instants) > 1 else None
@@ -213,6 +217,8 @@ class RayTracer:
             parts.append(self._scattered(local[tx], local[rx], amplitude, face, point, common))
         if self.field is not None:
             parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
+        if self.twice is not None:
+            parts.extend(self.twice.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
         leakage = self._scenario.propagation.leakage
         if tx == rx and leakage.enabled:
             ahead = local[tx].rotation[:, 1][None]

@@ -101,7 +101,8 @@ class Sight:
     """How far N points are in sight of each terminal, from 0 to 1, at any time of a run."""
 
     def __init__(self, shadows: Shadows, flights: dict[str, Flight], points: np.ndarray, normals: np.ndarray) -> None:
-        self._shadows, self._flights, self._points, self._normals = shadows, flights, points, normals
+        self.shadows, self.flights = shadows, flights
+        self._points, self._normals = points, normals
         self._seen: dict[tuple[str, int], np.ndarray] = {}
 
     @property
@@ -111,9 +112,9 @@ class Sight:
 
     def share(self, name: str, pose: Pose, time: float) -> np.ndarray:
         """(N,) float32 for a terminal at a pose, local coordinates."""
-        flight = self._flights[name]
+        flight = self.flights[name]
         if not flight.holds(pose, time):
-            return self._shadows.sees(pose.position, self._points, self._normals).astype(np.float32)
+            return self.shadows.sees(pose.position, self._points, self._normals).astype(np.float32)
         out = np.zeros(len(self._points), np.float32)
         for knot, weight in flight.blend(time).items():
             if weight > 0:
@@ -122,5 +123,5 @@ class Sight:
 
     def _knot(self, name: str, knot: int) -> np.ndarray:
         if (name, knot) not in self._seen:
-            self._seen[name, knot] = np.packbits(self._shadows.sees(self._flights[name].knots[knot], self._points, self._normals))
+            self._seen[name, knot] = np.packbits(self.shadows.sees(self.flights[name].knots[knot], self._points, self._normals))
         return np.unpackbits(self._seen[name, knot], count=len(self._points))
