@@ -63,6 +63,7 @@ class MeshExpectation:
         """
         wrong = mistakes or Mistakes()
         local = replace(pose, position=pose.position - self._city.origin, velocity=pose.velocity + np.array(wrong.velocity))
+        amplitude = amplitude * 10 ** (wrong.level_db / 20)
         error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
         once = self._field.seen(name, name, local, local, time)
         parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
@@ -73,7 +74,7 @@ class MeshExpectation:
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
             moved = 2 * error[part.mirror.faces[0]] * (met @ n)
             parts.append(self._expected(s, there, back, error, amplitude, local, moved))
-        return joined(parts).louder(wrong.level_db)
+        return joined(parts)
 
     def _expected(
         self,
