@@ -18,7 +18,7 @@ floor_s : float
     The floor [CPU s]: one cube of the job filled once and transformed once by `scipy.fft` in complex64.
 
 and, where they say something: seconds (median [s]), unit (of `size`), error_of (what `error` is), oracle (bool, True for the
-reference), job (what is measured, in words).
+reference), job (what is measured, in words), also (what else was measured, in words).
 
 Import only what a stage needs: none of the modules here is imported with the package.
 """

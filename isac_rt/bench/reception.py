@@ -1,8 +1,10 @@
 """Cost of a full reception of one frame (M = 3) at the active and at the passive terminal, over the number of paths that are seen.
 
 The frame is made by the program's own synthesis: the strongest path some 13 dB over the noise of a sample, each further one 2 dB weaker.
-`error` is that of the estimated ranges of all paths in range cells (RMS over those that have a detection within two cells); beside it
-are the floor of the transforms alone and the memory that was allocated at most, in cubes.
+`error` is that of the estimated ranges of all paths in range cells (RMS over those that have a detection within two cells). Beside it
+are the cost over that of its transforms alone - `scipy.fft` of the cube once (AT) or twice (PT: to decode and to sense) and once over the
+chirps of the range cells that are looked at - and the memory at most, the cube included, in cubes. One thread, as a run gives every
+terminal.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
+from scipy.fft import fft
+from threadpoolctl import threadpool_limits
 
 from isac_rt.arrays import Antennas, pseudo_random_schedule
 from isac_rt.bench.measure import cpu_seconds, floor_seconds
@@ -65,29 +69,50 @@ def _range_error(found: Detections, count: int, passes: int) -> float | None:
 
 
 def _peak_cubes(work: Callable[[], object], cube: IFCube) -> float:
+    """Memory at most, in cubes, the one that is received among them."""
     tracemalloc.start()
     work()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    return peak / cube.samples.nbytes
+    return 1 + peak / cube.samples.nbytes
+
+
+def _jobs(
+    cube: IFCube, payload: Payload, antennas: Antennas, prediction: Prediction
+) -> list[tuple[str, int, Callable[[], Detections]]]:
+    """Name, passes of the way and work of each reception."""
+    settings = Receivers()
+    return [
+        ("active terminal (DCA-SPE)", 2, lambda: receive_active(cube, payload, antennas, settings).detections),
+        ("passive terminal (J-SPEDD)", 1, lambda: receive_passive(cube, antennas, settings, _DPSK, prediction, True).detections),
+    ]
+
+
+def _transform_seconds(cube: IFCube, repeats: int) -> tuple[float, float]:
+    """CPU seconds of `scipy.fft` along the samples of a cube, and along the chirps of the cells that a map shows."""
+    w, samples = cube.waveform, cube.samples
+    cells = np.zeros((w.num_tx, samples.shape[1], w.num_delay_symbols, samples.shape[2]), np.complex64)
+    return cpu_seconds(lambda: fft(samples, axis=-1), repeats), cpu_seconds(lambda: fft(cells, axis=-1), repeats)
 
 
 def rows(quick: bool) -> list[dict[str, object]]:
     """Rows of the benchmark (`isac_rt.bench`): cost in floors of AT and PT receptions."""
+    with threadpool_limits(limits=1):
+        return _rows(quick)
+
+
+def _rows(quick: bool) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
-    repeats, settings = 3 if quick else 7, Receivers()
+    repeats = 3 if quick else 7
     for size in QUICK_SIZES if quick else SIZES:
         cube, payload, antennas, prediction = _frame(size)
         floor = floor_seconds(cube.samples.shape, repeats)
-        jobs: list[tuple[str, int, Callable[[], Detections]]] = [
-            ("active terminal (DCA-SPE)", 2, lambda c=cube, p=payload, a=antennas: receive_active(c, p, a, settings).detections),
-            ("passive terminal (J-SPEDD)", 1,
-             lambda c=cube, a=antennas, q=prediction: receive_passive(c, a, settings, _DPSK, q, True).detections),
-        ]  # fmt: skip
-        for method, passes, work in jobs:
-            seconds = cpu_seconds(work, repeats)
+        along_range, along_chirps = _transform_seconds(cube, repeats)
+        for method, passes, work in _jobs(cube, payload, antennas, prediction):
+            seconds, cubes = cpu_seconds(work, repeats), _peak_cubes(work, cube)
+            ratio = seconds / (along_range * (3 - passes) + along_chirps)
             out.append({"kind": "reception", "method": method, "size": size, "unit": "paths", "error": _range_error(work(), size, passes),
                         "error_of": "RMS range error in cells", "cost": seconds / floor, "seconds": seconds, "floor_s": floor,
-                        "oracle": False, "job": "one frame, M = 3, full reception",
-                        "memory_cubes": _peak_cubes(work, cube)})  # fmt: skip
+                        "oracle": False, "job": "one frame, M = 3, full reception", "transforms": ratio, "memory_cubes": cubes,
+                        "also": f"{ratio:.2f} of its transforms, {cubes:.2f} cubes of memory"})  # fmt: skip
     return out

@@ -73,7 +73,8 @@ def markdown(found: Mapping[str, Any]) -> str:
     m = found["machine"]
     text = [f"Machine: {m['processor']}, {m['cores']} cores, {m['platform']}. Cost in floors of the same run (CPU time).", ""]
     for kind in dict.fromkeys(row["kind"] for row in found["rows"]):
-        text += [f"## {kind}", "", "| method | size | cost [floors] | CPU s | floor [s] | error | of |", "|---|---|---|---|---|---|---|"]
+        text += [f"## {kind}", "", "| method | size | cost [floors] | CPU s | floor [s] | error | of | also |",
+                 "|---|---|---|---|---|---|---|---|"]  # fmt: skip
         for (of_kind, method, unit), rows in curves(found["rows"]).items():
             if of_kind == kind:
                 text += [_line(method, unit, row) for row in rows]
@@ -87,7 +88,7 @@ def _line(method: str, unit: str, row: Row) -> str:
     error = "" if row["error"] is None else "oracle" if row.get("oracle") else f"{row['error']:.2g}"
     seconds = row.get("seconds", row["cost"] * row["floor_s"])
     return (f"| {method} | {row['size']:,} {unit} | {row['cost']:.3g} | {seconds:.3g} | {row['floor_s']:.3g} | {error} "
-            f"| {row.get('error_of', 'samples')} |")  # fmt: skip
+            f"| {row.get('error_of', 'samples')} | {row.get('also', '')} |")  # fmt: skip
 
 
 def write(found: Mapping[str, Any], folder: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from isac_rt.arrays import Antennas
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import by_antenna, demodulate_bits, gray_bits, running_phases
 from isac_rt.receive.clutter_filter import chirp_runs
-from isac_rt.receive.demodulate import EXTRA_CELLS, WEAKEST_WEIGHT, Symbols, known_cycles
+from isac_rt.receive.demodulate import EXTRA_CELLS, WEAKEST_WEIGHT, Symbols, known_cycles, symbol_cells
 from isac_rt.receive.estimate import beat_cells, middle_times
 from isac_rt.receive.joint import element_delays
 from isac_rt.receive.types import Prediction
@@ -67,7 +67,7 @@ def demodulate_beams(
     rows = usable_paths(prediction)
     p = Prediction(**{name: value[rows] for name, value in vars(prediction).items()})
     delays, rates = p.range / SPEED_OF_LIGHT, p.velocity / SPEED_OF_LIGHT
-    cells = np.arange(-EXTRA_CELLS, w.num_delay_symbols + EXTRA_CELLS)
+    cells = symbol_cells(w)
     spectra = _beam_spectra(cube, p, antennas, cells, run_cells)
     noise, snr, each = zip(*(_likelihood(one) for one in spectra), strict=True)
     likelihood = np.sum(each, axis=0)

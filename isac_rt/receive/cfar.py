@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 from scipy import ndimage, optimize, stats
 
 from isac_rt.scenario import Receivers
@@ -60,29 +61,26 @@ def side_rows(rows: int, guard: int, training: int) -> np.ndarray:
     return np.where(count >= max(training // 2, 1), count, 0)
 
 
-def _side_mean(power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int], side: int) -> np.ndarray:
-    """Mean over the kept cells of the training block before (-1) or behind (+1) each cell in range; Doppler wraps. NaN where
-    too few are."""
-    rows, _ = power.shape
-    width = 2 * (guard[1] + training[1]) + 1
-    count = side_rows(rows, guard[0], training[0])[:, 0 if side < 0 else 1]
-    index = np.arange(rows)
-    start = np.where(count == 0, 0, index - guard[0] - count if side < 0 else index + guard[0] + 1)
-
-    def block(values: np.ndarray) -> np.ndarray:
-        across = ndimage.uniform_filter1d(values, width, axis=1, mode="wrap") * width
-        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(across, axis=0)])
-        return total[start + count] - total[start]
-
-    held = np.round(block(keep.astype(np.float64)))
-    enough = (count[:, None] > 0) & (held >= LEAST_KEPT * count[:, None] * width)
-    return np.where(enough, block(np.where(keep, power, 0.0).astype(np.float64)) / np.maximum(held, 1), np.nan)
-
-
 def background(power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
-    """The greater of the two training means over the kept cells; where one is missing the other, infinite where both are."""
-    level = np.fmax(_side_mean(power, keep, guard, training, -1), _side_mean(power, keep, guard, training, +1))
+    """The greater of the means over the kept cells of the training blocks before and behind each cell in range; Doppler wraps. Where
+    one holds too few cells the other, infinite where both do."""
+    width = 2 * (guard[1] + training[1]) + 1
+    total, held = _summed(np.where(keep, power, 0.0), width), _summed(keep, width)
+    index, count = np.arange(len(power)), side_rows(len(power), guard[0], training[0])
+    means = []
+    for rows, first in zip(count.T, (index - guard[0] - count[:, 0], index + guard[0] + 1), strict=True):
+        start = np.where(rows == 0, 0, first)
+        cells = np.round(held[start + rows] - held[start])
+        enough = (rows[:, None] > 0) & (cells >= LEAST_KEPT * rows[:, None] * width)
+        means.append(np.where(enough, (total[start + rows] - total[start]) / np.maximum(cells, 1), np.nan))
+    level = np.fmax(*means)
     return np.where(np.isnan(level), np.inf, level)
+
+
+def _summed(values: np.ndarray, width: int) -> np.ndarray:
+    """(rows + 1, P) sums of the first 0, 1, ... rows over `width` bins about each."""
+    across = ndimage.uniform_filter1d(values.astype(np.float64), width, axis=1, mode="wrap") * width
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(across, axis=0)])
 
 
 def strong_lobes(power: np.ndarray) -> np.ndarray:
@@ -179,11 +177,28 @@ def independent_cells(count: int) -> float:
 
 def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Cells above the threshold that are the largest within `reach` (range, Doppler); Doppler wraps. Strongest first."""
-    size = (2 * reach[0] + 1, 2 * reach[1] + 1)
-    largest = ndimage.maximum_filter(power, size=size, mode=("nearest", "wrap"))
-    rows, bins = np.nonzero(above & (power == largest))
+    rows, bins = np.nonzero(above)
+    keep = _largest(power, rows, bins, *reach)
+    rows, bins = rows[keep], bins[keep]
     order = np.argsort(-power[rows, bins], kind="stable")
     return rows[order], bins[order]
+
+
+@njit(nogil=True, cache=True)
+def _largest(power, rows, bins, along, across):  # pragma: no cover - compiled
+    """Whether nothing within reach is larger, of each cell."""
+    num_rows, num_bins = power.shape
+    out = np.ones(rows.size, np.bool_)
+    for i in range(rows.size):
+        value = power[rows[i], bins[i]]
+        for r in range(max(rows[i] - along, 0), min(rows[i] + along + 1, num_rows)):
+            for b in range(bins[i] - across, bins[i] + across + 1):
+                if power[r, b % num_bins] > value:
+                    out[i] = False
+                    break
+            if not out[i]:
+                break
+    return out
 
 
 def strongest_peaks(power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float) -> tuple[np.ndarray, np.ndarray]:

@@ -13,12 +13,11 @@ from isac_rt.ifsignal import IFCube
 from isac_rt.receive.cfar import detect, detect_chirps, first_row, strongest_peaks
 from isac_rt.receive.doppler import (
     UNION_FLOOR,
-    accumulate,
-    channel_maps,
     conventional_power,
     doppler_bins,
     omp_power,
     own_bins,
+    power_map,
     slow_window,
     sparse_enough,
 )
@@ -41,12 +40,13 @@ OMP_SPARSITY = 4
 
 @dataclass(frozen=True)
 class Sensed:
-    """Detections of a frame with their estimates, strongest first, and the maps that they came from. `sparse`: see `Reception`."""
+    """Detections of a frame with their estimates, strongest first, the map that they came from and its background (`cfar.detect`).
+    `sparse`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
     power: np.ndarray
-    noise: float
+    level: np.ndarray
     sparse: bool | None = None
 
 
@@ -76,17 +76,17 @@ def sense(
     passes: int,
 ) -> Sensed:
     """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose `delay_symbols` were removed."""
-    w, method = waveform, velocity_method(settings, schedule, waveform.num_tx)
+    w, method, looks = waveform, velocity_method(settings, schedule, waveform.num_tx), num_looks(settings, schedule, antennas)
+    rules = looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
     if method == "pursuit":
         paths, ratio, power = pursue(spectra, w, schedule, delay_symbols, antennas, settings, passes)
-        return Sensed(paths, describe(paths, ratio, antennas, w, passes), power, float(np.median(power)))
+        return Sensed(paths, describe(paths, ratio, antennas, w, passes), power, detect(power, *rules)[1])
     conventional = method == "conventional"
     if conventional:
         power = conventional_power(spectra, w, schedule)
     else:
-        power = accumulate(channel_maps(spectra, w, schedule, delay_symbols))
-    looks = num_looks(settings, schedule, antennas)
-    above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+        power = power_map(spectra, w, schedule, delay_symbols)
+    above, level = detect(power, *rules)
     above[: first_row(settings, w.range_cell(passes))] = False
     sparse = None
     if conventional:
@@ -102,7 +102,7 @@ def sense(
         estimates.append(estimate_at(local, power, int(row), int(column), settings))
     snr = power[rows, bins] / level[rows, bins]
     found = describe(estimates, snr, antennas, w, passes, on_grid=settings.refinement == "grid")
-    return Sensed(estimates, found, power, float(np.median(power)), sparse)
+    return Sensed(estimates, found, power, level, sparse)
 
 
 def window_gain(waveform: Waveform, schedule: Schedule) -> float:

@@ -8,18 +8,18 @@ the search runs a few cells past the alphabet (`raw`), where such a slip shows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-import scipy.fft
 from scipy import stats
 
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.receive.clutter_filter import chirp_runs
-from isac_rt.receive.doppler import add_power
 from isac_rt.receive.estimate import beat_cells, middle_phase
 from isac_rt.receive.profile import correlate
 from isac_rt.receive.spectrum import data_phase, tones, window_length
+from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Prediction
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
@@ -48,6 +48,7 @@ class Symbols:
     soft_bits: np.ndarray | None = None
 
 
+@lru_cache(maxsize=64)
 def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
     """Median delay confidence over a frame that noise alone exceeds in fewer than one frame in a million.
 
@@ -58,6 +59,11 @@ def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
     tail = stats.binom.sf(num_chirps // 2 - 1, num_chirps, share)
     q = float(share[np.flatnonzero(tail < 1e-6)[-1]])
     return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
+
+
+def symbol_cells(waveform: Waveform) -> np.ndarray:
+    """Where a derotated chirp may have its symbol: the alphabet and `EXTRA_CELLS` on both sides."""
+    return np.arange(-EXTRA_CELLS, waveform.num_delay_symbols + EXTRA_CELLS)
 
 
 def demodulate(
@@ -85,12 +91,12 @@ def demodulate(
     shape = cube.schedule.shape
     raw, sure = np.empty(shape, np.int64), np.empty(shape)
     picked = np.empty((shape[0], cube.samples.shape[1], shape[1]), np.complex128)
+    cells = symbol_cells(w)
+    spectra = np.empty((picked.shape[1], cells.size, shape[1]), np.complex64)
     for m in range(shape[0]):
         turn = tones(-beats[m] / w.num_samples, w.num_samples)
-        spectra = scipy.fft.fft(cube.samples[m] * turn, axis=-1, workers=1, overwrite_x=True)
-        power = np.zeros(spectra.shape[1:], np.float32)
-        for one in spectra:
-            add_power(power, one)
+        power = np.zeros(turn.shape, np.float32)
+        transform(cube.samples[m], turn, cells, spectra, power=power)
         if run_cells is not None:
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
         if profile is not None:
@@ -98,7 +104,7 @@ def demodulate(
         raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others] if profile is None else [], w)
         if profile is not None:  # next to the right symbol the template still overlaps itself: the mean of the rest is not the noise's
             sure[m] = power.max(axis=1) / np.median(power, axis=1)
-        picked[m] = np.take_along_axis(spectra, (raw[m] % w.num_samples)[None, :, None], axis=2)[..., 0]
+        picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     known = known_cycles(w, delays[0], rates[0], raw)
     picked *= np.exp(-2j * np.pi * known)[:, None, :]
@@ -125,7 +131,7 @@ def known_cycles(waveform: Waveform, delay: float, delay_rate: float, raw: np.nd
 
 def decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
     """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from (P, N) power."""
-    cells = np.arange(-EXTRA_CELLS, waveform.num_delay_symbols + EXTRA_CELLS)
+    cells = symbol_cells(waveform)
     metric = power[:, cells % waveform.num_samples].astype(np.float64)
     chirps = np.arange(power.shape[0])[:, None]
     for weight, offset in others:

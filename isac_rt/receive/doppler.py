@@ -7,6 +7,8 @@ Doppler bins are centred: bin 0 of the output is -P/2. Receding is positive.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numba import njit
 
@@ -51,18 +53,73 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, de
     maps : (L_tx, L_rx, rows, P) complex64, FFT order. Where the union is not the full sampling (M < L_tx) these are the
         correlations with the Doppler atoms, with the sampling's sidelobes in them.
     """
-    num_groups, num_rx, num_rows, num_chirps = spectra.shape
+    num_rx, num_rows, num_chirps = spectra.shape[1:]
     out = np.empty((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
+    for tx, (places, operator) in enumerate(_operators(spectra.shape, waveform, schedule, delay_symbols)):
+        united = np.empty((num_rx * num_rows, places.size), np.complex64)
+        _unite(spectra.reshape(-1), places, num_chirps, united)
+        np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
+    return out
+
+
+def _operators(
+    shape: tuple[int, ...], waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Of each transmit antenna where its chirps lie in the flat spectra of a `shape`, in the first row, and the operator on them."""
+    num_groups, num_rx, num_rows, num_chirps = shape
     full = num_groups == waveform.num_tx and is_latin(schedule, waveform.num_tx)
     times = slow_times(waveform, delay_symbols)
     for tx in range(waveform.num_tx):
         sent = schedule == tx
         groups, chirps = np.nonzero(sent)
-        united = np.empty((num_rx * num_rows, chirps.size), np.complex64)
-        _unite(spectra.reshape(-1), (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), num_chirps, united)
-        operator = union_operator(waveform, times[sent]) if full else correlation_operator(waveform, times[sent])
-        np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
-    return out
+        operator = (union_operator if full else correlation_operator)(waveform, times[sent])
+        yield (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), operator
+
+
+def power_map(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray) -> np.ndarray:
+    """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, Doppler centred.
+
+    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates. With a + j b such a row and x + j y
+    the samples, both bins follow from a x, b x, a y and b y: half of the multiplications.
+    """
+    num_rx, num_rows, num_chirps = spectra.shape[1:]
+    half = num_chirps // 2 + 1
+    power = np.zeros((num_rows, num_chirps), np.float32)
+    for places, operator in _operators(spectra.shape, waveform, schedule, delay_symbols):
+        rows = operator[:half].copy()
+        if num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
+            rows[-1] = rows[-1].conj()
+        parts = np.ascontiguousarray(np.concatenate([rows.real, rows.imag]).T)
+        united = np.empty((2, num_rows, places.size), np.float32)
+        made = np.empty((2 * num_rows, 2 * half), np.float32)
+        for rx in range(num_rx):
+            _unite_parts(spectra.reshape(-1), places + np.uint64(rx * num_rows * num_chirps), num_chirps, united)
+            np.matmul(united.reshape(2 * num_rows, -1), parts, out=made)
+            _add_both_bins(made.reshape(2, num_rows, 2, half), power)
+    return np.fft.fftshift(power, axes=-1) / (waveform.num_tx * num_rx)
+
+
+@njit(nogil=True, cache=True)
+def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
+    """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]."""
+    for i in range(out.shape[1]):
+        first = np.uint64(i * num_chirps)
+        for s in range(out.shape[2]):
+            value = flat[first + places[s]]
+            out[0, i, s], out[1, i, s] = value.real, value.imag
+
+
+@njit(nogil=True, cache=True, fastmath={"contract"})
+def _add_both_bins(made, power):  # pragma: no cover - compiled
+    """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
+    num_chirps = power.shape[1]
+    for i in range(power.shape[0]):
+        ax, bx, ay, by = made[0, i, 0], made[0, i, 1], made[1, i, 0], made[1, i, 1]
+        line = power[i]
+        for k in range((num_chirps + 1) // 2):
+            line[k] += (ax[k] - by[k]) ** 2 + (bx[k] + ay[k]) ** 2
+        for k in range(1, num_chirps // 2 + 1):
+            line[num_chirps - k] += (ax[k] + by[k]) ** 2 + (ay[k] - bx[k]) ** 2
 
 
 @njit(nogil=True, cache=True)
@@ -90,11 +147,9 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
     remains is below -60 dB, and below -50 dB within 2 % of the unambiguous velocity.
     """
     p = np.arange(waveform.num_chirps)
-    bins = np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps)
     grid = p + (times - np.floor(times)).mean()
     resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - grid)).T
-    analyse = np.exp(-2j * np.pi * np.outer(bins, p) / waveform.num_chirps)
-    return (analyse @ (slow_window(waveform)[:, None] * resample)).astype(np.complex64)
+    return np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
 
 
 @njit(nogil=True, cache=True)

@@ -11,6 +11,7 @@ slow-time phase follows tau_c. `Template` is this formula; nothing of it is line
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -91,7 +92,9 @@ class LocalSpectra:
         self._sets = w.num_groups if separate else 1
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
-        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1), np.complex64).reshape(schedule.size, rows.shape[2], -1)
+        # the window begins at sample 0 and its transform is real about its middle: the turn from row to row is taken out here
+        turn = np.exp(2j * np.pi * (low + np.arange(rows.shape[2])) * (window_length(w) / 2 / w.num_samples))
+        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(schedule.size, rows.shape[2], -1)
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         self._tx = np.ascontiguousarray((schedule + own).ravel())
@@ -111,7 +114,7 @@ class LocalSpectra:
         """Responses (sets, L_tx, L_rx) and the templates' energies (sets, L_tx, 1)."""
         out = np.zeros((self._sets * self.waveform.num_tx, self._data.shape[2]), np.complex128)
         energy = np.zeros(len(out))
-        _match(self._data.view(np.float32), self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out, energy)
+        _match(self._data.view(np.float64), self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out, energy)
         shape = self._sets, self.waveform.num_tx, -1
         return out.reshape(shape), energy.reshape(shape)
 
@@ -127,34 +130,36 @@ def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energ
     """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`, `middle_phase` and
     `hann_response` in one loop, which a test holds against them.
 
-    `data` alternates real and imaginary parts. Multiples by the factor's real and by its imaginary part are summed apart, which
-    the compiler turns into vector code.
+    `data` alternates real and imaginary parts, and is turned so that the template's rows differ by real factors.
     """
     carrier, slope, middle, duration, length, size = numbers
     chirps, rows, width = data.shape
-    sums = np.zeros((out.shape[0], 2, width))
-    step = np.exp(2j * np.pi * (length / 2 / size))
+    share = length / size
+    step_cos, step_sin = np.cos(np.pi * share * np.arange(rows)), np.sin(np.pi * share * np.arange(rows))
+    line = np.empty(width)
     for i in range(chirps):
         tau = delay + delay_rate * time[i]
         beat = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
-        cycles = (carrier * tau) % 1.0 + (slope * tau * (middle - tau / 2)) % 1.0
-        turn = weight[i] * np.exp(-2j * np.pi * (cycles - first * (length / 2 / size)))
-        with_real, with_imag = sums[tx[i], 0], sums[tx[i], 1]
+        turns, chirp = carrier * tau, slope * tau * (middle - tau / 2)
+        cycles = 2 * np.pi * (turns - np.floor(turns) + chirp - np.floor(chirp))
+        near = (beat - first) * share
+        sine, cosine = np.sin(np.pi * near), np.cos(np.pi * near)
+        line[:] = 0.0
         for k in range(rows):
-            d = (beat - (first + k)) * length / size
+            d = near - k * share
             if abs(abs(d) - 1.0) < 1e-6:
                 shape = length / 4
             elif abs(d) < 1e-9:
                 shape = length / 2
             else:
-                shape = length / 2 * np.sin(np.pi * d) / (np.pi * d * (1.0 - d * d))
+                shape = length / 2 * (sine * step_cos[k] - cosine * step_sin[k]) / (np.pi * d * (1.0 - d * d))
             energy[tx[i]] += weight[i] * shape * shape
-            real, imag, line = turn.real * shape, turn.imag * shape, data[i, k]
+            row = data[i, k]
             for c in range(width):
-                with_real[c] += real * line[c]
-                with_imag[c] += imag * line[c]
-            turn *= step
-    out[:] = sums[:, 0, 0::2] - sums[:, 1, 1::2] + 1j * (sums[:, 0, 1::2] + sums[:, 1, 0::2])
+                line[c] += shape * row[c]
+        turn = weight[i] * complex(np.cos(cycles), -np.sin(cycles))
+        for c in range(width // 2):
+            out[tx[i], c] += turn * complex(line[2 * c], line[2 * c + 1])
     for t in range(out.shape[0]):
         out[t] /= max(energy[t], 1e-30)
 
@@ -218,6 +223,7 @@ def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int
     return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
 
 
+@lru_cache(maxsize=32)
 def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels (tx index, rx index) along X (axis 0) or Z (axis 2) of the L and their places along it [m].
 
@@ -228,6 +234,8 @@ def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.nd
     tx = along if virtual else np.arange(antennas.num_tx)
     t, r = (a.ravel() for a in np.meshgrid(tx, rx, indexing="ij"))
     place = antennas.rx_positions[r, axis] + (antennas.tx_positions[t, axis] if virtual else 0.0)
+    for a in (t, r, place):
+        a.setflags(write=False)
     return t, r, place
 
 
@@ -243,14 +251,13 @@ def direction_cosine(
     tx, rx, place = arm(antennas, axis, virtual)
     scale = 2 * np.pi * (waveform.carrier_frequency + waveform.slope * window_middle(waveform)) / SPEED_OF_LIGHT
     limit = min(1.0, np.pi / (scale * antennas.spacing))
-    values = channels[tx, rx]
-    groups = [np.ones(tx.size, bool)] if virtual else [tx == t for t in np.unique(tx)]
+    values = channels[tx, rx].reshape(1 if virtual else antennas.num_tx, -1).T
+    apart = 1j * scale * place[: len(values)]  # the receivers stand alike for every transmitter
 
     def beam(u: np.ndarray) -> np.ndarray:
-        steer = np.exp(1j * scale * np.outer(u, place))
-        return sum(np.abs(steer[:, g] @ values[g]) ** 2 for g in groups)
+        return (np.abs(np.exp(np.outer(u, apart)) @ values) ** 2).sum(axis=1)
 
-    u = np.linspace(-limit, limit, 8 * np.unique(rx).size * (2 if virtual else 1) + 1)
+    u = np.linspace(-limit, limit, 8 * (antennas.rx_x if axis == 0 else antennas.rx_z) * (2 if virtual else 1) + 1)
     best = u[np.argmax(beam(u))]
     for step in () if on_grid else ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
         low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))

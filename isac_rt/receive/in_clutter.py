@@ -64,7 +64,7 @@ def sense_in_clutter(
         if np.isfinite(cosines).all():
             direction[i] = _direction(found[i], antennas, w, cosines)
     named = {name: getattr(detections, name) for name in ("range", "velocity", "snr", "std", "is_reference")}
-    return Sensed(found, type(detections)(direction=direction, **named), power, float(np.median(power)))
+    return Sensed(found, type(detections)(direction=direction, **named), power, judged.level)
 
 
 def _beam(antennas: Antennas, waveform: Waveform, cosines: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from isac_rt.arrays import Antennas, Schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive.beams import demodulate_beams, usable_paths
-from isac_rt.receive.cfar import detect, threshold
+from isac_rt.receive.cfar import row_factors, threshold
 from isac_rt.receive.common import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
 from isac_rt.receive.estimate import Estimate, LocalSpectra
@@ -152,13 +152,13 @@ def _at_prediction(
     gate = found.power[np.ix_(rows, columns)]
     i, j = np.unravel_index(gate.argmax(), gate.shape)
     looks = num_looks(settings, cube.schedule, antennas)
-    above, level = detect(found.power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
-    if not above[rows[i], columns[j]]:
+    factors = row_factors(len(found.power), looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+    snr = found.power[rows[i], columns[j]] / found.level[rows[i], columns[j]]
+    if not snr > factors[rows[i]]:
         return no_detections(), None
     separate = velocity_method(settings, cube.schedule, w.num_tx) == "conventional"
     local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]), separate=separate)
     estimate = estimate_at(local, found.power, int(rows[i]), int(columns[j]), settings)
-    snr = found.power[rows[i], columns[j]] / level[rows[i], columns[j]]
     reference = describe([estimate], np.array([snr]), antennas, w, 1, on_grid=settings.refinement == "grid")
     d = found.detections
     apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1

@@ -11,7 +11,7 @@ import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
 from isac_rt.receive.cfar import detect, first_row
-from isac_rt.receive.doppler import accumulate, channel_maps
+from isac_rt.receive.doppler import power_map
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -57,7 +57,7 @@ def pursue(
     """
     w, left = waveform, spectra.copy()
     looks, first = antennas.num_tx * antennas.num_rx, first_row(settings, w.range_cell(passes))
-    power = accumulate(channel_maps(left, w, schedule, delay_symbols))
+    power = power_map(left, w, schedule, delay_symbols)
     whole = power.copy()
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder
     found: list[Estimate] = []
@@ -79,7 +79,7 @@ def pursue(
         taken[block] = np.maximum(taken[block], power[row, column] * 10 ** (-LEFT_OVER_DB / 10))
         changed = _take_out(left, estimate, w, schedule, delay_symbols, antennas, passes)
         _fit_again(left, found, w, schedule, delay_symbols, antennas, passes)
-        power[changed] = accumulate(channel_maps(left[:, :, changed], w, schedule, delay_symbols))
+        power[changed] = power_map(left[:, :, changed], w, schedule, delay_symbols)
     return found, np.array(snr), whole
 
 

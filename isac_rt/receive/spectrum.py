@@ -6,8 +6,8 @@ With a data delay tau_D = D / (alpha T) the tone of a path at cell f becomes (cy
 
 The bracket and the ramp D n/N do not depend on the path. The cross term does: it shifts the tone's time origin
 by s_D samples (17 for the largest symbol of the paper's settings). So the window is laid s_D samples later, over the same
-stretch of the shifted time for every symbol, and the spectrum's cell k is turned by exp(+j 2 pi k s_D/N) after
-it is read at k + D. What remains is, at fractional cells too, an unmodulated chirp that was sent tau_D later: the path's motion during
+stretch of the shifted time for every symbol, and the spectrum's cell k, which was k + D before the factor exp(-j 2 pi D n/N), is turned
+by exp(+j 2 pi k s_D/N). What remains is, at fractional cells too, an unmodulated chirp that was sent tau_D later: the path's motion during
 tau_D is in it, and whoever follows the phase from chirp to chirp has to count tau_D to the chirp's time.
 """
 
@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.fft
 from numba import njit
 
 from isac_rt.ifsignal import IFCube
+from isac_rt.receive.transform import transform
 from isac_rt.waveform import Waveform
 
 
@@ -39,27 +39,44 @@ def hann(position: np.ndarray, length: float) -> np.ndarray:
     return np.where(inside, np.sin(np.pi * position / length) ** 2, 0.0)
 
 
-def _windows(num_samples: int, starts: np.ndarray, length: float) -> np.ndarray:
-    """`hann` of sample n less each start: (P, N) float32, with sines of sums made of few sines."""
-    places, out = np.arange(num_samples) * (2 * np.pi / length), np.empty((len(starts), num_samples), np.float32)
-    _fill_windows(starts.astype(np.float64), np.cos(places), np.sin(places), length, out)
+def _factors(num_samples: int, delay_symbols: np.ndarray, starts: np.ndarray, length: float) -> np.ndarray:
+    """`hann` of sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D to k: (P, N) complex64."""
+    out = np.empty((len(starts), num_samples), np.complex64)
+    _fill_factors(
+        np.asarray(delay_symbols, np.int64) % num_samples, starts.astype(np.float64), length,
+        np.exp(2j * np.pi / length * np.arange(num_samples)), np.exp(-2j * np.pi / num_samples * np.arange(num_samples)), out,
+    )  # fmt: skip
     return out
 
 
 @njit(nogil=True, cache=True)
-def _fill_windows(starts, cosine, sine, length, out):  # pragma: no cover - compiled
+def _fill_factors(symbols, starts, length, places, roots, out):  # pragma: no cover - compiled
+    """Sines of sums made of few sines: `places` are those of the window, `roots` those of the transform."""
     for p in range(out.shape[0]):
-        c, s = np.cos(starts[p] * 2 * np.pi / length), np.sin(starts[p] * 2 * np.pi / length)
+        begin = np.exp(-2j * np.pi * starts[p] / length)
+        at = 0
         for n in range(out.shape[1]):
             inside = starts[p] <= n <= starts[p] + length
-            out[p, n] = 0.5 - 0.5 * (c * cosine[n] + s * sine[n]) if inside else 0.0
+            out[p, n] = (0.5 - 0.5 * (begin * places[n]).real) * roots[at] if inside else 0.0
+            at += symbols[p]
+            if at >= out.shape[1]:
+                at -= out.shape[1]
 
 
 def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
-    """exp(j 2 pi f n) for n = 0 .. N-1: (..., N) complex64, each a product of two phasors reduced in float64."""
+    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, each a product of two phasors reduced in float64."""
     coarse, fine = np.arange(0, num_samples, 32), np.arange(32)
-    start, step = (np.exp(2j * np.pi * (frequency[..., None] * n % 1.0)) for n in (coarse, fine))
-    return (start[..., :, None] * step[..., None, :]).reshape(*frequency.shape, -1)[..., :num_samples].astype(np.complex64)
+    start, step = (np.exp(2j * np.pi * (np.asarray(frequency)[:, None] * n % 1.0)) for n in (coarse, fine))
+    out = np.empty((len(start), num_samples), np.complex64)
+    _fill_tones(start, step, out)
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _fill_tones(start, step, out):  # pragma: no cover - compiled
+    for p in range(out.shape[0]):
+        for n in range(out.shape[1]):
+            out[p, n] = start[p, n // 32] * step[p, n % 32]
 
 
 def data_phase(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
@@ -89,23 +106,8 @@ def clean_spectrum(cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, 
     shift = shift_of(w, delay_symbols)
     out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
     for m in range(num_groups):
-        window = _windows(num_samples, shift[m], window_length(w))
-        factor = phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, delay_symbols[m]))
-        turn = factor.astype(np.complex64)[:, None] * tones(shift[m] / num_samples, num_rows)
-        for rx in range(num_rx):
-            spectrum = scipy.fft.fft(samples[m, rx] * window, axis=1, workers=1, overwrite_x=True)
-            _gather(spectrum, delay_symbols[m].astype(np.int64), turn, out[m, rx])
+        factor = _factors(num_samples, delay_symbols[m], shift[m], window_length(w))
+        phase = phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, delay_symbols[m]))
+        turn = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
+        transform(samples[m], factor, np.arange(num_rows), out[m], turn=turn)
     return out
-
-
-@njit(nogil=True, cache=True)
-def _gather(spectrum, symbols, turn, out):  # pragma: no cover - compiled
-    """out[k, p] = spectrum[p, (k + D_p) mod N] * turn[p, k], some rows at a time so that what is written stays in the cache."""
-    num_rows, num_chirps = out.shape
-    num_samples = spectrum.shape[1]
-    for first in range(0, num_rows, 32):
-        for p in range(num_chirps):
-            at = (first + symbols[p]) % num_samples
-            for k in range(first, min(first + 32, num_rows)):
-                out[k, p] = spectrum[p, at] * turn[p, k]
-                at = at + 1 if at + 1 < num_samples else 0

@@ -1,0 +1,145 @@
+r"""Range transforms of many chirps at once: the FFTs of a reception, with what comes before and after them in the same pass.
+
+.. math:: Y[r, i, p] = g[i, p] \sum_n h[p, n]\, s[r, p, n]\, e^{-j 2 \pi c_i n / N}
+
+Sixteen chirps lie side by side in a table that stays in the second-level cache from the first factor to the last (`isac_rt.lanefft`);
+the samples are read once and only the cells that are wanted are written. `transform_plain` is the same by `scipy.fft`: the oracle, and
+what is used for an N that is no product of 8 and twos, threes and fives.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from numba import njit
+
+from isac_rt import lanefft
+from isac_rt.lanefft import ROW
+from isac_rt.simd import LANES, aligned, load, store, transpose, zip_high, zip_low
+
+
+def transform(
+    samples: np.ndarray,
+    factor: np.ndarray,
+    cells: np.ndarray,
+    out: np.ndarray,
+    *,
+    turn: np.ndarray | None = None,
+    power: np.ndarray | None = None,
+) -> None:
+    """Cells of the range spectra of one group (module docstring).
+
+    Parameters
+    ----------
+    samples : (L_rx, P, N) complex64
+    factor : (P, N) complex64, h: window, derotation
+    cells : (rows,) int, c, modulo N
+    out : (L_rx, rows, P) complex64, filled with Y
+    turn : (rows, P) complex64, g; None: 1
+    power : (P, N) float32, to which sum_r |spectrum|^2 is added over all cells, without g
+    """
+    size = samples.shape[-1]
+    try:
+        radices, twiddles, order = lanefft.plan(size)
+    except ValueError:
+        size = 0
+    if size == 0 or size % 8:
+        transform_plain(samples, factor, cells, out, turn=turn, power=power)
+        return
+    place = order[-np.arange(size) % size] * ROW  # the lane transform turns the other way
+    turns = np.zeros((0, 1), np.complex64) if turn is None else turn
+    wanted = np.zeros((0, size), np.float32) if power is None else power
+    work = [aligned(rows * ROW) for rows in (size, size, len(turns), len(wanted) and size // 2)]
+    _transform(  # type: ignore[call-arg]
+        *(np.ascontiguousarray(a, np.complex64).view(np.float32) for a in (samples, factor, turns)), wanted,
+        out.view(np.float32), radices, twiddles, place, place[np.asarray(cells) % size], *work,
+    )  # fmt: skip
+
+
+def transform_plain(
+    samples: np.ndarray,
+    factor: np.ndarray,
+    cells: np.ndarray,
+    out: np.ndarray,
+    *,
+    turn: np.ndarray | None = None,
+    power: np.ndarray | None = None,
+) -> None:
+    """`transform` with `scipy.fft`, for any N."""
+    for r, one in enumerate(samples):
+        spectrum = scipy.fft.fft(one * factor, axis=1, workers=1, overwrite_x=True)
+        if power is not None:
+            power += spectrum.real**2 + spectrum.imag**2
+        out[r] = spectrum[:, np.asarray(cells) % samples.shape[-1]].T
+        if turn is not None:
+            out[r] *= turn
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, table, factors, turns, added):  # pragma: no cover
+    """`transform`; complex arrays as float32 with real and imaginary parts in turn. The last four are work space."""
+    num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
+    for first in range(0, num_chirps, LANES):
+        count = min(LANES, num_chirps - first)
+        _fill(factor, 0, first, count, factors)
+        for i in range(turns.size // ROW):
+            for lane in range(count):
+                turns[i * ROW + lane], turns[i * ROW + LANES + lane] = turn[i, 2 * (first + lane)], turn[i, 2 * (first + lane) + 1]
+        added[:] = 0.0
+        for r in range(num_rx):
+            _fill(samples.reshape(num_rx * num_chirps, 2 * size), r * num_chirps, first, count, table)
+            _multiply(table, factors)
+            lanefft.transform(table, 0, size, radices, twiddles)
+            if added.size:
+                _add_power(table, place, added)
+            _write(table, at, turns, first, count, out[r])
+        for k in range(power.shape[1] if added.size else 0):
+            for lane in range(count):
+                power[first + lane, k] += added[k * LANES + lane]
+
+
+@njit(nogil=True, error_model="numpy")
+def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
+    """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16 chirps are turned over at a time."""
+    lanes = lines.shape[1]
+    flat = lines.reshape(-1)
+    for n in range(0, lanes, LANES):
+        for lane in range(count):
+            store(table, (n + lane) * LANES, load(flat, (offset + first + lane) * lanes + n))
+        for lane in range(count, LANES):
+            table[(n + lane) * LANES : (n + lane + 1) * LANES] = 0.0
+        transpose(table, n * LANES)
+
+
+@njit(nogil=True, error_model="numpy")
+def _multiply(table, factors):  # pragma: no cover - compiled
+    for i in range(0, table.size, ROW):
+        a, b, c, d = load(table, i), load(table, i + LANES), load(factors, i), load(factors, i + LANES)
+        store(table, i, a * c - b * d)
+        store(table, i + LANES, a * d + b * c)
+
+
+@njit(nogil=True, error_model="numpy")
+def _add_power(table, place, added):  # pragma: no cover - compiled
+    for k in range(place.size):
+        a, b = load(table, place[k]), load(table, place[k] + LANES)
+        store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
+
+
+@njit(nogil=True, error_model="numpy")
+def _write(table, at, turns, first, count, out):  # pragma: no cover - compiled
+    """out[i, first + l] = the cells, times g where there is one."""
+    flat, width, spare = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
+    for i in range(at.size):
+        a, b = load(table, at[i]), load(table, at[i] + LANES)
+        if turns.size:
+            c, d = load(turns, i * ROW), load(turns, i * ROW + LANES)
+            a, b = a * c - b * d, a * d + b * c
+        to = i * width + 2 * first
+        if count == LANES:
+            store(flat, to, zip_low(a, b))
+            store(flat, to + LANES, zip_high(a, b))
+        else:
+            store(spare, 0, zip_low(a, b))
+            store(spare, LANES, zip_high(a, b))
+            flat[to : to + 2 * count] = spare[: 2 * count]
