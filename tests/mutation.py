@@ -1,6 +1,7 @@
 """Mutation testing: does anything notice when the program is wrong?
 
     python tests/mutation.py --planted [WORDS]        plant each case's bug of `isac-rt validate`; the case must fail
+    python tests/mutation.py --hard [WORDS]           plant the bugs of planted.py; the hard cases' tests must fail
     python tests/mutation.py --sample 60 --seed 1     plant sampled sign, factor, index and unit errors; the tests must fail
 
 Both work on a copy in a temporary folder. --planted takes about ten minutes. --sample first runs the tests once to see which of them call
@@ -260,7 +261,7 @@ class Copy:
 
 @dataclass(frozen=True)
 class Record:
-    """Which tests call which function, from `mutation_record`: `called` by "file:first line", `seconds` of each test."""
+    """Which tests call which function, from `mutation_record`: `called` by "file:name", `seconds` of each test."""
 
     called: dict[str, list[str]]
     seconds: dict[str, float]
@@ -279,21 +280,21 @@ class Record:
 
     def tests(self, mutant: Mutant, source: str) -> list[str]:
         """Those that call a mutant's function, or all of its module if none does: what is compiled is called unseen. Quick ones first."""
-        first, last = next((f for f in _functions(source) if f[0] <= mutant.line <= f[1]), (mutant.line, mutant.line))
-        callers = {t for line in range(first, last + 1) for t in self.called.get(f"{mutant.file}:{line}", ())} & set(self.seconds)
+        name = next((name for name, first, last in _functions(source) if first <= mutant.line <= last), "")
+        callers = set(self.called.get(f"{mutant.file}:{name}", ())) & set(self.seconds)
         files = tuple(f"tests/{name}.py::" for name in TESTS_OF[mutant.file].split())
         return sorted(callers or {t for t in self.seconds if t.startswith(files)}, key=self.seconds.__getitem__)
 
 
 @lru_cache
-def _functions(source: str) -> list[tuple[int, int]]:
-    """First and last line of all functions and methods."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ClassDef | ast.Module):
-            for one in node.body:
-                if isinstance(one, ast.FunctionDef):
-                    found.append((min([one.lineno, *(d.lineno for d in one.decorator_list)]), one.end_lineno or 0))
+def _functions(source: str) -> list[tuple[str, int, int]]:
+    """All functions and methods by qualified name, with their first and last lines."""
+    tree, found = ast.parse(source), []
+    for holder in [tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))]:
+        head = f"{holder.name}." if isinstance(holder, ast.ClassDef) else ""
+        for one in holder.body:
+            if isinstance(one, ast.FunctionDef):
+                found.append((head + one.name, one.lineno, one.end_lineno or 0))
     return found
 
 
@@ -397,9 +398,33 @@ def check_planted(words: str) -> int:
     return 1 if wrong else 0
 
 
+def check_hard(words: str) -> int:
+    """Plant the bugs that the hard cases are written against; print those that their tests do not see."""
+    from planted import BUGS
+
+    wrong, count = 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Copy(Path(folder))
+        server = Server(copy)
+        for bug in BUGS:
+            if words not in bug.test:
+                continue
+            source, count = copy.source(bug.file), count + 1
+            state = "STALE"
+            if source.count(bug.old) == 1:
+                with copy.changed(bug.file, source.replace(bug.old, bug.new)):
+                    state = server.outcome(["tests/" + bug.test.replace("::", ".py::")], LIMIT)[0]
+            wrong += state in ("passed", "STALE")
+            print(f"{state:8s} {bug.test}: {bug.file} {bug.new}", flush=True)
+        server.end()
+    print(f"{count - wrong} of {count} noticed")
+    return 1 if wrong else 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--planted", nargs="?", const="", metavar="WORDS")
+    parser.add_argument("--hard", nargs="?", const="", metavar="WORDS")
     parser.add_argument("--sample", type=int, default=0, metavar="COUNT")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", metavar="WORDS", help="of the sample, the files with these words in their name")
@@ -408,6 +433,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.planted is not None:
         return check_planted(arguments.planted)
+    if arguments.hard is not None:
+        return check_hard(arguments.hard)
     if arguments.sample:
         with tempfile.TemporaryDirectory() as folder:
             copy = Copy(Path(folder))

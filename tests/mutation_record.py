@@ -27,7 +27,8 @@ _now = ""
 def _note(frame: FrameType, event: str, _: object) -> None:
     code = frame.f_code
     if PACKAGE in code.co_filename:
-        _called.setdefault(f"{code.co_filename.rpartition(PACKAGE)[2]}:{code.co_firstlineno}", {})[_now] = None
+        name = code.co_qualname.partition(".<locals>")[0]
+        _called.setdefault(f"{code.co_filename.rpartition(PACKAGE)[2]}:{name}", {})[_now] = None
 
 
 @pytest.hookimpl(wrapper=True)
@@ -46,6 +47,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def pytest_sessionfinish() -> None:
-    """Write what was noted."""
-    text = {"called": {place: list(tests) for place, tests in _called.items()}, "seconds": _seconds}
-    Path(os.environ["RECORD"]).write_text(json.dumps(text, indent=0) + "\n")
+    """Write what was noted, beside what was noted before of other tests."""
+    file = Path(os.environ["RECORD"])
+    before = json.loads(file.read_text()) if file.exists() else {"called": {}, "seconds": {}}
+    for place, tests in before["called"].items():
+        _called.setdefault(place, {}).update(dict.fromkeys(t for t in tests if t not in _seconds))
+    text = {"called": {place: list(tests) for place, tests in _called.items()}, "seconds": before["seconds"] | _seconds}
+    file.write_text(json.dumps(text, indent=0) + "\n")

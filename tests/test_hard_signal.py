@@ -116,7 +116,7 @@ def test_one_path_80_db_above_another():
     assert stage.relative(rest, truth) < 1e-2  # complex64 of the strong one: 1e4 * 6e-8 * a few roundings
 
 
-@pytest.mark.parametrize("times", [30, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_million_paths(times):
     """A thousand paths over and over, with a part of the gain each, are the thousand paths. Written against: an index of 16 bits.
 

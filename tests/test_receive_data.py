@@ -15,7 +15,7 @@ from isac_rt.arrays import pseudo_random_schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.demodulate import confidence_threshold, demodulate
+from isac_rt.receive.demodulate import confidence_threshold, decide_transitions, demodulate
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -76,6 +76,23 @@ def test_cleaned_frame_is_the_unmodulated_frame(cell: float):
     rounding = 2e-6  # of the peak: complex64 samples and transform
     assert np.abs(plain).max() > 100
     assert np.abs(modulated - plain).max() < rounding * np.abs(plain).max()
+
+
+def test_transitions_with_their_spread_and_share():
+    """Phases off their symbols by known angles, receivers that disagree by others: symbols, the RMS angle and the share of the aligned sum by
+    hand. Planted bugs: degrees of the circle over D twice; the earlier chirp not conjugated; the share of powers."""
+    rng, schedule = np.random.default_rng(7), np.tile([[0, 1, 2]], (1, 8))
+    symbols = rng.integers(0, 8, (1, 3, 7))
+    off, apart = rng.uniform(-0.3, 0.3, (1, 3, 7)), 0.4
+    total = np.concatenate([np.zeros((1, 3, 1)), np.cumsum(2 * np.pi / 8 * symbols + off, axis=2)], axis=2)
+    chirps = np.empty((1, 2, 24), complex)
+    for tx in range(3):
+        for rx, sign in enumerate((1, -1)):  # the receivers see the phases advance by more and by less
+            chirps[0, rx, tx::3] = 1.7 * np.exp(1j * (total[0, tx] + sign * apart * np.arange(8)))
+    found, share, spread = decide_transitions(chirps, schedule, 3, 8)
+    assert np.array_equal(found, symbols)
+    assert spread == pytest.approx(np.sqrt((off**2).mean()), rel=1e-9)
+    assert share == pytest.approx(np.full((1, 3, 7), np.cos(apart)), rel=1e-9)
 
 
 def test_cleaned_spectra_against_their_sums():

@@ -421,6 +421,58 @@ def test_start_point_is_near_and_refinement_moves_to_the_truth():
     assert np.abs(np.abs(found.channels) - 1).max() < 2e-3  # the amplitude of a sample
 
 
+class Hill:
+    """In place of `LocalSpectra`: the logarithm of the power is a paraboloid over beat [cells] and Doppler [bins] at mid-frame."""
+
+    def __init__(self, w: Waveform, top: tuple[float, float], bend: np.ndarray) -> None:
+        self.waveform, self._top, self._bend = w, np.array(top), bend
+
+    def power(self, delay: float, delay_rate: float) -> float:
+        w = self.waveform
+        doppler = delay_rate * w.effective_carrier * w.frame_duration
+        beat = (w.slope * delay + delay_rate * w.effective_carrier) * w.sampled_duration
+        off = np.array([beat, doppler]) - self._top
+        return float(np.exp(-off @ self._bend @ off / 2))
+
+    def respond(self, delay: float, delay_rate: float) -> np.ndarray:
+        return np.array([[delay, delay_rate]])
+
+
+@pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
+def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
+    """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a half of it; the gradient over a step for over
+    two; the coupling of beat and Doppler left out. Far from the top, where the paraboloid is none, the step is up."""
+    w = Waveform()
+    rate_unit = 1 / (w.frame_duration * w.effective_carrier)
+    start = 101.3 * w.delay_step, 7.7 * rate_unit
+    beat = 101.3 + 7.7 * w.sampled_duration / w.frame_duration
+    for off in ([0.31, -0.22], [-0.17, -0.35]):
+        hill = Hill(w, (beat + off[0], 7.7 + off[1]), np.array(bend))
+        found = refine(hill, *start, iterations=1)
+        assert found.delay_rate / rate_unit == pytest.approx(7.7 + off[1], abs=1e-6)
+        there = (w.slope * found.delay + found.delay_rate * w.effective_carrier) * w.sampled_duration
+        assert there == pytest.approx(beat + off[0], abs=1e-6)
+        assert found.channels.tolist() == [[found.delay, found.delay_rate]]
+    valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
+    found = refine(valley, *start, iterations=1)
+    assert valley.power(found.delay, found.delay_rate) > valley.power(*start)
+
+
+def test_two_cells_of_a_hann_tone_give_its_place():
+    """Exact at any fraction, by the window's closed form. Planted bugs: the ratio's two for a one; the side of the greater neighbour."""
+    w = Waveform()
+    length = window_length(w) / w.num_samples
+    for d in (-0.49, -0.2, 0.0, 0.13, 0.5):
+        three = hann_response(w, (np.array([-1.0, 0.0, 1.0]) - d) / length)
+        power = np.zeros((40, w.num_chirps))
+        power[19:22, 33] = three**2
+        power[20, 32:35] = three**2
+        found, rate = start_point(power, 20, 33, w)
+        bins = rate * w.frame_duration * w.effective_carrier
+        assert bins == pytest.approx(33 - w.num_chirps // 2 + d, abs=1e-9)
+        assert (w.slope * found + rate * w.effective_carrier) * w.sampled_duration == pytest.approx(20 + d, abs=1e-9)
+
+
 def test_threshold_grows_with_fewer_training_cells():
     assert threshold(45, 1e-6, (3, 3), (2, 1)) > threshold(45, 1e-6, (3, 3), (8, 6)) > stats.gamma(45, scale=1 / 45).isf(1e-6) * 0.9
 

@@ -13,7 +13,7 @@ from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.joint import Frame, JointPath, _normal_equations, element_delays, fit, residual_channels, tone_sums
-from isac_rt.receive.separate import _beams
+from isac_rt.receive.separate import _beams, _earlier_reference
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
 
@@ -240,6 +240,17 @@ def test_two_echoes_in_one_cell_at_the_active_terminal():
     assert len(d) == 2
     found = np.column_stack([d.range, d.velocity, d.direction])
     assert (np.abs(found - echoes[:, :4]) < 5 * d.std).all()
+    assert d.snr[1] / d.snr[0] == pytest.approx(0.25, rel=0.05)  # as their powers: the weaker one has an amplitude of a half
+
+
+def test_the_earlier_of_two_paths_in_a_cell_is_the_line_of_sight():
+    """Found beside the reference, not beside another path, and within 10 dB of it. Planted bugs: the strongest taken; paths of other cells."""
+    power = np.array([1.0, 0.5, 0.2, 0.3, 0.05])
+    source, ranges = np.array([0, 1, 0, 1, 0]), np.array([9.1, 7.0, 8.9, 8.0, 8.5])
+    for change, expected in ((1.0, 2), (0.4, 0)):
+        values = {"is_reference": np.array([True, False, False, False, False]), "range": ranges.copy()}
+        _earlier_reference(values, power * np.array([1, 1, change, 1, 1]), source, 2)
+        assert np.flatnonzero(values["is_reference"]).tolist() == [expected]
 
 
 def test_one_path_and_noise_are_not_split():

@@ -11,8 +11,11 @@ from receiver_cubes import ANTENNAS, Path, cube
 from isac_rt.arrays import pseudo_random_schedule
 from isac_rt.payload import random_payload
 from isac_rt.receive import receive_active
+from isac_rt.receive.estimate import Estimate, LocalSpectra
+from isac_rt.receive.pursuit import _take_out
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 FEW = replace(ANTENNAS, rx_x=3, rx_z=3)
 W = Waveform(num_samples=256, num_groups=1)
@@ -39,6 +42,31 @@ def test_a_weak_path_in_the_row_of_a_strong_one(ratio_db: float):
     assert np.abs(d.direction[1] - v).max() < 0.05
     plain = heard(paths, "omp", noise=1.0)
     assert not (np.abs(plain.velocity - weak[1]) < W.velocity_cell(2)).any()
+
+
+@pytest.mark.parametrize("passes", [2, 1])
+def test_a_path_is_taken_out_whole_and_put_back(passes: int):
+    """An exact path, off all grids, moving, with data, leaves a thousandth of itself in the rows that it reaches; put back it is there again.
+    Planted bugs: the elements' delays left out, or those of the transmitters at a PT taken in; time without the data; the middle of the
+    window for its start."""
+    schedule = pseudo_random_schedule(1, W.num_chirps, 3, np.random.default_rng(5))
+    payload = random_payload(W, schedule, 8, np.random.default_rng(6))
+    path = Path(43.817, 21.3, 0.7 - 0.4j, (0.45, -0.31), (0.45, -0.31) if passes == 2 else (-0.2, 0.1))
+    spectra = clean_spectrum(cube(W, schedule, payload, [path], FEW), payload.delay_symbols, payload.phases, 128)
+    k = 2 * np.pi * W.effective_carrier / SPEED_OF_LIGHT
+    sent, heard = (np.exp(1j * k * places[:, [0, 2]] @ u) for places, u in
+                   ((FEW.tx_positions, np.array(path.departure)), (FEW.rx_positions, np.array(path.arrival))))  # fmt: skip
+    near = LocalSpectra(spectra, W, schedule, payload.delay_symbols, round(43.817 / W.range_cell(1)))
+    delay, rate = 43.817 / SPEED_OF_LIGHT, 21.3 / SPEED_OF_LIGHT
+    exact = Estimate(delay, rate, near.respond(delay, rate))
+    turned = exact.channels * np.outer(sent, heard).conj() if passes == 2 else exact.channels * heard.conj()
+    assert np.abs(np.abs(turned) - abs(path.amplitude)).max() < 0.02
+    left = spectra.copy()
+    rows = _take_out(left, exact, W, schedule, payload.delay_symbols, FEW, passes)
+    assert rows.stop - rows.start == 49
+    assert np.abs(left).max() < 3e-3 * np.abs(spectra).max()  # the wavefront is plane here and spherical there
+    _take_out(left, exact, W, schedule, payload.delay_symbols, FEW, passes, back=True)
+    assert np.abs(left - spectra).max() < 1e-6 * np.abs(spectra).max()
 
 
 def test_noise_and_one_path_are_left_as_they_are():

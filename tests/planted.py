@@ -1,0 +1,83 @@
+"""Bugs that tests of hard cases are written against; `python tests/mutation.py --hard` plants each and runs its test, which must fail."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Bug:
+    """In `file` of the package `old` becomes `new`; `test` (file::name) is to fail then."""
+
+    test: str
+    file: str
+    old: str
+    new: str
+
+
+BUGS = (
+    Bug(
+        "test_hard_geometry::test_grazing_rays",
+        "city/mesh.py",
+        '_read_only(np.einsum("fi,fi->f", self.normals, self.corners.mean(axis=1)))',
+        '_read_only(np.einsum("fi,fi->f", self.normals, self.corners.mean(axis=1)).astype(np.float32) + np.float64(1e-7))',
+    ),
+    Bug("test_hard_geometry::test_a_transmitter_close_to_a_wall_or_on_it", "propagation/clearance.py", "if near.size and", "if False and"),
+    Bug(
+        "test_hard_geometry::test_a_transmitter_close_to_a_wall_or_on_it",
+        "propagation/clearance.py",
+        "float(distance_to_triangles(city.corners[near], place).min())",
+        "float(np.abs(city.normals @ place - city.plane_offsets).min())",
+    ),
+    Bug("test_hard_geometry::test_a_wall_seen_edge_on_and_slivers", "city/mesh.py", "1e-9 * longest**2", "1e-14 * longest"),
+    Bug("test_hard_geometry::test_two_bodies_at_one_point_are_refused_before_the_run", "preflight.py",
+        "range(0, scenario.frames, step)", "[0]"),
+    Bug(
+        "test_hard_geometry::test_a_vertical_link_with_vertical_polarisation",
+        "propagation/direct.py",
+        "friis = wavelength / (4 * np.pi * direct.length)",
+        "friis = wavelength / (4 * np.pi * direct.length) * (-1 if abs(direct.departure[0, 2]) > 0.999999999 else 1)",
+    ),
+    Bug(
+        "test_hard_signal::test_whole_and_half_cells",
+        "receive/estimate.py",
+        "return float(offset if after >= before else -offset)",
+        "return float(-offset if after >= before else offset)",
+    ),
+    Bug(
+        "test_hard_signal::test_beyond_the_filter_there_is_nothing",
+        "synthesis.py",
+        "np.maximum(-beat, beat - sampling_rate) / transition",
+        "np.maximum(-beat, beat - sampling_rate) / (2 * transition)",
+    ),
+    Bug(
+        "test_hard_signal::test_velocities_beyond_the_limit_are_aliases_of_a_known_span",
+        "receive/estimate.py",
+        "column - num_bins // 2 + _hann_ratio(across)",
+        "column + _hann_ratio(across)",
+    ),
+    Bug(
+        "test_hard_signal::test_a_target_at_half_a_metre",
+        "ifsignal.py",
+        "np.where(np.isfinite(radius)[:, None], near, -along)",
+        "np.where(np.zeros_like(near, bool), near, -along)",
+    ),
+    Bug("test_hard_signal::test_one_path_80_db_above_another", "ifsignal.py", "return (chosen & strong) | sight", "return chosen & sight"),
+    Bug("test_hard_signal::test_a_million_paths", "gridding.py", "k, lag = path[index], offset[index]",
+        "k, lag = path[index.astype(np.int16)], offset[index.astype(np.int16)]"),
+    Bug("test_hard_signal::test_ten_thousand_paths_at_one_delay", "gridding.py", "path, offset = path[order], offset[order]",
+        "path, offset = (a[order][np.r_[True, np.diff(t.delay[path[order]]) != 0]] for a in (path, offset))"),
+    Bug("test_hard_signal::test_sizes_that_are_no_powers_of_two", "gridding.py", "half, together = w.num_samples // 2,",
+        "half, together = (w.num_samples + 3) // 4 * 2,"),
+    Bug("test_fuzz::test_a_mesh_too_large_for_memory_is_refused_before_it_is_read", "city/meshfiles.py",
+        "if free is not None and READING_FACTOR * size > free:", "if False:"),
+    Bug("test_fuzz::test_what_cannot_run_is_refused_before_it_starts", "preflight.py",
+        "if free is not None and needed > free:", "if False:"),
+    Bug("test_fuzz::test_units_wrong_by_a_thousand_are_warned_of", "scenario_doubts.py",
+        '(1e9, 1e12, "hertz")', '(1e3, 1e15, "hertz")'),
+    Bug("test_killed::test_a_full_disk_is_one_message_and_leaves_nothing", "results.py", "temporary.unlink(missing_ok=True)", "pass"),
+    Bug("test_killed::test_reruns_are_equal_bit_by_bit_whatever_the_threads", "simulate.py",
+        'words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)',
+        'words = vars(np).setdefault("_shared", np.random.default_rng(self.scenario.seed)).integers(2**32, size=2, dtype=np.uint32)'),
+    Bug("test_killed::test_versions_stand_in_the_results", "provenance.py", "return dict(_versions())", 'return {"numpy": "1"}'),
+)  # fmt: skip
