@@ -213,15 +213,16 @@ def test_sampled_scan_is_the_filter_of_the_cells_around(row: int):
 
 
 def test_noise_level_from_the_quietest_cells():
-    """Means of few exponentials: their median is less than their mean, which Wilson and Hilferty's cube makes up for to 0.3 %; and half of the
-    map under clutter that the mesh foretells. Planted bugs: the cube left out; the loudest cells taken."""
+    """Means of few exponentials: their median is less than their mean, which Wilson and Hilferty's cube makes up for to 0.3 %; and half
+    of the map under clutter that the mesh foretells. Planted bugs: the cube left out; the loudest cells taken."""
     rng = np.random.default_rng(14)
     for looks in (5, 21):
         power = 0.37 * rng.gamma(looks, 1 / looks, (400, 500))
         spread = 5 * 1.3 / np.sqrt(looks * power.size)
         assert noise_level(power, None, looks) == pytest.approx(0.37, rel=3e-3 + spread)
         expected = np.where(np.arange(400)[:, None] < 200, 0.0, 10.0) * np.ones(power.shape)
-        assert noise_level(power + expected * rng.exponential(1.0, power.shape), expected, looks) == pytest.approx(0.37, rel=3e-3 + 2 * spread)
+        loud = power + expected * rng.exponential(1.0, power.shape)
+        assert noise_level(loud, expected, looks) == pytest.approx(0.37, rel=3e-3 + 2 * spread)
 
 
 def test_ratio_of_the_cfar_is_its_decision():
@@ -234,8 +235,8 @@ def test_ratio_of_the_cfar_is_its_decision():
 
 
 def test_size_of_the_scanned_directions():
-    """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances written out; beams half a lobe apart at most.
-    Planted bugs: the variance for the deviation; the area without the covariance of the two arms."""
+    """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances written out; beams half a lobe apart at
+    most. Planted bugs: the variance for the deviation; the area without the covariance of the two arms."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
     channels = joint_channels(antennas)
     x, z = channels.places[:, 0] - channels.places[:, 0].mean(), channels.places[:, 2] - channels.places[:, 2].mean()

@@ -7,6 +7,7 @@ import pytest
 from scipy import special
 from scipy.integrate import quad
 
+from isac_rt.propagation.bodies import Bodies
 from isac_rt.propagation.diffraction import LIT_REACH, SHADOW_REACH, disc, edge_factor, knife_edge
 
 LAMBDA = 299_792_458.0 / 77e9
@@ -52,6 +53,37 @@ def test_disc_has_poissons_spot_and_a_large_one_is_an_edge():
     assert np.abs(disc(np.zeros(3), radius) - np.exp(-0.5j * np.pi * radius**2)).max() < 1e-12
     off = np.linspace(-4.7, 4.7, 41)
     assert np.abs(disc(60.0 + off, np.full(41, 60.0)) - knife_edge(-off)).max() < 0.05
+
+
+def test_bodies_shade_every_straight_part_that_passes_them():
+    """Chains of three parts among bodies of all sizes and distances: the product of the discs over bodies and parts, each found by plain
+    vectors, the Fresnel unit from the whole path's lengths to both ends. Planted bugs: paths passed over that are in reach; lengths
+    counted from the part's begin; a part's end for the path's."""
+    rng = np.random.default_rng(9)
+    names, places = tuple("abcdefgh"), rng.uniform(-14, 14, (8, 3))
+    radii = rng.uniform(0.1, 0.9, 8)
+    chains = rng.uniform(-20, 20, (300, 4, 3))
+    chains[:, 1:3] = places[rng.integers(0, 8, (300, 2))] + rng.normal(0, 2.5, (300, 2, 3))
+    found = Bodies(names, places, radii).factor(chains, LAMBDA, ("c",))
+    truth, shaded = np.ones(300, complex), 0
+    for i, chain in enumerate(chains):
+        parts = np.linalg.norm(np.diff(chain, axis=0), axis=1)
+        for k, length in enumerate(parts):
+            u = (chain[k + 1] - chain[k]) / length
+            for name, place, radius in zip(names, places, radii, strict=True):
+                along = (place - chain[k]) @ u
+                if name == "c" or not 0 < along < length:
+                    continue
+                off = np.linalg.norm(place - chain[k] - along * u)
+                before = max(parts[:k].sum() + along, radius)
+                after = max(parts.sum() - parts[:k].sum() - along, radius)
+                unit = np.sqrt(LAMBDA * before * after / (2 * (before + after)))
+                if (off - radius) / unit < LIT_REACH:
+                    x = np.clip(2 * (off - radius) / unit / LIT_REACH - 1, 0, 1)
+                    truth[i] *= 1 + (disc(np.array([off / unit]), np.array([radius / unit]))[0] - 1) * (1 - x * x * (3 - 2 * x))
+                    shaded += 1
+    assert shaded > 150 and (np.abs(truth) < 0.9).sum() > 30
+    assert np.abs(found - truth).max() < 1e-6  # the discs' quadrature
 
 
 def test_edge_factor_has_no_step():

@@ -79,8 +79,8 @@ def test_cleaned_frame_is_the_unmodulated_frame(cell: float):
 
 
 def test_transitions_with_their_spread_and_share():
-    """Phases off their symbols by known angles, receivers that disagree by others: symbols, the RMS angle and the share of the aligned sum by
-    hand. Planted bugs: degrees of the circle over D twice; the earlier chirp not conjugated; the share of powers."""
+    """Phases off their symbols by known angles, receivers that disagree by others: symbols, the RMS angle and the share of the aligned
+    sum by hand. Planted bugs: degrees of the circle over D twice; the earlier chirp not conjugated; the share of powers."""
     rng, schedule = np.random.default_rng(7), np.tile([[0, 1, 2]], (1, 8))
     symbols = rng.integers(0, 8, (1, 3, 7))
     off, apart = rng.uniform(-0.3, 0.3, (1, 3, 7)), 0.4
@@ -96,13 +96,15 @@ def test_transitions_with_their_spread_and_share():
 
 
 def test_cleaned_spectra_against_their_sums():
-    """Noise through the definition, written as sums with each phase in cycles: window, data phase and turn, and rows on which the symbol leads
-    round the end of the spectrum. Planted bugs: the wrap one cell late; the window of another length; half the data's own chirp phase."""
+    """Noise through the definition, written as sums with each phase in cycles: window, data phase and turn, and rows on which the symbol
+    leads round the end of the spectrum. Planted bugs: the wrap one cell late; the window of another length; half the data's own chirp
+    phase."""
     w = Waveform(num_samples=48, num_chirps=12)
     schedule, rng = pseudo_random_schedule(w.num_groups, 12, w.num_tx, np.random.default_rng(5)), np.random.default_rng(6)
     payload = random_payload(w, schedule, 8, rng)
     samples = rng.standard_normal((w.num_groups, 2, 12, 48, 2)).astype(np.float32).view(np.complex64)[..., 0]
-    found = clean_spectrum(IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0), payload.delay_symbols, payload.phases, 48)
+    received = IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0)
+    found = clean_spectrum(received, payload.delay_symbols, payload.phases, 48)
     n, T, alpha = np.arange(48), 48 / w.sampling_rate, w.bandwidth / w.chirp_duration
     assert (payload.delay_symbols > 0).any()
     for m, p in ((0, 3), (1, 7), (2, 11)):

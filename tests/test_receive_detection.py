@@ -440,8 +440,8 @@ class Hill:
 
 @pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
 def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
-    """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a half of it; the gradient over a step for over
-    two; the coupling of beat and Doppler left out. Far from the top, where the paraboloid is none, the step is up."""
+    """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a half of it; the gradient over a step
+    for over two; the coupling of beat and Doppler left out. Far from the top, where the paraboloid is none, the step is up."""
     w = Waveform()
     rate_unit = 1 / (w.frame_duration * w.effective_carrier)
     start = 101.3 * w.delay_step, 7.7 * rate_unit

@@ -244,7 +244,7 @@ def test_two_echoes_in_one_cell_at_the_active_terminal():
 
 
 def test_the_earlier_of_two_paths_in_a_cell_is_the_line_of_sight():
-    """Found beside the reference, not beside another path, and within 10 dB of it. Planted bugs: the strongest taken; paths of other cells."""
+    """Found beside the reference, not beside others, and within 10 dB of it. Planted bugs: the strongest taken; those of other cells."""
     power = np.array([1.0, 0.5, 0.2, 0.3, 0.05])
     source, ranges = np.array([0, 1, 0, 1, 0]), np.array([9.1, 7.0, 8.9, 8.0, 8.5])
     for change, expected in ((1.0, 2), (0.4, 0)):

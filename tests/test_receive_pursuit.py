@@ -46,8 +46,9 @@ def test_a_weak_path_in_the_row_of_a_strong_one(ratio_db: float):
 
 @pytest.mark.parametrize("passes", [2, 1])
 def test_a_path_is_taken_out_whole_and_put_back(passes: int):
-    """An exact path, off all grids, moving, with data, leaves a thousandth of itself in the rows that it reaches; put back it is there again.
-    Planted bugs: the elements' delays left out, or those of the transmitters at a PT taken in; time without the data; the middle of the
+    """An exact path, off all grids, moving, with data, leaves a thousandth of itself in the rows that it reaches; put back it is there
+    again. Planted bugs: the elements' delays left out, or those of the transmitters at a PT taken in; time without the data; the middle
+    of the
     window for its start."""
     schedule = pseudo_random_schedule(1, W.num_chirps, 3, np.random.default_rng(5))
     payload = random_payload(W, schedule, 8, np.random.default_rng(6))
