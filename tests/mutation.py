@@ -46,6 +46,8 @@ TESTS_OF = {
     "propagation/statistical.py": "test_clutter_models",
     "propagation/clutter.py": "test_clutter_field",
     "propagation/cells.py": "test_clutter_field",
+    "propagation/twice.py": "test_clutter_twice",
+    "propagation/images.py": "test_clutter_twice",
     "propagation/visibility.py": "test_clutter_field test_clutter_coherence",
     "propagation/elements.py": "test_propagation",
     "propagation/diffuse.py": "test_raytrace_scenes",
