@@ -86,6 +86,35 @@ def test_one_atom_is_omp_with_sparsity_one():
     assert ours == pytest.approx(omp_power(spectra, np.arange(5), w, schedule, 1), rel=1e-4, abs=1e-3)
 
 
+def test_maps_at_a_level_are_those_of_the_mixed_samples():
+    """One map from signal and noise apart, and of both together. Planted bugs: the cross term halved; the level squared for the noise."""
+    case = Case(name="A", kind="AT", snr_db=(-30.0,), samples=512)
+    w, rng, level = case.waveform, np.random.default_rng(5), 0.7
+    schedule = pseudo_random_schedule(1, 120, 3, rng)
+    signal, white = ((rng.standard_normal((1, 4, 6, 120, 2)) @ [1, 1j]).astype(np.complex64) for _ in range(2))
+    mixed = signal + np.float32(level) * white
+    sums = hits._Sums(*(hits.correlations(s, w, schedule) for s in (signal, white)))
+    assert sums.power(level) == pytest.approx(one_atom_power(mixed, w, schedule), rel=1e-4, abs=1e-3)  # float32, 40 terms
+    maps = [(rng.standard_normal((3, 4, 6, 120, 2)) @ [1, 1j]).astype(np.complex64) for _ in range(2)]
+    expected = np.fft.fftshift((np.abs(maps[0] + level * maps[1]) ** 2).mean(axis=(0, 1)), axes=-1)
+    assert hits._Parts(*maps).power(level) == pytest.approx(expected, rel=1e-4, abs=1e-3)
+
+
+def test_spectra_without_a_window_hold_all_samples():
+    """A tone on a cell, with data: N in its cell and nothing beside it. Planted bug: the turn of the cross term left out."""
+    case = Case(name="A", kind="AT", snr_db=(0.0,), samples=512)
+    w, rng = case.waveform, np.random.default_rng(9)
+    schedule = pseudo_random_schedule(1, 120, 3, rng)
+    payload = random_payload(w, schedule, 8, rng)
+    path = cube(w, schedule, payload, [Path(31 * w.range_cell(1), 0.0, 1.0, (0.0, 0.0), (0.0, 0.0))])
+    found = hits.plain_spectrum(path, payload)[0, 0]
+    away = np.abs(np.arange(len(found)) - 31) > 1
+    # the data's own time shift detunes the tone by up to 17 samples of a cell's turn: what is left beside it is under 5 %
+    assert np.abs(np.abs(found[31]) - 512).max() < 1 and np.abs(found[away]).max() < 0.05 * 512
+    turns = np.angle(found[31] * found[31, 0].conj())
+    assert np.abs(turns).max() < 0.02
+
+
 def test_strongest_cell_and_its_gate():
     power = np.zeros((20, 12))
     power[[1, 9, 11], [3, 11, 5]] = [9.0, 7.0, 8.0]

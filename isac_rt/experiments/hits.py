@@ -10,14 +10,16 @@ receiver does ("gated").
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
+import scipy.fft
+from numba import njit
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
+from isac_rt.arrays import Antennas, Schedule, pseudo_random_schedule
 from isac_rt.baselines import Echoes, LoRadar, fmcw_frame, loradar_frame, resolution
 from isac_rt.baselines.fmcw import fmcw_spectra
 from isac_rt.baselines.loradar import Compensation, loradar_delay, loradar_spectra
@@ -37,7 +39,7 @@ from isac_rt.receive.demodulate import demodulate
 from isac_rt.receive.doppler import accumulate, channel_maps
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
 from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
-from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.spectrum import clean_spectrum, data_phase, shift_of, tones
 from isac_rt.scenario import Clutter, Receivers
 from isac_rt.swarm import Pose
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -70,6 +72,7 @@ class Case:
     profile : a PT that predicts the clutter's cells and powers too
     known : a PT that is told the data
     gated : a PT that looks for the strongest cell near its prediction only
+    unwindowed : an AT that also looks at range spectra without a window
     """
 
     name: str
@@ -85,6 +88,7 @@ class Case:
     profile: bool = False
     known: bool = False
     gated: bool = False
+    unwindowed: bool = False
 
     @property
     def passes(self) -> int:
@@ -265,17 +269,33 @@ def _active(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoi
     w = case.waveform
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, case.orders[0], rng)
-    cube = make_cube(case, target, schedule, payload)
-    signal = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-    white = clean_spectrum(replace(cube, samples=noise()), payload.delay_symbols, payload.phases, w.num_delay_symbols)
+    cubes = [cube := make_cube(case, target, schedule, payload), replace(cube, samples=noise())]
+    signal, white = (clean_spectrum(c, payload.delay_symbols, payload.phases, w.num_delay_symbols) for c in cubes)
+    if case.filtered:  # not linear in the samples
+        for level in levels(case):
+            spectra = signal + np.float32(level) * white
+            remove_standing(spectra, schedule, SETTINGS.clutter_run_cells)
+            look = _Look(case, target, spectra, schedule, payload.delay_symbols)
+            note("hits", look.at(one_atom_power(spectra, w, schedule))[0])
+            _note_united(look, accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols)), note)
+        return
+    sums = {"hits": _Sums(*(correlations(s, w, schedule) for s in (signal, white)))}
+    if case.unwindowed:
+        sums["hits, no window"] = _Sums(*(correlations(plain_spectrum(c, payload), w, schedule) for c in cubes))
+    united = _Parts(*(channel_maps(s, w, schedule, payload.delay_symbols) for s in (signal, white)))
     for level in levels(case):
         spectra = signal + np.float32(level) * white
-        if case.filtered:
-            remove_standing(spectra, schedule, SETTINGS.clutter_run_cells)
         look = _Look(case, target, spectra, schedule, payload.delay_symbols)
-        note("hits", look.by_omp())
-        for name, success in zip(("hits, united", "hits, united, detected"), look.united(), strict=True):
-            note(name, success)
+        for name, one in sums.items():
+            note(name, look.at(one.power(level))[0])
+        _note_united(look, united.power(level), note)
+
+
+def _note_united(look: _Look, power: np.ndarray, note: Note) -> None:
+    """Whether the map of the united correlations hits (M = L_tx: the transform of the full sampling), and whether in a detection."""
+    success, cell = look.at(power)
+    note("hits, united", success)
+    note("hits, united, detected", success and is_detected(power, *cell, 45))
 
 
 @dataclass(frozen=True)
@@ -290,16 +310,17 @@ class _Look:
     near: tuple[int, int] | None = None
 
     def by_omp(self) -> bool:
-        """Whether the paper's map hits: OMP, summed over the channels."""
-        return self._try(one_atom_power(self.spectra, self.case.waveform, self.schedule))[0]
+        """Whether the paper's map hits: OMP, summed over the channels; made near the prediction only where nothing else is looked at."""
+        w, num_rows = self.case.waveform, self.spectra.shape[2]
+        if self.near is None:
+            return self.at(one_atom_power(self.spectra, w, self.schedule))[0]
+        rows = slice(max(self.near[0] - GATE_CELLS, 0), self.near[0] + GATE_CELLS + 1)
+        power = np.zeros((num_rows, w.num_chirps))
+        power[rows] = one_atom_power(self.spectra[:, :, rows], w, self.schedule)
+        return self.at(power)[0]
 
-    def united(self) -> tuple[bool, bool]:
-        """Whether the map of the united correlations hits (M = L_tx: the transform of the full sampling), and whether in a detection."""
-        power = accumulate(channel_maps(self.spectra, self.case.waveform, self.schedule, self.delay_symbols))
-        success, cell = self._try(power)
-        return success, success and is_detected(power, *cell, 45)
-
-    def _try(self, power: np.ndarray) -> tuple[bool, tuple[int, int]]:
+    def at(self, power: np.ndarray) -> tuple[bool, tuple[int, int]]:
+        """Whether the estimate at a map's strongest cell hits, and the cell."""
         w = self.case.waveform
         row, column = strongest(power, first_row(self.case, w.range_cell(self.case.passes)), self.near)
         local = LocalSpectra(self.spectra, w, self.schedule, self.delay_symbols, row)
@@ -307,24 +328,79 @@ class _Look:
         return hit(self.case, self.target, estimate, paper_antennas(w)), (row, column)
 
 
-def one_atom_power(spectra: np.ndarray, waveform: Waveform, schedule: np.ndarray) -> np.ndarray:
+class _Sums:
+    """Maps of OMP with one atom at any noise amplitude, from the correlations of signal and noise."""
+
+    def __init__(self, signal: Iterable[np.ndarray], white: Iterable[np.ndarray]) -> None:
+        self._pairs = list(zip(signal, white, strict=True))
+
+    def power(self, level: float) -> np.ndarray:
+        total = np.zeros(self._pairs[0][0].shape[1:])
+        for signal, white in self._pairs:
+            _add_strongest(total, signal + np.float32(level) * white)
+        return np.fft.fftshift(total, axes=-1)
+
+
+class _Parts:
+    """Mean power over the channels of maps at any noise amplitude s: |S|^2 + 2 s Re(conj(S) W) + s^2 |W|^2."""
+
+    def __init__(self, signal: np.ndarray, white: np.ndarray) -> None:
+        both = signal + white
+        self._signal, self._white, together = (accumulate(maps).astype(float) for maps in (signal, white, both))
+        self._cross = together - self._signal - self._white
+
+    def power(self, level: float) -> np.ndarray:
+        return (self._signal + level * self._cross + level**2 * self._white).astype(np.float32)
+
+
+def plain_spectrum(cube: IFCube, payload: Payload) -> np.ndarray:
+    """As `clean_spectrum` without its Hann window: all samples of every chirp."""
+    w, symbols = cube.waveform, payload.delay_symbols
+    out = np.empty((*cube.samples.shape[:2], w.num_delay_symbols, w.num_chirps), np.complex64)
+    for m, samples in enumerate(cube.samples):
+        cells = (symbols[m][:, None] + np.arange(w.num_delay_symbols)) % w.num_samples
+        turn = (payload.phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, symbols[m]))).astype(np.complex64)[:, None]
+        turn = turn * tones(shift_of(w, symbols[m]) / w.num_samples, w.num_delay_symbols)
+        for rx, one in enumerate(samples):
+            out[m, rx] = (np.take_along_axis(scipy.fft.fft(one, axis=1, workers=1), cells, axis=1) * turn).T
+    return out
+
+
+def one_atom_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
     """(rows, P) power of OMP with one atom in every vector, summed over groups, antennas and receivers, Doppler centred.
 
     With one atom OMP keeps the strongest correlation of each vector of an antenna's chirps and no other.
     """
-    num_groups, _, num_rows, num_chirps = spectra.shape
-    total = np.zeros((num_rows, num_chirps))
-    bins, rows = np.fft.fftfreq(num_chirps, 1 / num_chirps), np.arange(num_rows)
-    for m in range(num_groups):
+    total = np.zeros(spectra.shape[2:])
+    for found in correlations(spectra, waveform, schedule):
+        _add_strongest(total, found)
+    return np.fft.fftshift(total, axes=-1)
+
+
+def correlations(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> Iterator[np.ndarray]:
+    """(L_rx, rows, P) complex64 for every group and transmit antenna: its chirps against the Doppler atoms, FFT order."""
+    num_chirps = waveform.num_chirps
+    bins = np.fft.fftfreq(num_chirps, 1 / num_chirps)
+    for m, group in enumerate(spectra):
         for tx in range(waveform.num_tx):
             chosen = np.flatnonzero(schedule[m] == tx)
             atoms = np.exp(-2j * np.pi * np.outer(chosen, bins) / num_chirps).astype(np.complex64)
-            for one in spectra[m][..., chosen]:
-                found = one @ atoms
-                squared = found.real**2 + found.imag**2
-                best = squared.argmax(axis=1)
-                total[rows, best] += squared[rows, best]
-    return np.fft.fftshift(total, axes=-1)
+            # indexing would leave a layout that the matrix product does not like
+            found = np.take(group, chosen, axis=-1).reshape(-1, chosen.size) @ atoms
+            yield found.reshape(*group.shape[:2], num_chirps)
+
+
+@njit(nogil=True, cache=True)
+def _add_strongest(total, found):  # pragma: no cover - compiled
+    """Of every vector of (L_rx, rows, P) the strongest power onto its place in `total`."""
+    for one in found:
+        for row in range(one.shape[0]):
+            best, largest = 0, np.float32(-1)
+            for k in range(one.shape[1]):
+                power = one[row, k].real ** 2 + one[row, k].imag ** 2
+                if power > largest:
+                    best, largest = k, power
+            total[row, best] += largest
 
 
 def _passive(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note) -> None:
