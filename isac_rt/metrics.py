@@ -15,7 +15,7 @@ from scipy.stats import beta
 
 from isac_rt.arrays import Antennas
 from isac_rt.payload import Payload
-from isac_rt.propagation.pathset import PathSet
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.swarm import Pose
 from isac_rt.tracking import TrackSet
@@ -93,6 +93,14 @@ def associate(truths: Sequence[Truth], estimates: np.ndarray, resolution: np.nda
     refused = 4 * GATE_RESOLUTIONS**2 * (min(inside.shape) + 1)
     rows, columns = linear_sum_assignment(np.where(inside, np.sum(off**2, axis=-1), refused))
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if inside[i, j]]
+
+
+def direct_targets(paths: PathSet, names: list[str]) -> np.ndarray:
+    """Whether each UAV is reached straight, without the city: the transmitter by the line of sight, the others by their echo."""
+    straight = ~paths.bent
+    echo = {paths.target_names[i] for i in paths.target[straight & (paths.kind == PathKind.TARGET)]}
+    sight = bool((straight & (paths.kind == PathKind.LINE_OF_SIGHT)).any())
+    return np.array([sight if name == paths.tx != paths.rx else name in echo for name in names])
 
 
 class Explanation(NamedTuple):

@@ -172,6 +172,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         paths=Table(("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]),
         figures=_embedded(pictures),
         access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),
+        sparsity=row_table([{"link": name.replace("->", " to "), **row} for name, row in (s.get("sparsity") or {}).items()]),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
         timing=Table(("Stage", "Seconds"), [(k, number(v)) for k, v in s["timing_s"].items()]),

@@ -87,6 +87,7 @@ class ObserverRecord:
     state : code of the terminal's state, an index into the recorder's `states`
     detection_kind, detection_target, detection_order, detection_face : (Q,) what explains each detection, as `metrics.Explanation` says
     symbols : what was sent to it and became of it
+    fell_back : whether the transmitter sent the conventional schedule in place of the scenario's (`isac_rt.fall_back`)
     num_false : detections that no path explains
     slips : symbols decided outside their alphabet
     reference_snr : per sample and antenna before processing (linear); NaN where there is no reference path
@@ -107,6 +108,7 @@ class ObserverRecord:
     detection_order: np.ndarray
     detection_face: np.ndarray
     symbols: SymbolCount = field(default_factory=SymbolCount)
+    fell_back: bool = False
     num_false: int = 0
     slips: int = 0
     reference_snr: float = np.nan
@@ -216,8 +218,18 @@ class Recorder:
             "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
             "fidelity": dict(fidelity),
             "access": None if access is None else dict(access),
+            "sparsity": {f"{tx}->{rx}": row for tx, rx in symbols if (row := self._sparsity((tx, rx)))} or None,
             "versions": versions(),
         }
+
+    def _sparsity(self, link: Link) -> dict[str, int] | None:
+        """Frames whose receiver judged how sparse the scene is, those found dense, and those sent by the conventional schedule for that
+        reason; None where no frame was judged."""
+        label = self.timetable.labels[link]
+        seen = [f.observers[label] for f in self._frames if label in f.observers]
+        judged = [found for s in seen if (found := _sparse(s)) >= 0]
+        fell_back = sum(s.record.fell_back for s in seen)
+        return {"judged": len(judged), "dense": judged.count(0), "fell_back": fell_back} if judged else None
 
     def _symbols(self, link: Link) -> SymbolCount | None:
         """What was sent over a link and became of it; None for a terminal's own echoes."""
@@ -247,6 +259,10 @@ class _SlimFrame:
     poses: Mapping[str, Pose]
     observers: Mapping[str, _Slim]
     snapshot: bool
+
+
+def _sparse(s: _Slim) -> int:
+    return -1 if s.record.reception.sparse is None else int(s.record.reception.sparse)
 
 
 def _slim(o: ObserverRecord, snapshot: bool) -> _Slim:
@@ -351,8 +367,11 @@ class _Builder:
         for name, text, get in (
             ("decoded", "data symbols were decided", lambda s: s.record.reception.decoded),
             ("line_of_sight", "the receiver says that it sees its reference path", lambda s: s.record.reception.line_of_sight),
+            ("fell_back", "sent by the conventional schedule in place of the random one", lambda s: s.record.fell_back),
         ):
             self.put(name, two, self.over(get, False, bool), DIMENSIONLESS, text)
+        self.put("sparse", two, self.over(_sparse, -1, np.int8), DIMENSIONLESS,
+                 "the receiver found the scene sparse: 1, not: 0, not judged: -1")  # fmt: skip
         power = self.over(lambda s: s.record.reception.reference_power, np.nan, float)
         self.put("reference_power", two, power, "W", "mean power of the reference path per sample and antenna, as received")
         self.put("reference_snr", two, self.over(lambda s: s.record.reference_snr, np.nan, float), DIMENSIONLESS,

@@ -139,6 +139,8 @@ class Array(Node):
     rx_z: Annotated[int, Field(ge=2, le=64)] = 8
     spacing_wavelengths: Positive = 0.5774
     schedule: Literal["pseudo_random", "conventional"] = "pseudo_random"
+    fall_back: bool = False
+    """Send the conventional schedule instead of the pseudo-random one as long as a receiver finds the scene not sparse."""
     element_pattern: Literal["isotropic", "sector", "cosine"] = "cosine"
     element_gain_dbi: Finite = 5.0
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0

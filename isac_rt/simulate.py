@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
+from isac_rt.fall_back import Schedules
 from isac_rt.fidelity import Plan, Use, decisions, used
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
 from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
@@ -29,6 +30,7 @@ from isac_rt.metrics import (
     Truth,
     associate,
     count_symbols,
+    direct_targets,
     explain,
     resolutions,
     truth_of,
@@ -107,14 +109,14 @@ class Setup:
         active, receivers = self.timetable.with_role("active", frame), dict.fromkeys(rx for _, rx in heard)
         return poses, self.propagation.paths(poses, epoch, [(tx, rx) for tx in active for rx in receivers])
 
-    def transmission(self, active: str, frame: int, pose: Pose) -> Transmission:
-        """What an active terminal sends in a frame."""
+    def transmission(self, active: str, frame: int, pose: Pose, schedule: Schedule | None = None) -> Transmission:
+        """What an active terminal sends in a frame, by another `schedule` than the usual one if there is one."""
         return Transmission(
             name=active,
             pose=pose,
             antennas=self.antennas,
-            schedule=self.schedule,
-            payload=self.timetable.payload(active, frame),
+            schedule=self.schedule if schedule is None else schedule,
+            payload=self.timetable.payload(active, frame, schedule),
             amplitude=transmit_amplitude(self.scenario.noise),
             first_block=self.timetable.first_block(active, frame),
         )
@@ -426,16 +428,18 @@ def _fly(
             setup = setup or prepare(scenario)
             timetable = setup.timetable
             observers = {link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links}
+            schedules = Schedules(scenario, setup.schedule)
             recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
         waiting: tuple[_Frame, dict[Link, Future[_Heard]]] | None = None
         for number in range(scenario.frames):
             with clock.stage("trace"):
                 poses, paths = setup.trace(number)
             if waiting is not None:
-                _collect(recorder, observers, *waiting, clock)
+                schedules.heed(_collect(recorder, observers, *waiting, clock))
                 if progress:
                     progress(number, scenario.frames)
-            sent = {name: setup.transmission(name, number, poses[name]) for name in timetable.with_role("active", number)}
+            active = timetable.with_role("active", number)
+            sent = {name: setup.transmission(name, number, poses[name], schedules.of(name)) for name in active}
             frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), number in snapshots)
             waiting = frame, {link: pool.submit(observers[link].hear, frame, clock) for link in timetable.links(number)}
         if waiting is not None:
@@ -465,8 +469,10 @@ def _snapshot_frames(scenario: Scenario, count: int) -> set[int]:
     return {heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)}
 
 
-def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame, jobs: dict[Link, Future], clock: _Clock) -> None:
-    """Wait for a frame's receivers, score and record it."""
+def _collect(
+    recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame, jobs: dict[Link, Future], clock: _Clock
+) -> dict[Link, Reception]:
+    """Wait for a frame's receivers, score and record it; what they received."""
     heard = {link: job.result() for link, job in jobs.items()}
     with clock.stage("track"):
         timetable = recorder.timetable
@@ -484,6 +490,7 @@ def _collect(recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame
                 snapshot=frame.snapshot,
             )
         )
+    return {link: h.reception for link, h in heard.items()}
 
 
 def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord:
@@ -496,7 +503,7 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
         by_way = active if observer.passes == 1 and name != tx else None
         truth.append(None if name == rx else truth_of(own, poses[name], by_way))
     in_view = np.array([name != rx and _in_view(setup, own, active, poses[name]) for name in names])
-    direct = _direct_targets(paths, names)
+    direct = direct_targets(paths, names)
     seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
     targets = [t for i in seen if (t := truth[i]) is not None]
     explained = explain(reception.detections, paths, setup.waveform, observer.passes)
@@ -528,6 +535,7 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
         state=heard.state,
         **{f"detection_{name}": value for name, value in explained._asdict().items()},
         symbols=count_symbols(frame.sent[tx].payload, reception, observer.groups) if observer.passes == 1 else SymbolCount(),
+        fell_back=frame.sent[tx].schedule is not setup.schedule,
         num_false=int((stray & (explained.kind < 0)).sum()),
         slips=int(((raw < 0) | (raw >= setup.waveform.num_delay_symbols)).sum()),
         reference_snr=_reference_snr(setup, frame, paths),
@@ -546,14 +554,6 @@ def _in_view(setup: Setup, own: Pose, active: Pose, body: Pose) -> bool:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
-
-
-def _direct_targets(paths: PathSet, names: list[str]) -> np.ndarray:
-    """Whether each UAV is reached straight, without the city: the transmitter by the line of sight, the others by their echo."""
-    straight = ~paths.bent
-    echo = {paths.target_names[i] for i in paths.target[straight & (paths.kind == PathKind.TARGET)]}
-    sight = bool((straight & (paths.kind == PathKind.LINE_OF_SIGHT)).any())
-    return np.array([sight if name == paths.tx != paths.rx else name in echo for name in names])
 
 
 def _reference_snr(setup: Setup, frame: _Frame, paths: PathSet) -> float:

@@ -107,9 +107,9 @@ class Timetable:
         chosen = self.scenario.modulation.streams.get(link[1])
         return None if chosen is None or link[0] == link[1] else tuple(sorted(chosen))
 
-    def payload(self, active: str, frame: int) -> Payload:
-        """What an active terminal's chirps carry in a frame."""
+    def payload(self, active: str, frame: int, schedule: Schedule | None = None) -> Payload:
+        """What an active terminal's chirps carry in a frame; `schedule`: if it is another than the usual one. The bits are the same."""
         if not self.modulated(frame):
             return unmodulated(self.waveform)
         rng = generator(self.scenario.seed, "payload", active, frame)
-        return random_payload(self.waveform, self.schedule, self.scenario.modulation.dpsk_order, rng)
+        return random_payload(self.waveform, self.schedule if schedule is None else schedule, self.scenario.modulation.dpsk_order, rng)

@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "scenario_base scenario_clutter scenario_doubts scenario scenario_file provenance runtime randomness waveform arrays "
     "payload timetable city swarm preflight linkbudget propagation simd lanefft synthesis separable gridding noise ifsignal receive "
-    "tracking ghosts terminal baselines access metrics fidelity results simulate budget sweep experiments validation bench "
+    "tracking ghosts terminal baselines access metrics fidelity fall_back results simulate budget sweep experiments validation bench "
     "figures render interactive animate report interchange starter cli"
 ).split()
 ALONE = {"runtime", "randomness"}

@@ -13,6 +13,7 @@ from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.joint import Frame, JointPath, _normal_equations, element_delays, fit, residual_channels, tone_sums
+from isac_rt.receive.phases import decide_phases
 from isac_rt.receive.separate import _beams, _earlier_reference
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -172,13 +173,33 @@ def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
     )
 
 
+def test_wrong_transitions_are_undone_by_the_path_itself():
+    """Two transitions decided wrong turn the rest of their chains, and the velocity starts half a bin off: the phases come back as sent,
+    all but those that noise alone moves. Per chirp over the receivers 12.6 dB: 8-PSK errs in 1.4 %, of 72 chirps one; four are 3 sigma.
+    Planted bugs: the carrier of one antenna for all; the first phases handed back."""
+    w, schedule, payload = frame(waveform=SHORT)
+    theta = np.array(LOS)
+    cube = noisy(w, schedule, samples(w, schedule, payload, FEW, theta, 1), 10**-1.32, 3)
+    wrong = payload.phases.copy()
+    for group, tx in ((0, 1), (2, 0)):
+        later = np.flatnonzero(schedule[group] == tx)[3:]
+        wrong[group, later] *= np.exp(2j * np.pi / 8)
+    start = JointPath(theta[0] / C, (theta[1] + 0.5 * w.velocity_cell(1)) / C, theta[2:4], np.ones(1), np.zeros(4))
+    found = decide_phases(Frame(cube, payload.delay_symbols, wrong, FEW, 1), start, 8)
+    apart = np.abs(found - payload.phases) > 0.1
+    assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 4
+    right = decide_phases(Frame(cube, payload.delay_symbols, payload.phases, FEW, 1), start, 8)
+    assert (np.abs(right - payload.phases) > 0.1).sum() <= 4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [2, 1])
 def test_receivers_stay_within_one_decibel_of_the_bound(passes: int):
     """The whole receiver (data, map, CFAR, estimates) on modulated frames off the grid, from -20 to +10 dB per sample. Each method sees the
-    same samples; run with -s for the table of 10 log10(MSE / bound)."""
+    same samples; run with -s for the table of 10 log10(MSE / bound). 300 frames leave a deviation of 0.35 dB in each figure. Planted bug:
+    at a PT the phases as they were decided first (25 dB over in velocity at -20 dB)."""
     w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
-    trials, pooled = 60, np.zeros(4)
+    trials, ratios = {"grid": 40, "local": 40, "joint": 300}, []
     print(f"\npasses {passes}: dB over the bound in range, velocity, u_x, u_z")
     for i, snr_db in enumerate((-20.0, -10.0, 0.0, 10.0)):
         rng, snr = np.random.default_rng([i, 5]), 10 ** (snr_db / 10)
@@ -186,20 +207,23 @@ def test_receivers_stay_within_one_decibel_of_the_bound(passes: int):
         theta = theta[: 6 if passes == 2 else 8]
         clean = samples(w, schedule, payload, ANTENNAS, theta, passes)
         least = bound(w, schedule, payload, ANTENNAS, theta, passes, snr)[:4]
-        square = {name: np.zeros(4) for name in ("grid", "local", "joint")}
-        for seed in range(trials):
-            cube = noisy(w, schedule, clean, snr, 100 * i + seed)
+        square = {name: np.zeros(4) for name in trials}
+        for seed in range(max(trials.values())):
+            cube = noisy(w, schedule, clean, snr, 1000 * i + seed)
             for name, total in square.items():
+                if seed >= trials[name]:
+                    continue
                 settings = Receivers(refinement=name)
                 if passes == 2:
                     d = receive_active(cube, payload, ANTENNAS, settings).detections
                 else:
                     d = receive_passive(cube, ANTENNAS, settings, 8, predicted(theta, w), True).detections
-                total += np.square([d.range[0] - theta[0], d.velocity[0] - theta[1], *(d.direction[0] - theta[2:4])]) / trials
-        pooled += square["joint"] / least / 4
+                total += np.square([d.range[0] - theta[0], d.velocity[0] - theta[1], *(d.direction[0] - theta[2:4])]) / trials[name]
+        ratios.append(square["joint"] / least)
         for name, total in square.items():
             print(f"{snr_db:6.0f} dB  {name:6s}", np.round(10 * np.log10(total / least), 2), flush=True)
-    assert (pooled < ONE_DB).all()
+    print("joint, mean of the rows", np.round(10 * np.log10(np.mean(ratios, axis=0)), 2))
+    assert (np.array(ratios) < ONE_DB).all() and (np.mean(ratios, axis=0) < 1 + 3 * np.sqrt(2 / 1200)).all()  # 3 deviations of the mean
 
 
 def two_paths(w: Waveform) -> list[list[float]]:

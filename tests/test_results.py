@@ -98,7 +98,7 @@ def test_every_variable_has_units_and_a_meaning(run, tmp_path):
 
 def test_summary_has_the_fixed_keys(run):
     s = run.summary
-    assert {"scenario", "seed", "frames", "terminals", "paths", "timing_s", "fidelity", "access", "versions", "links"} == set(s)
+    assert {"scenario", "seed", "frames", "terminals", "paths", "timing_s", "fidelity", "access", "sparsity", "versions", "links"} == set(s)
     assert set(s["terminals"]) == {"AT", "PT1"} and set(s["links"]) == {"AT->AT", "AT->PT1"}
     for part in (*s["terminals"].values(), *s["links"].values()):
         assert set(part) == TERMINAL_KEYS and set(part["rmse"]) == RMSE_KEYS == set(part["rmse_tracked"])

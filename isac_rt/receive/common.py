@@ -89,11 +89,13 @@ def sense(
     above, level = detect(power, *rules)
     above[: first_row(settings, w.range_cell(passes))] = False
     sparse = None
+    if method in ("omp", "conventional"):
+        added = len(schedule) if conventional else 1  # groups in power, there
+        noise = float(np.median(power)) * added / window_gain(w, schedule)
+        sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, w, schedule)
     if conventional:
         above[:, ~own_bins(w)] = False
     elif method == "omp":
-        noise = float(np.median(power)) / window_gain(w, schedule)
-        sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, w, schedule)
         above &= _confirmed_by_omp(spectra, above, level, w, schedule)
     rows, bins = strongest_peaks(power, above, settings, UNION_FLOOR)
     estimates = []

@@ -75,6 +75,12 @@ class Frame:
         return self.cube.schedule if self.passes == 1 else np.zeros_like(self.cube.schedule)
 
     @property
+    def middle(self) -> np.ndarray:
+        """(M, P) middles of the chirps' samples [s], from the frame's."""
+        w = self.waveform
+        return w.chirp_time + w.window_start + (w.num_samples - 1) / 2 * w.sample_interval - w.frame_duration / 2
+
+    @property
     def units(self) -> np.ndarray:
         """One cell of delay, one bin of delay rate, and 1 and 1."""
         w = self.waveform
@@ -117,7 +123,7 @@ def _tone(frame: Frame, path: JointPath) -> _Tone:
     if frame.passes == 1:
         e_tx, de_tx = np.zeros_like(e_tx), np.zeros_like(de_tx)
     u = w.window_start + (w.num_samples - 1) / 2 * T_s
-    t = w.chirp_time + u - w.frame_duration / 2
+    t = frame.middle
     schedule = frame.cube.schedule
     tau = frame.delay_symbols * w.delay_step + path.delay + path.delay_rate * t + e_tx[schedule]
     g = w.carrier_frequency + w.slope * (u - tau)
@@ -179,6 +185,12 @@ def _moments(frame: Frame, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
         first[m] *= frame.phases[m].conj()
     back = np.exp(-2j * np.pi * tone.phase)
     return zeroth * back, first * back
+
+
+def match_chirps(frame: Frame, path: JointPath) -> np.ndarray:
+    """(M, P) the chirps against a path's signal, summed over their samples and the receivers in phase."""
+    tone = _tone(frame, path)
+    return (_moments(frame, tone)[0] * tone.amplitude.conj()).sum(axis=1)
 
 
 def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -287,8 +299,7 @@ def residual_channels(
     w, schedule = frame.waveform, frame.cube.schedule
     tones = [_tone(frame, p) for p in paths]
     left = _normal_equations(frame, paths)[2]
-    middle = w.chirp_time + w.window_start + (w.num_samples - 1) / 2 * w.sample_interval - w.frame_duration / 2
-    turns = np.exp(-2j * np.pi * offsets[:, None, None] * middle / w.frame_duration)  # a bin is one turn per frame
+    turns = np.exp(-2j * np.pi * offsets[:, None, None] * frame.middle / w.frame_duration)  # a bin is one turn per frame
     for path, at in zip(paths, tones, strict=True):
         residual = _moments(frame, at)[0]
         for of in tones:

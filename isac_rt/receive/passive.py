@@ -15,12 +15,13 @@ from isac_rt.receive.cfar import row_factors, threshold
 from isac_rt.receive.common import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
 from isac_rt.receive.estimate import Estimate, LocalSpectra
-from isac_rt.receive.joint import Frame
+from isac_rt.receive.joint import Frame, JointPath
+from isac_rt.receive.phases import decide_phases
 from isac_rt.receive.separate import separate
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 REFERENCE_SPAN_DB = 20.0  # the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
 GATE_CELLS = 1  # range rows searched on each side of the predicted one: the fraction is known, the whole cell is the prediction's
@@ -79,11 +80,25 @@ def receive_passive(
     confident = np.median(symbols.delay_confidence) >= confidence_threshold(symbols.looks, cells, symbols.raw.size)
     if not confident or not moves_as_predicted(symbols, dpsk_order):
         return _reception(cube, settings, no_detections(), None, None, None, maps)
-    spectra = clean_spectrum(cube, symbols.raw, symbols.phases, w.num_delay_symbols)
-    found = sense(spectra, w, cube.schedule, symbols.raw, antennas, settings, passes=1)
-    detections, reference = _at_prediction(spectra, symbols.raw, found, prediction, cube, antennas, settings)
+    frame = Frame(cube, symbols.raw, symbols.phases, antennas, 1)
+    found, detections, reference = _sense_data(frame, prediction, settings)
+    if settings.refinement == "joint" and reference is not None and np.isfinite(detections.direction[0]).all():
+        first = detections  # row 0 is the reference
+        start = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT, first.direction[0]
+        phases = decide_phases(frame, JointPath(*start, np.ones(1), np.zeros(4)), dpsk_order)
+        if not np.allclose(phases, frame.phases):
+            frame = replace(frame, phases=phases)
+            found, detections, reference = _sense_data(frame, prediction, settings)
     reception = _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
-    return _jointly(reception, Frame(cube, symbols.raw, symbols.phases, antennas, 1), settings)
+    return _jointly(reception, frame, settings)
+
+
+def _sense_data(frame: Frame, prediction: Prediction, settings: Receivers) -> tuple[Sensed, Detections, Estimate | None]:
+    """What a frame shows once its symbols are taken out, with the reference put first."""
+    cube, raw = frame.cube, frame.delay_symbols
+    spectra = clean_spectrum(cube, raw, frame.phases, frame.waveform.num_delay_symbols)
+    found = sense(spectra, frame.waveform, cube.schedule, raw, frame.antennas, settings, passes=1)
+    return found, *_at_prediction(spectra, raw, found, prediction, cube, frame.antennas, settings)
 
 
 def _jointly(reception: Reception, frame: Frame, settings: Receivers) -> Reception:

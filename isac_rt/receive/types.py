@@ -118,9 +118,9 @@ class Reception:
     maps : Maps or None
     soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or decided from powers
     confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many exponentials; 0 when not decoded
-    sparse : where the velocities came from sparse sampling with OMP, whether the scene was sparse enough for it
-        (`isac_rt.receive.doppler.sparse_enough`); False advises the transmitter to fall back from a pseudo-random schedule to a
-        conventional one. None elsewhere
+    sparse : where the velocities came from sparse sampling with OMP or from a conventional schedule, whether the scene is sparse
+        enough for OMP (`isac_rt.receive.doppler.sparse_enough`); False advises the transmitter to fall back from a pseudo-random
+        schedule to a conventional one (`isac_rt.fall_back`). None elsewhere
     """
 
     detections: Detections
