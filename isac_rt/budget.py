@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.city.mesh import City
-from isac_rt.fidelity import Use, decibels, decisions, frame_reach, missed_chains, standing
+from isac_rt.fidelity import Use, decibels, decisions, extent, frame_reach, missed_chains, standing
 from isac_rt.ifsignal import Transmission, if_signal
 from isac_rt.propagation.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -97,6 +97,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     share = len(plan.traced_frames) / plan.scenario.frames
     traced = float(np.median(trace))
     items = [_tracing_item(setup, share, missed, traced * share + advance * (1 - share))]
+    items += _scene_items(setup)
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link, stages.get(link))
     items += [Item(what, "all", "no", "always", value, "rad") for what, value in phases.items()]
@@ -105,6 +106,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         seconds["receive"] = sum(s["receive"] for s in stages.values())
     return {
         **decisions(plan),
+        **extent(setup.city, getattr(setup.propagation, "field", None)),
         "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
@@ -142,6 +144,21 @@ def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> 
         return Item("tracing", "all", f"all {number} frames", "nothing", None, "", seconds)
     said = f"{number} of {setup.scenario.frames} frames traced, unfolded in between"
     return Item("tracing", "all", said, "chains that live between two traces", missed, "chains/frame", seconds)
+
+
+def _scene_items(setup: Setup) -> list[Item]:
+    """Lines of the mesh and of its scatterers, with the reason for each count."""
+    out, record, c = [], extent(setup.city, getattr(setup.propagation, "field", None)), setup.scenario.clutter
+    if record["city_faces"] + record["city_faces_beyond_reach"]:
+        gone = record["city_faces_beyond_reach"]
+        whole = setup.plan.preset == "everything" or setup.scenario.access.establish
+        why = "nothing" if whole else f"{gone} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
+        out.append(Item("mesh", "all", f"{record['city_faces']} faces", why, None, ""))
+    if record["scatterers"] is not None:
+        hidden = record["scatterer_cells"] - record["scatterers"]
+        said = f"{record['scatterers']} scatterers, one per {c.cell_area_per_metre_m:g} m2 and metre from the flights"
+        out.append(Item("clutter field", "all", said, f"{hidden} cells that no transmitter sees", None, ""))
+    return out
 
 
 def _link_items(setup: Setup, link: Link, uses: list[Use], stages: dict[str, float] | None) -> list[Item]:

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.arrays import Antennas
+from isac_rt.city.mesh import City
 from isac_rt.gridding import GRIDDED_ERROR
 from isac_rt.ifsignal import Method
 from isac_rt.linkbudget import transmit_amplitude
@@ -39,6 +40,10 @@ FASTEST_UNTRACED_M = 4.0
 FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them; beyond, "auto"."""
+
+
+REACH_MARGIN_M = 1.0
+"""Of the mesh, for accelerations within a frame."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,22 @@ class Plan:
     def reach(self) -> float:
         """Farthest from its terminal that a surface can be heard [m]."""
         return self.longest_delay * SPEED_OF_LIGHT / 2
+
+    def mesh_radius(self, centre: np.ndarray) -> float:
+        """A surface farther than this from a place takes part in nothing that is heard, whole metres [m].
+
+        All points of a path of length L, what shadows it included, lie within L/2 of the middle between its ends, which is no farther from
+        the place than the farther end. What moves during a frame adds its way. The field of view cuts nothing: a second wall may stand
+        outside it. Infinite where nothing is to be left out, and where the blocks, and with them the reach, are found out in the run.
+        """
+        s = self.scenario
+        if self.preset == "everything" or s.access.establish or s.propagation.model != "ray_traced":
+            return float(np.inf)
+        terminals = [name for name, uav in s.swarm.items() if uav.role != "target"]
+        poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(s.frames)]
+        farthest = max(float(np.linalg.norm(pose[name].position - centre)) for pose in poses for name in terminals)
+        fastest = max(float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values())
+        return float(np.ceil(farthest + self.reach + 2 * fastest * frame_reach(self.waveform) + REACH_MARGIN_M))
 
     def cell_noise_gain(self) -> float:
         """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell, per watt of noise in a sample."""
@@ -286,6 +307,26 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0),
         "synthesis_error": GRIDDED_ERROR,
+    }
+
+
+def extent(city: City, field: Any) -> dict[str, Any]:
+    """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
+
+    Parameters
+    ----------
+    field : ClutterField, None where there is none, or where paths came from a store and it was not made
+
+    Returns
+    -------
+    record : faces traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
+        without a field, and cells of the whole mesh among which they were
+    """
+    return {
+        "city_faces": city.num_faces,
+        "city_faces_beyond_reach": city.num_beyond,
+        "scatterers": None if field is None else len(field.cells),
+        "scatterer_cells": None if field is None else field.num_candidates,
     }
 
 

@@ -21,7 +21,7 @@ from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.fall_back import Schedules
-from isac_rt.fidelity import Plan, Use, decisions, used
+from isac_rt.fidelity import Plan, Use, decisions, extent, used
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
 from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
 from isac_rt.metrics import (
@@ -175,8 +175,8 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     check_memory(waveform, antennas, scenario, timetable)
     check_flights(scenario, swarm, timetable)
     check_reference(scenario, timetable)
-    city = city_of(scenario)
     plan = Plan(scenario, waveform, antennas, timetable, swarm)
+    city = city_of(scenario, plan.mesh_radius(_centre(scenario)))
     setup = Setup(
         scenario,
         waveform,
@@ -209,14 +209,20 @@ def _connected(setup: Setup) -> Setup:
     return replace(setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable))
 
 
-def city_of(scenario: Scenario) -> City:
-    """The scenario's city about the middle of the flight; the same object again while scenario after scenario flies over the same one."""
-    waveform, swarm = waveform_of(scenario), Swarm.from_scenario(scenario)
-    times = np.linspace(0, scenario.frames * (scenario.frame_interval_s or waveform.frame_duration), 9)
-    middle = np.mean([pose.position for t in times for pose in swarm.poses(t).values()], axis=0)
-    carrier, centre = waveform.carrier_frequency, tuple(middle.tolist())
+def city_of(scenario: Scenario, radius: float = np.inf) -> City:
+    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object again for like scenarios."""
+    centre, carrier = tuple(_centre(scenario).tolist()), waveform_of(scenario).carrier_frequency
     text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
-    return _loaded_city(text, scenario.folder, _city_digest(scenario), carrier, centre)
+    return _near_city(radius, text, scenario.folder, _city_digest(scenario), carrier, centre)
+
+
+@lru_cache(maxsize=2)
+def _near_city(radius: float, *of: Any) -> City:
+    return _loaded_city(*of).within(radius)
+
+
+def _centre(scenario: Scenario) -> np.ndarray:
+    return Swarm.from_scenario(scenario).middle(scenario.frames * (scenario.frame_interval_s or waveform_of(scenario).frame_duration))
 
 
 @lru_cache(maxsize=2)
@@ -251,7 +257,7 @@ def _propagation(
 
     if store is None or scenario.propagation.model == "free_space":
         return make()
-    return CachedPropagation(make, store, path_content(scenario))
+    return CachedPropagation(make, store, json.dumps([path_content(scenario), city.num_faces]))
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
@@ -587,13 +593,10 @@ def _fidelity(setup: Setup) -> dict[str, object]:
     return {
         "propagation": p.model,
         "max_bounces": p.max_bounces if traced and p.specular else 0,
-        "ghosts": traced and p.ghosts,
-        "leakage": traced and p.leakage.enabled,
-        "clutter": c.model,
-        "rays": p.rays if traced else None,
-        "clutter_rays": c.rays if c.model == "diffuse" else None,
+        "ghosts": traced and p.ghosts, "leakage": traced and p.leakage.enabled,
+        "clutter": c.model, "rays": p.rays if traced else None, "clutter_rays": c.rays if c.model == "diffuse" else None,
         **decisions(setup.plan),
         "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
         "paths_contradicted": setup.propagation.dropped,
-        "city_faces": setup.city.num_faces,
-    }
+        **extent(setup.city, getattr(setup.propagation, "field", None)),
+    }  # fmt: skip

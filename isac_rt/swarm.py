@@ -90,6 +90,10 @@ class Swarm:
         """Every UAV's pose at `time` [s]."""
         return {name: trajectory.pose(time) for name, trajectory in self.trajectories.items()}
 
+    def middle(self, duration: float) -> np.ndarray:
+        """(3,) mean position of all UAVs over nine instants of a flight [s, m]."""
+        return np.mean([pose.position for t in np.linspace(0, duration, 9) for pose in self.poses(t).values()], axis=0)
+
     def with_role(self, role: str) -> list[str]:
         """Names of the UAVs of one role."""
         return [name for name, uav in self.uavs.items() if uav.role == role]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numba
@@ -54,6 +54,8 @@ class City:
         What was assumed, removed or left out on the way here, in words, for the user.
     plane_tolerance : float
         Coplanar within this. [m]
+    num_beyond : int
+        Faces that `within` cut away.
     """
 
     name: str
@@ -64,6 +66,7 @@ class City:
     origin: NDArray[np.float64]
     notes: tuple[str, ...] = ()
     plane_tolerance: float = PLANE_TOLERANCE
+    num_beyond: int = 0
 
     def __post_init__(self) -> None:
         for array in (self.vertices, self.faces, self.face_material, self.origin):
@@ -118,6 +121,23 @@ class City:
         planes = np.empty(self.num_faces, dtype=np.int64)
         planes[order] = _group_planes(self.corners[order], self.normals[order], self.plane_offsets[order], self.plane_tolerance)
         return _read_only(planes)
+
+    def within(self, radius: float) -> City:
+        """The faces that come as near to the origin as `radius` [m], whole; this very city if all do."""
+        near = distance_to_triangles(self.corners, np.zeros(3)) <= radius if np.isfinite(radius) and self.num_faces else np.True_
+        if np.all(near):
+            return self
+        faces, face_material = self.faces[near], self.face_material[near]
+        corners, numbers = np.unique(faces, return_inverse=True)
+        materials, owner = np.unique(face_material, return_inverse=True)
+        return replace(
+            self,
+            vertices=self.vertices[corners],
+            faces=numbers.reshape(-1, 3).astype(np.int32),
+            face_material=owner.astype(np.int16),
+            materials=tuple(self.materials[i] for i in materials),
+            num_beyond=self.num_beyond + int((~near).sum()),
+        )
 
     def bounds(self) -> NDArray[np.float64]:
         """(2, 3) lowest and highest local coordinates; zeros for an empty city. [m]"""

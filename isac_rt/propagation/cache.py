@@ -98,6 +98,11 @@ class CachedPropagation:
         self._model: Any = None
         self.dropped = 0
 
+    @property
+    def field(self) -> Any:
+        """The model's scatterers; None before it is made."""
+        return getattr(self._model, "field", None)
+
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
         """As the model's own, bit for bit."""
         where = {

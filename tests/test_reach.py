@@ -1,0 +1,124 @@
+"""How far the mesh reaches, and how many scatterers there are: decisions that the plan shows and the summary repeats."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from isac_rt import simulate
+from isac_rt.budget import make_plan
+from isac_rt.city.mesh import City
+from isac_rt.fidelity import extent
+from isac_rt.propagation import PathKind, PathSet, make_propagation
+from isac_rt.scenario import Scenario
+
+SHORT = {"groups": 1, "samples_per_chirp": 256, "chirps_per_frame": 12}
+"""A waveform that hears no farther than 66 m."""
+
+
+def district(seed: int, **changes: Any) -> Scenario:
+    """Three bodies between many blocks of houses, drawn at random: nothing was tuned on it."""
+    rng = np.random.default_rng(seed)
+    swarm = {
+        name: {"role": role, "position_m": rng.uniform([-5, -30, 6], [5, 30, 17]).tolist(), "velocity_mps": rng.normal(0, 4, 3).tolist(),
+               "boresight": [*rng.normal(0, 1, 2).tolist(), 0]}
+        for name, role in (("A", "active"), ("P", "passive"), ("U", "target"))
+    }  # fmt: skip
+    tree = {
+        "name": f"district{seed}", "seed": seed, "frames": 3, "frame_interval_s": 0.4, "radio": SHORT,
+        "modulation": {"acquisition_frames": 1},
+        "city": {"source": "blocks", "street_width_m": float(rng.uniform(14, 24)), "block_size_m": float(rng.uniform(14, 27)),
+                 "blocks_x": 8, "blocks_y": 8, "building_height_m": 12, "height_spread_m": 4},
+        "swarm": swarm,
+        "propagation": {"model": "ray_traced", "max_bounces": 2, "rays": 20_000},
+        "clutter": {"model": "field", "cell_area_per_metre_m": 0.4},
+    } | changes  # fmt: skip
+    return Scenario.model_validate(tree)
+
+
+def places(paths: PathSet, city: City, kind: PathKind) -> set[tuple[int, ...]]:
+    """Of each path of one kind its delay and its points, in whole micrometres of way and millimetres of place."""
+    some = paths.select(paths.kind == kind)
+    return {(round(delay * 3e14), *np.rint(np.nan_to_num(points.ravel()) * 1e3).astype(int))
+            for delay, points in zip(some.delay, some.points, strict=True)}  # fmt: skip
+
+
+@pytest.mark.sionna
+@pytest.mark.parametrize("seed", [311, 312])
+def test_a_cut_mesh_returns_all_that_is_heard(seed: int):
+    """Whole and cut meshes of two districts: the same line of sight, echoes, ghosts, mirror images and scatterers within the filter,
+    with the same gains. Planted bug: the reach counted one way, half of it."""
+    setup = simulate.prepare(district(seed))
+    whole = simulate.city_of(setup.scenario)
+    assert setup.city.num_faces + setup.city.num_beyond == whole.num_faces
+    assert setup.city.num_beyond > 0.3 * whole.num_faces
+    full = make_propagation(setup.scenario, setup.waveform, setup.antennas, whole, ())
+    part = make_propagation(setup.scenario, setup.waveform, setup.antennas, setup.city, ())
+    seen = set()
+    for frame in (0, 2):
+        epoch = setup.timetable.epoch(frame)
+        poses = setup.swarm.poses(epoch)
+        links = [("A", "A"), ("A", "P")]
+        expected, got = (model.paths(poses, epoch, links) for model in (full, part))
+        for link in links:
+            a, b = (one[link].select(one[link].delay <= setup.plan.longest_delay) for one in (expected, got))
+            assert len(a) == len(b) > 0
+            for kind in PathKind:
+                assert places(a, whole, kind) == places(b, setup.city, kind), kind
+            seen |= set(a.kind.tolist())
+            power = [np.sort(one.power) for one in (a, b)]
+            # Sionna's float32 amplitudes, of a chain that it found next to an edge: 3e-4 where it bounces 7 cm from one
+            assert power[1] == pytest.approx(power[0], rel=1e-3, abs=0)
+    assert seen >= {PathKind.TARGET, PathKind.DIFFUSE} and len(seen) >= 4
+
+
+def test_a_city_within_a_radius():
+    """Faces that come near enough stay whole with their materials. Planted bug: the distance of centroids."""
+    city = simulate.city_of(district(313))
+    part = city.within(61.7)
+    nearest = np.linalg.norm(city.corners, axis=2).min(axis=1)
+    assert part.num_faces + part.num_beyond == city.num_faces
+    # by corners alone: whatever has a corner inside stays; what stays and has none inside is larger than its distance
+    kept = {tuple(np.sort(face, axis=0).ravel()) for face in np.round(part.corners, 9)}
+    for face, distance in zip(np.round(city.corners, 9), nearest, strict=True):
+        if distance <= 61.7:
+            assert tuple(np.sort(face, axis=0).ravel()) in kept
+    ground = [m.name for m in city.materials]
+    assert [m.name for m in part.materials] == ground
+    assert part.within(61.7) is part
+    assert city.within(np.inf) is city
+    none = city.within(1e-3) if nearest.min() > 1e-3 else city
+    assert none.num_faces + none.num_beyond == city.num_faces
+
+
+def test_the_reach_follows_the_groups():
+    """One group hears up to T_d and the filter's skirt, three up to 4 T_d more. Planted bug: the number of groups for their distance."""
+    w = simulate.prepare(district(314)).waveform
+    for groups in (1, 3):
+        plan = simulate.prepare(district(314, radio=SHORT | {"groups": groups})).plan
+        expected = (w.max_delay + 0.4e6 / w.slope + (groups - 1) * 2 * w.max_delay) * 299_792_458 / 2
+        assert plan.reach == pytest.approx(expected, rel=1e-9)
+        far = max(np.linalg.norm(plan.swarm.poses(plan.timetable.epoch(f))[n].position) for f in range(3) for n in "AP")
+        assert plan.mesh_radius(np.zeros(3)) - far - expected == pytest.approx(1.6, abs=1.2)  # whole metres, a metre, the way in a frame
+    free = district(314, propagation={"model": "free_space"}, city=None, clutter={"model": "none"})
+    assert simulate.prepare(free).plan.mesh_radius(np.zeros(3)) == np.inf
+    everything = simulate.prepare(district(314, accuracy={"preset": "everything"}))
+    assert everything.city.num_beyond == 0
+
+
+@pytest.mark.sionna
+def test_the_plan_counts_what_the_summary_counts():
+    """Faces and scatterers. Planted bug: the candidates of the field in place of its scatterers in the plan."""
+    s = district(315, frames=2)
+    setup = simulate.prepare(s)
+    planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
+    record = extent(setup.city, setup.propagation.field)
+    assert record["scatterers"] == len(setup.propagation.field.cells) > 0
+    for key, value in record.items():
+        assert planned[key] == done[key] == value, key
+    lines = {item["what"]: item for item in planned["items"]}
+    assert str(record["city_faces"]) in lines["mesh"]["modelled"]
+    assert str(record["city_faces_beyond_reach"]) in lines["mesh"]["left_out"]
+    assert str(record["scatterers"]) in lines["clutter field"]["modelled"]
