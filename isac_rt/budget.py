@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.city.mesh import City
-from isac_rt.fidelity import Use, decibels, decisions, extent, frame_reach, missed_chains, standing
+from isac_rt.fidelity import Use, decibels, decisions, extent, frame_reach, mechanisms, missed_chains, standing
 from isac_rt.ifsignal import Transmission, if_signal
 from isac_rt.propagation.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -105,6 +105,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     if receive:
         seconds["receive"] = sum(s["receive"] for s in stages.values())
     return {
+        **mechanisms(plan.scenario),
         **decisions(plan),
         **extent(setup.city, getattr(setup.propagation, "field", None)),
         "traced_share": share if tracer is not None else 0.0,

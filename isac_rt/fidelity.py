@@ -310,6 +310,21 @@ def decisions(plan: Plan) -> dict[str, Any]:
     }
 
 
+def mechanisms(scenario: Scenario) -> dict[str, Any]:
+    """What is modelled of the propagation, as the scenario says."""
+    p, c = scenario.propagation, scenario.clutter
+    traced = p.model == "ray_traced"
+    return {
+        "propagation": p.model,
+        "max_bounces": p.max_bounces if traced and p.specular else 0,
+        "ghosts": traced and p.ghosts,
+        "leakage": traced and p.leakage.enabled,
+        "clutter": c.model,
+        "rays": p.rays if traced else None,
+        "clutter_rays": c.rays if c.model == "diffuse" else None,
+    }
+
+
 def extent(city: City, field: Any) -> dict[str, Any]:
     """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
 

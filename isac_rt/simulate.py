@@ -21,7 +21,7 @@ from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.fall_back import Schedules
-from isac_rt.fidelity import Plan, Use, decisions, extent, used
+from isac_rt.fidelity import Plan, Use, decisions, extent, mechanisms, used
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
 from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
 from isac_rt.metrics import (
@@ -588,15 +588,10 @@ def _estimates(count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen
 
 def _fidelity(setup: Setup) -> dict[str, object]:
     """What was modelled, for the summary."""
-    p, c = setup.scenario.propagation, setup.scenario.clutter
-    traced = p.model == "ray_traced"
     return {
-        "propagation": p.model,
-        "max_bounces": p.max_bounces if traced and p.specular else 0,
-        "ghosts": traced and p.ghosts, "leakage": traced and p.leakage.enabled,
-        "clutter": c.model, "rays": p.rays if traced else None, "clutter_rays": c.rays if c.model == "diffuse" else None,
+        **mechanisms(setup.scenario),
         **decisions(setup.plan),
         "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
         "paths_contradicted": setup.propagation.dropped,
         **extent(setup.city, getattr(setup.propagation, "field", None)),
-    }  # fmt: skip
+    }

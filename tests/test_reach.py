@@ -10,7 +10,7 @@ import pytest
 from isac_rt import simulate
 from isac_rt.budget import make_plan
 from isac_rt.city.mesh import City
-from isac_rt.fidelity import extent
+from isac_rt.fidelity import extent, mechanisms
 from isac_rt.propagation import PathKind, PathSet, make_propagation
 from isac_rt.scenario import Scenario
 
@@ -116,7 +116,7 @@ def test_the_plan_counts_what_the_summary_counts():
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
     record = extent(setup.city, setup.propagation.field)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
-    for key, value in record.items():
+    for key, value in {**record, **mechanisms(s)}.items():
         assert planned[key] == done[key] == value, key
     lines = {item["what"]: item for item in planned["items"]}
     assert str(record["city_faces"]) in lines["mesh"]["modelled"]
