@@ -94,8 +94,8 @@ def test_field_is_coherent_with_a_separate_sum(name):
     """Correlation of the range profile >= 0.99 after steps of 0.1 to 100 mm from seven places of each flight, against a list of scatterers
     exported once; and each scatterer's phase within 1e-6 rad of the closed form (in long doubles).
 
-    The separate sum switches scatterers at shadow edges, the field blends them over about two metres: that is what 0.99 leaves room
-    for. Planted bug: delays in float32.
+    The separate sum switches scatterers at shadow edges, the field takes them across by the knife edge's factor: that is what 0.99 leaves
+    room for. Planted bug: delays in float32.
     """
     model, swarm = flown(STREETS[name], cell_area_per_metre_m=4.0, smallest_cell_m2=0.8)
     cells, city = model.field.cells, crossing()

@@ -127,7 +127,7 @@ class ClutterField:
         active = {n for n in names if scenario.swarm[n].role == "active"} | {change.to_uav for change in scenario.role_changes}
         kept = _ever_seen(shadows, [flights[n] for n in names if n in active], candidates.points, city.normals[candidates.face])
         cells = candidates.select(np.flatnonzero(kept))
-        sight = Sight(shadows, flights, cells.points, city.normals[cells.face])
+        sight = Sight(shadows, flights, cells.points, city.normals[cells.face], cells.area, wavelength)
         return cls(city, cells, sight, wavelength, len(candidates))
 
     @property
