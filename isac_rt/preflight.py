@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import itertools
 import os
+import warnings
+from collections.abc import Iterator
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
+from isac_rt.arrays import Antennas, antennas_of
 from isac_rt.runtime import available_memory
 from isac_rt.scenario import NEAREST_M, Scenario
-from isac_rt.scenario_file import ScenarioError
-from isac_rt.swarm import Swarm
-from isac_rt.timetable import Timetable
+from isac_rt.scenario_file import ScenarioError, ScenarioWarning
+from isac_rt.swarm import Pose, Swarm
+from isac_rt.timetable import Link, Timetable
 from isac_rt.waveform import Waveform
 
 SAMPLE_BYTES = 8
@@ -21,6 +23,7 @@ RECORD_BYTES = 40
 PROGRAM_BYTES = 4e8
 """Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of scenes/paper_swarm.yaml."""
 MOST_EPOCHS = 4_000
+ALIAS_EPOCHS = 50
 
 
 def memory_needed(waveform: Waveform, antennas: Antennas, frames: int, links: int, at_once: int) -> float:
@@ -55,7 +58,7 @@ def check_memory(waveform: Waveform, antennas: Antennas, scenario: Scenario, tim
 
 def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> None:
     """Refuse flights on which two bodies meet, or on which the numbers run out of float64's range: at such a frame there are no
-    directions between them. Of very long runs every so manyth frame is looked at.
+    directions between them. Of very long runs every so manyth frame is looked at. Warns of velocities that alias.
 
     Raises
     ------
@@ -76,6 +79,48 @@ def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Non
                 f"swarm.{b}: is {apart[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s (frame {nearest * step}), at least "
                 f"{NEAREST_M} m are needed; change one of their flights"
             )
+    for said in aliases(scenario, swarm, timetable):
+        warnings.warn(said, ScenarioWarning, stacklevel=3)
+
+
+def aliases(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Iterator[str]:
+    """What is in view and moves faster than the frame can tell: it is reported a whole period slower, and what the groups' offsets
+    make of it as weak further detections.
+
+    Looks at an active terminal's echoes and at lines of sight, in `ALIAS_EPOCHS` frames over the run.
+    """
+    w = timetable.waveform
+    antennas = antennas_of(scenario, w)
+    frames = np.unique(np.linspace(0, scenario.frames - 1, ALIAS_EPOCHS).round().astype(int))
+    poses = [swarm.poses(timetable.epoch(int(frame))) for frame in frames]
+    for tx, rx in timetable.all_links:
+        passes = 2 if tx == rx else 1
+        limit = _fastest(scenario, w, timetable, (tx, rx))
+        for name in [n for n in swarm.uavs if n != tx] if tx == rx else [rx]:
+            rates = np.array([_closing(at[tx], at[name], antennas, passes) for at in poses])
+            worst = int(np.abs(rates).argmax())
+            if abs(rates[worst]) > limit:
+                shown = (rates[worst] + limit) % (2 * limit) - limit
+                what = f"the echo of {name} at {tx}" if tx == rx else f"{name} from {tx}"
+                yield (
+                    f"{scenario.name}: {what} moves at {rates[worst]:.4g} m/s (receding is positive) in frame {frames[worst]}, beyond "
+                    f"the unambiguous {limit:.4g} m/s: it is reported at about {shown:.3g} m/s, beside weaker false detections"
+                )
+
+
+def _fastest(scenario: Scenario, waveform: Waveform, timetable: Timetable, link: Link) -> float:
+    """Unambiguous speed of a link [m/s]: a conventional schedule of few groups has a share of it."""
+    r, limit = scenario.receivers, waveform.max_velocity(2 if link[0] == link[1] else 1)
+    whole = len(timetable.groups(link) or range(waveform.num_groups)) == waveform.num_tx and r.velocity_method != "conventional"
+    return limit if whole or scenario.array.schedule == "pseudo_random" else limit / waveform.num_tx
+
+
+def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
+    """Range rate of another body [m/s], 0 where it is out of view (of either end, for a line of sight)."""
+    line = other.position - own.position
+    line = line / np.linalg.norm(line)
+    seen = antennas.in_view(own.to_body(line)) and (passes == 2 or antennas.in_view(other.to_body(-line)))
+    return float((other.velocity - own.velocity) @ line) if seen else 0.0
 
 
 def check_reference(scenario: Scenario, timetable: Timetable) -> None:

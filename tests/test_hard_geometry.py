@@ -12,7 +12,7 @@ from isac_rt import scenario as tree
 from isac_rt.city import City, load_city
 from isac_rt.city.materials import CityError, MaterialUse
 from isac_rt.city.mesh import Surface, clean
-from isac_rt.preflight import check_flights
+from isac_rt.preflight import aliases, check_flights
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.propagation.clearance import CLEARANCE, ClearanceWarning
 from isac_rt.propagation.geometry import unfold
@@ -182,6 +182,22 @@ def test_two_bodies_at_one_point_are_refused_before_the_run():
     passing = flight(A=((0, 0, 9), (0, 0, 0)), U=((0.3, 20, 9), (0, -10.0, 0)))
     w = waveform_of(passing)
     check_flights(passing, Swarm.from_scenario(passing), Timetable(passing, w, np.zeros((3, 120), int)))
+
+
+def test_velocities_that_alias_are_warned_of_before_the_run():
+    """An echo at 17 m/s is shown at 17 less the period; as a line of sight it is below the limit of one way, and out of view nothing
+    is said. Planted bugs: the limit of one way for echoes; the field of view left out."""
+    for v, way, expected in ((17.0, 1, ["the echo of U at A"]), (31.0, 1, ["the echo of U at A"]), (17.0, -1, []), (14.0, 1, [])):
+        s = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, way * 20, 9), (0, way * v, 0)))
+        w = waveform_of(s)
+        said = list(aliases(s, Swarm.from_scenario(s), Timetable(s, w, np.zeros((3, 120), int))))
+        assert [text.split(": ")[1].split(" moves")[0] for text in said] == expected
+        if expected:
+            shown = (v + w.max_velocity(2)) % (2 * w.max_velocity(2)) - w.max_velocity(2)
+            assert f"moves at {v:g} m/s" in said[0] and f"about {shown:.3g} m/s" in said[0]
+    s = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 20, 9), (0, 17.0, 0)))
+    with pytest.warns(ScenarioWarning, match="unambiguous"):
+        check_flights(s, Swarm.from_scenario(s), Timetable(s, waveform_of(s), np.zeros((3, 120), int)))
 
 
 def test_a_flight_beyond_all_bounds_is_refused():

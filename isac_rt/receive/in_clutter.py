@@ -12,10 +12,10 @@ from isac_rt.arrays import Antennas, Schedule
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.cfar import first_row, strongest_peaks
 from isac_rt.receive.clutter_map import joint_channels, steering
-from isac_rt.receive.common import Sensed, describe
+from isac_rt.receive.common import Sensed, describe, estimate_at
 from isac_rt.receive.detectors import judge
 from isac_rt.receive.doppler import UNION_FLOOR, accumulate, channel_maps
-from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point
+from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
 
@@ -56,13 +56,14 @@ def sense_in_clutter(
         local = kind(spectra, w, schedule, delay_symbols, row)
         if isinstance(local, BeamSpectra):
             local.weights = _beam(antennas, w, cosines)
-        found.append(refine(local, *start_point(power if kind is LocalSpectra else ratio, row, column, w)))
+        found.append(estimate_at(local, power if kind is LocalSpectra else ratio, row, column, settings))
     snr = power[rows, bins] / judged.level[rows, bins]
-    detections = describe(found, np.maximum(snr, ratio[rows, bins]), antennas, w, 2)
+    on_grid = settings.refinement == "grid"
+    detections = describe(found, np.maximum(snr, ratio[rows, bins]), antennas, w, 2, on_grid=on_grid)
     direction = detections.direction.copy()
     for i, cosines in enumerate(towards):
         if np.isfinite(cosines).all():
-            direction[i] = _direction(found[i], antennas, w, cosines)
+            direction[i] = cosines if on_grid else _direction(found[i], antennas, w, cosines)
     named = {name: getattr(detections, name) for name in ("range", "velocity", "snr", "std", "is_reference")}
     return Sensed(found, type(detections)(direction=direction, **named), power, judged.level)
 
