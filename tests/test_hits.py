@@ -152,6 +152,7 @@ def test_fig14_verdicts_from_made_up_curves():
     """Planted bugs: the difference to FMCW the wrong way round; LoRadar judged by the better of its two ways."""
     curves = {f"PT: D = {d}": made_up(-29) for d in (2, 4, 8, 16)}
     curves |= {"PT: D = 8, delay errors": made_up(-30, False), "PT, known: data known": made_up(-41), "FMCW: hits": made_up(-44)}
+    curves["AT, M = 1: hits, no window"] = made_up(-43)
     curves |= {"AT, M = 1: hits": made_up(-42), "AT, M = 3: hits, united": made_up(-46), "PT, T = 25.6 us: D = 8": made_up(-26)}
     curves |= {"LoRadar: ordered": made_up(-44), "LoRadar: phase": made_up(-40), "FMCW, full velocity range: hits": made_up(-30)}
     curves |= {f"AT, M = 1, clutter, {how}: hits": made_up(-34) for how in ("moving", "at rest")}

@@ -101,7 +101,8 @@ def _figure(curves: dict[str, Curve], theory: dict[int, np.ndarray]) -> Figure:
         right.set(title="delay symbols known")
         for ax in (left, right):
             ax.set(xlabel="SNR per sample and antenna [dB]", xlim=(-36, -18))
-            ax.legend(fontsize=6.5, loc="lower left")
+        left.legend(fontsize=6.5, loc="lower left")
+        right.legend(fontsize=6.5, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
     return figure
 
 

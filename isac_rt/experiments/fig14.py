@@ -105,7 +105,7 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
     spent, half = difference(pt, known, 0.5), pt.threshold(0.5)
     follows: Judgement = "holds" if spent[1] > 3 else "does not hold"
     later = difference(curves["PT, T = 25.6 us: D = 8"], pt, 0.5)
-    superior = difference(at, fmcw, 0.5)
+    superior, plain = difference(at, fmcw, 0.5), curves["AT, M = 1: hits, no window"].threshold(0.5)
     united = difference(curves["AT, M = 3: hits, united"], fmcw, 0.5)
     better: Judgement = "does not hold" if superior[1] <= 0 else "holds under a condition" if united[2] < 0 else "holds"
     w = Waveform()
@@ -120,8 +120,9 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
         _clutter(curves),
         Verdict("TDM-MIMO FMCW's hit rate is higher, the proposed scheme's slightly lower", better,
                 f"half hit at {decibels(fmcw.threshold(0.5))} (FMCW), {decibels(at.threshold(0.5))} (AT, one group, OMP) and "
-                f"{decibels(half)} (PT); AT with three groups united {decibels(united)} after FMCW (negative: earlier). FMCW within a "
-                f"third of the velocities alone: over all of them {curves['FMCW, full velocity range: hits'].text(-36)}"),
+                f"{decibels(half)} (PT); AT without a range window {decibels(plain)}; with three groups united "
+                f"{decibels(united)} after FMCW (negative: earlier). FMCW within a third of the velocities alone: over all "
+                f"of them {curves['FMCW, full velocity range: hits'].text(-36)}"),
         _loradar(curves, at),
         Verdict("The unambiguous distance is smaller than FMCW's", "holds", f"AT {ranges[0]:.1f} m, FMCW {ranges[1]:.1f} m: half of the "
                 "cells are the data's"),
