@@ -46,7 +46,7 @@ def path(w: Waveform, length: float, rate: float, gain: float = 1.0) -> PathSet:
 
 def blocks(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Isolation against the spacing of the blocks, mean over sets of chirps with its 95 % interval."""
-    w, sets, rows = Waveform(), 3 if quick else 24, []
+    w, sets, rows = Waveform(), 3 if quick else 12, []
     for spacing in (-3, -2, -1, 1, 2, 3):
         every = [isolation(w, spacing, 0.0, generator(seed, "claims", "blocks", spacing + 9, k), transition=SKIRT, chirps=6)
                  for k in range(sets)]  # fmt: skip
@@ -69,7 +69,7 @@ def blocks(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
 def tolerance(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Isolation of both neighbours against their timing error, for short and long delays."""
     w, rows = Waveform(), []
-    grid = np.linspace(-2.125, 0.375, 21 if quick else 101)
+    grid = np.linspace(-2.125, 0.375, 21 if quick else 51)
     for spacing in (1, -1):
         for cells in (8.3, 511.7, 1015.3):
             for k, error in enumerate(spacing * grid):
@@ -123,7 +123,7 @@ def _rates(n: SymbolCount) -> str:
 
 def sharing(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Six active terminals at once, and two in the same blocks."""
-    frames, snr = (4, -5.0) if quick else (60, -5.0)
+    frames, snr = (4, -5.0) if quick else (24, -5.0)
     blocks_of_others = (3, 6, 9, 12, 15)
     cases: dict[str, dict[int, float]] = {
         "alone": {}, "five others, equal": dict.fromkeys(blocks_of_others, 0.0),
@@ -150,7 +150,7 @@ STREAMS = {"PT1": ((0,), 41.317, 6.2), "PT2": ((1, 2), 67.713, -3.9)}
 
 def streams(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Groups assigned to different passive terminals: rate and symbol error rate of each user and of one user with all groups."""
-    w, frames = Waveform(), 2 if quick else 60
+    w, frames = Waveform(), 2 if quick else 16
     arrays, users = _antennas(w), {**STREAMS, "one user": ((0, 1, 2), 41.317, 6.2)}
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, generator(seed, "claims", "streams"))
     levels = (10.0, -22.0)
@@ -216,7 +216,7 @@ def _network(seed: int, snr_db: float) -> tuple[Network, dict[str, Clock]]:
 
 def stages(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Announcement, two rounds and acknowledgment of random networks."""
-    networks, snr = (3 if quick else 40), -6.0
+    networks, snr = (3 if quick else 16), -6.0
     rows = []
     for k in range(networks):
         net, clocks = _network(seed + k, snr)
@@ -249,7 +249,7 @@ def stages(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tupl
 
 def feedback(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Whole-cell slips planted at a passive terminal: what the data suffer and how often one feedback undoes them."""
-    w, tries = Waveform(num_samples=256, num_chirps=60), 8 if quick else 200
+    w, tries = Waveform(num_samples=256, num_chirps=60), 8 if quick else 64
     arrays, cell, rows = _antennas(w), w.range_cell(1), []
     length, rate, echo_std = 21.317, -3.1, 0.09
     slips = (-3, -1, 1, 3)

@@ -106,7 +106,7 @@ def antenna_order(frames: int, seed: int) -> tuple[int, int]:
 
 def antennas(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """All of them."""
-    targets, frames, pairs = (12, 6, 2000) if quick else (300, 200, 50_000)
+    targets, frames, pairs = (12, 6, 2000) if quick else (100, 50, 20_000)
     rows = []
     for i, scheme in enumerate("abd"):
         angles, velocities = angle_hits(scheme, targets, seed)

@@ -130,7 +130,7 @@ def decisions(seed: int, repeats: int) -> list[Growth]:
 
 def cost(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Measure all steps."""
-    repeats, found = 3 if quick else 15, []
+    repeats, found = 3 if quick else 7, []
     parts = (data_removal, decisions, matching_pursuit)
     for i, part in enumerate(parts):
         found += part(seed, repeats)

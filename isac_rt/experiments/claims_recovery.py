@@ -75,7 +75,7 @@ def recovered(sparsity: int, trials: int, spread_db: float, off_grid: bool, seed
 
 def latin(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Whether schedules keep the Latin constraint for any L_tx and M, and whether it costs randomness."""
-    draws, rows = 20 if quick else 400, []
+    draws, rows = 20 if quick else 100, []
     for num_tx in range(1, 9):
         rng = generator(seed, "claims", "latin", num_tx)
         for groups in range(1, num_tx + 1):
@@ -119,7 +119,7 @@ FALLBACK_TONES = (1, 2, 3, 4, 6, 8, 12, 16)
 
 def fallback(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """How the receiver's rule for falling back to the conventional schedule decides."""
-    frames = 25 if quick else 400
+    frames = 25 if quick else 100
     table = pd.DataFrame([{"tones": k, "called_sparse": judged_sparse(k, frames, seed), "frames": frames} for k in FALLBACK_TONES])
     ends = bool(table.called_sparse.iloc[0] == frames and table.called_sparse.iloc[-1] == 0)
     text = ", ".join(f"{r.tones}: {proportion(r.called_sparse, r.frames)}" for r in table.itertuples())
@@ -141,12 +141,12 @@ def united_error(sparsity: int, trials: int, seed: int) -> float:
 
 def recovery(quick: bool, seed: int, report: Progress) -> tuple[dict[str, pd.DataFrame], tuple[Verdict, ...]]:
     """Coherence, isometry and recovery."""
-    schedules, trials = (200, 400) if quick else (4000, 10_000)
+    schedules, trials = (200, 400) if quick else (1000, 2000)
     rng = generator(seed, "claims", "coherence")
     samples = [slots(True, rng) for _ in range(schedules)]
     mu = np.array([coherence(s) for s in samples])
     plain = coherence(slots(False, rng))
-    delta = pd.DataFrame([{"sparsity": k, "isometry_at_least": max(isometry(s, k, 100 if quick else 500, rng) for s in samples[:10])}
+    delta = pd.DataFrame([{"sparsity": k, "isometry_at_least": max(isometry(s, k, 100 if quick else 300, rng) for s in samples[:10])}
                           for k in SPARSITIES if k <= 12])  # fmt: skip
     cases: list[tuple[str, float, bool]] = [*((name, db, False) for name, db in LEVELS.items()), ("equal, off the grid", 0.0, True)]
     rows = []
@@ -164,7 +164,7 @@ def recovery(quick: bool, seed: int, report: Progress) -> tuple[dict[str, pd.Dat
 
 def against_coherence(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """Recovery of six equal tones as ever fewer chirps are an antenna's own: coherence rises with L_tx."""
-    schedules, trials = (50, 400) if quick else (500, 10_000)
+    schedules, trials = (50, 400) if quick else (200, 2000)
     rows = []
     for num_tx in (2, 3, 4, 5, 6):
         rng = generator(seed, "claims", "coherence", num_tx)
