@@ -71,6 +71,7 @@ TESTS_OF = {
     "receive/spectrum.py": "test_receive_data test_receive_detection",
     "receive/in_clutter.py": "test_clutter_detectors",
     "receive/joint.py": "test_receive_joint",
+    "receive/phases.py": "test_receive_joint",
     "receive/separate.py": "test_receive_joint",
     "receive/beams.py": "test_receive_beams",
     "receive/pursuit.py": "test_receive_pursuit",
