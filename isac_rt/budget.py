@@ -107,7 +107,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     return {
         **mechanisms(plan.scenario),
         **decisions(plan),
-        **extent(setup.city, getattr(setup.propagation, "field", None)),
+        **extent(setup.city, getattr(setup.propagation, "field", None), setup.scenario.clutter),
         "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
@@ -149,7 +149,7 @@ def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> 
 
 def _scene_items(setup: Setup) -> list[Item]:
     """Lines of the mesh and of its scatterers, with the reason for each count."""
-    out, record, c = [], extent(setup.city, getattr(setup.propagation, "field", None)), setup.scenario.clutter
+    out, record = [], extent(setup.city, getattr(setup.propagation, "field", None), setup.scenario.clutter)
     if record["city_faces"] + record["city_faces_beyond_reach"]:
         gone = record["city_faces_beyond_reach"]
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
@@ -157,8 +157,9 @@ def _scene_items(setup: Setup) -> list[Item]:
         out.append(Item("mesh", "all", f"{record['city_faces']} faces", why, None, ""))
     if record["scatterers"] is not None:
         hidden = record["scatterer_cells"] - record["scatterers"]
-        said = f"{record['scatterers']} scatterers, one per {c.cell_area_per_metre_m:g} m2 and metre from the flights"
-        out.append(Item("clutter field", "all", said, f"{hidden} cells that no transmitter sees", None, ""))
+        said = f"{record['scatterers']} scatterers, one for {record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
+        why, error = f"{hidden} cells that no transmitter sees", record["clutter_error_db"]
+        out.append(Item("clutter field", "all", said, why, error, "dB of a cell's mean"))
     return out
 
 

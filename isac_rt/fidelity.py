@@ -29,8 +29,10 @@ from isac_rt.city.mesh import City
 from isac_rt.gridding import GRIDDED_ERROR
 from isac_rt.ifsignal import Method
 from isac_rt.linkbudget import transmit_amplitude
+from isac_rt.propagation.cells import Density, error_for
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario import Scenario
+from isac_rt.scenario_clutter import Clutter
 from isac_rt.swarm import Swarm
 from isac_rt.timetable import Link, Timetable
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -325,7 +327,7 @@ def mechanisms(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def extent(city: City, field: Any) -> dict[str, Any]:
+def extent(city: City, field: Any, clutter: Clutter) -> dict[str, Any]:
     """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
 
     Parameters
@@ -334,10 +336,14 @@ def extent(city: City, field: Any) -> dict[str, Any]:
 
     Returns
     -------
-    record : faces traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
+    record : area of a scatterer over its distance [m] and the error of the mean power that this brings, None without a field; faces
+        traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
         without a field, and cells of the whole mesh among which they were
     """
+    area = Density.of(clutter).per_metre if clutter.model == "field" else None
     return {
+        "cell_area_per_metre_m": area,
+        "clutter_error_db": None if area is None else round(error_for(area), 4),
         "city_faces": city.num_faces,
         "city_faces_beyond_reach": city.num_beyond,
         "scatterers": None if field is None else len(field.cells),

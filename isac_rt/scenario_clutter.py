@@ -44,8 +44,12 @@ class Clutter(Node):
     """rayleigh: how often number, centre, places, directions and amplitudes are drawn."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
     """diffuse: rays of a re-trace, per transmitter."""
-    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.024
-    """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m]."""
+    max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
+    """field: error of the mean power in a range cell of 4 m that nine of ten cells keep to, of those with a thousandth of all power and
+    more; decides how many scatterers there are (`isac_rt.propagation.cells`)."""
+    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m], in place of what
+    max_error_db asks for."""
     smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
     """field: cells of this area are cut no further, however near."""
     mirrors: Annotated[int, Field(ge=0, le=64)] = 0
@@ -70,6 +74,6 @@ CLUTTER_KEYS: dict[str, frozenset[str]] = {
         {"level_db", "level_of", "cells", "centre", "centre_m", "place", "direction", "cell_correlation", "redraw"}
     ),
     "diffuse": frozenset({"rays"}),
-    "field": frozenset({"cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
+    "field": frozenset({"max_error_db", "cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
 }
 """Keys that each clutter model understands, beside model; the others may stand and are not written back."""

@@ -13,6 +13,7 @@ from isac_rt.arrays import antennas_of
 from isac_rt.city import City, load_city
 from isac_rt.city.mesh import distance_to_triangles
 from isac_rt.propagation import make_propagation
+from isac_rt.propagation.cells import area_for
 from isac_rt.swarm import Swarm
 from isac_rt.waveform import waveform_of
 
@@ -23,9 +24,12 @@ CLEARANCE = 10.0
 FRAMES = 400  # of 7.8 ms
 CELL = 4.0
 STREET = {"source": "canyon", "street_width_m": 29.3, "street_length_m": 87.0, "building_height_m": 23.4}
+QUARTER = {"source": "blocks", "street_width_m": 31.7, "block_size_m": 23.1, "blocks_x": 4, "blocks_y": 4, "building_height_m": 11.3,
+           "height_spread_m": 5.1}  # fmt: skip
 FLIGHTS = {  # where A and P are at the start of the run and how they fly
     "munich": (((34.0, 54.0, 21.0), (7.6, -1.3, 0.4)), ((88.0, -11.0, 41.7), (3.3, 8.7, -0.6))),
     "street": (((2.4, -22.7, 12.3), (-0.9, 7.7, 0.6)), ((-1.3, 17.9, 13.1), (0.7, -4.1, 0.3))),
+    "quarter": (((1.3, -21.0, 19.2), (0.8, 6.1, 0.3)), ((-3.1, 24.0, 22.7), (-0.6, -4.3, 0.5))),
     "san_francisco": (((-41.0, 23.0, 44.3), (8.3, 3.1, 0.7)), ((27.0, -38.0, 48.1), (-2.9, 7.7, 0.9))),
 }
 
@@ -41,7 +45,7 @@ def flown(name: str, per_metre: float):
                 "A": {"role": "active", "position_m": list(a), "velocity_mps": list(v)},
                 "P": {"role": "passive", "position_m": list(p), "velocity_mps": list(w)},
             },
-            "city": STREET if name == "street" else {"source": "builtin", "name": name},
+            "city": {"street": STREET, "quarter": QUARTER}.get(name, {"source": "builtin", "name": name}),
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
             "clutter": {"model": "field", "cell_area_per_metre_m": per_metre},
@@ -101,6 +105,15 @@ def test_mean_power_in_a_street_is_sionnas():
     assert abs(np.median(cells)) < 0.05
     assert np.quantile(np.abs(cells), 0.9) < 0.2
     assert np.abs(totals).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["street", "quarter"])
+@pytest.mark.parametrize("goal", [0.5, 1.0])
+def test_the_density_keeps_the_error_that_is_asked_for(name: str, goal: float):
+    """Two scenes on which the law of `cells.area_for` was not set: nine of ten cells are within the goal, and not ten times better.
+    Planted bug: the area in proportion to the square of the error."""
+    cells, _, _ = compare(name, area_for(goal), rays=1_000_000, places=2)
+    assert goal / 10 < np.quantile(np.abs(cells), 0.9) < goal
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from isac_rt.budget import make_plan
 from isac_rt.city.mesh import City
 from isac_rt.fidelity import extent, mechanisms
 from isac_rt.propagation import PathKind, PathSet, make_propagation
+from isac_rt.propagation.cells import Density, area_for, error_for
 from isac_rt.scenario import Scenario
 
 SHORT = {"groups": 1, "samples_per_chirp": 256, "chirps_per_frame": 12}
@@ -114,7 +115,7 @@ def test_the_plan_counts_what_the_summary_counts():
     s = district(315, frames=2)
     setup = simulate.prepare(s)
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
-    record = extent(setup.city, setup.propagation.field)
+    record = extent(setup.city, setup.propagation.field, s.clutter)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
     for key, value in {**record, **mechanisms(s)}.items():
         assert planned[key] == done[key] == value, key
@@ -122,3 +123,15 @@ def test_the_plan_counts_what_the_summary_counts():
     assert str(record["city_faces"]) in lines["mesh"]["modelled"]
     assert str(record["city_faces_beyond_reach"]) in lines["mesh"]["left_out"]
     assert str(record["scatterers"]) in lines["clutter field"]["modelled"]
+    assert lines["clutter field"]["estimate"] == record["clutter_error_db"]
+
+
+def test_the_density_follows_from_the_error():
+    """The law and its inverse, what a scenario says against what it asks for. Planted bug: the exponent the other way round."""
+    assert area_for(0.2) == pytest.approx(0.024, rel=1e-5)
+    assert area_for(0.37) == pytest.approx(0.024 * 1.85 ** (4 / 3), rel=1e-5)
+    assert error_for(area_for(0.731)) == pytest.approx(0.731, rel=1e-5)
+    said = district(316).clutter
+    assert Density.of(said).per_metre == 0.4
+    asked = said.model_copy(update={"cell_area_per_metre_m": None, "max_error_db": 0.9})
+    assert Density.of(asked).per_metre == area_for(0.9)

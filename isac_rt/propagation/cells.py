@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from isac_rt.city.mesh import City
 from isac_rt.randomness import seed_sequence
+from isac_rt.scenario_clutter import Clutter
 
 UNIT = 1e-6 * np.sqrt(2)
 """World coordinates are hashed in whole multiples of this [m]. Irrational, so that no coordinate of a file lies where rounding
@@ -36,6 +37,31 @@ class Density:
 
     per_metre: float
     smallest: float
+
+    @classmethod
+    def of(cls, clutter: Clutter) -> Density:
+        """As a scenario asks for it."""
+        return cls(clutter.cell_area_per_metre_m or area_for(clutter.max_error_db), clutter.smallest_cell_m2)
+
+
+KNOWN_ERROR_DB, KNOWN_AREA = 0.2, 0.024
+"""Of the mean power in range cells of 4 m, that nine of ten keep to, at this area over distance [m]: what Munich and San Francisco
+show (0.17 and 0.18 dB, `docs/clutter.md`) and a tenth more."""
+
+
+def area_for(error_db: float) -> float:
+    """Area over distance [m] at which nine of ten range cells keep to an error of their mean power.
+
+    Of the surface within a range cell, cells of area A that its two edges cut count on one side or the other, their whole power. There are
+    n ~ 1/A inside and m ~ 1/sqrt(A) on the edges, so the error sqrt(m)/n grows with A^(3/4). It is the same for all presets of
+    the budget, because another density is another draw of the clutter.
+    """
+    return float(f"{KNOWN_AREA * (error_db / KNOWN_ERROR_DB) ** (4 / 3):.6g}")
+
+
+def error_for(per_metre: float) -> float:
+    """The error [dB] at an area over distance: `area_for` the other way."""
+    return KNOWN_ERROR_DB * (per_metre / KNOWN_AREA) ** 0.75
 
 
 @dataclass(frozen=True)
@@ -98,8 +124,8 @@ def cut(city: City, scattering: np.ndarray, places: np.ndarray, density: Density
         count += int((~large).sum()) + 2 * int(large.sum())
         if count > MOST_CELLS:
             raise ValueError(
-                f"clutter.cell_area_per_metre_m {density.per_metre:g} cuts the city into more than {MOST_CELLS} cells; "
-                "raise it, or lower city.keep_radius_m"
+                f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, or cell_area_per_metre_m) cuts "
+                f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
             )
         corners = _halves(corners[large])
         row, area = np.repeat(row[large], 2), np.repeat(area[large] / 2, 2)

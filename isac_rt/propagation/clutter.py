@@ -120,7 +120,7 @@ class ClutterField:
         names = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
         flights = {name: Flight(trajectories[name], duration, city.origin) for name in names}
         places = np.concatenate([flight.knots for flight in flights.values()])
-        density = Density(scenario.clutter.cell_area_per_metre_m, scenario.clutter.smallest_cell_m2)
+        density = Density.of(scenario.clutter)
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[city.face_material]
         candidates = cut(city, scatters, places, density, scenario.seed)
         shadows = Shadows(scene)
