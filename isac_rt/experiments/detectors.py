@@ -24,14 +24,14 @@ from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter_filter import remove_standing
-from isac_rt.receive.clutter_map import Taper, cells_of, power_map
+from isac_rt.receive.clutter_map import cells_of, power_map
 from isac_rt.receive.detectors import judge, noise_level
 from isac_rt.receive.doppler import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
 
-RATE = 0.9e-3
-"""False alarms per cell that thresholds are scaled to."""
+RATE = 0.75e-3
+"""False alarms per cell that thresholds are scaled to, some 140 events: what is counted on other frames then stays below `WORST_RATE`."""
 WORST_RATE = 1e-3
 STRONG_DB = 20.0
 POWER_DBM = 30.0
@@ -50,33 +50,36 @@ class Detector:
     text : for people
     settings : of the receiver
     mistakes : what the terminal has wrong
-    taper : of its filter, None for the receiver's own
+    fitted : it corrects its velocity and the clutter's level by each case's first frame, one with UAVs
     """
 
     text: str
     settings: dict
     mistakes: Mistakes | None = None
-    taper: Taper | None = None
+    fitted: bool = True
 
 
 ALL_WRONG = Mistakes((0.07, 0.07, 0.0), -3.0, 0.1)
 """0.1 m/s, 3 dB too low, 0.1 m rms of every face."""
-WIDE = Taper(range_cells=2.0, doppler_bins=1.4, cosine=0.05)
-"""Two deviations of these mistakes on either side."""
+PER_ARM = {"clutter_detector": "angle_doppler"}
+JOINT = {"clutter_detector": "angle_doppler", "clutter_channels": "joint"}
 DETECTORS = {
     "cfar": Detector("CFAR", {}),
     "runs": Detector("CFAR after the paper's filter (runs)", {"clutter_filter": "runs"}),
     "notch": Detector("CFAR after a zero-Doppler notch", {"clutter_filter": "zero_doppler"}),
     "sample": Detector("sample matrix, per arm", {"clutter_detector": "sample_matrix"}),
     "map": Detector("threshold map from the mesh", {"clutter_detector": "map"}),
-    "arms": Detector("mesh and velocity, per arm", {"clutter_detector": "angle_doppler"}),
-    "joint": Detector("mesh and velocity, joint", {"clutter_detector": "angle_doppler", "clutter_channels": "joint"}),
-    "wide": Detector("per arm, wide taper", {"clutter_detector": "angle_doppler"}, None, WIDE),
-    "wide_wrong": Detector("per arm, wide taper, all three off", {"clutter_detector": "angle_doppler"}, ALL_WRONG, WIDE),
-    "arms_wrong": Detector("per arm, all three off", {"clutter_detector": "angle_doppler"}, ALL_WRONG),
+    "arms": Detector("mesh and velocity, per arm", PER_ARM),
+    "joint": Detector("mesh and velocity, joint", JOINT),
+    "velocity_wrong": Detector("per arm, velocity 0.1 m/s off", PER_ARM, Mistakes(ALL_WRONG.velocity)),
+    "level_wrong": Detector("per arm, level 3 dB off", PER_ARM, Mistakes(level_db=ALL_WRONG.level_db)),
+    "mesh_wrong": Detector("per arm, mesh 0.1 m off", PER_ARM, Mistakes(mesh_std=ALL_WRONG.mesh_std)),
+    "arms_wrong": Detector("per arm, all three off", PER_ARM, ALL_WRONG),
+    "joint_wrong": Detector("joint, all three off", JOINT, ALL_WRONG),
+    "unfitted": Detector("per arm, all three off, not corrected", PER_ARM, ALL_WRONG, fitted=False),
     "map_wrong": Detector("threshold map, all three off", {"clutter_detector": "map"}, ALL_WRONG),
 }
-LEFT_OUT_QUICK = "joint", "sample", "map_wrong"
+LEFT_OUT_QUICK = "joint", "joint_wrong", "sample", "map_wrong"
 BOUNDS = {"bound_arms": "arms", "bound_joint": "joint"}
 """Detectors without any clutter, of which the better is the bound."""
 
@@ -203,11 +206,12 @@ def score(scenes: Scenes, case: Case, detector: Detector, tally: Tally, *, quiet
             remove_standing(spectra, s.schedule, settings.clutter_run_cells if settings.clutter_filter == "runs" else None)
             frames.append(channel_maps(spectra, s.waveform, s.schedule, case.payload.delay_symbols))
     expected = NOTHING if quiet else _expected(scenes, case.place, case.speed, detector.mistakes)
-    judged = judge(frames, s.waveform, s.antennas, s.schedule, case.payload.delay_symbols, settings, expected, detector.taper)
+    frames = [*frames[2:], *frames[:2]]  # the first one corrects the terminal, and what is in the air must not hinder that
+    judged = judge(frames, s.waveform, s.antennas, s.schedule, case.payload.delay_symbols, settings, expected, fitted=detector.fitted)
     rows = slice(*(round(r / s.waveform.range_cell(2)) for r in SPAN_M))
-    tally.tuning.append(judged[0].ratio[rows].ravel())
-    tally.free.append(judged[1].ratio[rows].ravel())
-    for one, cells in zip(judged[2:], case.cells, strict=True):
+    tally.tuning.append(judged[-2].ratio[rows].ravel())
+    tally.free.append(judged[-1].ratio[rows].ravel())
+    for one, cells in zip(judged[:-2], case.cells, strict=True):
         best = ndimage.maximum_filter(one.ratio, size=3, mode=("nearest", "wrap"))
         tally.hits.append(best[tuple(cells.T)])
 
@@ -215,7 +219,7 @@ def score(scenes: Scenes, case: Case, detector: Detector, tally: Tally, *, quiet
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     """Every detector on every place; `quick`: coarser scatterers, fewer UAVs, without the slowest detectors."""
     places = COMPARED
-    target_frames, count = (1, 50) if quick else (3, 60)
+    target_frames, count = (1, 50) if quick else (2, 70)
     scenes = Scenes(scenario(places, seed, 0.03 if quick else 0.015, POWER_DBM))
     chosen = {k: d for k, d in DETECTORS.items() if not (quick and k in LEFT_OUT_QUICK)}
     bounds = {k: DETECTORS[of] for k, of in BOUNDS.items() if of in chosen}
@@ -276,10 +280,15 @@ def _verdicts(table: pd.DataFrame, quick: bool) -> tuple[Verdict, ...]:
     best = "joint" if "joint" in table.index and table.pd_strong["joint"] >= table.pd_strong["arms"] else "arms"
     bound = max((n for n in table.index if n.startswith("bound_")), key=lambda n: table.pd[n])
     top, limit, threshold_map = table.loc[best], table.loc[bound], table.loc["map"]
-    wrong = table.loc["arms_wrong"]
+    wrong = table.loc[f"{best}_wrong"]
+
+    alone = [table.loc[n] for n in ("velocity_wrong", "level_wrong", "mesh_wrong")]
 
     def judged(good: bool) -> Judgement:
         return "holds" if good else "does not hold"
+
+    def strong(row: pd.Series) -> str:
+        return proportion(round(row.pd_strong * row.n_strong), int(row.n_strong))
 
     worst = table[~table.index.str.startswith("bound_")].sort_values("rate").iloc[-1]
     count = f"{int(top.n_strong)} UAVs in cells with clutter over {STRONG_DB:g} dB"
@@ -287,18 +296,21 @@ def _verdicts(table: pd.DataFrame, quick: bool) -> tuple[Verdict, ...]:
                        if n in ("cfar", "runs", "notch", "sample", "map"))  # fmt: skip
     return (
         Verdict("False alarms are at most 1e-3 per cell on target-free frames, counted on at least 100 events",
-                judged(worst.rate_low <= WORST_RATE and table.false_alarms.min() >= 100),
+                judged(worst.rate <= WORST_RATE and table.false_alarms.min() >= 100),
                 f"worst {worst.detector}: {rate_text(worst)}; {best}: {rate_text(top)}"),
         Verdict("The angle-Doppler filter comes within 0.03 of the clutter-free bound over all UAVs",
                 judged(top.pd >= limit.pd - 0.03), f"{best} {top.pd:.4f}, bound {limit.pd:.4f}, {int(top.n_strong + top.n_weak)} UAVs"),
         Verdict("In strong-clutter cells the filter finds at least 0.95", judged(top.pd_strong >= 0.95),
-                f"{best} {proportion(round(top.pd_strong * top.n_strong), int(top.n_strong))}; hovering {top.pd_strong_hovering:.3f}, "
+                f"{best} {strong(top)}; bound {strong(limit)}; hovering {top.pd_strong_hovering:.3f}, "
                 f"at {SPEED:g} m/s {top.pd_strong_moving:.3f}; {count}"),
         Verdict("There the filter is at least 0.1 above the threshold map", judged(top.pd_strong >= threshold_map.pd_strong + 0.1),
                 f"{best} {top.pd_strong:.3f}, threshold map {threshold_map.pd_strong:.3f}"),
         Verdict("The filter holds this with 0.1 m/s of velocity error, 3 dB of level error and 0.1 m of mesh error",
-                judged(wrong.pd >= limit.pd - 0.03 and wrong.pd_strong >= 0.95),
-                f"all three at once, per arm: {wrong.pd:.4f} over all, {wrong.pd_strong:.3f} in strong clutter, rate {rate_text(wrong)}"),
+                judged(all(row.pd >= limit.pd - 0.03 and row.pd_strong >= 0.95 for row in (wrong, *alone))),
+                f"all three at once, {wrong.detector}: {wrong.pd:.4f} over all, {strong(wrong)} in strong clutter, "
+                f"false alarms {rate_text(wrong)}; "
+                + ", ".join(f"{row.detector} alone {row.pd:.4f} and {row.pd_strong:.3f}" for row in alone)
+                + f"; not corrected by the frame {table.pd['unfitted']:.4f} and {table.pd_strong['unfitted']:.3f}"),
         Verdict("What the others reach (no claim; stated beside the filter)", "holds", losers),
     )  # fmt: skip
 

@@ -5,9 +5,10 @@
 - angle_doppler: the adaptive matched filter with the covariance that the mesh and the platform's own velocity predict;
 - sample_matrix: the same filter with the covariance of the cells around.
 
-`clutter_channels` says whether the last two filter each arm of the virtual L by itself and add the two, or both arms jointly. The level
-of angle_doppler is held up by the energy that the filter leaves around a cell, the greater of both sides in range, where that is more
-than predicted.
+map and angle_doppler first correct what the terminal believes of its velocity and of the clutter's level by the frame's own clutter
+(`isac_rt.receive.clutter_fit`). `clutter_channels` says whether the last two filter each arm of the virtual L by itself and add the
+two, or both arms jointly. The level of angle_doppler is held up by the energy that the filter leaves around a cell, the greater of both
+sides in range, where that is more than predicted.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from isac_rt.arrays import Antennas, Schedule
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.adaptive import Beams, Scan, beams_of, map_factor, predicted, sampled, scan_threshold
 from isac_rt.receive.cfar import background, detect, row_factors, strong_lobes
+from isac_rt.receive.clutter_fit import fit
 from isac_rt.receive.clutter_map import Channels, Taper, arm_channels, joint_channels, power_map
 from isac_rt.receive.doppler import accumulate
 from isac_rt.scenario import Receivers
@@ -59,6 +61,7 @@ def judge(
     settings: Receivers,
     clutter: ExpectedClutter | None = None,
     taper: Taper | None = None,
+    fitted: bool = True,
 ) -> list[Judged]:
     """The verdict of the detector that the settings name, on frames that share their data and the expected clutter.
 
@@ -67,6 +70,7 @@ def judge(
     frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
     clutter : what is expected; needed by map and angle_doppler
     taper : how uncertain that is; None: `Taper()`
+    fitted : correct the own velocity and the clutter's level by the first frame (`isac_rt.receive.clutter_fit`) before anything is decided
 
     Raises
     ------
@@ -86,6 +90,9 @@ def judge(
         raise ValueError(f"receivers.clutter_detector {name} needs the clutter that the mesh predicts; give it, or use cfar")
     expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols, taper)
     noise = [noise_level(power, expected, looks) for power in powers]
+    if fitted:
+        clutter = fit(powers[0], noise[0], clutter, waveform, schedule, delay_symbols).apply(clutter)
+        expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols, taper)
     if name == "map":
         limits = [n * map_factor(expected / n, looks, rate) for n in noise]
         return [Judged(p / limit, n + expected, _nowhere(p)) for p, n, limit in zip(powers, noise, limits, strict=True)]
