@@ -11,7 +11,7 @@ import trimesh
 
 from isac_rt.city.mesh import City
 from isac_rt.experiments.ghosts import explained_tracks, run, verdicts, whole_tracks
-from isac_rt.ghosts import Walls, echoes, suspicion
+from isac_rt.ghosts import Walls, echoes, reflections, suspicion
 from isac_rt.swarm import Pose
 from isac_rt.tracking import Gaussian, Track, track_set
 
@@ -118,6 +118,91 @@ def test_a_place_just_behind_a_wall_is_in_doubt_as_far_as_it_is_unsure():
     unsure = replace(behind, state=Gaussian(behind.state.mean, np.diag([0.09] * 3 + [1e-2] * 3)))
     for one, expected in ((behind, True), (unsure, False)):
         assert suspicion(track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD).suspect.tolist() == [expected]
+
+
+SENDER = np.array([3.9, 34.2, 2.6, 0.9, -5.7, 0.3])
+"""Local position and velocity of an active terminal that `OWN` listens to."""
+
+
+def touch(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Where the shortest way over the wall touches it, by similar triangles: the heights over the plane divide the way."""
+    a, b = WALL_X - start[0], WALL_X - end[0]
+    return start + (end - start) * a / (a + b) + np.array([2 * a * b / (a + b), 0, 0])
+
+
+def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
+    """Path length and rate over the wall before the body, behind it and both, and of the sender itself, against lengths found by minimising; the
+    direction is that of the point where the last way touches the wall. Tolerances as for the echoes. Planted bugs: the wave before the
+    body mirrored in the receiver's plane side only; arrival from the body where the last way is over the wall; rate of one way."""
+    here = np.concatenate([OWN.position - ORIGIN, OWN.velocity])
+    found = {order_of: echo for order_of, echo in zip(
+        ("back", "out", "both"), (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))), strict=True)}  # fmt: skip
+    assert [o for _, o, _ in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))] == [1, 1, 2]
+    ((_, order, own_echo),) = reflections(SENDER - here, None, OWN, Walls(wall()))
+    assert order == 1
+    found["sender"] = own_echo
+    h = 1e-3
+
+    def lengths(t: float) -> dict[str, float]:
+        own, body, sender = (x[:3] + t * x[3:] for x in (here, BODY, SENDER))
+        return {
+            "out": length(sender, body, True) + length(body, own, False),
+            "back": length(sender, body, False) + length(body, own, True),
+            "both": length(sender, body, True) + length(body, own, True),
+            "sender": length(sender, own, True),
+        }
+
+    now, before, after = lengths(0.0), lengths(-h), lengths(h)
+    ends = {"out": BODY[:3], "back": touch(BODY[:3], here[:3]), "both": touch(BODY[:3], here[:3]), "sender": touch(SENDER[:3], here[:3])}
+    for name, echo in found.items():
+        assert echo[0] == pytest.approx(now[name], abs=1e-7)
+        assert echo[1] == pytest.approx((after[name] - before[name]) / (2 * h), abs=1e-3)
+        towards = (ends[name] - here[:3]) / np.linalg.norm(ends[name] - here[:3])
+        np.testing.assert_allclose(echo[2:], towards[[0, 2]], rtol=0, atol=1e-12)
+
+
+def heard(number: int, path: float, rate: float, towards: np.ndarray) -> Track:
+    """A track whose path from `SENDER` by way of a point towards a direction has this length and rate."""
+    from scipy.optimize import brentq
+
+    own = OWN.position - ORIGIN
+    rho = brentq(lambda r: r + np.linalg.norm(own + r * towards - SENDER[:3]) - path, 1e-3, path)
+    place = own + rho * towards
+    leaving = (place - SENDER[:3]) / np.linalg.norm(place - SENDER[:3])
+    both = towards + leaving
+    still = -towards @ OWN.velocity - leaving @ SENDER[3:]
+    return track(number, place, both * (rate - still) / (both @ both))
+
+
+def test_a_passive_terminal_suspects_its_ghosts():
+    """Its reference; a body; an echo over the wall on the way to the body, one on the way from it, the reference over the wall; and a body
+    elsewhere with the first echo's length and rate. Planted bugs: the reference's own reflection not asked for; the active terminal's
+    ranges taken."""
+    own = OWN.position - ORIGIN
+    here = np.concatenate([own, OWN.velocity])
+    back, out, _ = (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall())))
+    ((_, _, mirrored),) = reflections(SENDER - here, None, OWN, Walls(wall()))
+
+    def ahead(u: np.ndarray) -> np.ndarray:
+        return np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
+
+    aside = np.array([-0.6, 0.8, 0.0])
+    tracks = [track(3, BODY[:3], BODY[3:]), heard(5, *out[:2], ahead(out[2:])), heard(6, *back[:2], ahead(back[2:])),
+              heard(7, *mirrored[:2], ahead(mirrored[2:])), heard(8, *out[:2], aside)]  # fmt: skip
+    everyone = track_set(tracks, OWN, track(1, SENDER[:3], SENDER[3:]))
+    one_pass = RESOLUTION * [2, 2, 3, 3]
+    found = suspicion(everyone, OWN, Walls(wall()), one_pass, 2 * PERIOD)
+    assert found.suspect.tolist() == [False, False, True, True, True, False]
+    assert found.source.tolist() == [-1, -1, 3, 3, 1, -1] and found.order.tolist() == [0, 0, 1, 1, 1, 0]
+
+
+def test_a_place_that_the_sender_cannot_see_is_suspect_at_a_passive_terminal():
+    """The sender behind the wall's plane, the place in sight of the own pose alone. Planted bug: only the own line of sight asked."""
+    hidden = SENDER + np.array([2 * (WALL_X - SENDER[0]), 0, 0, 0, 0, 0])
+    found = suspicion(
+        track_set([track(3, BODY[:3], BODY[3:])], OWN, track(1, hidden[:3], hidden[3:])), OWN, Walls(wall()), RESOLUTION, PERIOD
+    )
+    assert (found.behind >= 0).tolist() == [False, True]
 
 
 def test_tracks_are_counted_by_what_explains_them():
