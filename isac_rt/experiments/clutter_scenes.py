@@ -27,6 +27,9 @@ SPEED = 10.0
 """Of a terminal in flight [m/s], along its boresight over ground."""
 LEFT_OUT_DB = 20.0
 """Scatterers this far below the noise of one range-Doppler cell are left out: 1 % of the clutter's power at 27 m, 7 % at 60 m."""
+WIDEST = np.sin(np.deg2rad(45))
+"""Direction cosine from boresight within which targets are drawn. Elements of 10 dBi are 12 dB down there, both ways together; farther
+out noise alone hides small UAVs at 100 m, and a comparison would count that."""
 SMALL_UAV_M2 = 10 ** (-12.81 / 10)
 """TR 38.901's small UAV."""
 
@@ -198,7 +201,7 @@ class Targets:
 
 
 def in_the_air(scenes: Scenes, place: str, ranges: np.ndarray, velocities: np.ndarray, rng: np.random.Generator) -> Targets:
-    """Targets at these ranges and radial velocities, each in a direction of the field of view in which the terminal sees it; those for
+    """Targets at these ranges and radial velocities, each in a direction (`WIDEST`) in which the terminal sees it; those for
     which 30 draws find none are left out."""
     pose = scenes.pose(place, 0.0)
     count = ranges.size
@@ -207,8 +210,8 @@ def in_the_air(scenes: Scenes, place: str, ranges: np.ndarray, velocities: np.nd
         left = np.flatnonzero(~found)
         if not left.size:
             break
-        u = rng.uniform(-0.8, 0.8, (left.size, 2))
-        inside = (u**2).sum(axis=1) < 0.95
+        u = rng.uniform(-WIDEST, WIDEST, (left.size, 2))
+        inside = (u**2).sum(axis=1) < WIDEST**2
         body = np.stack([u[:, 0], np.sqrt(np.maximum(1 - (u**2).sum(axis=1), 0)), u[:, 1]], axis=1)
         world = pose.to_world(body)
         points = pose.position + ranges[left, None] * world
