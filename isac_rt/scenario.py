@@ -328,7 +328,8 @@ class Receivers(Node):
     clutter_detector: Literal["cfar", "map", "angle_doppler", "sample_matrix"] = "cfar"
     """What the AT holds a cell against, after the filter if there is one. cfar: its surroundings. map: the clutter power that the city's
     mesh predicts. angle_doppler: filtered over the antennas with the covariance that the mesh and the terminal's own velocity predict.
-    sample_matrix: filtered with the covariance of the cells around."""
+    sample_matrix: filtered with the covariance of the cells around. map and angle_doppler first correct the own velocity and the
+    clutter's level by the frame."""
     clutter_channels: Literal["arms", "joint"] = "arms"
     """angle_doppler, sample_matrix: filter each arm of the virtual L by itself, or both jointly (several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1

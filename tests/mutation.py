@@ -77,6 +77,7 @@ TESTS_OF = {
     "receive/pursuit.py": "test_receive_pursuit",
     "receive/profile.py": "test_profile_decision",
     "receive/adaptive.py": "test_clutter_detectors",
+    "receive/clutter_fit.py": "test_clutter_fit",
     "receive/clutter_map.py": "test_clutter_detectors",
     "receive/detectors.py": "test_clutter_detectors",
 }

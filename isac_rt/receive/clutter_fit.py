@@ -111,7 +111,9 @@ class _Response:
         out = []
         for number in range(1 + slope.shape[1]):
             weight = (power if number == 0 else power * slope[:, number - 1])[inside]
-            grid = sum(np.bincount(where, weight * part, lines * fine) for where, part in zip(at, (1 - share, share), strict=True))
+            grid = np.zeros(lines * fine)
+            for where, part in zip(at, (1 - share, share), strict=True):
+                grid += np.bincount(where, weight * part, lines * fine)
             kernel = self._along if number == 0 else -self._along * self._turn
             turned = scipy.fft.irfft(scipy.fft.rfft(grid.reshape(lines, fine)) * kernel, fine)[:, ::FINE_DOPPLER]
             spread = ndimage.convolve1d(turned, self._across, axis=0, mode="constant")
