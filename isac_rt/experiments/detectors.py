@@ -327,7 +327,7 @@ def _figure(table: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame):
         for at, n in zip(y, names, strict=True):
             ax.text(1.01, at, f"{table.rate[n]:.1e}", fontsize=7, va="center")
         ax.set_yticks(y, [text[n] for n in names])
-        ax.set(xlim=(0, 1.16), xlabel="probability of detection; right: false alarms per cell, measured")
+        ax.set(xlim=(0, 1.2), xlabel="probability of detection; right: false alarms per cell, measured")
         ax.legend(loc="upper right", fontsize=7, ncols=2, bbox_to_anchor=(1.0, 1.09), framealpha=1)
         edges = np.array([-100.0, 0, 10, 15, 20, 25, 30, 60])
         bins = np.digitize(targets.clutter_db, edges)
@@ -345,5 +345,5 @@ def _figure(table: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame):
                 values = [hits[n][bins == b].mean() for b in range(1, edges.size) if (bins == b).sum() > 4]
                 curve.plot(at, values, mark + "-", label=text[n])
         curve.set(xlabel="clutter over noise in the UAV's cell [dB]", ylabel="probability of detection", ylim=(-0.02, 1.04))
-        curve.legend(loc="lower center", fontsize=7, ncols=3, bbox_to_anchor=(0.5, 1.0), framealpha=1)
+        curve.legend(loc="upper center", fontsize=7, ncols=2, bbox_to_anchor=(0.5, -0.13), framealpha=1)
     return figure
