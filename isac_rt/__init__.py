@@ -20,6 +20,7 @@ _HOME = {
     "run": "simulate",
     "trace": "simulate",
     "if_signal": "ifsignal",
+    "range_profiles": "ifsignal",
     "add_noise": "ifsignal",
     "Transmission": "ifsignal",
     "IFCube": "ifsignal",

@@ -296,10 +296,12 @@ def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
         for ax, o in zip(axes[:, 0], with_map, strict=True):
             range_doppler(ax, d, s, o)
         yield f"range_doppler_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
-        figure, axes = _figure(len(with_map), 1, 3.2 * len(with_map))
-        for ax, o in zip(axes[:, 0], with_map, strict=True):
-            equivalent_range(ax, d, s, o)
-        yield f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
+        before = [o for o in with_map if np.isfinite(d.map_equivalent_range.values[s, o]).any()]  # none where profiles were made directly
+        if before:
+            figure, axes = _figure(len(before), 1, 3.2 * len(before))
+            for ax, o in zip(axes[:, 0], before, strict=True):
+                equivalent_range(ax, d, s, o)
+            yield f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
     for o in observers:
         figure, axes = _figure(3, 1, 7.6)
         for ax, name in zip(axes[:, 0], ("range", "velocity", "azimuth"), strict=True):

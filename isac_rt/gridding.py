@@ -23,7 +23,8 @@ import scipy.fft
 from numba import njit
 
 from isac_rt.lanefft import ROW, plan, transform
-from isac_rt.simd import LANES, aligned, cos_sin, floor, load, narrow, splat, store, transpose, zip_high, zip_low
+from isac_rt.rangecells import CHIRPS, Band, data_phase, make_band, no_band, shift_of, to_cells, window_length, write_cells
+from isac_rt.simd import LANES, aligned, cos_sin, cube_memory, floor, load, narrow, splat, store, transpose, zip_high, zip_low
 from isac_rt.synthesis import FAST, Tones, chirp_terms, filter_gain, numbers, passed, sources
 from isac_rt.waveform import Waveform
 
@@ -50,6 +51,8 @@ DEFAULT = Setting(1.5, 6, True)
 """For runs: error below `GRIDDED_ERROR`."""
 GRIDDED_ERROR = 1e-4
 """Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see tests/test_ifsignal.py)."""
+PROFILES = Setting(1.25, 6, True)
+"""For range cells made directly: error below `GRIDDED_ERROR` under the window, 3e-4 of samples."""
 ACCURATE = Setting(1.5, 8, True, True)
 """Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square of the speed."""
 ACCURATE_ERROR = 5e-6
@@ -57,6 +60,7 @@ _MANY = 4000  # paths that no longer stay in the second-level cache beside the g
 _TOGETHER = 3
 _MARGIN = LANES  # rows beyond the grid
 _STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
+_DOPPLER = 4 / 1024  # cycles per sample, more than motion and elements move a frequency
 _FIELDS = 3  # float64 of a path before its transmit elements' delays
 _ONE, _HALF, _SIXTH, _TENTH = np.float32(1), np.float32(0.5), np.float32(1 / 6), np.float32(1 / 10)
 _SKEW = np.float32(4 / 15)  # x (x^2 - 1/3) is nearest to 4/15 x
@@ -111,10 +115,10 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _prepare(work, places, table, at, tx, factor, f, w, time, symbol, send, half, centre, size):
-    """Of 16 paths: place on the grid to `places`; distance from the middle of the cell, complex factor (less the filter's gain),
-    quadratic term [rad] and lambda, 16 floats of each, to `work`."""
-    f_c, slope, ts, u = w[0], w[1], w[2], w[3]
+def _prepare(work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size):
+    """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the middle of the cell, complex factor
+    (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to `work`. `view`: see `views_of`."""
+    f_c, slope, ts, u = w[0], w[1], w[2], w[3] + view[1] * w[2]
     delay, rate, accel, extra = load(table, at), load(table, at + 16), load(table, at + 32), load(table, at + tx)
     tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
     element = tau + extra
@@ -123,7 +127,11 @@ def _prepare(work, places, table, at, tx, factor, f, w, time, symbol, send, half
     sent = carrier - splat(slope) * element
     cycles = element * (carrier - splat(slope / 2) * element)
     frequency = sent * b + splat(slope * ts) * element
-    place = (frequency - floor(frequency)) * splat(size * _BELOW)
+    wanted = frequency - splat(view[0])
+    wanted = wanted - floor(wanted + splat(view[3]))
+    store(places, 16, wanted)
+    wanted = wanted * splat(view[2])
+    place = (wanted - floor(wanted)) * splat(size * _BELOW)
     cell = floor(place)
     store(places, 0, cell)
     store(work, 0, narrow(place - cell) - splat(_HALF))
@@ -135,7 +143,7 @@ def _prepare(work, places, table, at, tx, factor, f, w, time, symbol, send, half
     store(work, 16, ar * c - ai * s)
     store(work, 32, ar * s + ai * c)
     store(work, 48, bend * splat(np.float32(2 * np.pi)))
-    store(work, 64, narrow(tau * splat(1 / (ts * half))))
+    store(work, 64, narrow((tau - splat(view[1] * ts)) * splat(1 / (ts * half))))
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
@@ -282,46 +290,73 @@ def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolutio
                     out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
 
 
+@njit(nogil=True)
+def _in_band(work, places, count, limit):
+    """Strike out the paths from the frequency `limit` on; the number up to the last one that stays."""
+    last = 0
+    for i in range(count):
+        if places[16 + i] < limit:
+            last = i + 1
+        else:
+            work[16 + i], work[32 + i], places[i] = np.float32(0), np.float32(0), 0.0
+    return last
+
+
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _chirps(out, shape, first_channel, chirps, together, w, half, centre, width, wideband, cubic, poly, deconvolution, radices,
-            twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, grid, work, scratch, tile):  # fmt: skip
+def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, centre, width, wideband, cubic, poly, deconvolution,
+            radices, twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, band, grid, work, scratch,
+            tile):  # fmt: skip
     """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
     _, num_rx, num_chirps, num_samples = shape
     groups, size, low, degree = send.shape[1], rows.shape[0], width // 2 - 1, poly.shape[0] // (4 * width) - 1
-    channels, per_block = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1)
-    top, skirt = w[7] / w[1], w[8] / w[1]
+    channels, per_block, cells = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1), band.turn.shape[0]
+    top, skirt, per_delay = w[7] / w[1], w[8] / w[1], w[1] * w[2]
     cut = top + skirt
-    stride, places = (size + _MARGIN) * ROW, np.zeros(16)
+    stride, places = (size + _MARGIN) * ROW, np.zeros(32)
     for start in range(0, chirps.shape[0], together):
         now = chirps[start : start + together]
         grid[:] = np.float32(0)
         for b in range(blocks.shape[0]):
             at, count = b * per_block, blocks[b, 2]
             for g in range(now.shape[0]):
-                m, p = now[g] // num_chirps, now[g] % num_chirps
+                m, p, view = now[g] // num_chirps, now[g] % num_chirps, views[now[g]]
                 q, source = blocks[b, 0], m - blocks[b, 1]
                 if source < 0 or source >= groups or send[q, source, p] == 0:
                     continue
-                time, delay, tx = w[6] + p * w[4] + m * w[5], symbol[q, source, p], (_FIELDS + antenna[q, source, p]) * 16
-                if bounds[b, 0] + delay > cut or bounds[b, 1] + delay < -skirt:
+                time, delay = w[6] + view[1] * w[2] + p * w[4] + m * w[5], symbol[q, source, p]
+                tx = (_FIELDS + antenna[q, source, p]) * 16
+                least, most = bounds[b, 0] + delay, bounds[b, 1] + delay
+                if least > cut or most < -skirt:
                     continue
-                _prepare(work, places, table, at, tx, factor, 32 * b, w, time, delay, send[q, source, p], half, centre, size)
-                if blocks[b, 3] or bounds[b, 0] + delay < 0 or bounds[b, 1] + delay > top:
+                low_end, high_end = least * per_delay - view[0], most * per_delay - view[0]
+                if low_end > view[4] + _DOPPLER and high_end < 1 - view[3] - _DOPPLER:
+                    continue
+                sent = send[q, source, p] * turns[now[g]]
+                _prepare(work, places, table, at, tx, factor, 32 * b, w, view, time, delay, sent, half, centre, size)
+                if blocks[b, 3] or least < 0 or most > top:
                     _gate(work, table, at, life, 32 * b, w, time, delay)
+                used = _in_band(work, places, count, view[4]) if cells else count
                 _weigh(work, scratch, poly, width, degree, wideband, cubic)
                 if cubic:
-                    _spread_cubic(grid, g * stride, places, scratch, count, width, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_cubic(grid, g * stride, places, scratch, used, width, steer, b * 16 * 48, work, np.float32(centre))
                 elif wideband:
-                    _spread_wideband(grid, g * stride, places, scratch, count, width, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_wideband(grid, g * stride, places, scratch, used, width, steer, b * 16 * 48, work, np.float32(centre))
                 else:
-                    _spread(grid, g * stride, places, scratch, count, width, steer, b * 16 * 32)
+                    _spread(grid, g * stride, places, scratch, used, width, steer, b * 16 * 32)
         for g in range(now.shape[0]):
             m, p = now[g] // num_chirps, now[g] % num_chirps
             table_g = grid[g * stride : (g + 1) * stride]
             _fold(table_g, size, low, width)
             transform(table_g, low * ROW, size, radices, twiddles)
-            to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
-            _emit(out, to, 2 * num_samples * num_chirps, channels, num_samples, table_g, low, rows, deconvolution, tile, fresh)
+            if cells == 0:
+                to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
+                _emit(out, to, 2 * num_samples * num_chirps, channels, num_samples, table_g, low, rows, deconvolution, tile, fresh)
+                continue
+            block = (first_channel // 16 * shape[0] + m) * num_chirps + p
+            to_cells(table_g, low, rows, deconvolution, band, block * deconvolution.shape[0] * LANES, p % CHIRPS)
+            if p % CHIRPS == CHIRPS - 1 or p == num_chirps - 1:
+                to = 2 * ((m * num_rx + first_channel) * cells * num_chirps + p - p % CHIRPS)
+                write_cells(out, to, 2 * cells * num_chirps, channels, p % CHIRPS + 1, num_chirps, cells, band.stage, tile)
 
 
 def _steering(waveform: Waveform, delay: np.ndarray, wideband: bool) -> np.ndarray:
@@ -335,7 +370,7 @@ def _steering(waveform: Waveform, delay: np.ndarray, wideband: bool) -> np.ndarr
     out[:, 0, :count], out[:, 1, :count] = np.cos(angle), np.sin(angle)
     if wideband:
         out[:, 2, :count] = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2) * delay
-    return out.reshape(len(delay), -1)
+    return out.reshape(len(delay), planes * LANES)
 
 
 @dataclass(frozen=True)
@@ -397,23 +432,82 @@ def add_gridded(
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
     """
-    w, t = waveform, tones
+    if not _synthesise(samples, samples.shape, waveform, tones, transition, setting, fresh, no_band(), *_as_it_is(waveform)) and fresh:
+        samples[:] = 0
+
+
+def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+    """`views` and `turns` of `_synthesise` for samples."""
+    count = waveform.num_groups * waveform.num_chirps
+    return np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (count, 1)), np.ones(count, complex)
+
+
+def range_cells(waveform: Waveform, tones: Tones, transition: float, delay_symbols: np.ndarray, phases: np.ndarray, num_cells: int,
+                setting: Setting = PROFILES, power: float = 0.0, key: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
+    """Range cells under Hann's window, made directly (`isac_rt.rangecells`): what a transform of the windowed samples gives.
+
+    The window of a chirp with delay symbol D starts D / (alpha T) (the delay) after its first sample, and cell k is read at k + D, its
+    phase counted from the start of the window.
+
+    Parameters
+    ----------
+    delay_symbols : (M, P) int, D
+    phases : (M, P) complex, beta^(D), taken out with the symbols
+    num_cells : from cell 0, at most 3/4 of N: beyond the band a path's tail has no right phase
+    power, key : of white noise per IF sample [W], and its stream; no noise without a key
+
+    Returns
+    -------
+    cells : (M, L_rx, num_cells, P) complex64
+    """
+    w = waveform
+    if 4 * num_cells > 3 * w.num_samples:
+        raise ValueError(f"{num_cells} range cells of {w.num_samples} samples: at most three quarters can be made directly; take samples")
+    length = window_length(w)
+    band = make_band(w.num_samples, num_cells, length, 0.0 if key is None else power, np.zeros(2) if key is None else key)
+    start = np.ravel(shift_of(w, delay_symbols))
+    size = len(band.window)
+    pad = (size - num_cells) // 2 / w.num_samples
+    limit = num_cells / w.num_samples + pad if size < w.num_samples else 1.0
+    middle = start + length / 2 - w.num_samples // 2
+    one = np.ones(start.size)
+    views = np.stack([delay_symbols.ravel() / w.num_samples, middle, w.num_samples / size * one, pad * one, limit * one], axis=1)
+    shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
+    out = cube_memory((*shape[:2], num_cells, w.num_chirps))
+    cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(data_phase(w, delay_symbols))
+    turns = np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0))
+    _synthesise(out, shape, w, tones, transition, setting, True, band, views, turns)
+    return out
+
+
+def _synthesise(
+    out: np.ndarray, shape: tuple[int, ...], w: Waveform, t: Tones, transition: float, setting: Setting, fresh: bool, band: Band,
+    views: np.ndarray, turns: np.ndarray,
+) -> bool:  # fmt: skip
+    """Run the kernel over all elements; False, and nothing done, where no path can be heard and there is no band.
+
+    Parameters
+    ----------
+    views : (M P, 5) what of a chirp is wanted: cycles per sample taken off every frequency; samples from the middle one to the
+        origin; samples of the chirp to one of the grid's; frequencies below zero that are kept; first frequency left out
+    turns : (M P,) complex, factors of the chirps' paths
+    """
     b = _blocks(w, t, transition)
-    if b.path.size == 0:
-        if fresh:
-            samples[:] = 0
-        return
-    size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
+    if b.path.size == 0 and band.turn.size == 0:
+        return False
+    num_samples = len(band.window) or w.num_samples
+    size, poly, deconvolution = weights(num_samples, setting.oversampling, setting.width)
     radices, twiddles, rows = plan(size)
-    half, together = w.num_samples // 2, _TOGETHER if b.path.size > _MANY else 1
+    together = _TOGETHER if b.path.size > _MANY else 1
     buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(_STEP * setting.width), aligned(512)
-    chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(w.num_samples)
-    for first in range(0, samples.shape[1], LANES):
+    chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(num_samples)
+    for first in range(0, shape[1], LANES):
         steer = _steering(w, t.rx_delay[b.path, first : first + LANES], setting.wideband)
-        _chirps(samples.reshape(-1).view(np.float32), samples.shape, first, chirps, together, numbers(w, transition), float(half), centre,
-                setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(), deconvolution, radices, twiddles, rows,
-                b.table, b.factor, b.life, b.blocks, b.bounds, steer.ravel(), t.symbol_delay, t.send, t.antenna, fresh,
-                *buffers)  # fmt: skip
+        _chirps(out.reshape(-1).view(np.float32), shape, first, chirps, together, numbers(w, transition), views, turns,
+                float(w.num_samples // 2), centre, setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(),
+                deconvolution, radices, twiddles, rows, b.table, b.factor, b.life, b.blocks, b.bounds, steer.ravel(), t.symbol_delay,
+                t.send, t.antenna, fresh, band, *buffers)  # fmt: skip
+    return True
 
 
 def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
-from isac_rt.gridding import DEFAULT, GRIDDED_ERROR, Setting, add_gridded
+from isac_rt.gridding import ACCURATE, DEFAULT, GRIDDED_ERROR, PROFILES, Setting, add_gridded, range_cells
 from isac_rt.noise import add_white_noise
 from isac_rt.payload import Payload
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -91,6 +91,22 @@ class IFCube:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class RangeProfiles:
+    """What a terminal that knows the data makes of its samples first, made directly.
+
+    Attributes
+    ----------
+    spectra : (M, L_rx, cells, P) complex64, the data taken out, under Hann's window: see `isac_rt.receive.spectrum.clean_spectrum`
+    waveform, schedule, start_time : as of an `IFCube`
+    """
+
+    spectra: np.ndarray
+    waveform: Waveform
+    schedule: Schedule
+    start_time: float
+
+
 def if_signal(
     waveform: Waveform,
     links: Sequence[tuple[Transmission, PathSet]],
@@ -139,16 +155,7 @@ def if_signal(
     by their radii, jointly for lines of sight; for folded paths the joint term r_tx.r_rx/L of the perpendicular offsets is
     left out (5e-6 m, 0.01 rad at 30 m), as it is for lines of sight in "gridded".
     """
-    if schedule is None:
-        if not links:
-            raise ValueError("if_signal got neither a link nor a schedule; pass the schedule of the cube")
-        schedule = links[0][0].schedule
-    if waveform.blocks is not None:
-        raise ValueError("if_signal makes all groups of a frame; take those that a receiver reads with IFCube.of_groups")
-    if first_block is None:
-        first_block = links[0][0].first_block if links else 0
-    middle = start_time + waveform.frame_duration / 2
-    _check_epochs(links, middle, waveform.slot_duration)
+    schedule, first_block, middle = _frame(waveform, links, start_time, schedule, first_block)
     tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas, middle, first_block)
     shape = (waveform.num_groups, rx_antennas.num_rx, waveform.num_chirps, waveform.num_samples)
     if method in ("exact", "paper"):
@@ -164,6 +171,48 @@ def if_signal(
     return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
 
 
+def range_profiles(
+    waveform: Waveform,
+    links: Sequence[tuple[Transmission, PathSet]],
+    rx_pose: Pose,
+    rx_antennas: Antennas,
+    payload: Payload,
+    *,
+    start_time: float,
+    filter_transition: float,
+    num_cells: int | None = None,
+    schedule: Schedule | None = None,
+    first_block: int | None = None,
+    noise_power: float = 0.0,
+    seed_words: np.ndarray | None = None,
+    setting: Setting | None = None,
+) -> RangeProfiles:
+    """Range profiles of a receiver that knows the data and never looks at its samples: Hann's window and noise included.
+
+    The same as `if_signal`, `add_noise` and `isac_rt.receive.spectrum.clean_spectrum` but for the draw of the noise, whose covariance over
+    cells, chirps and receivers is that of windowed and transformed white noise. The joint curvature of lines of sight is left out.
+
+    Parameters
+    ----------
+    payload : whose delay and DPSK symbols are taken out, as they were sent
+    num_cells : range cells, from cell 0; by default those of the delay symbols; at most 3/4 of N
+    noise_power : per complex IF sample [W]; it is added if there are `seed_words`, (2,) uint32 as of `add_noise`
+    setting : by default `PROFILES`, or `ACCURATE` where the error of the strongest path could show above the noise of a cell, as it does
+        where there is none
+    others : as of `if_signal`
+    """
+    schedule, first_block, middle = _frame(waveform, links, start_time, schedule, first_block)
+    tones, _, power = _tones(waveform, links, rx_pose, rx_antennas, middle, first_block)
+    cells = waveform.num_delay_symbols if num_cells is None else num_cells
+    if setting is None:
+        size = waveform.num_samples * rx_antennas.num_rx * schedule.size
+        setting = ACCURATE if power.max(initial=0.0) * GRIDDED_ERROR**2 * size > noise_power else PROFILES
+    spectra = range_cells(
+        waveform, tones, filter_transition, payload.delay_symbols, payload.phases, cells, setting, noise_power, seed_words
+    )
+    return RangeProfiles(spectra=spectra, waveform=waveform, schedule=schedule, start_time=start_time)
+
+
 def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     """Add thermal noise to the cube's samples, in place, and return the cube.
 
@@ -174,6 +223,27 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     """
     add_white_noise(cube.samples, power, seed_words)
     return cube
+
+
+def _frame(
+    waveform: Waveform,
+    links: Sequence[tuple[Transmission, PathSet]],
+    start_time: float,
+    schedule: Schedule | None,
+    first_block: int | None,
+) -> tuple[Schedule, int, float]:
+    """Schedule, first block and middle of a frame, checked."""
+    if schedule is None:
+        if not links:
+            raise ValueError("a frame with neither a link nor a schedule; pass the schedule of the cube")
+        schedule = links[0][0].schedule
+    if waveform.blocks is not None:
+        raise ValueError("if_signal makes all groups of a frame; take those that a receiver reads with IFCube.of_groups")
+    if first_block is None:
+        first_block = links[0][0].first_block if links else 0
+    middle = start_time + waveform.frame_duration / 2
+    _check_epochs(links, middle, waveform.slot_duration)
+    return schedule, first_block, middle
 
 
 def _check_epochs(links: Sequence[tuple[Transmission, PathSet]], middle: float, slot: float) -> None:

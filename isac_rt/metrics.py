@@ -365,3 +365,14 @@ def binomial_interval(successes: float, trials: float, confidence: float = 0.95)
     low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
     high = float(beta.ppf(1 - tail, successes + 1, trials - successes)) if successes < trials else 1.0
     return low, high
+
+
+def within_view(antennas: Antennas, own: Pose, active: Pose, body: Pose) -> bool:
+    """Whether a body is in the field of view of the receiver and, unless it is the transmitter itself, of the transmitter."""
+    ends = [(own, body)]
+    if body is active:
+        ends.append((active, own))
+    elif own is not active:
+        ends.append((active, body))
+    offsets = [(a, b.position - a.position) for a, b in ends]
+    return all(bool(antennas.in_view(a.to_body(d / np.linalg.norm(d)))) for a, d in offsets)

@@ -97,7 +97,7 @@ def _cos_sin(word):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _add(out, power, key0, key1, first):
+def add_stream(out, power, key0, key1, first):
     """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1])."""
     for i in range(out.shape[0] // 2):
         index = first + np.uint64(i)
@@ -128,4 +128,4 @@ def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: i
     first : index of the first sample, so that parts of a cube can be filled one by one
     """
     flat = samples.reshape(-1).view(np.float32)
-    _add(flat, np.float32(power), np.uint32(key[0]), np.uint32(key[1]), np.uint64(first))
+    add_stream(flat, np.float32(power), np.uint32(key[0]), np.uint32(key[1]), np.uint64(first))

@@ -334,6 +334,12 @@ class Receivers(Node):
     """angle_doppler, sample_matrix: filter each arm of the virtual L by itself, or both jointly (several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """The AT processes one frame in so many."""
+    active_input: Literal["samples", "profiles"] = "samples"
+    """samples: the AT transforms IF samples. profiles: range profiles made directly (`isac_rt.ifsignal.range_profiles`), faster."""
+
+    def problems(self) -> Iterator[Problem]:
+        if self.active_input == "profiles" and self.refinement == "joint":
+            yield Problem((("active_input",), ("refinement",)), "joint refinement needs samples; set active_input: samples or another one")
 
 
 class Tracking(Node):

@@ -80,6 +80,18 @@ def store(typingctx, array, index, value):
 
 
 @intrinsic
+def stream(typingctx, array, index, value):
+    """`store` past the caches, to an address that is a multiple of 64."""
+
+    def codegen(context, builder, signature, args):
+        written = builder.store(args[2], _address(context, builder, signature.args[0], args[0], args[1]), align=64)
+        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _of(array.dtype)), codegen
+
+
+@intrinsic
 def splat(typingctx, value):
     """The same number in all lanes."""
 
@@ -261,5 +273,13 @@ def cube_memory(shape: tuple[int, ...]) -> np.ndarray:
     try:
         memory = _SPARE.pop()
     except IndexError:
-        memory = np.empty(shape, np.complex64)
-    return np.asarray(_Lent(memory if memory.shape == shape else np.empty(shape, np.complex64)))
+        memory = _new_memory(shape)
+    return np.asarray(_Lent(memory if memory.shape == shape else _new_memory(shape)))
+
+
+def _new_memory(shape: tuple[int, ...]) -> np.ndarray:
+    """From an address that is a multiple of 64."""
+    size = 8 * int(np.prod(shape))
+    room = np.empty(size + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    return room[start : start + size].view(np.complex64).reshape(shape)

@@ -22,7 +22,7 @@ from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
 from isac_rt.city import City, load_city
 from isac_rt.fall_back import Schedules
 from isac_rt.fidelity import Plan, Use, decisions, extent, mechanisms, used
-from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
+from isac_rt.ifsignal import IFCube, RangeProfiles, Transmission, add_noise, if_signal, range_profiles
 from isac_rt.linkbudget import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
 from isac_rt.metrics import (
     SensingScore,
@@ -34,6 +34,7 @@ from isac_rt.metrics import (
     explain,
     resolutions,
     truth_of,
+    within_view,
 )
 from isac_rt.preflight import check_flights, check_memory, check_reference
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
@@ -129,25 +130,34 @@ class Setup:
         `sent` holds every active terminal; what the others' chirps leave in these blocks is in the samples. They depend on
         nothing but the frame and the link.
         """
+        arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
+        method = self.plan.synthesis(sum(len(p) for _, p in arriving))
+        cube = if_signal(self.waveform, arriving, poses[link[1]], self.antennas, noise_power=level, method=method, **frame_of)
+        return add_noise(cube, level, words)
+
+    def receive_input(
+        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+    ) -> IFCube | RangeProfiles:
+        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at the active terminal range profiles."""
+        if link[0] != link[1] or self.scenario.receivers.active_input == "samples":
+            return self.receive_samples(frame, link, sent, paths, poses)
+        arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
+        own = sent[link[0]].payload
+        return range_profiles(self.waveform, arriving, poses[link[1]], self.antennas, own, noise_power=level, seed_words=words, **frame_of)
+
+    def _arriving(
+        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+    ) -> tuple[list[tuple[Transmission, PathSet]], float, np.ndarray, dict[str, Any]]:
+        """What reaches a link's receiver, its noise power and the noise's stream, and when and through what it listens."""
         tx, rx = link
-        level = self.noise_power(poses, link)
         when = self.timetable.epoch(frame, tx)
-        links = []
+        arriving = []
         for name in [tx, *(name for name in sent if name != tx)]:
             clock = self.connections.apart(name, link, when)
-            links.append((replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift), paths[name, rx]))
-        cube = if_signal(
-            self.waveform,
-            links,
-            poses[rx],
-            self.antennas,
-            start_time=self.timetable.start_time(frame, tx),
-            filter_transition=self.scenario.radio.filter_transition_hz,
-            noise_power=level,
-            method=self.plan.synthesis(sum(len(p) for _, p in links)),
-        )
+            arriving.append((replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift), paths[name, rx]))
         words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
-        return add_noise(cube, level, words)
+        frame_of = {"start_time": self.timetable.start_time(frame, tx), "filter_transition": self.scenario.radio.filter_transition_hz}
+        return arriving, self.noise_power(poses, link), words, frame_of
 
 
 def link_budgets(setup: Setup) -> list[LinkBudget]:
@@ -323,7 +333,7 @@ class _Observer:
         """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
         number, when = frame.number, self.setup.timetable.epoch(frame.number, self.link[0])
         with clock.stage("synthesis"):
-            cube = self.setup.receive_samples(number, self.link, frame.sent, frame.paths, frame.poses)
+            cube = self.setup.receive_input(number, self.link, frame.sent, frame.paths, frame.poses)
         with clock.stage("receive"):
             tx, rx = self.link
             own = self.setup.swarm.trajectories[rx].pose(when)
@@ -332,6 +342,7 @@ class _Observer:
                 reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, own, when, clutter=clutter, maps=frame.snapshot)
                 return _Heard(reception, tracks, int(TerminalState.TRACKING))
             modulated = self.setup.timetable.modulated(number)
+            assert isinstance(cube, IFCube)  # profiles are for active terminals only
             reception, tracks = self.terminal.step(cube, own, when, modulated, maps=frame.snapshot)
             return _Heard(reception, tracks, int(self.terminal.state))
 
@@ -388,7 +399,7 @@ def stage_seconds(
             _Observer(setup, link, standard_terminal(setup, link)).hear(frame, clock)
         else:
             with clock.stage("synthesis"):
-                setup.receive_samples(number, link, sent, paths, poses)
+                setup.receive_input(number, link, sent, paths, poses)
         out[link] = {name: value for name, value in clock.seconds.items() if name == "synthesis" or (receive and name == "receive")}
     return out
 
@@ -508,7 +519,7 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
     for name in names:
         by_way = active if observer.passes == 1 and name != tx else None
         truth.append(None if name == rx else truth_of(own, poses[name], by_way))
-    in_view = np.array([name != rx and _in_view(setup, own, active, poses[name]) for name in names])
+    in_view = np.array([name != rx and within_view(setup.antennas, own, active, poses[name]) for name in names])
     direct = direct_targets(paths, names)
     seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
     targets = [t for i in seen if (t := truth[i]) is not None]
@@ -546,20 +557,6 @@ def _record(observer: _Observer, frame: _Frame, heard: _Heard) -> ObserverRecord
         slips=int(((raw < 0) | (raw >= setup.waveform.num_delay_symbols)).sum()),
         reference_snr=_reference_snr(setup, frame, paths),
     )
-
-
-def _in_view(setup: Setup, own: Pose, active: Pose, body: Pose) -> bool:
-    """Whether a body is in the field of view of the receiver and, unless it is the transmitter itself, of the transmitter."""
-    ends = [(own, body)]
-    if body is active:
-        ends.append((active, own))
-    elif own is not active:
-        ends.append((active, body))
-    return all(bool(setup.antennas.in_view(a.to_body(_unit(b.position - a.position)))) for a, b in ends)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
 
 
 def _reference_snr(setup: Setup, frame: _Frame, paths: PathSet) -> float:

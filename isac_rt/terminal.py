@@ -19,7 +19,7 @@ import numpy as np
 from scipy import stats
 
 from isac_rt.arrays import Antennas
-from isac_rt.ifsignal import IFCube
+from isac_rt.ifsignal import IFCube, RangeProfiles
 from isac_rt.payload import Payload
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive import Detections, Prediction, Reception, receive_active, receive_passive
@@ -80,7 +80,8 @@ class ActiveTerminal:
         self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
 
     def step(
-        self, cube: IFCube, payload: Payload, own_pose: Pose, time: float, *, clutter: ExpectedClutter | None = None, maps: bool = False
+        self, cube: IFCube | RangeProfiles, payload: Payload, own_pose: Pose, time: float, *, clutter: ExpectedClutter | None = None,
+        maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal expects of its mesh there."""
         reception = self.receive(cube, payload, clutter, maps)
@@ -88,7 +89,7 @@ class ActiveTerminal:
         self.tracker.update(reception.detections, own_pose)
         return reception, self.tracker.snapshot(own_pose)
 
-    def receive(self, cube: IFCube, payload: Payload, clutter: ExpectedClutter | None, maps: bool) -> Reception:
+    def receive(self, cube: IFCube | RangeProfiles, payload: Payload, clutter: ExpectedClutter | None, maps: bool) -> Reception:
         """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
         return receive_active(cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps)
 

@@ -10,7 +10,7 @@ from isac_rt.gridding import ACCURATE_ERROR, GRIDDED_ERROR
 
 def test_errors_of_the_synthesis_are_as_stated():
     found = synthesis.errors()
-    assert set(found) == {"direct", *(name for name, _ in synthesis.GRIDS)}
+    assert set(found) == {"direct", synthesis.BOTH, *(name for name, _ in synthesis.GRIDS + synthesis.DIRECTLY)}
     assert found["direct"] < 1e-6
     assert max(found.values()) < 3e-4
     assert found["gridded wideband, 1.5 N, width 6"] < GRIDDED_ERROR

@@ -1,4 +1,4 @@
-"""Cost and error of the IF synthesis: each method over the number of paths, and the noise of a cube.
+"""Cost and error of the IF synthesis: each method over the number of paths, range profiles by way of samples and directly, and noise.
 
 The job is the full cube 3 x 120 x 1024 x 15 with data on, |v| <= 15 m/s and directions up to 60 degrees to both sides in azimuth and
 elevation. Errors are measured on 40 such paths in three chirps per group (they hardly depend on either) against the exact float64 model,
@@ -14,17 +14,20 @@ import numpy as np
 
 from isac_rt.arrays import Antennas, pseudo_random_schedule
 from isac_rt.bench.measure import cpu_seconds, floor_seconds
-from isac_rt.gridding import ACCURATE, DEFAULT, Setting
-from isac_rt.ifsignal import Method, Transmission, if_signal
+from isac_rt.gridding import ACCURATE, DEFAULT, PROFILES, Setting
+from isac_rt.ifsignal import IFCube, Method, Transmission, if_signal, range_profiles
 from isac_rt.noise import add_white_noise
 from isac_rt.payload import random_payload
 from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.swarm import Pose, attitude
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 SIZES = (3, 30, 1000, 10_000, 50_000, 200_000)
 QUICK_SIZES = (3, 1000)
 MOST_DIRECT = 30
+PROFILE_SIZES = (3, 30, 1000, 10_000)
+BOTH = "samples (gridded wideband, 1.5 N, width 6), Hann window, transform, data out"
 JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
 ERROR_OF = "relative RMS against the exact model"
 _TRANSITION = 0.4e6
@@ -36,6 +39,7 @@ GRIDS = (
     ("gridded wideband, 1.5 N, width 6", DEFAULT),
     ("gridded wideband, cubic, 1.5 N, width 8", ACCURATE),
 )
+DIRECTLY = (("profiles directly, 1.25 N, width 6", PROFILES), ("profiles directly, cubic, 1.5 N, width 8", ACCURATE))
 
 
 class _Job:
@@ -65,6 +69,16 @@ class _Job:
         return if_signal(self.waveform, links, self.pose, self.antennas, start_time=0.0, filter_transition=_TRANSITION,
                          method=method, setting=setting).samples  # fmt: skip
 
+    def transformed(self, links: list, method: Method, setting: Setting = DEFAULT) -> np.ndarray:
+        """Range profiles of a receiver that knows the data, by way of the samples."""
+        samples = self.samples(links, method, setting)
+        cube = IFCube(samples=samples, waveform=self.waveform, schedule=self.sender.schedule, start_time=0.0)
+        return clean_spectrum(cube, self.sender.payload.delay_symbols, self.sender.payload.phases, self.waveform.num_delay_symbols)
+
+    def profiles(self, links: list, setting: Setting) -> np.ndarray:
+        return range_profiles(self.waveform, links, self.pose, self.antennas, self.sender.payload, start_time=0.0,
+                              filter_transition=_TRANSITION, setting=setting).spectra  # fmt: skip
+
     def narrowband(self, links: list) -> np.ndarray:
         """The exact model path by path with one element in the middle of the array, times the elements' phases at mid-window."""
         w, (sender, paths) = self.waveform, links[0]
@@ -91,6 +105,9 @@ def errors() -> dict[str, float]:
     found = {"direct": _relative(job.samples(links, "direct"), full)}
     for name, setting in GRIDS:
         found[name] = _relative(job.samples(links, "gridded", setting), full if setting.wideband else narrow)
+    whole = job.transformed(links, "exact")
+    found[BOTH] = _relative(job.transformed(links, "gridded"), whole)
+    found |= {name: _relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
     return found
 
 
@@ -116,6 +133,10 @@ def rows(quick: bool) -> list[dict[str, object]]:
         for name, setting in GRIDS:
             seconds = cpu_seconds(partial(job.samples, links, "gridded", setting), times)
             add(name, size, "paths", seconds, error[name])
+        if size in PROFILE_SIZES:
+            add(BOTH, size, "paths", cpu_seconds(lambda k=links: job.transformed(k, "gridded"), times), error[BOTH])
+            for name, setting in DIRECTLY:
+                add(name, size, "paths", cpu_seconds(lambda k=links, s=setting: job.profiles(k, s), times), error[name])
     cube = np.zeros(shape, np.complex64)
     words = np.array([1, 2], np.uint32)
     add("noise", cube.size, "samples", cpu_seconds(lambda: add_white_noise(cube, 1.0, words), repeats), None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.arrays import Antennas
-from isac_rt.ifsignal import IFCube
+from isac_rt.ifsignal import IFCube, RangeProfiles
 from isac_rt.payload import Payload
 from isac_rt.propagation.expected import ExpectedClutter
 from isac_rt.receive.clutter_filter import remove_standing
@@ -19,7 +19,7 @@ from isac_rt.scenario import Receivers
 
 
 def receive_active(
-    cube: IFCube,
+    cube: IFCube | RangeProfiles,
     payload: Payload,
     antennas: Antennas,
     settings: Receivers,
@@ -31,7 +31,7 @@ def receive_active(
 
     Parameters
     ----------
-    cube : IFCube, received by the terminal that sent `payload`
+    cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which there is no `joint` refinement
     clutter : what the city is expected to return, for the detectors that need it (`isac_rt.receive.detectors`)
     maps : also return pictures
 
@@ -40,7 +40,10 @@ def receive_active(
     Reception with detections only: range one way, velocity receding positive, direction cosines from the virtual L
     """
     w = cube.waveform
-    spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
+    if isinstance(cube, RangeProfiles):
+        spectra = cube.spectra.copy() if settings.clutter_filter != "none" else cube.spectra
+    else:
+        spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
     if settings.clutter_filter != "none":
         remove_standing(spectra, cube.schedule, settings.clutter_run_cells if settings.clutter_filter == "runs" else None)
     if settings.clutter_detector == "cfar":
@@ -48,7 +51,7 @@ def receive_active(
     else:
         found = sense_in_clutter(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter)
     detections = found.detections
-    if settings.refinement == "joint":
+    if settings.refinement == "joint" and isinstance(cube, IFCube):
         detections = separate(Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections)[0]
     groups, chirps = payload.delay_symbols.shape
     return Reception(

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.arrays import Antennas, Schedule, is_latin
-from isac_rt.ifsignal import IFCube
+from isac_rt.ifsignal import IFCube, RangeProfiles
 from isac_rt.receive.cfar import detect, detect_chirps, first_row, strongest_peaks
 from isac_rt.receive.doppler import (
     UNION_FLOOR,
@@ -176,14 +176,14 @@ def equivalent_range_power(cube: IFCube) -> np.ndarray:
     return total / cube.samples.shape[1]
 
 
-def make_maps(power: np.ndarray, cube: IFCube, settings: Receivers, passes: int) -> Maps:
+def make_maps(power: np.ndarray, cube: IFCube | RangeProfiles, settings: Receivers, passes: int) -> Maps:
     """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
-    w, before = cube.waveform, equivalent_range_power(cube)
-    looks, guard, training = cube.samples.shape[1], settings.guard_cells[0], settings.training_cells[0]
+    w, guard, training = cube.waveform, settings.guard_cells[0], settings.training_cells[0]
+    before, looks = (equivalent_range_power(cube), cube.samples.shape[1]) if isinstance(cube, IFCube) else (np.zeros((0, 0)), 1)
     return Maps(
         range_doppler=power.astype(np.float32),
         range_axis=np.arange(power.shape[0]) * w.range_cell(passes),
         velocity_axis=doppler_bins(w) * w.velocity_cell(passes),
         equivalent_range=np.sqrt(before),
-        equivalent_detections=detect_chirps(before, looks, settings.false_alarm_rate, guard, training),
+        equivalent_detections=detect_chirps(before, looks, settings.false_alarm_rate, guard, training) if before.size else before > 0,
     )

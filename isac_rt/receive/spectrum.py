@@ -13,24 +13,12 @@ tau_D is in it, and whoever follows the phase from chirp to chirp has to count t
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
 from isac_rt.ifsignal import IFCube
+from isac_rt.rangecells import data_phase, shift_of, window_length
 from isac_rt.receive.transform import transform
-from isac_rt.waveform import Waveform
-
-
-def window_length(waveform: Waveform) -> float:
-    """Samples that the range window may cover, whatever the data: N less the largest time shift."""
-    return waveform.num_samples - shift_of(waveform, waveform.num_delay_symbols)
-
-
-def shift_of(waveform: Waveform, delay_symbol: Any) -> Any:
-    """s_D, the data delay in samples."""
-    return np.asarray(delay_symbol) * waveform.delay_step * waveform.sampling_rate
 
 
 def hann(position: np.ndarray, length: float) -> np.ndarray:
@@ -77,13 +65,6 @@ def _fill_tones(start, step, out):  # pragma: no cover - compiled
     for p in range(out.shape[0]):
         for n in range(out.shape[1]):
             out[p, n] = start[p, n // 32] * step[p, n % 32]
-
-
-def data_phase(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
-    """f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2/2 [cycles mod 1], float64."""
-    w = waveform
-    tau = np.asarray(delay_symbols) * w.delay_step
-    return (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (w.window_start - tau / 2)) % 1.0
 
 
 def clean_spectrum(cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, num_rows: int) -> np.ndarray:
