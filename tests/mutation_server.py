@@ -1,7 +1,7 @@
-"""Runs pytest again and again for `mutation.py`, each time in a child of one process that has the libraries loaded.
+"""Runs pytest or a program again and again for `mutation.py`, each time in a child of one process that has the libraries loaded.
 
-Reads lines of JSON {"arguments": [...], "limit": seconds, "log": file} and answers each with a line: pytest's exit status, or -1 when the
-time was up. What is tested is loaded by the child, never here.
+Reads lines of JSON {"arguments": [...] of pytest or "program": text, "limit": seconds, "log": file} and answers each with a line: the exit
+status, or -1 when the time was up. What is tested is loaded by the child, never here.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from importlib import import_module
 
 import pytest
@@ -18,7 +19,7 @@ import pytest
 LIBRARIES = "numpy scipy.fft scipy.stats scipy.optimize scipy.ndimage scipy.interpolate scipy.spatial numba xarray pydantic yaml hypothesis"
 
 
-def in_child(arguments: list[str], log: str) -> None:
+def in_child(order: dict, log: str) -> None:
     """Does not return."""
     os.setsid()
     out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -26,17 +27,23 @@ def in_child(arguments: list[str], log: str) -> None:
     os.dup2(out, 2)
     status: int = 70
     try:
-        status = int(pytest.main(arguments))
+        if "program" in order:
+            exec(order["program"], {"__name__": "__main__"})
+            status = 0
+        else:
+            status = int(pytest.main(order["arguments"]))
         sys.stdout.flush()
+    except Exception:
+        traceback.print_exc()
     finally:
         os._exit(status)
 
 
-def run(arguments: list[str], limit: float, log: str) -> int:
+def run(order: dict, limit: float, log: str) -> int:
     """Exit status of one run."""
     child = os.fork()
     if child == 0:
-        in_child(arguments, log)
+        in_child(order, log)
     end = time.monotonic() + limit
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -53,4 +60,4 @@ if __name__ == "__main__":
         import_module(name)
     for line in sys.stdin:
         order = json.loads(line)
-        print(run(order["arguments"], order["limit"], order["log"]), flush=True)
+        print(run(order, order["limit"], order["log"]), flush=True)
