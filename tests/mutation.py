@@ -100,6 +100,7 @@ EXCUSED = [
     ("propagation/statistical.py", "- (inside if clutter.place", "a draw from -0.5 to 0.5: the same law"),
     ("receive/estimate.py", "step / np.sign([gx, gy])", "a product with a sign is the quotient"),
     ("propagation/bodies.py", "reach / np.sqrt(wavelength * (before[i]", "a wider first look at a body; the exact one follows"),
+    ("propagation/bodies.py", "+ radius) * 2)", "wider as well"),
     ("propagation/direct.py", "(which.size, 2, 3)) for name in pair]", "a part of no length, which nothing shades"),
     ("gridding.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
     ("gridding.py", "lag[:, 1]", "and of one offset"),

@@ -15,7 +15,7 @@ from isac_rt.receive import receive_active
 from isac_rt.receive.adaptive import Matched, beams_of, expected_count, like_exponential, map_factor, sampled, scan_threshold
 from isac_rt.receive.cfar import detect
 from isac_rt.receive.clutter_map import Taper, arm_channels, covariances, joint_channels, power_map, steering
-from isac_rt.receive.detectors import cfar_ratio, noise_level
+from isac_rt.receive.detectors import cfar_ratio, judge, noise_level
 from isac_rt.receive.doppler import accumulate, channel_maps
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.in_clutter import _beam, _direction
@@ -223,6 +223,20 @@ def test_noise_level_from_the_quietest_cells():
         expected = np.where(np.arange(400)[:, None] < 200, 0.0, 10.0) * np.ones(power.shape)
         loud = power + expected * rng.exponential(1.0, power.shape)
         assert noise_level(loud, expected, looks) == pytest.approx(0.37, rel=3e-3 + 2 * spread)
+
+
+def test_background_is_noise_and_expected_clutter():
+    """White noise through the receiver's chain where the mesh foretells clutter: the level is its power over the foretold one's, alike in
+    all cells. Planted bug: the clutter taken off."""
+    w, schedule, payload = frame(waveform=SHORT)
+    guess = expected(scatterers(7, 5, (8.0, 26.0)))
+    maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
+    settings = Receivers(clutter_detector="angle_doppler")
+    (judged,) = judge([maps], w, FEW, schedule, payload.delay_symbols, settings, guess)
+    noise = judged.level - power_map(guess, w, 110, schedule, payload.delay_symbols)
+    assert np.ptp(noise) < 1e-5 * judged.level.max()
+    mean = (np.abs(maps) ** 2).mean()
+    assert noise.mean() == pytest.approx(mean, rel=0.05)  # the median of a third of the cells
 
 
 def test_ratio_of_the_cfar_is_its_decision():

@@ -269,3 +269,16 @@ def test_acquisition_takes_the_earliest_path(link):
     assert len(d) == 3 and r.line_of_sight and not r.decoded and d.is_reference.sum() == 1
     assert abs(d.range[d.is_reference][0] - 33.4) < 0.01 and abs(d.velocity[d.is_reference][0] - 2.2) < 0.02
     assert r.reference_power == pytest.approx(0.25, rel=0.02)
+
+
+def test_a_terminal_that_reads_some_groups(link):
+    """What it decides of its own groups is what was sent in them, and -1 and no confidence stand where it does not read, in the shapes of
+    all. Planted bugs: its groups put first; the shapes of its own."""
+    _, payload, clean = link
+    r = receive_passive(with_noise(clean, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True, groups=(0, 2))
+    assert r.delay_symbols.shape == payload.delay_symbols.shape and r.transitions.shape == payload.transitions.shape
+    for name, sent in (("delay_symbols", payload.delay_symbols), ("transitions", payload.transitions)):
+        found = getattr(r, name)
+        assert np.array_equal(found[[0, 2]], sent[[0, 2]]) and (found[1] == -1).all()
+    for sure in (r.delay_confidence, r.transition_confidence):
+        assert (sure[[0, 2]] > 0.5).all() and not sure[1].any()
