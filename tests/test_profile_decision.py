@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
@@ -46,10 +48,10 @@ def test_the_profile_reads_what_the_strongest_cell_does_not(snr_db: float):
 
 def test_profile_is_the_cells_power_over_noise():
     """The reference and a path 3 cells behind it: N times their SNR in their cells, next to nothing far away.
-    Planted bug: cells counted from range 0."""
+    Planted bugs: cells counted from range 0; the velocity left out or in other units."""
     w, schedule, _ = frame(waveform=SHORT)
-    _, expected = scene(5)
-    paths = [Path(11.31, 0.0, 0.3), Path(11.31 + 3 * w.range_cell(1), 0.0, 0.2)]
+    expected = replace(scene(5)[1], velocity=np.array([23.7]))  # a tenth of a cell of coupling, and of migration
+    paths = [Path(11.31, 23.7, 0.3), Path(11.31 + 3 * w.range_cell(1), 23.7, 0.2)]
     profile = learn_profile(cube(w, schedule, unmodulated(w), paths, ANTENNAS, 1.0, 1), expected)
     spread = 6 / np.sqrt(180 * 15)  # statistical
     assert profile[0] == pytest.approx(0.09 * 256, rel=0.02 + spread)

@@ -452,3 +452,9 @@ def test_free_space_is_reciprocal_and_knows_no_place():
         for name in names:
             assert getattr(other, name) == near(getattr(here, name), 1e-10)
     assert back.departure == pytest.approx(here.arrival, abs=1e-13)
+
+
+def test_every_kind_of_path_has_its_own_number():
+    """Of the results file, from 0 on in the order of their list. Planted bug: the number of another kind."""
+    names = ["LINE_OF_SIGHT", "TARGET", "GHOST", "SPECULAR", "DIFFUSE", "LEAKAGE"]
+    assert {name: int(kind) for name, kind in PathKind.__members__.items()} == {name: i for i, name in enumerate(names)}

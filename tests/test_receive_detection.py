@@ -187,6 +187,23 @@ def test_training_at_the_ends_and_across_the_doppler_wrap():
     assert counts[0].tolist() == [0, 4] and counts[2].tolist() == [0, 4] and counts[3].tolist() == [2, 4] and counts[39].tolist() == [4, 0]
 
 
+def test_background_against_plain_loops():
+    """Guard and training of four different sizes, cells left out, both ends of the range axis, Doppler round its ends: the greater of
+    both sides' means. Planted bugs: the guard of Doppler in range; the rows of the other side; a side of too few cells that counts."""
+    rng, guard, training = np.random.default_rng(17), (2, 1), (5, 3)
+    power, keep = rng.exponential(1.0, (23, 17)), rng.random((23, 17)) > 0.3
+    found = background(power, keep, guard, training)
+    for row in range(23):
+        for column in range(17):
+            columns = np.arange(column - 4, column + 5) % 17
+            means = []
+            for rows in (range(max(row - 7, 0), max(row - 2, 0)), range(row + 3, min(row + 8, 23))):
+                block = np.ix_(list(rows), columns)
+                if len(rows) >= 2 and keep[block].sum() >= 0.25 * 9 * len(rows):
+                    means.append(power[block][keep[block]].mean())
+            assert found[row, column] == pytest.approx(max(means, default=np.inf), rel=1e-9)
+
+
 def test_a_clutter_edge_raises_no_alarms():
     """A step of 20 dB in range. Planted bug: the mean of both sides, which gives thousands of alarms before the edge's far side."""
     rng = np.random.default_rng(4)
