@@ -51,7 +51,7 @@ def specular(paths: PathSet) -> PathSet:
 @pytest.mark.parametrize("height", [1e-3, 0.02, 0.3])
 def test_grazing_rays(height):
     """Two terminals just over the ground, 200 m apart: one reflection, its length to a nanometre; below a centimetre a warning.
-    Written against: offsets of the planes in float32."""
+    Written against: an image a thousandth short of its place."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         paths = specular(found(GROUND, (0, 0, height), (200.3, 0, 1.3 * height)))

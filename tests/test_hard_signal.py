@@ -156,7 +156,7 @@ def test_denormal_and_zero_gains(method):
 
 @pytest.mark.parametrize(("size", "chirps", "tx"), [(90, 10, 5), (100, 21, 3), (250, 28, 4)])
 def test_sizes_that_are_no_powers_of_two(size, chirps, tx):
-    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is decoded. Written against: N/2 rounded up."""
+    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is decoded."""
     w = Waveform(num_samples=size, num_chirps=chirps, num_tx=tx, num_groups=min(tx, 3))
     every = stage.random_paths(w, np.random.default_rng(size), 30, w.frame_duration / 2)
     truth = samples(w, every, "exact", True)
