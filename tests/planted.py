@@ -67,8 +67,6 @@ BUGS = (
         "k, lag = path[index.astype(np.int16)], offset[index.astype(np.int16)]"),
     Bug("test_hard_signal::test_ten_thousand_paths_at_one_delay", "gridding.py", "path, offset = path[order], offset[order]",
         "path, offset = (a[order][np.r_[True, np.diff(t.delay[path[order]]) != 0]] for a in (path, offset))"),
-    Bug("test_fuzz::test_a_mesh_too_large_for_memory_is_refused_before_it_is_read", "city/meshfiles.py",
-        "if free is not None and READING_FACTOR * size > free:", "if False:"),
     Bug("test_fuzz::test_what_cannot_run_is_refused_before_it_starts", "preflight.py",
         "if free is not None and needed > free:", "if False:"),
     Bug("test_fuzz::test_units_wrong_by_a_thousand_are_warned_of", "scenario_doubts.py",
