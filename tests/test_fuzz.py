@@ -274,8 +274,8 @@ def test_an_empty_mesh_is_refused(tmp_path):
 
 
 def test_a_mesh_too_large_for_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
-    """A sparse file of 2 GB against 1 GB free; a file that is large but fits is read. Written against: no look at the size (do not plant it:
-    the reader takes the memory)."""
+    """A sparse file of 2 GB against 1 GB free; a file that is large but fits is read. Written against: no look at
+    the size (not to be planted: the reader takes the memory)."""
     from isac_rt.city import meshfiles
 
     with (tmp_path / "m.ply").open("wb") as out:

@@ -30,7 +30,7 @@ PLACES = ((-11.37, 2.13, 14.21), (17.93, -3.31, 9.67), (4.41, 1.73, 20.3))
     planted=(
         "propagation/raytrace.py",
         "return amplitude, valid, faces, points\n\n    def _leg_set",
-        "return amplitude.conj(), valid, faces, points\n\n    def _leg_set",
+        "return np.abs(amplitude), valid, faces, points\n\n    def _leg_set",
     ),
     tracer=True,
 )

@@ -95,8 +95,8 @@ def dpsk_symbol_errors() -> float:
     why=ONCE_IN_1E5,
     planted=(
         "receive/demodulate.py",
-        "turn = np.exp(-2j * np.pi * ((beats[m]",
-        "turn = np.exp(-2j * np.pi * ((np.floor(beats[m])",
+        "turn = tones(-beats[m] / w.num_samples, w.num_samples)",
+        "turn = tones(-np.floor(beats[m]) / w.num_samples, w.num_samples)",
     ),
     quick=False,
 )
@@ -381,8 +381,8 @@ def scatter_of_range_and_velocity() -> float:
     why=ONCE_IN_1E5 + "; 400 draws",
     planted=(
         "receive/estimate.py",
-        "steer = np.exp(1j * scale * np.outer(u, place))",
-        "steer = np.exp(1j * scale * np.outer(u, place) * 1.02)",
+        "apart = 1j * scale * place[: len(values)]",
+        "apart = 1.02j * scale * place[: len(values)]",
     ),
 )
 def scatter_of_directions() -> float:

@@ -522,8 +522,8 @@ def births_and_deaths() -> float:
     why="complex64 samples and transform",
     planted=(
         "receive/spectrum.py",
-        "step = np.exp(2j * np.pi * shift[m] / num_samples)",
-        "step = np.exp(-2j * np.pi * shift[m] / num_samples)",
+        "tones(shift[m] / num_samples, num_rows).T",
+        "tones(-shift[m] / num_samples, num_rows).T",
     ),
 )
 def data_are_taken_out() -> float:
