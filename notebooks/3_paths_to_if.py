@@ -17,7 +17,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import isac_rt as irt
-from isac_rt.payload import unmodulated
 
 scenario = irt.load(
     "../scenes/paper_swarm_consistent.yaml",
@@ -53,7 +52,10 @@ slot = p * w.slot_duration
 tau, rate = path.delay[0], path.delay_rate[0]
 beat, doppler = w.slope * tau * u, w.carrier_frequency * rate * slot
 # delay of the two elements against the arrays' middles: they delay the whole chirp, not only its carrier
-elements = [(poses["AT"], setup.antennas.tx_positions[0], path.departure[0]), (poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0])]
+elements = [
+    (poses["AT"], setup.antennas.tx_positions[0], path.departure[0]),
+    (poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0]),
+]
 element = -sum(pose.to_world(place) @ direction for pose, place, direction in elements) / 299792458.0
 terms = {
     "paper: beat and Doppler": beat + doppler,

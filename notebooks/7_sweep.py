@@ -27,7 +27,8 @@ base = Path("../scenes/paper_swarm_consistent.yaml").resolve()
 (folder / "sweep.yaml").write_text(f"""
 name: snr
 scenario: {base}
-set: {{frames: 5, receivers.active_every_frames: 5, modulation.pilot_every_frames: null, radio.samples_per_chirp: 256, radio.bandwidth_hz: 320e6}}
+set: {{frames: 5, receivers.active_every_frames: 5, modulation.pilot_every_frames: null,
+       radio.samples_per_chirp: 256, radio.bandwidth_hz: 320e6}}
 axes:
   snr_db: {{key: noise.snr_db, values: [-25, -20, -10, 0]}}
   order: {{key: modulation.dpsk_order, values: [4, 16]}}

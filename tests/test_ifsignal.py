@@ -260,7 +260,8 @@ def test_auto_is_more_accurate_where_a_path_is_strong():
 @pytest.mark.parametrize("method", ["exact", "gridded"])
 def test_the_epoch_is_only_where_the_polynomial_is_written(method):
     """Paths said for another instant, delays expanded about it by hand, and births counted from it, give the same samples. Accelerations of
-    1e6 m/s^2 so that their square shows: 0.3 mm. Planted bugs: the acceleration's half left out or subtracted; the rate not moved; births not."""
+    1e6 m/s^2 so that their square shows: 0.3 mm.
+    Planted bugs: the acceleration's half left out or subtracted; the rate not moved; births not."""
     w, rng = SMALL, np.random.default_rng(14)
     accel = rng.normal(size=9) * 1e6 / C
     born = np.where(np.arange(9) % 3 == 1, 0.13 * w.frame_duration, -np.inf)

@@ -87,6 +87,19 @@ def test_importing_the_package_starts_no_ray_tracer():
     assert done.stdout.strip() == "[]"
 
 
+def test_style():
+    """Planted bug: an unused import."""
+    done = subprocess.run([sys.executable, "-m", "ruff", "check", "."], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_types():
+    """Planted bug: an argument too many."""
+    done = subprocess.run([sys.executable, "-m", "mypy"], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_no_registry_address_in_the_set_up():
     root = PACKAGE.parent
     for name in ("requirements.lock", "pyproject.toml", "Makefile", ".ci/run"):

@@ -31,7 +31,8 @@ def kind_of(entry: dict[str, Any], definitions: dict[str, Any]) -> str:
     if entry.get("type") == "object":
         inner = entry.get("additionalProperties")
         return "mapping" + (f" to {kind_of(inner, definitions)}" if isinstance(inner, dict) else "")
-    limits = [f"{sign} {entry[key]:g}" for key, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<")) if key in entry]
+    signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    limits = [f"{sign} {entry[key]:g}" for key, sign in signs.items() if key in entry]
     return " ".join([str(entry.get("type", "anything")), ", ".join(limits)]).strip()
 
 

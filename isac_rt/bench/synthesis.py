@@ -134,9 +134,9 @@ def rows(quick: bool) -> list[dict[str, object]]:
             seconds = cpu_seconds(partial(job.samples, links, "gridded", setting), times)
             add(name, size, "paths", seconds, error[name])
         if size in PROFILE_SIZES:
-            add(BOTH, size, "paths", cpu_seconds(lambda k=links: job.transformed(k, "gridded"), times), error[BOTH])
+            add(BOTH, size, "paths", cpu_seconds(partial(job.transformed, links, "gridded"), times), error[BOTH])
             for name, setting in DIRECTLY:
-                add(name, size, "paths", cpu_seconds(lambda k=links, s=setting: job.profiles(k, s), times), error[name])
+                add(name, size, "paths", cpu_seconds(partial(job.profiles, links, setting), times), error[name])
     cube = np.zeros(shape, np.complex64)
     words = np.array([1, 2], np.uint32)
     add("noise", cube.size, "samples", cpu_seconds(lambda: add_white_noise(cube, 1.0, words), repeats), None)

@@ -164,7 +164,7 @@ class TwoBounces:
         out = [np.empty(count), np.empty(count), np.empty(count, np.float32), np.empty(count), np.empty(count)]
         out += [np.empty((count, 3)), np.empty((count, 3))]
         c, s = self._field.cells, self._field.surfaces
-        _lay_out(index, c.points, mirror.normal, *motion, before, *out)
+        _lay_out(index, c.points, mirror.normal, *motion, before, *out)  # type: ignore[call-arg]
         tx_radius, rx_radius, departure, arrival = out[3:]
         met = departure if before else arrival
         te, tm = slab_coefficients(mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength)

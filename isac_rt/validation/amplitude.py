@@ -299,7 +299,7 @@ def lambertian_wall_by_way_of_the_ground() -> float:
         if abs(part.mirror.normal[2]) > 0.5:
             ends = [poses["A"].position, poses["P"].position]
             ends[0 if part.before else 1] = ends[0 if part.before else 1] * [1, 1, -1] - [0, 0, 60.0]
-            truth = (1 - share**2) * truths.lambertian_wall(*ends, share, 50.0, (60.0, 30.0))
+            truth = (1 - share**2) * truths.lambertian_wall(ends[0], ends[1], share, 50.0, (60.0, 30.0))
             worst = max(worst, abs(10 * np.log10((part.seen.magnitude.astype(float) ** 2).sum() / truth)))
             count += 1
     return worst if count == 2 else np.inf
