@@ -75,8 +75,8 @@ def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
         setup = prepare(alone(frames=3 * per_metre, frame_interval_s=1 / speed / per_metre,
                               clutter={"model": "field", "cell_area_per_metre_m": 1.0}))  # fmt: skip
         sight = tracer_of(setup).field.sight
-        sees, calls = sight._shadows.sees, []
-        sight._shadows.sees = lambda *args, sees=sees, calls=calls: (calls.append(1), sees(*args))[1]
+        sees, calls = sight.shadows.sees, []
+        sight.shadows.sees = lambda *args, sees=sees, calls=calls: (calls.append(1), sees(*args))[1]
         clutter.advance(setup, range(3 * per_metre))
         tests.append(len(calls))
     assert 0 < tests[1] <= tests[0] + 2

@@ -108,7 +108,6 @@ def test_quick_cases_without_rays_pass(one):
     assert verdict.passed, (verdict.error, one.bound, verdict.note)
 
 
-@pytest.mark.slow
 def test_planted_bugs_fit_the_source():
     """Each stands in its file as it is written, once, so that tests/mutation.py can plant it."""
     stale = [c.name for c in CASES if (PACKAGE.parent / c.planted.file).read_text().count(c.planted.old) != 1]
