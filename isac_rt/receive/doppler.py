@@ -109,7 +109,8 @@ def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
             out[0, i, s], out[1, i, s] = value.real, value.imag
 
 
-@njit(nogil=True, cache=True, fastmath={"contract"})
+# no fused products: which of two is fused the compiler may decide anew, and bits would differ between processes
+@njit(nogil=True, cache=True)
 def _add_both_bins(made, power):  # pragma: no cover - compiled
     """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
     num_chirps = power.shape[1]

@@ -125,7 +125,7 @@ class LocalSpectra:
         return float(((out.real**2 + out.imag**2) * energy).sum())
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz"})
 def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energy):  # pragma: no cover - compiled
     """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`, `middle_phase` and
     `hann_response` in one loop, which a test holds against them.
