@@ -18,9 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+
+from isac_rt.console import err as _err
+from isac_rt.console import out as _out
+from isac_rt.console import table as _table
+from isac_rt.console import with_progress as _with_progress
 
 if TYPE_CHECKING:
     from isac_rt.results import Results
@@ -40,17 +43,6 @@ FrameNumber = Annotated[int, typer.Option("--frame", min=0, help="Number of the 
 
 class InputProblem(Exception):
     """A command's arguments do not fit the scenario."""
-
-
-def _out() -> Console:
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = 140  # in a file or a pipe there is no edge to wrap at
-    return console
-
-
-def _err() -> Console:
-    return Console(stderr=True, highlight=False)
 
 
 def _load(file: Path, overrides: Sequence[str] | None = None, frames: int | None = None, seed: int | None = None) -> Scenario:
@@ -373,7 +365,7 @@ def _validate(cases: list[Any]) -> list[Any]:
 
 @app.command()
 def bench(
-    stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...", help="synthesis receive trace clutter end-to-end.")] = None,
+    stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...", help="From synthesis to hermespy; all by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes only.")] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where tables and figures go.")] = Path("runs/bench"),
     json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows to a file too.")] = None,
@@ -398,6 +390,8 @@ def bench(
         error = "" if row["error"] is None else f"{row['error']:.2g}"
         table.add_row(f"{row['kind']}: {row['method']}", f"{row['size']:,} {row.get('unit', '')}", f"{row['cost']:.3g}", error)
     _out().print(table)
+    for name, reason in found["left_out"].items():
+        _out().print(f"{name} left out: {reason}", soft_wrap=True)
     _out().print(f"in {out}: {', '.join(file.name for file in files)}", soft_wrap=True)
 
 
@@ -466,23 +460,6 @@ def _check_frame(scenario: Scenario, frame: int) -> None:
         raise InputProblem(
             f"--frame {frame}: {scenario.name} has frames 0 to {scenario.frames - 1}; choose one of these or set frames higher"
         )
-
-
-def _with_progress(work: Any, what: str, steps: int | None = None) -> Any:
-    """Do `work(report)` with a bar on stderr; `report(done, total)` moves it."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, console=_err()) as bar:
-        task = bar.add_task(what, total=steps)
-        return work(lambda done, total: bar.update(task, completed=done, total=total))
-
-
-def _table(*titles: str, justify: Any = "right") -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for i, title in enumerate(titles):
-        table.add_column(title, justify="left" if i == 0 else justify, no_wrap=i == 0)
-    return table
 
 
 def _print_budget(rows: Sequence[Any]) -> None:

@@ -13,7 +13,7 @@ from isac_rt.simulate import prepare
 
 def test_synthesis_grows_no_faster_than_its_paths():
     """Four times the paths cost at most eight times as much. Planted bug: `_blocks` that lists every path once per hundred paths."""
-    job = synthesis._Job(30)
+    job = synthesis.Job(30)
     seconds = []
     for count in (1000, 4000):
         links = job.paths(count)

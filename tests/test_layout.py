@@ -16,7 +16,7 @@ ORDER = (
     "scenario_base scenario_clutter scenario_doubts scenario scenario_file provenance runtime randomness waveform arrays payload "
     "timetable city swarm preflight linkbudget propagation simd lanefft synthesis separable noise rangecells gridding ifsignal "
     "receive tracking ghosts terminal baselines access metrics fidelity fall_back results simulate budget sweep experiments "
-    "validation bench figures render interactive animate report interchange starter cli"
+    "validation bench figures render interactive animate report interchange starter console cli"
 ).split()
 ALONE = {"runtime", "randomness"}
 MAX_MODULE_LINES = 600

@@ -1,7 +1,8 @@
 """Speed against error, method by method, in units of one floor that is measured in the same run.
 
-Every stage has a module with ``rows(quick: bool) -> list[dict[str, object]]``: `synthesis`, `reception`, `tracing`, `clutter` and
-`endtoend`. A row is one method at one size, with these keys:
+Every stage has a module with ``rows(quick: bool) -> list[dict[str, object]]``: `synthesis`, `reception`, `tracing`, `clutter`,
+`endtoend` and `hermes`. One that needs what may not be installed also has ``missing() -> str | None``, which says why it is left out.
+A row is one method at one size, with these keys:
 
 kind : str
     The stage, a key of `STAGES`' values.
@@ -27,5 +28,6 @@ from __future__ import annotations
 
 REQUIRED = ("kind", "method", "size", "error", "cost", "floor_s")
 """Keys of every row."""
-STAGES = {"synthesis": "synthesis", "receive": "reception", "trace": "tracing", "clutter": "clutter", "end-to-end": "endtoend"}
+STAGES = {"synthesis": "synthesis", "receive": "reception", "trace": "tracing", "clutter": "clutter", "end-to-end": "endtoend",
+          "hermespy": "hermes"}  # fmt: skip
 """The stages by their name on the command line, with the module (and kind) of each."""

@@ -36,13 +36,19 @@ def machine() -> dict[str, Any]:
 
 
 def measure(names: Sequence[str], quick: bool, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
-    """All rows of some stages, with the machine and the growth of every curve."""
+    """All rows of some stages, with the machine, the growth of every curve, and why a stage was left out."""
     rows: list[dict[str, Any]] = []
+    left_out: dict[str, str] = {}
     for done, name in enumerate(names):
-        rows += importlib.import_module(f"isac_rt.bench.{STAGES[name]}").rows(quick)
+        module = importlib.import_module(f"isac_rt.bench.{STAGES[name]}")
+        reason = module.missing() if hasattr(module, "missing") else None
+        if reason is None:
+            rows += module.rows(quick)
+        else:
+            left_out[name] = reason
         if progress:
             progress(done + 1, len(names))
-    return {"machine": machine(), "quick": quick, "rows": rows, "growth": growth(rows)}
+    return {"machine": machine(), "quick": quick, "rows": rows, "growth": growth(rows), "left_out": left_out}
 
 
 def curves(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
@@ -81,6 +87,7 @@ def markdown(found: Mapping[str, Any]) -> str:
         text.append("")
     text += ["## Growth of cost with size", "", "| stage | method | size | exponent |", "|---|---|---|---|"]
     text += [f"| {g['kind']} | {g['method']} | {g['unit']} | {g['exponent']} |" for g in found["growth"]]
+    text += [f"\n{name} left out: {reason}" for name, reason in found.get("left_out", {}).items()]
     return "\n".join(text) + "\n"
 
 

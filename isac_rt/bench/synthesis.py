@@ -42,13 +42,13 @@ GRIDS = (
 DIRECTLY = (("profiles directly, 1.25 N, width 6", PROFILES), ("profiles directly, cubic, 1.5 N, width 8", ACCURATE))
 
 
-class _Job:
-    """A receiver and a sender with data; paths by their number."""
+class Job:
+    """A receiver and a sender with data; paths by their number, of which none is faster than `speed` [m/s]."""
 
-    def __init__(self, num_chirps: int) -> None:
+    def __init__(self, num_chirps: int, num_groups: int = 3, speed: float = 15.0) -> None:
         rng = np.random.default_rng(1)
-        w = replace(Waveform(), num_chirps=num_chirps)
-        self.waveform = w
+        w = replace(Waveform(), num_chirps=num_chirps, num_groups=num_groups)
+        self.waveform, self.speed = w, speed
         self.antennas = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
         self.pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
         schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
@@ -61,7 +61,7 @@ class _Job:
         u = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1)
         return [(self.sender, make_paths(
             epoch=w.frame_duration / 2, tx="A", rx="B", gain=rng.normal(size=count) + 1j * rng.normal(size=count),
-            delay=rng.uniform(0.01, 0.99, count) * w.max_delay, delay_rate=2 * rng.uniform(-15, 15, count) / SPEED_OF_LIGHT,
+            delay=rng.uniform(0.01, 0.99, count) * w.max_delay, delay_rate=2 * rng.uniform(-self.speed, self.speed, count) / SPEED_OF_LIGHT,
             delay_accel=np.zeros(count), departure=u, arrival=u, tx_radius=np.inf, rx_radius=np.inf, kind=PathKind.DIFFUSE,
         ))]  # fmt: skip
 
@@ -93,27 +93,27 @@ class _Job:
         return total
 
 
-def _relative(found: np.ndarray, truth: np.ndarray) -> float:
+def relative(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
 def errors() -> dict[str, float]:
     """Error of every method on 40 paths and 3 chirps per group."""
-    job = _Job(3)
+    job = Job(3)
     links = job.paths(40)
     full, narrow = job.samples(links, "exact"), job.narrowband(links)
-    found = {"direct": _relative(job.samples(links, "direct"), full)}
+    found = {"direct": relative(job.samples(links, "direct"), full)}
     for name, setting in GRIDS:
-        found[name] = _relative(job.samples(links, "gridded", setting), full if setting.wideband else narrow)
+        found[name] = relative(job.samples(links, "gridded", setting), full if setting.wideband else narrow)
     whole = job.transformed(links, "exact")
-    found[BOTH] = _relative(job.transformed(links, "gridded"), whole)
-    found |= {name: _relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
+    found[BOTH] = relative(job.transformed(links, "gridded"), whole)
+    found |= {name: relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
     return found
 
 
 def rows(quick: bool) -> list[dict[str, object]]:
     """Rows of the benchmark (`isac_rt.bench`): cost in floors and error of each method, over the number of paths."""
-    job, repeats = _Job(120), 3 if quick else 5
+    job, repeats = Job(120), 3 if quick else 5
     w = job.waveform
     shape = (w.num_groups, job.antennas.num_rx, w.num_chirps, w.num_samples)
     floor, error = floor_seconds(shape, repeats), errors()
