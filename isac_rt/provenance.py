@@ -13,7 +13,11 @@ from pathlib import Path
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_file import to_yaml
 
-PACKAGES = ("isac_rt", "numpy", "scipy", "numba", "drjit", "mitsuba", "sionna-rt", "trimesh", "xarray", "h5netcdf", "pydantic")
+PACKAGES = (
+    "isac_rt", "numpy", "scipy", "numba", "llvmlite", "drjit", "mitsuba", "sionna-rt", "trimesh", "shapely", "pyproj", "mapbox_earcut",
+    "xarray", "h5netcdf", "h5py", "pydantic",
+)  # fmt: skip
+"""What a number of a result, or the file that holds it, can depend on."""
 
 
 @lru_cache(maxsize=1)

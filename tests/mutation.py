@@ -36,16 +36,20 @@ TESTS_OF = {
     "payload.py": "test_payload test_receive_data",
     "arrays.py": "test_arrays test_ifsignal",
     "synthesis.py": "test_ifsignal",
+    "simd.py": "test_gridding test_receive_transform test_ifsignal",
     "gridding.py": "test_ifsignal test_gridding",
-    "lanefft.py": "test_gridding",
+    "rangecells.py": "test_gridding test_ifsignal",
+    "lanefft.py": "test_gridding test_receive_transform",
     "separable.py": "test_separable",
-    "ifsignal.py": "test_ifsignal",
+    "ifsignal.py": "test_ifsignal test_hard_signal",
     "noise.py": "test_noise",
     "linkbudget.py": "test_linkbudget",
     "propagation/free_space.py": "test_propagation",
     "propagation/geometry.py": "test_propagation test_raytrace_scenes",
     "propagation/rcs.py": "test_propagation",
     "propagation/raytrace.py": "test_raytrace_scenes",
+    "propagation/clearance.py": "test_hard_geometry",
+    "propagation/expected.py": "test_clutter_field test_clutter_detectors",
     "propagation/statistical.py": "test_clutter_models",
     "propagation/clutter.py": "test_clutter_field",
     "propagation/cells.py": "test_clutter_field",
@@ -67,11 +71,12 @@ TESTS_OF = {
     "receive/cfar.py": "test_receive_detection",
     "receive/clutter_filter.py": "test_clutter_filter",
     "receive/common.py": "test_receive_detection test_receive_data",
-    "receive/demodulate.py": "test_receive_data",
+    "receive/demodulate.py": "test_receive_data test_receive_hard",
     "receive/doppler.py": "test_receive_detection test_receive_schemes",
     "receive/estimate.py": "test_receive_detection test_receive_data",
     "receive/passive.py": "test_receive_data",
     "receive/spectrum.py": "test_receive_data test_receive_detection",
+    "receive/transform.py": "test_receive_transform",
     "receive/in_clutter.py": "test_clutter_detectors",
     "receive/joint.py": "test_receive_joint",
     "receive/phases.py": "test_receive_joint",
@@ -85,8 +90,16 @@ TESTS_OF = {
     "receive/detectors.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
-COMPILED_FROM = {"synthesis.py": ("gridding",), "lanefft.py": ("gridding",)}
-"""Modules whose compiled code holds another one's; its cache does not know that the other changed."""
+COMPILED_FROM = {
+    "simd.py": ("synthesis.py", "gridding.py", "receive/transform.py"),
+    "lanefft.py": ("gridding.py", "receive/transform.py"),
+    "rangecells.py": ("gridding.py",),
+    "synthesis.py": ("gridding.py",),
+    "noise.py": ("gridding.py",),
+    "propagation/clutter.py": ("propagation/twice.py",),
+    "propagation/images.py": ("propagation/twice.py",),
+}
+"""The modules in whose compiled code a module's own is held; their cache does not know that it changed."""
 LIMIT = 400
 """Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by then has been noticed."""
 BUDGET = 60.0
@@ -248,21 +261,20 @@ class Copy:
         """A file changed, and put back with what was compiled from it."""
         target = self.folder / "isac_rt" / file
         target.write_text(source)
-        names = (target.stem, *COMPILED_FROM.get(file, ()))
-        self._forget(target.parent / "__pycache__", names)
+        files = [Path(name) for name in (file, *COMPILED_FROM.get(file, ()))]
+        self._forget(files)
         try:
             yield
         finally:
             shutil.copy2(self._whole / file, target)
-            self._forget(target.parent / "__pycache__", names)
-            for name in names:
-                for compiled in ((self._whole / file).parent / "__pycache__").glob(f"{name}.*.nb?"):
-                    shutil.copy2(compiled, target.parent / "__pycache__")
+            self._forget(files)
+            for one in files:
+                for compiled in (self._whole / one.parent / "__pycache__").glob(f"{one.stem}.*.nb?"):
+                    shutil.copy2(compiled, self.folder / "isac_rt" / one.parent / "__pycache__")
 
-    @staticmethod
-    def _forget(folder: Path, names: tuple[str, ...]) -> None:
-        for name in names:
-            for compiled in folder.glob(f"{name}.*.nb?"):
+    def _forget(self, files: list[Path]) -> None:
+        for one in files:
+            for compiled in (self.folder / "isac_rt" / one.parent / "__pycache__").glob(f"{one.stem}.*.nb?"):
                 compiled.unlink()
 
 

@@ -166,6 +166,22 @@ def test_a_target_behind_another_and_a_body_in_the_way():
     assert own.counts()["target"] == 2
 
 
+@pytest.mark.sionna
+def test_a_target_inside_the_radars_own_body():
+    """7 cm from the radar, whose body reaches to 20 cm: the echo of the radar equation and its two ghosts under the ground, to a
+    nanometre, for a radar does not shadow itself. Sionna loses everything inside such a body, and what is nearer than a centimetre.
+    Written against: legs of less than a decimetre dropped."""
+    a, u = np.array([0.3, 1.1, 9.3]), np.array([0.34, 1.15, 9.27])
+    paths = found(GROUND, a, (21.7, 7.4, 8.1), u, link=("A", "A"))
+    echoes = paths.select(paths.target == 2)
+    straight, below = np.linalg.norm(u - a), np.linalg.norm(u * [1, 1, -1] - a)
+    order = np.argsort(echoes.delay)
+    assert C * echoes.delay[order] == pytest.approx([2 * straight, straight + below, straight + below], abs=NANOMETRE)
+    section = 10 ** (-11.7 / 10)
+    level = WAVELENGTH * np.sqrt(section) / ((4 * np.pi) ** 1.5 * straight**2)
+    assert abs(echoes.gain[order[0]]) == pytest.approx(level, rel=1e-5, abs=0)  # Sionna's amplitudes are float32
+
+
 def flight(**places) -> Scenario:
     roles = {"A": "active", "P": "passive", "U": "target"}
     swarm = {n: {"role": roles[n], "position_m": list(p), "velocity_mps": list(v)} for n, (p, v) in places.items()}
@@ -278,6 +294,28 @@ def test_a_shadow_edge_is_crossed_within_a_frame():
         levels.append(share)
         assert np.isinf(paths["A", "P"].begin).all()
     assert levels[0] < 0.1 and abs(levels[-1] - 1) < 0.3 and (np.diff(levels[:6]) > 0).all()
+
+
+@pytest.mark.sionna
+def test_reflections_are_born_and_die_between_traces():
+    """P flies out of a street: the reflections of its two walls last as long as their mirror points lie on the walls, by hand, at the
+    middle of each frame; no frame knows which ones were computed before it. Written against: the paths of the frame before."""
+    s = crossing()
+    swarm = {"P": s.swarm["P"].model_copy(update={"position_m": (-2.7, 47.3, 9.4), "velocity_mps": (0.0, 13.1, 0.0)})}
+    s = s.model_copy(update={"swarm": {**s.swarm, **swarm}, "frame_interval_s": 0.2887, "frames": 9})
+    setup, kept = prepare(s), {}
+    for frame in range(9):
+        poses, paths = setup.trace(frame)
+        a, p = poses["A"].position, poses["P"].position
+        truth = [np.hypot(np.linalg.norm((p - a)[:2]), p[2] + a[2])]  # off the ground
+        for wall in (-11.0, 11.0):
+            there = abs(wall - a[0]) / (abs(wall - a[0]) + abs(wall - p[0]))
+            if a[1] + there * (p[1] - a[1]) < 30.0:
+                truth.append(np.linalg.norm([2 * wall - a[0] - p[0], *(p - a)[1:]]))
+        kept[frame] = np.sort(C * specular(paths["A", "P"]).delay)
+        assert kept[frame] == pytest.approx(np.sort(truth), abs=NANOMETRE), frame
+    assert {len(lengths) for lengths in kept.values()} == {1, 2, 3}
+    assert np.array_equal(np.sort(C * specular(prepare(s).trace(2)[1]["A", "P"]).delay), kept[2])
 
 
 @pytest.mark.sionna

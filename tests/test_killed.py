@@ -6,10 +6,12 @@ import errno
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,8 @@ from isac_rt.scenario_file import load, to_yaml
 
 ROOT = Path(__file__).parent.parent
 WHOLE = {"results.nc", "summary.json", "scenario.yaml"}
+WITHOUT_A_NUMBER = {"dask", "distributed", "jinja2", "matplotlib", "pandas", "pyyaml", "rich", "rtree", "threadpoolctl", "typer"}
+"""Dependencies that start, show or look up what others compute."""
 
 PROGRAM = """
 import sys, time, types
@@ -160,12 +164,16 @@ def test_reruns_are_equal_bit_by_bit_whatever_the_threads():
 
 
 def test_versions_stand_in_the_results(tmp_path):
-    """Another version of a package is seen in the file and in the summary. Written against: versions taken when the module is written."""
+    """Another version of a package is seen in the file and in the summary. Written against: versions taken when the module is written,
+    and a new dependency that nobody entered."""
     import importlib.metadata
 
     run = fake_run()
     save(run, tmp_path)
     with xr.open_dataset(tmp_path / "results.nc", engine="h5netcdf") as dataset:
         kept = json.loads(dataset.attrs["versions"])
-    for name in ("numpy", "sionna-rt", "drjit", "numba", "scipy"):
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    names = {re.match(r"[\w-]+", line)[0] for line in needed} - WITHOUT_A_NUMBER
+    assert len(names) > 10
+    for name in [*names, "llvmlite"]:  # numba's compiler
         assert kept[name] == importlib.metadata.version(name) == run.summary["versions"][name]
