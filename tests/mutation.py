@@ -58,7 +58,7 @@ TESTS_OF = {
     "propagation/penumbra.py": "test_penumbra",
     "propagation/visibility.py": "test_penumbra test_clutter_field test_clutter_coherence",
     "propagation/elements.py": "test_propagation",
-    "propagation/diffuse.py": "test_raytrace_scenes",
+    "propagation/diffuse.py": "test_raytrace_scenes test_clutter_field",
     "propagation/between.py": "test_between",
     "propagation/mirrors.py": "test_mirrors test_between",
     "propagation/pathset.py": "test_propagation test_ifsignal",
@@ -105,10 +105,6 @@ LIMIT = 400
 BUDGET = 60.0
 """Seconds of tests, as they were recorded, that are tried on one mutant: what only a slower one would notice counts as missed."""
 EXCUSED = [
-    ("propagation/diffuse.py", "+ np.uint64(2)) * np.uint64(0x9E", "a word of a hash: another mixes as well"),
-    ("propagation/diffuse.py", "- np.uint64(1)) * np.uint64(0x9E", "a word of a hash"),
-    ("propagation/cells.py", "+ np.uint64(2)) * np.uint64(0x9E", "a word of a hash"),
-    ("propagation/cells.py", "- np.uint64(1)) * np.uint64(0x9E", "a word of a hash"),
     ("propagation/cells.py", "np.repeat(code[large], 2) * np.uint64(4)", "names of cells, for the hash: different all the same"),
     ("propagation/statistical.py", "- (inside if clutter.place", "a draw from -0.5 to 0.5: the same law"),
     ("receive/estimate.py", "step / np.sign([gx, gy])", "a product with a sign is the quotient"),

@@ -80,3 +80,12 @@ def _element_path(paths, k, tx, rx):
 
 def _norm(v):
     return np.sqrt((v * v).sum())
+
+
+def splitmix64(state: int, word: int) -> int:
+    """The state moved on by the golden ratio's multiple and mixed, in whole numbers of Python; the published generator with word 0."""
+    mask = 2**64 - 1
+    z = state + (word + 1) * 0x9E3779B97F4A7C15 & mask
+    z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9 & mask
+    z = (z ^ z >> 27) * 0x94D049BB133111EB & mask
+    return z ^ z >> 31

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles import splitmix64
 from scipy import stats
 from scipy.integrate import dblquad
 
@@ -17,7 +18,9 @@ from isac_rt import scenario
 from isac_rt.arrays import antennas_of
 from isac_rt.city import City, Material, load_city
 from isac_rt.propagation import PathKind, make_propagation
-from isac_rt.propagation.cells import Density, cut
+from isac_rt.propagation.cells import Density, _mixed, cut
+from isac_rt.propagation.diffuse import scatterer_phase
+from isac_rt.randomness import seed_sequence
 from isac_rt.swarm import Pose, Swarm
 from isac_rt.waveform import waveform_of
 
@@ -82,6 +85,27 @@ def test_cells_are_the_same_in_every_process():
     env = {"PYTHONHASHSEED": "9", "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=root, env=env)
     assert done.stdout.strip() == digest(all_cells(canyon()))
+
+
+def test_hash_of_cells_is_splitmix64():
+    """So that a scene has the same scatterers in every version: published outputs for the seed 0, then the hash of any word.
+    Planted bugs: a step of another sign or size, a shift by another number."""
+    published = [splitmix64(0, k) for k in range(3)]  # its state grows by the golden ratio each time
+    assert published == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
+    rng = np.random.default_rng(3)
+    states, words = rng.integers(2**64, size=(2, 50), dtype=np.uint64)
+    assert _mixed(states, words).tolist() == [splitmix64(int(s), int(w)) for s, w in zip(states, words, strict=True)]
+
+
+def test_phase_of_a_scatterer_is_a_hash_of_its_place():
+    """splitmix64 over the float32 bits of the place, one coordinate after the other, in whole numbers of Python. Planted bugs: a step of
+    another sign, half a turn."""
+    points, start = np.array([[0.31, -7.7, 12.9], [1e5, 0.0, -0.0]]), seed_sequence(5, "scatterers").generate_state(1, np.uint64)[0]
+    for point, found in zip(points, scatterer_phase(points, 5), strict=True):
+        state = int(start)
+        for value in point:
+            state = splitmix64(state, int.from_bytes(np.float32(value).tobytes(), sys.byteorder))
+        assert found == pytest.approx(2 * np.pi * (state >> 11) / 2**53, rel=1e-15, abs=0)
 
 
 def test_cells_do_not_know_where_the_city_was_recentred():

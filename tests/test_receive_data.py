@@ -15,7 +15,7 @@ from isac_rt.arrays import pseudo_random_schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.demodulate import confidence_threshold, decide_transitions, demodulate
+from isac_rt.receive.demodulate import confidence_threshold, decide_transitions, demodulate, known_cycles
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -63,6 +63,27 @@ def test_receivers_import_nothing_that_knows_the_truth():
                 assert name == allowed or not any(
                     word in name for word in ("swarm", "propagation", "PathSet", "Transmission", "simulate")
                 ), name
+
+
+@pytest.mark.parametrize("rate", [-29.4, 0.3, 23.7])
+def test_known_phase_is_that_of_the_picked_cells(rate: float):
+    """Sum over a chirp at the path's beat and symbol, the beat by differences of the phase: what is left after the known phase is 0.
+    Planted bugs: half of the window's half taken (a ramp of the beat, too slow for DPSK to mind); the cross term's sign.
+
+    Bound: the beat of a moving path moves within the chirp, in proportion to the velocity (2e-4 rad at 1 m/s); rounding.
+    """
+    w, schedule, payload = frame(waveform=Waveform(num_samples=256))
+    samples = cube(w, schedule, payload, [Path(LENGTH, rate)], replace(ANTENNAS, rx_x=1, rx_z=1)).samples[:, 0].astype(complex)
+    known = known_cycles(w, LENGTH / 299_792_458.0, rate / 299_792_458.0, payload.delay_symbols)
+    n, middle = np.arange(256), slice(127, 130, 2)
+    u = n / w.sampling_rate + w.chirp_duration - w.sampled_duration
+    for m in range(w.num_groups):
+        t = u + (np.arange(w.num_chirps) * w.slot_duration + 2 * m * w.max_delay - w.frame_duration / 2)[:, None]
+        tau = (LENGTH + rate * t) / 299_792_458.0
+        beat = np.diff((w.carrier_frequency * tau + w.slope * tau * (u - tau / 2))[:, middle])[:, 0] / 2
+        spun = samples[m] * np.exp(-2j * np.pi * (beat + payload.delay_symbols[m] / 256)[:, None] * n)
+        left = np.angle(spun.sum(axis=1) * payload.phases[m].conj() * np.exp(-2j * np.pi * known[m]))
+        assert np.abs(left).max() < 1e-4 + 3e-4 * abs(rate)
 
 
 @pytest.mark.parametrize("cell", [0.61, 22.5, 137.28, 401.93])
