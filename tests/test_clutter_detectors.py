@@ -212,6 +212,21 @@ def test_sampled_scan_is_the_filter_of_the_cells_around(row: int):
     assert scan.peak[row, column] == pytest.approx(float(like_exponential(np.array([peak]), 18, size)[0]), rel=2e-3, abs=0)
 
 
+def test_guard_of_the_sample_matrix_is_that_of_the_range():
+    """Its cells lie along the range: the guard of the Doppler axis plays no part, that of the range keeps a second echo three rows off
+    out of the covariance that would cancel the first. Planted bug: the other axis's guard."""
+    w, schedule, payload = frame(waveform=SHORT)
+    near = 20 * w.range_cell(2)
+    echoes = [Path(2 * (near + k * w.range_cell(2)), 3.7, 2.0) for k in (0, 3)]
+    maps = maps_of(w, schedule, payload, echoes, FEW, 60, noise=0.5, seed=4)
+    ratio = {}
+    for guard in ((4, 1), (4, 6), (1, 4)):
+        settings = Receivers(clutter_detector="sample_matrix", guard_cells=guard)
+        ratio[guard] = judge([maps], w, FEW, schedule, payload.delay_symbols, settings)[0].ratio
+    assert np.array_equal(ratio[4, 1], ratio[4, 6])
+    assert ratio[4, 1][20].max() > 3 * ratio[1, 4][20].max()
+
+
 def test_noise_level_from_the_quietest_cells():
     """Means of few exponentials: their median is less than their mean, which Wilson and Hilferty's cube makes up for to 0.3 %; and half
     of the map under clutter that the mesh foretells. Planted bugs: the cube left out; the loudest cells taken."""
