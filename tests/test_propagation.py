@@ -397,8 +397,11 @@ def test_echo_moves_as_its_exact_delay():
 
 
 def test_links_hold_the_right_paths():
-    """The own link has every other UAV and no line of sight; a link to a PT has no echo of its two ends."""
+    """The own link has every other UAV and no line of sight; a link to a PT has no echo of its two ends. An echo has one point, the
+    body's, and it lies on no face. Planted bug: a face more than there are points."""
     found = free_space().paths(POSES, 0.0, [("A", "A"), ("A", "P")])
+    assert found["A", "A"].faces.tolist() == [[-1], [-1]]
+    assert np.array_equal(found["A", "A"].points, [[POSES["P"].position], [POSES["U"].position]])
     assert found["A", "A"].kind.tolist() == [PathKind.TARGET] * 2
     assert found["A", "A"].target.tolist() == [1, 2]
     assert sorted(found["A", "P"].kind.tolist()) == [PathKind.LINE_OF_SIGHT, PathKind.TARGET]
