@@ -113,6 +113,7 @@ EXCUSED = [
     ("propagation/direct.py", "(which.size, 2, 3)) for name in pair]", "a part of no length, which nothing shades"),
     ("gridding.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
     ("gridding.py", "lag[:, 1]", "and of one offset"),
+    ("receive/doppler.py", "support] = -2", "less than any modulus, as -1 is"),
     ("rangecells.py", "*plan(2), np.zeros((0", "the transform of no band, which is never made"),
 ]
 """Mutants (file, what the changed line holds and the line did not, why) that are not sampled: what follows is as right."""
