@@ -47,7 +47,7 @@ class Item:
     link : "TX->RX", or "all"
     modelled, left_out : in words
     estimate : of the error, None where there is none
-    unit : "rad", "dB" (power over the noise of a cell), "relative" or "chains/frame"
+    unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative", "chains/frame" or "of the power radiated"
     seconds : per frame, None where it has no time of its own
     """
 
@@ -107,7 +107,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     return {
         **mechanisms(plan.scenario),
         **decisions(plan),
-        **extent(setup.city, getattr(setup.propagation, "field", None), setup.scenario.clutter),
+        **extent(setup.city, setup.propagation, setup.scenario.clutter),
         "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
@@ -149,7 +149,7 @@ def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> 
 
 def _scene_items(setup: Setup) -> list[Item]:
     """Lines of the mesh and of its scatterers, with the reason for each count."""
-    out, record = [], extent(setup.city, getattr(setup.propagation, "field", None), setup.scenario.clutter)
+    out, record = [], extent(setup.city, setup.propagation, setup.scenario.clutter)
     if record["city_faces"] + record["city_faces_beyond_reach"]:
         gone = record["city_faces_beyond_reach"]
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
@@ -160,7 +160,20 @@ def _scene_items(setup: Setup) -> list[Item]:
         said = f"{record['scatterers']} scatterers, one for {record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
         why, error = f"{hidden} cells that no transmitter sees", record["clutter_error_db"]
         out.append(Item("clutter field", "all", said, why, error, "dB of a cell's mean"))
+        out.append(_mirrors_item(record["mirrors"]))
     return out
+
+
+def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
+    """The line of two-bounce clutter: mirrors by terminal, and what the mirrors left out would have sent on."""
+    if record is None:
+        return Item("clutter by mirrors", "all", "none: one bounce", "two bounces; clutter.mirrors adds them", None, "")
+    counts = ", ".join(f"{row['count']} of {name}" for name, row in record.items())
+    shares = [100 * row["share"] for row in record.values()]
+    kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
+    said = f"mirrors {counts}: scatterers lit or heard by way of one, {kept} % of what a terminal radiates"
+    rest = max(row["share_left_out"] for row in record.values())
+    return Item("clutter by mirrors", "all", said, "weaker mirrors, more than one on a way", rest, "of the power radiated")
 
 
 def _link_items(setup: Setup, link: Link, uses: list[Use], stages: dict[str, float] | None) -> list[Item]:

@@ -322,24 +322,28 @@ def mechanisms(scenario: Scenario) -> dict[str, Any]:
         "ghosts": traced and p.ghosts,
         "leakage": traced and p.leakage.enabled,
         "clutter": c.model,
+        "clutter_bounces": None if c.model not in ("field", "diffuse") else 2 if c.mirrors else 1,
         "rays": p.rays if traced else None,
         "clutter_rays": c.rays if c.model == "diffuse" else None,
     }
 
 
-def extent(city: City, field: Any, clutter: Clutter) -> dict[str, Any]:
+def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
     """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
 
     Parameters
     ----------
-    field : ClutterField, None where there is none, or where paths came from a store and it was not made
+    model : the propagation, whose `field` is None where there is none, or where paths came from a store and it was not made; the same holds
+        for its `twice`
 
     Returns
     -------
     record : area of a scatterer over its distance [m] and the error of the mean power that this brings, None without a field; faces
         traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
-        without a field, and cells of the whole mesh among which they were
+        without a field, and cells of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and the shares of
+        its power that they and all others send on, None without mirrors
     """
+    field, twice = getattr(model, "field", None), getattr(model, "twice", None)
     area = Density.of(clutter).per_metre if clutter.model == "field" else None
     return {
         "cell_area_per_metre_m": area,
@@ -348,6 +352,12 @@ def extent(city: City, field: Any, clutter: Clutter) -> dict[str, Any]:
         "city_faces_beyond_reach": city.num_beyond,
         "scatterers": None if field is None else len(field.cells),
         "scatterer_cells": None if field is None else field.num_candidates,
+        "mirrors": None
+        if twice is None
+        else {
+            name: {"count": len(kept), "share": round(sum(m.share for m in kept), 6), "share_left_out": round(twice.left_out[name], 6)}
+            for name, kept in twice.mirrors.items()
+        },
     }
 
 

@@ -590,5 +590,5 @@ def _fidelity(setup: Setup) -> dict[str, object]:
         **decisions(setup.plan),
         "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
         "paths_contradicted": setup.propagation.dropped,
-        **extent(setup.city, getattr(setup.propagation, "field", None), setup.scenario.clutter),
+        **extent(setup.city, setup.propagation, setup.scenario.clutter),
     }

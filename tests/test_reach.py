@@ -115,7 +115,7 @@ def test_the_plan_counts_what_the_summary_counts():
     s = district(315, frames=2)
     setup = simulate.prepare(s)
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
-    record = extent(setup.city, setup.propagation.field, s.clutter)
+    record = extent(setup.city, setup.propagation, s.clutter)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
     for key, value in {**record, **mechanisms(s)}.items():
         assert planned[key] == done[key] == value, key
@@ -124,6 +124,30 @@ def test_the_plan_counts_what_the_summary_counts():
     assert str(record["city_faces_beyond_reach"]) in lines["mesh"]["left_out"]
     assert str(record["scatterers"]) in lines["clutter field"]["modelled"]
     assert lines["clutter field"]["estimate"] == record["clutter_error_db"]
+    assert planned["clutter_bounces"] == 1 and record["mirrors"] is None
+    assert "clutter.mirrors" in lines["clutter by mirrors"]["left_out"]
+
+
+@pytest.mark.sionna
+def test_the_plan_counts_mirrors():
+    """Two bounces: the mirrors of each terminal and the share of its power that they and all others send on, in the plan's record, its line
+    and the summary; few mirrors and the rest are what many are. Planted bugs: the share left out without the next mirror; the line's
+    error that of the terminal with the least."""
+    s = district(315, frames=2)
+    some, all_of_them = (s.model_copy(update={"clutter": s.clutter.model_copy(update={"mirrors": n})}) for n in (3, 64))
+    setup = simulate.prepare(some)
+    planned, done = make_plan(setup), simulate.summarise(some)["fidelity"]
+    assert planned["mirrors"] == done["mirrors"] and planned["clutter_bounces"] == done["clutter_bounces"] == 2
+    assert set(planned["mirrors"]) == {"A", "P"}
+    most = extent(setup.city, simulate.prepare(all_of_them).propagation, s.clutter)["mirrors"]
+    for name, row in planned["mirrors"].items():
+        assert row["count"] == len(setup.propagation.twice.mirrors[name]) == 3
+        whole = most[name]["share"] + most[name]["share_left_out"]
+        assert row["share"] + row["share_left_out"] == pytest.approx(whole, abs=3e-6, rel=0)  # six digits of each are kept
+        assert row["share"] > most[name]["share"] / 4 and row["share_left_out"] > 0
+    (line,) = (item for item in planned["items"] if item["what"] == "clutter by mirrors")
+    assert "3 of A, 3 of P" in line["modelled"]
+    assert line["estimate"] == max(row["share_left_out"] for row in planned["mirrors"].values())
 
 
 def test_the_density_follows_from_the_error():

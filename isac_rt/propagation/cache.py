@@ -103,6 +103,11 @@ class CachedPropagation:
         """The model's scatterers; None before it is made."""
         return getattr(self._model, "field", None)
 
+    @property
+    def twice(self) -> Any:
+        """Its mirror images, None as long as all paths came from the store."""
+        return getattr(self._model, "twice", None)
+
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
         """As the model's own, bit for bit."""
         where = {

@@ -63,10 +63,11 @@ class Mirror:
         return motion
 
 
-def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int) -> list[Mirror]:
-    """The mirrors that send on the most of what a terminal radiates on its flight, strongest first; at most `most`."""
+def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int) -> tuple[list[Mirror], float]:
+    """The mirrors that send on the most of what a terminal radiates on its flight, strongest first, at most `most`; and the share that
+    all others send on."""
     if not most or not city.num_faces:
-        return []
+        return [], 0.0
     places = flight.knots[np.unique(np.linspace(0, len(flight.knots) - 1, PLACES).round().astype(int))]
     cells = cut(city, np.ones(city.num_faces, bool), places, COARSE, seed)
     _, group = np.unique(np.stack([city.plane_of_face, city.face_material.astype(np.int64)], axis=1), axis=0, return_inverse=True)
@@ -88,14 +89,15 @@ def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, s
         angle = np.minimum(cells.area[seen] * cosine / r**2, 2 * np.pi)
         share += np.bincount(group[face], back * angle / (4 * np.pi), share.size) / len(places)
     out = []
-    for number in np.argsort(-share, kind="stable")[:most]:
+    order = np.argsort(-share, kind="stable")
+    for number in order[:most]:
         if share[number] > 0:
             faces = np.flatnonzero(group == number)
             faces = faces[np.argsort(-city.areas[faces], kind="stable")]
             first = faces[0]
             material = city.materials[city.face_material[first]]
             out.append(Mirror(normals[first], float(offsets[first]), faces, city.corners[faces], material, float(share[number])))
-    return out
+    return out, float(share[order[most:]].sum())
 
 
 def _reflected(material: Material, wavelength: float) -> np.ndarray:

@@ -61,10 +61,12 @@ class SeenTwice:
 class TwoBounces:
     """Mirror images of one field for all terminals of a run; `plan` makes it from a scenario."""
 
-    def __init__(self, field: ClutterField, city: City, mirrors: dict[str, list[Mirror]], wavelength: float) -> None:
+    def __init__(self, field: ClutterField, city: City, mirrors: dict[str, tuple[list[Mirror], float]], wavelength: float) -> None:
         self._field, self._city, self._wavelength = field, city, wavelength
-        self.mirrors = mirrors
+        self.mirrors = {name: kept for name, (kept, _) in mirrors.items()}
         """Of each terminal, the strongest first."""
+        self.left_out = {name: rest for name, (_, rest) in mirrors.items()}
+        """Share of what each terminal radiates that all other mirrors send on."""
         self._shown: dict[tuple[str, int], list[np.ndarray]] = {}
 
     @classmethod
