@@ -33,6 +33,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.4,
 }  # fmt: skip
 _SHOWN_DB = 60.0
+_TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 """Depth of a map's colour scale [dB]."""
 _UNITS = {"range": (1.0, "m"), "velocity": (1.0, "m/s"), "azimuth": (180 / np.pi, "deg"), "elevation": (180 / np.pi, "deg")}
 
@@ -91,9 +92,11 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     power = dataset.map_power.values[snapshot, observer]
     r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
     rows, columns = np.isfinite(r), np.isfinite(v)
-    level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], 1e-300))
+    level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], _TINY))
     level = level - np.median(level)  # most cells hold noise alone; the peak may be the transmitter's own leakage
-    _map(ax, v[columns], r[rows], level, (-5.0, min(level.max(), _SHOWN_DB)), "power above the median cell [dB]")
+    _map(ax, v[columns], r[rows], level, (-5.0, np.clip(level.max(), 5.0, _SHOWN_DB)), "power above the median cell [dB]")
+    if not power.any():
+        ax.text(0.5, 0.5, "no map: the data's delays were not known", color="white", ha="center", transform=ax.transAxes)
     frame = int(dataset.snapshot_frame.values[snapshot])
     mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
     kind = dataset.det_kind.values
@@ -146,7 +149,7 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
     """Range cell over chirp of the first group before the data are removed: what the delay symbols do to every echo."""
     magnitude = dataset.map_equivalent_range.values[snapshot, observer]
     magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
-    level = 20 * np.log10(np.maximum(magnitude, 1e-300))
+    level = 20 * np.log10(np.maximum(magnitude, _TINY))
     level = level - level.max()
     _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, (-_SHOWN_DB, 0.0), "magnitude [dB below the peak]")
     cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])

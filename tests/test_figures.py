@@ -73,6 +73,15 @@ def test_truth_beyond_the_unambiguous_velocity_is_drawn_where_it_folds_to(run):
     assert abs(truth.get_xdata()[0] - (0.25 * span + 0.1234)) < 1e-9
 
 
+def test_a_terminal_without_the_data_shows_no_map_and_says_so(run):
+    """A scale of a tenth of a decibel about nothing was what it showed before."""
+    blank = run.dataset.copy(deep=True)
+    blank.map_power.values[0, 1] = 0.0
+    ax = range_doppler(Figure().subplots(), blank, 0, 1)
+    assert "no map" in " ".join(text.get_text() for text in ax.texts) and ax.images[0].get_clim()[1] >= 5
+    assert not range_doppler(Figure().subplots(), run.dataset, 0, 1).texts
+
+
 def test_tracks_are_drawn_in_people_units_and_shadow_is_shaded(run):
     ax = over_time(Figure().subplots(), run.dataset, 1, "azimuth")
     line = next(line for line in ax.get_lines() if line.get_label() == "U1")
