@@ -24,7 +24,21 @@ from numba import njit
 
 from isac_rt.lanefft import ROW, plan, transform
 from isac_rt.rangecells import CHIRPS, Band, data_phase, make_band, no_band, shift_of, to_cells, window_length, write_cells
-from isac_rt.simd import LANES, aligned, cos_sin, cube_memory, floor, load, narrow, splat, store, transpose, zip_high, zip_low
+from isac_rt.simd import (
+    LANES,
+    aligned,
+    cos_sin,
+    cos_sin_exact,
+    cube_memory,
+    floor,
+    load,
+    narrow,
+    splat,
+    store,
+    transpose,
+    zip_high,
+    zip_low,
+)
 from isac_rt.synthesis import FAST, Tones, chirp_terms, filter_gain, numbers, passed, sources
 from isac_rt.waveform import Waveform
 
@@ -57,8 +71,9 @@ ACCURATE = Setting(1.5, 8, True, True)
 """Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square of the speed."""
 ACCURATE_ERROR = 5e-6
 _MANY = 4000  # paths that no longer stay in the second-level cache beside the grid; they are read once for several chirps
-_TOGETHER = 3
+_TOGETHER = 6
 _MARGIN = LANES  # rows beyond the grid
+_EXTRA = 2  # degree of the weights' polynomials above the width
 _STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
 _DOPPLER = 4 / 1024  # cycles per sample, more than motion and elements move a frequency
 _FIELDS = 3  # float64 of a path before its transmit elements' delays
@@ -82,7 +97,7 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
     polynomials : (4, degree + 1, WIDTH) float32, highest power first
     deconvolution : (N,) float32, D at x = n - N//2
     """
-    half, degree = num_samples // 2, width + 2
+    half, degree = num_samples // 2, width + _EXTRA
     grid = scipy.fft.next_fast_len(max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True)
     x = np.arange(-half, half + 1)
     nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
@@ -158,9 +173,10 @@ def _gate(work, table, at, life, f, w, time, symbol):
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _weigh(work, scratch, poly, width, degree, wideband, cubic):
+def _weigh(work, scratch, poly, taps, wideband, cubic):
     """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as they are."""
     r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
+    width, degree = len(taps), len(taps) + _EXTRA
     set_size = (degree + 1) * width
     for j in range(width):
         v0, v1, v2 = splat(poly[j]), splat(poly[set_size + j]), splat(poly[2 * set_size + j])
@@ -185,12 +201,13 @@ def _weigh(work, scratch, poly, width, degree, wideband, cubic):
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _spread(grid, base, places, scratch, count, width, steer, k):
+def _spread(grid, base, places, scratch, count, taps, steer, k):
     """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`."""
     for i in range(count):
         at = base + int(places[i]) * ROW
         ar, ai = load(steer, k), load(steer, k + 16)
-        for j in range(i, i + _STEP * width, _STEP):
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
             c, s = splat(scratch[j]), splat(scratch[j + 16])
             store(grid, at, load(grid, at) + c * ar - s * ai)
             store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
@@ -210,7 +227,7 @@ def _centred(steer, work, i, k):
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _spread_wideband(grid, base, places, scratch, count, width, steer, k, work, centre):
+def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
         at = base + int(places[i]) * ROW
@@ -221,7 +238,8 @@ def _spread_wideband(grid, base, places, scratch, count, width, steer, k, work, 
         skew = q * splat(_SKEW)
         br, bi = theta * (er - skew * ei), theta * (ei + skew * er)
         er, ei = er + bow * er, ei + bow * ei
-        for j in range(i, i + _STEP * width, _STEP):
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
             u, v, w = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32])
             store(grid, at, load(grid, at) + u * er + v * br + w * gr)
             store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi + w * gi)
@@ -230,7 +248,7 @@ def _spread_wideband(grid, base, places, scratch, count, width, steer, k, work, 
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _spread_cubic(grid, base, places, scratch, count, width, steer, k, work, centre):
+def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same to the third order: strengths of 1, j x, x^2 - c and j (x^3 - 3/5 x)."""
     for i in range(count):
         at = base + int(places[i]) * ROW
@@ -243,7 +261,8 @@ def _spread_cubic(grid, base, places, scratch, count, width, steer, k, work, cen
         bow, skew, less = minus * splat(centre), q * splat(_SKEW), splat(_ONE) - square * splat(_TENTH)
         br, bi = theta * (less * er - skew * ei), theta * (less * ei + skew * er)
         er, ei = er + bow * er, ei + bow * ei
-        for j in range(i, i + _STEP * width, _STEP):
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
             u, v, w, x = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32]), splat(scratch[j + 48])
             store(grid, at, (load(grid, at) + u * er + v * br) + (w * gr + x * tr))
             store(grid, at + 16, (load(grid, at + 16) + u * ei + v * bi) + (w * gi + x * ti))
@@ -303,12 +322,12 @@ def _in_band(work, places, count, limit):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, centre, width, wideband, cubic, poly, deconvolution,
+def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, centre, taps, wideband, cubic, poly, deconvolution,
             radices, twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, band, grid, work, scratch,
             tile):  # fmt: skip
     """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
     _, num_rx, num_chirps, num_samples = shape
-    groups, size, low, degree = send.shape[1], rows.shape[0], width // 2 - 1, poly.shape[0] // (4 * width) - 1
+    groups, size, low = send.shape[1], rows.shape[0], len(taps) // 2 - 1
     channels, per_block, cells = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1), band.turn.shape[0]
     top, skirt, per_delay = w[7] / w[1], w[8] / w[1], w[1] * w[2]
     cut = top + skirt
@@ -336,17 +355,17 @@ def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, 
                 if blocks[b, 3] or least < 0 or most > top:
                     _gate(work, table, at, life, 32 * b, w, time, delay)
                 used = _in_band(work, places, count, view[4]) if cells else count
-                _weigh(work, scratch, poly, width, degree, wideband, cubic)
+                _weigh(work, scratch, poly, taps, wideband, cubic)
                 if cubic:
-                    _spread_cubic(grid, g * stride, places, scratch, used, width, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_cubic(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
                 elif wideband:
-                    _spread_wideband(grid, g * stride, places, scratch, used, width, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_wideband(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
                 else:
-                    _spread(grid, g * stride, places, scratch, used, width, steer, b * 16 * 32)
+                    _spread(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 32)
         for g in range(now.shape[0]):
             m, p = now[g] // num_chirps, now[g] % num_chirps
             table_g = grid[g * stride : (g + 1) * stride]
-            _fold(table_g, size, low, width)
+            _fold(table_g, size, low, len(taps))
             transform(table_g, low * ROW, size, radices, twiddles)
             if cells == 0:
                 to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
@@ -359,18 +378,31 @@ def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, 
                 write_cells(out, to, 2 * cells * num_chirps, channels, p % CHIRPS + 1, num_chirps, cells, band.stage, tile)
 
 
-def _steering(waveform: Waveform, delay: np.ndarray, wideband: bool) -> np.ndarray:
-    """Phasors of up to 16 receive elements at mid-window and their turn over half a chirp: (K, 48) float32."""
-    w = waveform
-    cycles = (w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]) * delay - w.slope * delay**2 / 2
-    angle = 2 * np.pi * (cycles - np.rint(cycles))
-    planes = 3 if wideband else 2
-    out = aligned(len(delay) * planes * LANES).reshape(len(delay), planes, LANES)
-    count = delay.shape[1]
-    out[:, 0, :count], out[:, 1, :count] = np.cos(angle), np.sin(angle)
-    if wideband:
-        out[:, 2, :count] = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2) * delay
-    return out.reshape(len(delay), planes * LANES)
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
+    """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from the last element on."""
+    count = min(LANES, rx_delay.shape[1] - first)
+    for i in range(path.shape[0]):
+        for r in range(count):
+            delay[r] = rx_delay[path[i], first + r]
+        late, at = load(delay, 0), i * planes * LANES
+        cycles = late * (splat(frequency) - splat(slope / 2) * late)
+        c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
+        store(out, at, c)
+        store(out, at + LANES, s)
+        if planes == 3:
+            store(out, at + 2 * LANES, narrow(late * splat(turn)))
+
+
+def _steering(waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first: int, wideband: bool) -> np.ndarray:
+    """Of each listed path the phasors of the up to 16 receive elements from `first` on at mid-window (real, imaginary) and, `wideband`,
+    their turn over half a chirp [rad]: (32 or 48 n,) float32."""
+    w, planes = waveform, 3 if wideband else 2
+    out = aligned(len(path) * planes * LANES)
+    middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
+    turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
+    _steer(out, planes, path, rx_delay, first, middle, w.slope, turn, np.zeros(LANES))
+    return out
 
 
 @dataclass(frozen=True)
@@ -502,10 +534,10 @@ def _synthesise(
     buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(_STEP * setting.width), aligned(512)
     chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(num_samples)
     for first in range(0, shape[1], LANES):
-        steer = _steering(w, t.rx_delay[b.path, first : first + LANES], setting.wideband)
+        steer = _steering(w, t.rx_delay, b.path, first, setting.wideband)
         _chirps(out.reshape(-1).view(np.float32), shape, first, chirps, together, numbers(w, transition), views, turns,
-                float(w.num_samples // 2), centre, setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(),
-                deconvolution, radices, twiddles, rows, b.table, b.factor, b.life, b.blocks, b.bounds, steer.ravel(), t.symbol_delay,
+                float(w.num_samples // 2), centre, (0,) * setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(),
+                deconvolution, radices, twiddles, rows, b.table, b.factor, b.life, b.blocks, b.bounds, steer, t.symbol_delay,
                 t.send, t.antenna, fresh, band, *buffers)  # fmt: skip
     return True
 

@@ -28,6 +28,8 @@ sight; the rest are gridded. At most FEW_PATHS paths all go direct. paper: the p
 FEW_PATHS = 10
 """Up to so many paths the direct method costs about as much as the transforms of the gridded one."""
 
+_CHUNK = 1024  # paths whose element delays stay in the second-level cache
+
 
 @dataclass(frozen=True, kw_only=True)
 class Transmission:
@@ -327,11 +329,19 @@ def _grid_shape(waveform: Waveform) -> tuple[int, int]:
 def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """(|R u - r| - R)/c, and -r.u/c where R is infinite: (K, L) [s], free of cancellation."""
     along = direction @ elements.T
-    with np.errstate(invalid="ignore"):
-        square = (elements**2).sum(1)
-        distance = np.sqrt(radius[:, None] ** 2 - 2 * radius[:, None] * along + square)
-        near = (square - 2 * radius[:, None] * along) / (distance + radius[:, None])
-    return np.where(np.isfinite(radius)[:, None], near, -along) / SPEED_OF_LIGHT
+    out = along * (-1 / SPEED_OF_LIGHT)
+    square = (elements**2).sum(1)
+    near = np.flatnonzero(np.isfinite(radius))
+    for some in np.split(near, range(_CHUNK, near.size, _CHUNK)):
+        far = radius[some, None]
+        change = square - 2 * far * along[some]
+        distance = far**2 + change
+        np.sqrt(distance, out=distance)
+        distance += far
+        change /= distance
+        change /= SPEED_OF_LIGHT
+        out[some] = change
+    return out
 
 
 def _straight_delay(tx: np.ndarray, rx: np.ndarray, direction: np.ndarray, length: np.ndarray) -> np.ndarray:
