@@ -44,3 +44,14 @@ def test_links_between_pages_and_files_lead_somewhere():
             assert (page.parent / target).exists(), f"{page.name}: {target}"
         for name in re.findall(r"`((?:isac_rt|docs|tests|scenes|notebooks)/[\w./-]+\.\w+)`", text):
             assert (ROOT / name).exists(), f"{page.name}: {name}"
+
+
+def test_tests_that_the_pages_name_are_there():
+    """`test_file::test_name`. Planted bug: one of them renamed."""
+    found = 0
+    for page in (ROOT / "docs").glob("*.md"):
+        for file, name in re.findall(r"`(?:tests/)?(test_\w+)(?:\.py)?::(test_\w+)`", page.read_text(encoding="utf-8")):
+            tests = (ROOT / "tests" / f"{file}.py").read_text(encoding="utf-8")
+            assert re.search(rf"^def {name}\(", tests, re.MULTILINE), f"{page.name}: {name}"
+            found += 1
+    assert found > 50
