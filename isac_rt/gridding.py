@@ -143,7 +143,8 @@ def _prepare(work, places, table, at, tx, factor, f, w, view, time, symbol, send
     cycles = element * (carrier - splat(slope / 2) * element)
     frequency = sent * b + splat(slope * ts) * element
     wanted = frequency - splat(view[0])
-    wanted = wanted - floor(wanted + splat(view[3]))
+    fold = floor(wanted + splat(view[3]))
+    wanted, cycles = wanted - fold, cycles - fold * splat(view[1])
     store(places, 16, wanted)
     wanted = wanted * splat(view[2])
     place = (wanted - floor(wanted)) * splat(size * _BELOW)

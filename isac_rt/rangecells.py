@@ -8,7 +8,8 @@ the window and transformed back, with the chirp's grid still in the second-level
 
 x counts samples from the middle of the window, wherever it lies in the chirp. The sum over N samples differs by tails of the
 window's transform at N' - (cells between path and cell), `PAD` cells or more: 1e-5 of a path for Hann's window, at the edges alone.
-A path less than `PAD` cells below N is taken for one below 0, as the samples have it, but its tail lacks the phase of the window's place.
+A path less than `PAD` cells below N is taken for one below 0, as the samples have it; since the x_i are not the samples' times, it is
+turned by exp(-j 2 pi n_c), n_c the place of the window's middle in the chirp.
 
 White noise of power sigma^2 in N samples is noise of power sigma^2 N'/N in the N' samples before the window; the cells' covariance
 sigma^2 sum_n w_n^2 exp(-j 2 pi (k - k') n/N) is the same, since the transform of w^2 falls faster still.

@@ -62,8 +62,8 @@ BUGS = (
     Bug(
         "test_hard_signal::test_a_target_at_half_a_metre",
         "ifsignal.py",
-        "np.where(np.isfinite(radius)[:, None], near, -along)",
-        "np.where(np.zeros_like(near, bool), near, -along)",
+        "near = np.flatnonzero(np.isfinite(radius))",
+        "near = np.flatnonzero(np.zeros_like(radius, bool))",
     ),
     Bug("test_hard_signal::test_one_path_80_db_above_another", "ifsignal.py", "return (chosen & strong) | sight", "return chosen & sight"),
     Bug("test_hard_signal::test_a_million_paths", "gridding.py", "k, lag = path[index], offset[index]",
