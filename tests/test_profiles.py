@@ -82,9 +82,9 @@ def test_paths_below_the_first_cell_leave_their_tails():
 
 
 def test_paths_of_the_last_cells_leave_their_tails_too():
-    """Beats just under the sampling rate, which small delay symbols let through: the samples have them below zero, so that their tails lie in
-    the first cells, with the phase of the window's place. Of one path's power in its own cells 1e-3 is there. The bound: tails cut 32 cells
-    away, 1e-5 of a path. Planted bug: a folded path without the turn `fold` (0.02 of the power)."""
+    """Beats just under the sampling rate, which small delay symbols let through: samples have them below zero, so that their tails lie in
+    the first cells, with the phase of the window's place. The bound: tails cut 32 cells away, 1e-5 of a path. Planted bug: a folded
+    path without its turn, `cycles` left as they are (0.54)."""
     w = replace(Waveform(), num_chirps=9)
     own = sender(w, "A", 1)
     small = replace(own.payload, delay_symbols=own.payload.delay_symbols % 16)

@@ -432,11 +432,7 @@ def filter_skirts() -> float:
     unit="rad",
     bound=0.002,
     why=("the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but for its change over the window"),
-    planted=(
-        "ifsignal.py",
-        "square - 2 * radius[:, None] * along) / (distance + radius[:, None])",
-        "0 * square - 2 * radius[:, None] * along) / (2 * radius[:, None])",
-    ),
+    planted=("ifsignal.py", "square - 2 * far * along[some]", "0 * square - 2 * far * along[some]"),
 )
 def spherical_waves() -> float:
     """Phases over the full array of a scatterer at 0.5 m follow the elements' own distances."""
