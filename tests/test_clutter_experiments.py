@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.experiments.clutter import PT_SNR, Bench, Kind, pt_errors, resting, strongest_mean, weeded
+from isac_rt.experiments.clutter import PT_SNR, Bench, Kind, _found, earlier, pt_errors, resting, strongest_mean, weeded
 from isac_rt.experiments.clutter_statistics import statistics
 from isac_rt.experiments.detectors import RATE, Tally, summarise
 from isac_rt.propagation.expected import ExpectedClutter
@@ -64,6 +65,40 @@ def test_run_and_weeding():
     paths = resting(ranges, gains, 2, 0.0, np.array([0.0, 1.0, 0.0]))
     assert strongest_mean(paths, W) == pytest.approx(9, rel=1e-6)
     assert len(weeded(paths)) == 45
+
+
+def test_paths_of_some_frames_before():
+    """Delay and rate of ways over points at rest, seen in steady flight: closed forms at both times; the third derivative of the distance,
+    3 v^3/r^2 at most, leaves a micrometre. Planted bugs: later in place of earlier; the half of the acceleration's term left out."""
+    rng = np.random.default_rng(5)
+    points, place, v = rng.uniform((-90, -90, 60), (90, 90, 240), (40, 3)), np.array([3.1, -2.2, 1.7]), np.array([7.7, -5.1, 3.3])
+    ago = 0.0071
+
+    def at(t: float) -> tuple[np.ndarray, np.ndarray]:
+        span = place + v * t - points
+        return np.linalg.norm(span, axis=1), span @ v / np.linalg.norm(span, axis=1)
+
+    (r, rate), (r_before, rate_before) = at(0.0), at(-ago)
+    ways = resting(r, np.ones(40), 2, 0.3, np.array([0.0, 1.0, 0.0]))
+    ways = replace(ways, delay_rate=2 * rate / SPEED_OF_LIGHT, delay_accel=2 * (v @ v - rate**2) / r / SPEED_OF_LIGHT)
+    before = earlier(ways, ago)
+    assert np.abs(before.delay * SPEED_OF_LIGHT / 2 - r_before).max() < 3 * (v @ v) ** 1.5 / r.min() ** 2 * ago**3 / 6
+    assert np.abs(before.delay_rate * SPEED_OF_LIGHT / 2 - rate_before).max() < 3 * (v @ v) ** 1.5 / r.min() ** 2 * ago**2 / 2
+    np.testing.assert_array_equal(before.gain, ways.gain)
+
+
+def test_false_alarms_are_counted_where_no_target_is():
+    """Crossings in noise of one level far from three targets, all of which are found; crossings in their rows count for nothing.
+    Planted bug: rows near targets counted."""
+    maps = np.full((4, 3, 120, 60), 1.0 + 0j, np.complex64)
+    targets = np.array([[30, 10], [60, 59], [90, 31]])
+    alarms = np.array([[5 + 11 * k, 7 * k % 60] for k in range(10)])
+    alarms = alarms[np.abs(alarms[:, :1] - targets[:, 0]).min(axis=1) > 4]
+    for row, column in [*targets, *alarms, (31, 40), (62, 20)]:
+        maps[:, :, row, (column + 30) % 60] = 3.0  # zero Doppler is in the middle of the map that targets are told in
+    hits, crossed, free = _found(maps, targets)
+    assert hits == 3 and crossed == len(alarms) > 5
+    assert free == (120 - 3 * 9) * 60
 
 
 def test_thresholds_are_scaled_on_one_frame_and_counted_on_the_other():

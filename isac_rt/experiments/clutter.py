@@ -8,6 +8,8 @@ per sample and antenna, of the reference. A frame is one group at the PT, three 
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +22,7 @@ from isac_rt.experiments.clutter_scenes import PLACES, SMALL_UAV_M2, SPEED, Scen
 from isac_rt.experiments.outcome import Judgement, Outcome, Progress, Verdict, proportion
 from isac_rt.experiments.symbols import make_cells
 from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.propagation.statistical import rayleigh_cells
@@ -45,6 +47,10 @@ PT_SNR = np.array([-32.0, -29.0, -27.0, -25.0, -22.0, -17.0, -10.0])
 AT_SNR = np.array([-48.0, -45.0, -42.0, -39.0, -35.0, -30.0])
 FALSE_ALARMS = 1e-4
 TARGETS = 16
+CLEAR_ROWS = 4
+"""Range cells from a target within which a crossing of the threshold is not counted as a false alarm."""
+PILOTS = {"profile": 1, "old profile": 12}
+"""Frames from the pilot that a range profile is learned from to the data: one, and half of `modulation.pilot_every_frames`' 25."""
 ORDER = 8
 
 
@@ -129,36 +135,35 @@ def _mean_amplitude(scenes: Scenes, paths: PathSet, names: tuple[str, str], star
 
 
 def pt_errors(bench: Bench, kind: Kind, physical: bool, frame: int) -> dict[tuple[str, str], np.ndarray]:
-    """Errors of one group's frame at each SNR, {(symbol, decision): counts}: the delay symbols by the strongest cell and by the profile
-    of an unmodulated frame before it, the DPSK symbols from the cells so decided."""
+    """Errors of one group's frame at each SNR, {(symbol, decision): counts}: the delay symbols by the strongest cell and by the profiles
+    of unmodulated frames before it (`PILOTS`), the DPSK symbols from the cells so decided."""
     w = replace(bench.waveform, num_groups=1)
     own, other = bench.poses(kind)
-    ahead = (other.position - own.position) / DISTANCE
     schedule, rng = bench.scenes.setup.schedule[:1], generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame)
-    sight = make_paths(
-        gain=np.ones(1), delay=np.array([DISTANCE / SPEED_OF_LIGHT]), departure=ahead[None], arrival=-ahead[None],
-        kind=int(PathKind.LINE_OF_SIGHT), epoch=bench.scenes.epoch, tx="AT", rx="PT", tx_radius=DISTANCE, rx_radius=DISTANCE,
-    )  # fmt: skip
-    clutter = bench.clutter(kind, 1, frame, physical)
-    cubes = {}
-    for name, payload in (("data", random_payload(w, schedule, ORDER, rng)), ("pilot", unmodulated(w))):
+    sight, clutter = _sight(bench, own, other), bench.clutter(kind, 1, frame, physical)
+
+    def received(payload: Payload, before: int) -> IFCube:
         sent = Transmission(name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload)
-        links = [(sent, sight)] if clutter is None else [(sent, sight), (sent, clutter)]
-        cubes[name] = if_signal(w, links, other, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-3), payload
+        links = [(sent, sight)] if clutter is None else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
+        return if_signal(w, links, other, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-3)
+
+    payload = random_payload(w, schedule, ORDER, rng)
+    cube = received(payload, 0)
+    pilots = {name: received(unmodulated(w), frames) for name, frames in PILOTS.items() if kind.speed or frames == 1}
     beats = beat_cells(w, DISTANCE / SPEED_OF_LIGHT, 0.0)[0]
-    cube, payload = cubes["data"]
     shape = cube.samples[0].shape
     pairs = rng.standard_normal((*shape[:2], 2 * shape[2]), np.float32) * np.float32(np.sqrt(w.num_samples / 2))
     cells = make_cells(cube.samples[0].copy(), beats, pairs.view(np.complex64))
     one = np.ones(1)
     reference = Prediction(range=DISTANCE * one, velocity=0 * one, direction=np.zeros((1, 2)), range_std=one, velocity_std=one, weight=one)
-    wrong: dict[tuple[str, str], list[int]] = {(symbol, d): [] for symbol in ("delay", "dpsk") for d in ("strongest cell", "profile")}
+    wrong: dict[tuple[str, str], list[int]] = {(symbol, d): [] for symbol in ("delay", "dpsk") for d in ("strongest cell", *pilots)}
     for number, level in enumerate(10 ** (-PT_SNR / 20)):
         power = cells.power(level)
-        words = seed_sequence(bench.seed, "pilot noise", kind.clutter, frame, number).generate_state(2)
-        pilot = replace(cubes["pilot"][0], samples=cubes["pilot"][0].samples.copy())
-        profile = learn_profile(add_noise(pilot, level**2, words), reference)
-        metrics = {"strongest cell": power, "profile": correlate(power, profile) if profile.any() else power}
+        metrics = {"strongest cell": power}
+        for name, pilot in pilots.items():
+            words = seed_sequence(bench.seed, "pilot noise", name, kind.clutter, frame, number).generate_state(2)
+            profile = learn_profile(add_noise(replace(pilot, samples=pilot.samples.copy()), level**2, words), reference)
+            metrics[name] = correlate(power, profile) if profile.any() else power
         for name, metric in metrics.items():
             raw = decide(metric, [], w)[0]
             wrong["delay", name].append(int((np.clip(raw, 0, w.num_delay_symbols - 1) != payload.delay_symbols[0]).sum()))
@@ -168,9 +173,25 @@ def pt_errors(bench: Bench, kind: Kind, physical: bool, frame: int) -> dict[tupl
     return {name: np.array(counts) for name, counts in wrong.items()}
 
 
+def _sight(bench: Bench, own: Pose, other: Pose) -> PathSet:
+    """The line of sight from AT to PT, of unit amplitude; they fly side by side."""
+    ahead = (other.position - own.position) / DISTANCE
+    return make_paths(
+        gain=np.ones(1), delay=np.array([DISTANCE / SPEED_OF_LIGHT]), departure=ahead[None], arrival=-ahead[None],
+        kind=int(PathKind.LINE_OF_SIGHT), epoch=bench.scenes.epoch, tx="AT", rx="PT", tx_radius=DISTANCE, rx_radius=DISTANCE,
+    )  # fmt: skip
+
+
+def earlier(paths: PathSet, seconds: float) -> PathSet:
+    """The same scatterers some time before, gains and directions as they are: 0.94 m of flight in 12 frames at 10 m/s."""
+    rate = paths.delay_rate - seconds * paths.delay_accel
+    return replace(paths, delay=paths.delay - seconds * (rate + seconds * paths.delay_accel / 2), delay_rate=rate)
+
+
 def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.ndarray]:
     """Of `TARGETS` targets of unit amplitude, those that the CFAR finds within a cell at each SNR, without a filter and after the
-    zero-Doppler notch, for the clutter at the paper's level and as it is: {(physical, filter): hits}."""
+    zero-Doppler notch, for the clutter at the paper's level and as it is: {(physical, filter): (SNR, 3) hits, false alarms and cells in
+    which there could have been one}."""
     w, schedule = bench.waveform, bench.scenes.setup.schedule
     own, _ = bench.poses(kind)
     rng = generator(bench.seed, "at data", kind.clutter, round(kind.speed), frame)
@@ -205,12 +226,14 @@ def _cube(bench: Bench, paths: PathSet, sent: Transmission) -> IFCube:
     return if_signal(bench.waveform, [(sent, paths)], sent.pose, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-2)
 
 
-def _found(maps: np.ndarray, cells: np.ndarray) -> int:
+def _found(maps: np.ndarray, cells: np.ndarray) -> tuple[int, int, int]:
+    """Targets found; crossings of the threshold in range cells without a target near, and the number of cells there."""
     settings = Receivers(false_alarm_rate=FALSE_ALARMS)
     power = accumulate(maps)
     above, _ = detect(power, maps.shape[0] * maps.shape[1], FALSE_ALARMS, settings.guard_cells, settings.training_cells)
     near = ndimage.maximum_filter(above, size=3, mode=("nearest", "wrap"))
-    return int(near[tuple(cells.T)].sum())
+    clear = np.abs(np.arange(len(power))[:, None] - cells[:, 0]).min(axis=1) > CLEAR_ROWS
+    return int(near[tuple(cells.T)].sum()), int(above[clear].sum()), above[clear].size
 
 
 def _targets(bench: Bench, own: Pose, rng: np.random.Generator) -> tuple[PathSet, np.ndarray]:
@@ -239,24 +262,33 @@ def kinds() -> list[Kind]:
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Curves and statistics; `quick`: one frame per curve and coarser scatterers."""
-    frames = 1 if quick else 3
+    """Curves and statistics of six frames per curve; `quick`: of one frame and coarser scatterers."""
+    frames = 1 if quick else 6
     scenes = Scenes(scenario(PLACES_USED, seed, 0.05 if quick else 0.02, 30.0, partners=DISTANCE))
     bench = Bench(scenes, seed)
     symbols, hits = [], []
-    for number, kind in enumerate(kinds()):
+    done, steps = itertools.count(1), sum(2 + (kind.clutter in PLACES) for kind in kinds()) * frames
+
+    def each(what: Callable, *arguments: object) -> list:
+        out = []
+        for f in range(frames):
+            out.append(what(bench, *arguments, f))
+            progress(next(done), steps)
+        return out
+
+    for kind in kinds():
         for physical in (False, True) if kind.clutter in PLACES else (False,):
-            errors = [pt_errors(bench, kind, physical, f) for f in range(frames)]
+            errors = each(pt_errors, kind, physical)
             for symbol, name in errors[0]:
                 wrong, trials = np.sum([e[symbol, name] for e in errors], axis=0), (120 if symbol == "delay" else 117) * frames
                 symbols += [{"symbol": symbol, **_row(kind, physical, name, s, n, trials)} for s, n in zip(PT_SNR, wrong, strict=True)]
-        found = [at_hits(bench, kind, f) for f in range(frames)]
+        found = each(at_hits, kind)
         for physical, name in found[0]:
             if physical and kind.clutter not in PLACES:
                 continue
             count = np.sum([f[physical, name] for f in found], axis=0)
-            hits += [_row(kind, physical, name, s, n, TARGETS * frames) for s, n in zip(AT_SNR, count, strict=True)]
-        progress(number + 1, len(kinds()))
+            hits += [{**_row(kind, physical, name, s, n, TARGETS * frames), "false_alarms": int(a), "free_cells": int(c),
+                      "false_alarm_rate": a / c} for s, (n, a, c) in zip(AT_SNR, count, strict=True)]  # fmt: skip
     tables = {"symbols": pd.DataFrame(symbols), "hits": pd.DataFrame(hits), "statistics": _statistics(scenes)}
     settings = {"quick": quick, "seed": seed, "frames": frames, "false_alarm_rate": FALSE_ALARMS, "level_db": LEVEL_DB,
                 "places": {p: PLACES[p].text for p in PLACES_USED}, "speed_mps": SPEED}  # fmt: skip
@@ -300,9 +332,15 @@ def _verdicts(tables: dict[str, pd.DataFrame]) -> tuple[Verdict, ...]:
     plain, read = share(delay, top_pt, "strongest cell", "paper"), share(delay, top_pt, "profile", "paper")
     ray, ray_read = (share(delay, top_pt, d, "paper", False) for d in ("strongest cell", "profile"))
     natural = share(delay, top_pt, "strongest cell", "physical")
+    old = share(delay, top_pt, "old profile", "paper", speed_mps=SPEED)
     phases = [share(dpsk, top_pt, "profile", "paper"), share(dpsk, top_pt, "strongest cell", "physical")]
     still = [share(hits, top_at, d, "paper", speed_mps=0.0) for d in ("none", "notch")]
     flying = [share(hits, top_at, d, "paper", speed_mps=SPEED) for d in ("none", "notch")]
+
+    def alarms(decision: str, speed: float, level: str = "paper") -> str:
+        part = hits[(hits.snr_db == top_at) & (hits.decision == decision) & (hits.level == level) & (hits.speed_mps == speed)]
+        part = part[part.clutter.isin(PLACES_USED)]
+        return f"{part.false_alarms.sum() / part.free_cells.sum():.1e}"
 
     def level(good: bool) -> Judgement:
         return "holds" if good else "does not hold"
@@ -324,10 +362,14 @@ def _verdicts(tables: dict[str, pd.DataFrame]) -> tuple[Verdict, ...]:
                 f"{span(moving, 'frame_correlation', '.3f')} (hovering 1)"),
         Verdict("A passive terminal reads its symbols in urban clutter at +10 dB", level(plain[0] / plain[1] < 0.01),
                 f"delay symbols at {top_pt:g} dB SNR by the strongest cell: mesh {proportion(*plain)} wrong, Rayleigh {proportion(*ray)}; "
-                f"by the learned range profile: mesh {proportion(*read)}, Rayleigh {proportion(*ray_read)}; at the physical level, "
+                f"by the range profile learned one frame before: mesh {proportion(*read)}, Rayleigh {proportion(*ray_read)}, learned "
+                f"{PILOTS['old profile']} frames before at {SPEED:g} m/s: mesh {proportion(*old)}; at the physical level, "
                 f"mesh, by the strongest cell: {proportion(*natural)}. DPSK symbols (D = {ORDER}), mesh: by the "
                 f"profile at +10 dB {proportion(*phases[0])}, at the physical level {proportion(*phases[1])}"),
         Verdict("The clutter filter gives the active terminal its targets back", "holds under a condition",
                 f"hits at {top_at:g} dB SNR, mesh at +10 dB: hovering {proportion(*still[0])} without and {proportion(*still[1])} with "
-                f"a zero-Doppler notch; at {SPEED:g} m/s {proportion(*flying[0])} without and {proportion(*flying[1])} with it"),
+                f"a zero-Doppler notch; at {SPEED:g} m/s {proportion(*flying[0])} without and {proportion(*flying[1])} with it. "
+                f"False alarms per cell, {FALSE_ALARMS:g} by design: hovering {alarms('none', 0.0)} and {alarms('notch', 0.0)}, at "
+                f"{SPEED:g} m/s {alarms('none', SPEED)} and {alarms('notch', SPEED)}; at the physical level and {SPEED:g} m/s "
+                f"{alarms('none', SPEED, 'physical')} and {alarms('notch', SPEED, 'physical')}"),
     )  # fmt: skip

@@ -13,7 +13,11 @@ from isac_rt.propagation.free_space import radar_amplitude
 from isac_rt.waveform import SPEED_OF_LIGHT
 
 COLOURS = {"gaussian": "#000000", "rayleigh": "#E69F00", "square": "#0072B2", "street": "#009E73", "roofs": "#CC79A7"}
-LINES = {"strongest cell": "-", "none": "-", "profile": "--", "notch": "--"}
+LINES = {"strongest cell": "-", "none": "-", "profile": "--", "notch": "--", "old profile": ":"}
+WORDS = {
+    "strongest cell": "by the strongest cell", "profile": "by the range profile, one frame old", "old profile": "twelve frames old",
+    "none": "CFAR", "notch": "CFAR after a zero-Doppler notch",
+}  # fmt: skip
 COLUMNS = (
     ("paper", 0.0, "clutter at +10 dB, hovering"),
     ("paper", 10.0, "clutter at +10 dB, 10 m/s"),
@@ -24,33 +28,45 @@ COLUMNS = (
 def draw(tables: dict[str, pd.DataFrame], scenes: Scenes) -> Figure:
     """Three columns of curves by level and motion; profile, Doppler and distribution of the places' clutter."""
     with style():
-        figure, axes = blank(4, 3, (11.5, 12.0))
+        figure, axes = blank(5, 3, (11.5, 15.5))
         delay, dpsk = (tables["symbols"][tables["symbols"].symbol == name] for name in ("delay", "dpsk"))
+        least = 0.5 / delay.trials.max()
+        rows = (
+            (delay, "rate", "delay symbols in error, PT"),
+            (dpsk, "rate", "DPSK symbols in error, PT"),
+            (tables["hits"], "rate", "targets hit, AT"),
+            (tables["hits"], "false_alarm_rate", "false alarms per cell, AT"),
+        )
         for column, (level, speed, title) in enumerate(COLUMNS):
-            for ax, table in zip(axes[:3, column], (delay, dpsk, tables["hits"]), strict=True):
-                _curves(ax, table, level, speed)
-            axes[1, column].set(ylabel="DPSK symbol error rate, PT", xlabel="SNR of the line of sight [dB]")
-            axes[1, column].set(yscale="log", ylim=(1.5e-3, 1.3))
-            axes[0, column].set(title=title, ylabel="delay symbol error rate, PT", xlabel="SNR of the line of sight [dB]")
-            axes[0, column].set(yscale="log", ylim=(1.5e-3, 1.3))
-            axes[2, column].set(ylabel="hit rate, AT", xlabel="SNR of the target [dB]", ylim=(-0.03, 1.05))
+            axes[0, column].set_title(title)
+            for ax, (table, value, words) in zip(axes[:4, column], rows, strict=True):
+                _curves(ax, table, value, level, speed, least)
+                ax.set(ylabel=words, xlabel=f"SNR of the {'target' if table is tables['hits'] else 'line of sight'} [dB]")
+            for ax in axes[:2, column]:
+                ax.axhspan(0.7 * least, 1.3 * least, color="#EEEEEE", zorder=0)
+                ax.set(yscale="log", ylim=(0.6 * least, 1.4))
+            axes[2, column].set(ylim=(-0.03, 1.05))
+            axes[3, column].set(yscale="log", ylim=(2e-5, 0.2))
         for name, colour in COLOURS.items():
-            axes[0, 0].plot([], [], color=colour, label=name if name in ("gaussian", "rayleigh") else f"mesh, {name}")
-        axes[0, 0].legend(fontsize=7, loc="lower left")
-        for ax, words in ((axes[0, 1], ("strongest cell", "range profile")), (axes[2, 1], ("CFAR", "after a zero-Doppler notch"))):
-            for line, word in zip(("-", "--"), words, strict=True):
-                ax.plot([], [], line, color="#777777", label=word)
-            ax.legend(fontsize=7, loc="lower left")
-        _below(axes[3], scenes)
+            axes[2, 0].plot([], [], color=colour, label=name if name in ("gaussian", "rayleigh") else f"mesh, {name}")
+        axes[2, 0].legend(loc="lower right")
+        axes[0, 0].text(0.98, 0.03, "grey: no error", transform=axes[0, 0].transAxes, ha="right", fontsize=7, color="#555555")
+        for ax, names in ((axes[1, 1], ("strongest cell", "profile", "old profile")), (axes[2, 1], ("none", "notch"))):
+            for name in names:
+                ax.plot([], [], LINES[name], color="#555555", label=WORDS[name])
+            ax.legend(loc="lower left" if ax is axes[1, 1] else "lower right")
+        _below(axes[4], scenes)
     return figure
 
 
-def _curves(ax, table: pd.DataFrame, level: str, speed: float) -> None:
+def _curves(ax, table: pd.DataFrame, value: str, level: str, speed: float, least: float) -> None:
+    """One panel; Gaussian and Rayleigh clutter know no motion, and Rayleigh's level is the paper's. What happened not once in all trials
+    is drawn at `least`."""
     for (clutter, decision), part in table.groupby(["clutter", "decision"], sort=False):
         here = part[(part.level == level) & (part.speed_mps == speed)]
-        if clutter in ("gaussian", "rayleigh"):
+        if clutter == "gaussian" or (clutter == "rayleigh" and level == "paper"):
             here = part[part.level == "paper"]
-        shown = np.maximum(here.rate, 0.5 / here.trials) if decision in ("strongest cell", "profile") else here.rate
+        shown = np.maximum(here[value], least) if "symbol" in table else np.maximum(here[value], 1e-9)
         ax.plot(here.snr_db, shown, LINES[decision], color=COLOURS[clutter], marker="o", ms=2.5)
 
 
@@ -75,6 +91,7 @@ def _below(axes, scenes: Scenes) -> None:
         law.plot(np.sort(amplitude), 1 - np.arange(amplitude.size) / amplitude.size, color=COLOURS[place], lw=1)
     level.fill_between([20, 31], 8, 12, color=COLOURS["rayleigh"], alpha=0.5, lw=0)
     level.set(xlabel="range [m]", ylabel="clutter in a cell over a small UAV [dB]", ylim=(-30, 30))
+    level.text(32, 9, "the Rayleigh model", fontsize=7, color="#9A6B00")
     doppler.axvline(0, color=COLOURS["rayleigh"], lw=2)
     doppler.set(xlabel="radial velocity in the strongest 45 cells, 10 m/s [m/s]", ylabel="power [dB]", ylim=(-40, 3))
     x = np.linspace(0, 5, 100)
