@@ -262,8 +262,8 @@ def kinds() -> list[Kind]:
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Curves and statistics of six frames per curve; `quick`: of one frame and coarser scatterers."""
-    frames = 1 if quick else 6
+    """Curves of twenty frames and statistics; `quick`: of one frame and coarser scatterers."""
+    frames = 1 if quick else 20
     scenes = Scenes(scenario(PLACES_USED, seed, 0.05 if quick else 0.02, 30.0, partners=DISTANCE))
     bench = Bench(scenes, seed)
     symbols, hits = [], []

@@ -46,15 +46,17 @@ def draw(tables: dict[str, pd.DataFrame], scenes: Scenes) -> Figure:
                 ax.axhspan(0.7 * least, 1.3 * least, color="#EEEEEE", zorder=0)
                 ax.set(yscale="log", ylim=(0.6 * least, 1.4))
             axes[2, column].set(ylim=(-0.03, 1.05))
-            axes[3, column].set(yscale="log", ylim=(2e-5, 0.2))
+            axes[3, column].set(yscale="log", ylim=(4e-5, 0.1))
         for name, colour in COLOURS.items():
             axes[2, 0].plot([], [], color=colour, label=name if name in ("gaussian", "rayleigh") else f"mesh, {name}")
         axes[2, 0].legend(loc="lower right")
-        axes[0, 0].text(0.98, 0.03, "grey: no error", transform=axes[0, 0].transAxes, ha="right", fontsize=7, color="#555555")
-        for ax, names in ((axes[1, 1], ("strongest cell", "profile", "old profile")), (axes[2, 1], ("none", "notch"))):
+        axes[0, 0].text(0.98, 0.1, "in the grey: no error", transform=axes[0, 0].transAxes, ha="right", fontsize=8, color="#555555")
+        for ax, names in ((axes[0, 2], ("strongest cell", "profile", "old profile")), (axes[2, 1], ("none", "notch"))):
             for name in names:
                 ax.plot([], [], LINES[name], color="#555555", label=WORDS[name])
-            ax.legend(loc="lower left" if ax is axes[1, 1] else "lower right")
+            ax.legend(loc="upper right" if ax is axes[0, 2] else "lower right")
+        for ax, words in zip(axes[4], ("level of the mesh's clutter", "its Doppler in flight", "its amplitudes"), strict=True):
+            ax.set_title(words)
         _below(axes[4], scenes)
     return figure
 

@@ -7,8 +7,9 @@ __all__ = ["Case", "Planted", "Skipped", "Verdict", "all_cases", "run_case", "ru
 
 def all_cases(quick: bool = False) -> list[Case]:
     """All cases, or the quick selection, in the order of their groups."""
-    from isac_rt.validation import amplitude, crosschecks, geometry, noise, receivers, signal, tracking
+    from isac_rt.validation import amplitude, clutter, crosschecks, geometry, noise, receivers, signal, tracking
     from isac_rt.validation.case import cases_of
 
-    cases = [case for module in (geometry, amplitude, signal, noise, receivers, tracking, crosschecks) for case in cases_of(module)]
+    modules = (geometry, amplitude, clutter, signal, noise, receivers, tracking, crosschecks)
+    cases = [case for module in modules for case in cases_of(module)]
     return [case for case in cases if case.quick or not quick]
