@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import stats
+from scipy.integrate import quad
 
 from isac_rt.arrays import conventional_schedule
 from isac_rt.ifsignal import IFCube
@@ -21,6 +22,7 @@ from isac_rt.receive.cfar import (
     hann_envelope,
     independent_cells,
     peaks,
+    row_factors,
     side_rows,
     threshold,
     without_sidelobes,
@@ -174,6 +176,27 @@ def test_independent_cells_of_a_windowed_axis(count: int):
     alike = np.abs(squared / squared[0]) ** 2
     pairs = sum(alike[abs(i - j)] for i in range(count) for j in range(count))
     assert independent_cells(count) == pytest.approx(count**2 / pairs, rel=1e-9)  # rounding
+
+
+@pytest.mark.parametrize(("guard", "training"), [((1, 0), (2, 1)), ((3, 2), (5, 1))])
+def test_threshold_of_a_map_by_its_integral(guard: tuple[int, int], training: tuple[int, int]):
+    """A cell over the greater mean of two blocks of training[0] rows and 2 (guard + training) + 1 bins each, neighbours weighed by the
+    window; in the first row over the block behind alone. Planted bugs: a bin more; the guard's rows among the training's."""
+
+    def independent(count: int) -> float:
+        squared = np.fft.fft(np.sin(np.pi * (np.arange(120) + 0.5) / 120) ** 4)
+        alike = np.abs(squared / squared[0]) ** 2
+        return count**2 / sum(alike[abs(i - j)] for i in range(count) for j in range(count))
+
+    looks, rate, quadrature = 3, 2e-3, 1e-3  # of the rate; the factor is good to 1e-4 and the tail is steep
+    size = looks * independent(training[0]) * independent(2 * (guard[1] + training[1]) + 1)
+    cell, mean = stats.gamma(looks, scale=1 / looks), stats.gamma(size, scale=1 / size)
+    z = threshold(looks, rate, guard, training)
+    both = quad(lambda y: 2 * mean.pdf(y) * mean.cdf(y) * cell.sf(z * y), 0, 12, points=[0.3, 1, 2], limit=200)[0]
+    assert both == pytest.approx(rate, rel=quadrature, abs=0)
+    first = row_factors(60, looks, rate, guard, training)[0]
+    one = quad(lambda y: mean.pdf(y) * cell.sf(first * y), 0, 12, points=[0.3, 1, 2], limit=200)[0]
+    assert one == pytest.approx(rate, rel=quadrature, abs=0)
 
 
 def test_training_at_the_ends_and_across_the_doppler_wrap():
