@@ -265,7 +265,7 @@ def test_ratio_of_the_cfar_is_its_decision():
 
 def test_size_of_the_scanned_directions():
     """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances written out; beams half a lobe apart at
-    most. Planted bugs: the variance for the deviation; the area without the covariance of the two arms."""
+    most. Planted bugs: the variance for the deviation; the area without the covariance of the two arms; no limit to the view."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
     channels = joint_channels(antennas)
     x, z = channels.places[:, 0] - channels.places[:, 0].mean(), channels.places[:, 2] - channels.places[:, 2].mean()
@@ -279,6 +279,8 @@ def test_size_of_the_scanned_directions():
         lobe = w.wavelength / (np.ptp(channels.places[:, axis]) + antennas.spacing)
         apart = np.diff(np.unique(np.round(beams.cosines[:, axis], 12)))
         assert apart.max() <= lobe / 2 and apart.min() > 0.8 * lobe / 2
+    wide = beams_of(channels, w, replace(antennas, half_view=2.1), (0, 2))  # more than half a turn is all that an arm tells apart
+    assert np.abs(wide.cosines[:, 0]).max() == pytest.approx(1.0)
 
 
 def test_direction_within_a_filters_beam():

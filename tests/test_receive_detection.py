@@ -481,7 +481,8 @@ class Hill:
 @pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
 def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a half of it; the gradient over a step
-    for over two; the coupling of beat and Doppler left out. Far from the top, where the paraboloid is none, the step is up."""
+    for over two; the coupling of beat and Doppler left out; one end of the reach left open. Where the paraboloid is none the step is up,
+    and a far top is come near by no more than three times the stencil, for the power is no paraboloid as far as that."""
     w = Waveform()
     rate_unit = 1 / (w.frame_duration * w.effective_carrier)
     start = 101.3 * w.delay_step, 7.7 * rate_unit
@@ -496,6 +497,11 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
     found = refine(valley, *start, iterations=1)
     assert valley.power(found.delay, found.delay_rate) > valley.power(*start)
+    for far in ([4.3, -5.1], [-2.9, 3.7]):
+        found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, iterations=1)
+        there = (w.slope * found.delay + found.delay_rate * w.effective_carrier) * w.sampled_duration
+        moved = there - beat, found.delay_rate / rate_unit - 7.7
+        assert moved == pytest.approx(0.6 * np.sign(far), abs=1e-6)  # three times the stencil
 
 
 def test_two_cells_of_a_hann_tone_give_its_place():
