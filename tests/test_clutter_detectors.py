@@ -279,8 +279,8 @@ def test_size_of_the_scanned_directions():
         lobe = w.wavelength / (np.ptp(channels.places[:, axis]) + antennas.spacing)
         apart = np.diff(np.unique(np.round(beams.cosines[:, axis], 12)))
         assert apart.max() <= lobe / 2 and apart.min() > 0.8 * lobe / 2
-    wide = beams_of(channels, w, replace(antennas, half_view=2.1), (0, 2))  # more than half a turn is all that an arm tells apart
-    assert np.abs(wide.cosines[:, 0]).max() == pytest.approx(1.0)
+    wide, half = (beams_of(channels, w, replace(antennas, half_view=h), (0, 2)) for h in (2.1, np.pi / 2))  # an arm tells no more apart
+    assert wide.lengths == half.lengths and wide.lengths[0] == pytest.approx(beams.lengths[0] / np.sin(antennas.half_view))
 
 
 def test_direction_within_a_filters_beam():
