@@ -31,6 +31,16 @@ def test_runs_are_found_with_gaps_and_short_ones_are_not():
     assert runs(power, 1e4, 8)[100:108].all()
 
 
+def test_all_chirps_of_all_receivers_tell_a_run_from_noise():
+    """One group, 12 chirps, 15 receivers: cells 6 dB over the noise are occupied, for the mean of 180 exponentials scatters by a
+    thirteenth. Planted bug: looks per receiver, with which only cells 10 dB over it would be."""
+    rng = np.random.default_rng(12)
+    spectra = (rng.standard_normal((1, 15, 90, 12, 2)) @ np.array([1, 1j])).astype(np.complex64)
+    spectra[:, :, 40:60] *= 2
+    rows = remove_standing(spectra, np.zeros((1, 12), np.int64), 15)
+    assert np.array_equal(np.flatnonzero(rows), np.arange(38, 62))  # and the margin of two cells
+
+
 def test_noise_alone_makes_no_run():
     """15 looks, 400 spectra of 512 cells: a run of 15 cells at an occupancy of 1e-3 would be a wonder."""
     power = np.random.default_rng(9).gamma(15, 1 / 15, (400, 512))

@@ -15,7 +15,7 @@ from isac_rt.arrays import pseudo_random_schedule
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.demodulate import confidence_threshold, decide_transitions, demodulate, known_cycles
+from isac_rt.receive.demodulate import Symbols, confidence_threshold, decide_transitions, demodulate, known_cycles, moves_as_predicted
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
@@ -114,6 +114,25 @@ def test_transitions_with_their_spread_and_share():
     assert np.array_equal(found, symbols)
     assert spread == pytest.approx(np.sqrt((off**2).mean()), rel=1e-9)
     assert share == pytest.approx(np.full((1, 3, 7), np.cos(apart)), rel=1e-9)
+
+
+@pytest.mark.parametrize(("order", "receivers"), [(8, 3), (2, 1)])
+def test_phases_that_lie_anywhere_are_said_where_noise_lets_it_be_seen(order: int, receivers: int):
+    """Symbols' phases anywhere, or gathered, at SNRs of a cell at which the noise's own spread, by drawing, is well below and well above
+    0.6 of what phases anywhere have. Planted bugs: divided by what they have; one receiver for all."""
+    rng, anywhere, seen = np.random.default_rng(13), np.pi / order / np.sqrt(3), set()
+    for snr in (0.3, 1.0, 4.0, 16.0, 64.0):
+        two = np.sqrt(snr) + rng.standard_normal((2, receivers, 40_000, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+        spread = np.angle((two[0] * two[1].conj()).sum(axis=0)).std()
+        if not 0.8 < spread / (0.6 * anywhere) < 1.3:  # the formula is of first order in the noise
+            none = np.zeros((1, 1), int)
+            one = Symbols(raw=none, delay=none, delay_confidence=np.full((1, 1), snr + 1), transitions=none, transition_confidence=none,
+                          phase_spread=anywhere, phases=none, bits=none, looks=receivers)  # fmt: skip
+            hidden = spread > 0.6 * anywhere
+            assert moves_as_predicted(one, order) == hidden, snr
+            assert moves_as_predicted(replace(one, phase_spread=0.5 * anywhere), order)
+            seen.add(hidden)
+    assert seen == {True, False}
 
 
 def test_cleaned_spectra_against_their_sums():
