@@ -121,7 +121,7 @@ def test_phases_that_lie_anywhere_are_said_where_noise_lets_it_be_seen(order: in
     """Symbols' phases anywhere, or gathered, at SNRs of a cell at which the noise's own spread, by drawing, is well below and well above
     0.6 of what phases anywhere have. Planted bugs: divided by what they have; one receiver for all."""
     rng, anywhere, seen = np.random.default_rng(13), np.pi / order / np.sqrt(3), set()
-    for snr in (0.3, 1.0, 4.0, 16.0, 64.0):
+    for snr in (0.3, 1.0, 4.0, 16.0, 32.0, 64.0):
         two = np.sqrt(snr) + rng.standard_normal((2, receivers, 40_000, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         spread = np.angle((two[0] * two[1].conj()).sum(axis=0)).std()
         if not 0.8 < spread / (0.6 * anywhere) < 1.3:  # the formula is of first order in the noise
