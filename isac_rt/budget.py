@@ -345,8 +345,9 @@ def _synthesis_error(setup: Setup, frame: int, poses: dict[str, Pose], link: Lin
     start = setup.timetable.start_time(frame, link[0])
 
     def cube(method: Any) -> np.ndarray:
-        return if_signal(setup.waveform, [(sent, some)], poses[link[1]], setup.antennas, start_time=start,
-                         filter_transition=setup.scenario.radio.filter_transition_hz, noise_power=level, method=method).samples  # fmt: skip
+        return if_signal(setup.waveform, [(sent, some)], poses[link[1]], setup.antennas, start_time=start, method=method,
+                         filter_transition=setup.scenario.radio.filter_transition_hz, noise_power=level, costs=setup.plan.costs,
+                         max_error=setup.plan.synthesis_error, decide_for=len(kept)).samples  # fmt: skip
 
     exact, fast = cube("direct"), cube(setup.plan.synthesis(len(kept)))
     scale = float(np.linalg.norm(exact))

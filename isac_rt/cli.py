@@ -369,8 +369,11 @@ def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes only.")] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where tables and figures go.")] = Path("runs/bench"),
     json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows to a file too.")] = None,
+    fit: Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="Only fit accuracy.cost_model to this machine.")] = None,
 ) -> None:
     """Speed against error, method by method, in floors of the same run."""
+    if fit is not None:
+        return _fit(fit)
     from isac_rt.bench import report
     from isac_rt.results import check_folder, write_text
 
@@ -393,6 +396,23 @@ def bench(
     for name, reason in found["left_out"].items():
         _out().print(f"{name} left out: {reason}", soft_wrap=True)
     _out().print(f"in {out}: {', '.join(file.name for file in files)}", soft_wrap=True)
+
+
+def _fit(file: Path) -> None:
+    """Measure what the methods of synthesis cost here, for accuracy.cost_model of a scenario."""
+    from json import dumps
+
+    from isac_rt.bench.fit import fit
+    from isac_rt.results import check_folder, write_text
+
+    check_folder(file.parent)
+    found = _with_progress(lambda moved: fit(progress=moved), "repeats")
+    write_text(file, dumps(found, indent=1) + "\n")
+    table = _table("method", "chirp [us]", "path [ns]", "deviation [%]")
+    for name, row in found["methods"].items():
+        table.add_row(name, f"{row['chirp_ns'] / 1000:.3g}", f"{row['path_ns']:.3g}", f"{100 * row['deviation']:.2g}")
+    _out().print(table)
+    _out().print(f"{file}: name it in accuracy.cost_model of a scenario", soft_wrap=True)
 
 
 @app.command()

@@ -26,6 +26,8 @@ import numpy as np
 
 from isac_rt.arrays import Antennas
 from isac_rt.city.mesh import City
+from isac_rt.costs import SHIPPED, CostModel
+from isac_rt.costs import read as read_costs
 from isac_rt.gridding import GRIDDED_ERROR
 from isac_rt.ifsignal import Method
 from isac_rt.linkbudget import transmit_amplitude
@@ -33,6 +35,7 @@ from isac_rt.propagation.cells import Density, error_for
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_clutter import Clutter
+from isac_rt.scenario_file import ScenarioError
 from isac_rt.swarm import Swarm
 from isac_rt.timetable import Link, Timetable
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
@@ -106,11 +109,32 @@ class Plan:
         """Most flight between traced instants [m]."""
         return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(self.preset, self.scenario.accuracy.max_untraced_m)
 
+    def __post_init__(self) -> None:
+        _ = self.costs  # a bad file is told of before anything runs
+
     def synthesis(self, num_paths: int) -> Method:
         """Method of `isac_rt.ifsignal.if_signal` for a cube of so many paths."""
         if self.preset == "fastest":
             return "gridded"
         return "direct" if self.preset == "everything" and num_paths <= MOST_DIRECT else "auto"
+
+    @property
+    def synthesis_error(self) -> float:
+        """Relative RMS error that the samples may have."""
+        return GRIDDED_ERROR if self.preset == "fastest" else self.scenario.accuracy.synthesis_error
+
+    @cached_property
+    def costs(self) -> CostModel:
+        """What the methods of synthesis are taken to cost.
+
+        Raises
+        ------
+        ScenarioError  If the file of accuracy.cost_model is none.
+        """
+        try:
+            return read_costs(self.scenario.cost_model_path() or SHIPPED)
+        except ValueError as problem:
+            raise ScenarioError(f"accuracy.cost_model: {problem}") from None
 
     @cached_property
     def traced_frames(self) -> tuple[int, ...]:
@@ -308,7 +332,8 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0),
-        "synthesis_error": GRIDDED_ERROR,
+        "synthesis_error": plan.synthesis_error,
+        "cost_model": plan.costs.record(),
     }
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from isac_rt.arrays import Antennas, Schedule
+from isac_rt.costs import SHIPPED, CostModel, choose, read, speed_of
 from isac_rt.gridding import ACCURATE, DEFAULT, GRIDDED_ERROR, PROFILES, Setting, add_gridded, range_cells
 from isac_rt.noise import add_white_noise
 from isac_rt.payload import Payload
@@ -20,13 +21,11 @@ from isac_rt.synthesis import Tones, add_direct, exact
 from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 Method = Literal["auto", "exact", "direct", "gridded", "paper"]
-"""exact: float64 per sample. direct: error 1e-6 (float32 sums), cost ~ paths. gridded: error `GRIDDED_ERROR`, for many paths. auto: the
-paths whose gridding error, integrated coherently over the whole cube, could exceed the noise of a cell (amplitude^2 |gain|^2
-GRIDDED_ERROR^2 size > noise_power) go direct, the `max_direct` strongest of them at the most, and so does every line of
-sight; the rest are gridded. At most FEW_PATHS paths all go direct. paper: the paper's separable model, for comparison
-(`isac_rt.separable`)."""
-FEW_PATHS = 10
-"""Up to so many paths the direct method costs about as much as the transforms of the gridded one."""
+"""exact: float64 per sample. direct: error 1e-6 (float32 sums), cost ~ paths. gridded: error of its setting, for many paths. auto: all
+direct, or a grid and some paths direct, whichever a cost model says is cheapest within an error (`isac_rt.costs.choose`). Direct go lines
+of sight, paths too fast for the grid's error, and those whose error, integrated coherently over the whole cube, could exceed the noise
+of a cell (amplitude^2 |gain|^2 error^2 size > noise_power), the `max_direct` strongest at the most. paper: the paper's separable model,
+for comparison (`isac_rt.separable`)."""
 
 _CHUNK = 1024  # paths whose element delays stay in the second-level cache
 
@@ -123,6 +122,9 @@ def if_signal(
     noise_power: float = 0.0,
     max_direct: int = 16,
     setting: Setting = DEFAULT,
+    max_error: float = GRIDDED_ERROR,
+    costs: CostModel | None = None,
+    decide_for: int | None = None,
 ) -> IFCube:
     r"""Dechirped IF samples of one receiver in one frame, without noise.
 
@@ -143,7 +145,10 @@ def if_signal(
     first_block : resource block of the first reference chirp; by default that of the first transmission
     method : see `Method`
     noise_power : per complex sample [W], for "auto"; with 0 the `max_direct` strongest go direct
-    setting : of the gridded method: its grid, and whether the delays of the receive elements apply to the whole chirp
+    setting : of "gridded": its grid, and whether the delays of the receive elements apply to the whole chirp
+    max_error : for "auto": relative RMS error of the samples that the choice keeps
+    costs : for "auto": what the methods cost; by default the costs that ship with the program
+    decide_for : for "auto": number of paths whose cost decides, where the links hold some of them
 
     Raises
     ------
@@ -166,7 +171,9 @@ def if_signal(
         samples = cube_memory(shape)
         alone = np.full(len(tones), method == "direct")
         if method == "auto":
-            alone = _direct_paths(power, sight, samples.size, noise_power, max_direct)
+            speed = speed_of(tones.rate, tones.accel, waveform.frame_duration)
+            setting, alone = choose(costs or read(SHIPPED), shape, power, speed, sight, noise_power=noise_power, max_error=max_error,
+                                    max_direct=max_direct, num_paths=decide_for)  # fmt: skip
         if not alone.all():
             add_gridded(samples, waveform, tones.select(~alone), filter_transition, setting, fresh=True)
         add_direct(samples, waveform, tones.select(alone), filter_transition, fresh=bool(alone.all()))
@@ -255,16 +262,6 @@ def _check_epochs(links: Sequence[tuple[Transmission, PathSet]], middle: float, 
                 f"paths {transmission.name}->{paths.rx} have epoch {paths.epoch!r} s, the middle of the frame is {middle!r} s; "
                 f"compute the paths within a slot ({slot:g} s) of start_time + frame_duration/2"
             )
-
-
-def _direct_paths(power: np.ndarray, sight: np.ndarray, size: int, noise_power: float, limit: int) -> np.ndarray:
-    """Mask of the paths that "auto" gives to the direct method."""
-    if power.size <= FEW_PATHS:
-        return np.ones(power.size, bool)
-    strong = power * GRIDDED_ERROR**2 * size > noise_power
-    chosen = np.zeros(power.size, bool)
-    chosen[np.argsort(-power, kind="stable")[:limit]] = True
-    return (chosen & strong) | sight
 
 
 def _tones(

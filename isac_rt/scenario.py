@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, field_validator
 
+from isac_rt.scenario_accuracy import Accuracy
 from isac_rt.scenario_base import Finite, Fraction, Key, Node, Positive, Problem, Vector
 from isac_rt.scenario_clutter import Clutter
 from isac_rt.scenario_doubts import implausible
@@ -268,24 +269,6 @@ class Propagation(Node):
     leakage: Leakage = Leakage()
 
 
-class Accuracy(Node):
-    """How near to the full model a run has to come; what the scene then needs is decided link by link and frame by frame
-    (`isac_rt.fidelity`, `isac-rt plan`).
-
-    budget: what the keys below and propagation.weakest_path_db allow is left out. everything: nothing is left out, every frame is
-    traced. fastest: plane wavefronts, straight flight within a frame, weak paths up to the noise of a cell left out, few traces.
-    """
-
-    preset: Literal["budget", "everything", "fastest"] = "budget"
-    max_phase_error_rad: Positive = 0.05
-    """budget: most by which approximations together may turn the phase of a path, at any element and chirp."""
-    max_untraced_m: Annotated[float, Field(ge=0)] = 1.0
-    """budget: farthest that a UAV flies between two traced instants; 0: every frame is traced."""
-
-    def applies(self, name: str) -> bool:
-        return name == "preset" or self.preset == "budget"
-
-
 class Noise(Node):
     """link_budget: thermal noise and transmit power. snr: per-sample IF SNR of the reference path (the strongest target at
     the AT, the line of sight at a PT) as it would be unshadowed and in view."""
@@ -409,7 +392,8 @@ class Scenario(Node):
 
     @property
     def folder(self) -> Path:
-        """Folder of the scenario file, to which `city.file` is relative; the working folder for a tree made in Python."""
+        """Folder of the scenario file, to which `city.file` and `accuracy.cost_model` are relative; the working folder for a tree made in
+        Python."""
         return self._folder
 
     def in_folder(self, folder: Path) -> Scenario:
@@ -429,6 +413,10 @@ class Scenario(Node):
         if self.city is None or self.city.file is None:
             raise ValueError("the scenario has no city.file")
         return self.folder / self.city.file
+
+    def cost_model_path(self) -> Path | None:
+        """The file of accuracy.cost_model, found from the scenario's folder; None for the costs that ship with the program."""
+        return None if self.accuracy.cost_model is None else self.folder / self.accuracy.cost_model
 
     @property
     def num_tx(self) -> int:

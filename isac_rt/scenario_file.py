@@ -348,7 +348,7 @@ def load(path: str | os.PathLike[str], overrides: Iterable[str] = (), frames: in
 
     Parameters
     ----------
-    path : path of the YAML file; `city.file` in it is relative to its folder
+    path : path of the YAML file; `city.file` and `accuracy.cost_model` in it are relative to its folder
     overrides : of the form "radio.groups=2", as after --set; the value is YAML
     frames, seed : replace the file's, as --frames and --seed do
 
@@ -424,6 +424,10 @@ def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> 
     if scenario.city is not None and scenario.city.file is not None and not scenario.city_path().is_file():
         said = f"no such file in {path.parent}; the path is relative to the scenario's folder"
         raise ScenarioError(complaints.line([("city", "file")], said))
+    costs = scenario.cost_model_path()
+    if costs is not None and not costs.is_file():
+        said = f"no such file in {path.parent}; make one with isac-rt bench --fit {costs}"
+        raise ScenarioError(complaints.line([("accuracy", "cost_model")], said))
     for doubt in scenario.doubts():
         warnings.warn(complaints.problem(doubt), ScenarioWarning, stacklevel=3)
     return scenario
@@ -477,7 +481,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     Parameters
     ----------
     scenario : Scenario
-    folder : where the text will be saved, if not beside the original: `city.file` is then written relative to it
+    folder : where the text will be saved, if not beside the original: `city.file` and `accuracy.cost_model` are then written relative to it
 
     Returns
     -------
@@ -486,4 +490,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     data = plain_tree(scenario)
     if folder is not None and scenario.city is not None and scenario.city.file is not None:
         data["city"]["file"] = os.path.relpath(scenario.city_path(), folder)
+    costs = scenario.cost_model_path()
+    if folder is not None and costs is not None:
+        data["accuracy"]["cost_model"] = os.path.relpath(costs, folder)
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)

@@ -132,7 +132,8 @@ class Setup:
         """
         arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
         method = self.plan.synthesis(sum(len(p) for _, p in arriving))
-        cube = if_signal(self.waveform, arriving, poses[link[1]], self.antennas, noise_power=level, method=method, **frame_of)
+        cube = if_signal(self.waveform, arriving, poses[link[1]], self.antennas, noise_power=level, method=method,
+                         max_error=self.plan.synthesis_error, costs=self.plan.costs, **frame_of)  # fmt: skip
         return add_noise(cube, level, words)
 
     def receive_input(

@@ -65,7 +65,7 @@ BUGS = (
         "near = np.flatnonzero(np.isfinite(radius))",
         "near = np.flatnonzero(np.zeros_like(radius, bool))",
     ),
-    Bug("test_hard_signal::test_one_path_80_db_above_another", "ifsignal.py", "return (chosen & strong) | sight", "return chosen & sight"),
+    Bug("test_hard_signal::test_one_path_80_db_above_another", "costs.py", "(strong & top) | sight", "(strong & top & sight)"),
     Bug("test_hard_signal::test_a_million_paths", "gridding.py", "k, lag = path[index], offset[index]",
         "k, lag = path[index.astype(np.int16)], offset[index.astype(np.int16)]"),
     Bug("test_hard_signal::test_ten_thousand_paths_at_one_delay", "gridding.py", "path, offset = path[order], offset[order]",

@@ -32,9 +32,11 @@ JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
 ERROR_OF = "relative RMS against the exact model"
 _TRANSITION = 0.4e6
 GRIDS = (
+    ("gridded narrowband, 2.25 N, width 4", Setting(2.25, 4, False)),
     ("gridded narrowband, 1.25 N, width 6", Setting(1.25, 6, False)),
     ("gridded narrowband, 1.5 N, width 6", replace(DEFAULT, wideband=False)),
     ("gridded narrowband, 1.5 N, width 8", replace(ACCURATE, wideband=False)),
+    ("gridded wideband, 2.25 N, width 4", Setting(2.25, 4, True)),
     ("gridded wideband, 1.25 N, width 6", Setting(1.25, 6, True)),
     ("gridded wideband, 1.5 N, width 6", DEFAULT),
     ("gridded wideband, cubic, 1.5 N, width 8", ACCURATE),

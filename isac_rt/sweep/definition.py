@@ -193,7 +193,7 @@ class Plan:
 
     def key_of(self, tree: dict[str, Any]) -> str:
         """Under which a point is kept."""
-        return _digest([tree, self._city_file(tree), program_fingerprint()])
+        return _digest([tree, self._city_file(tree), self._cost_model(tree), program_fingerprint()])
 
     def _paths_key(self, tree: dict[str, Any]) -> str | None:
         if (tree.get("propagation") or {}).get("model") != "ray_traced":
@@ -204,6 +204,10 @@ class Plan:
     def _city_file(self, tree: dict[str, Any]) -> str:
         city = tree.get("city") or {}
         file = city.get("file") if isinstance(city, dict) else None
+        return "" if file is None else _file_digest(self.base.folder / str(file))
+
+    def _cost_model(self, tree: dict[str, Any]) -> str:
+        file = (tree.get("accuracy") or {}).get("cost_model")
         return "" if file is None else _file_digest(self.base.folder / str(file))
 
 
