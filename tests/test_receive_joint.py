@@ -14,7 +14,7 @@ from isac_rt.payload import unmodulated
 from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.joint import Frame, JointPath, _normal_equations, element_delays, fit, residual_channels, tone_sums
 from isac_rt.receive.phases import decide_phases
-from isac_rt.receive.separate import _beams, _earlier_reference
+from isac_rt.receive.separate import _beams, _earlier_reference, _hidden
 from isac_rt.scenario import Receivers
 from isac_rt.waveform import Waveform
 
@@ -265,6 +265,21 @@ def test_two_echoes_in_one_cell_at_the_active_terminal():
     found = np.column_stack([d.range, d.velocity, d.direction])
     assert (np.abs(found - echoes[:, :4]) < 5 * d.std).all()
     assert d.snr[1] / d.snr[0] == pytest.approx(0.25, rel=0.05)  # as their powers: the weaker one has an amplitude of a half
+
+
+@pytest.mark.parametrize(("level_db", "looked_at"), [(-22.0, True), (-29.0, False)])
+def test_what_is_too_weak_beside_a_path_is_not_looked_at(level_db: float, looked_at: bool):
+    """Beside an echo nearly 60 dB over the noise another direction holds a second one, well over the noise in both cases: on this side of 25 dB it
+    is a path to fit, on the other it is left. Planted bug: the first one's energy not over all samples."""
+    w, schedule, payload = frame(waveform=LONGER)
+    weak = [NEAR[0] + 0.2 * w.range_cell(2), NEAR[1], -0.4, 0.35, 0.1, 10 ** (level_db / 20)]
+    clean = sum(samples(w, schedule, payload, FEW, np.array(e), 2) for e in (NEAR, weak))
+    one = Frame(noisy(w, schedule, clean, 10.0, 3), payload.delay_symbols, payload.phases, FEW, 2)
+    start = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
+    found = _hidden(one, fit(one, [start]))
+    assert (found is not None) == looked_at
+    if found:
+        assert found[0] == 0 and found[1].direction == pytest.approx(weak[2:4], abs=0.15)  # a fraction of the arms' lobe
 
 
 def test_the_earlier_of_two_paths_in_a_cell_is_the_line_of_sight():

@@ -217,7 +217,7 @@ def city_100_km_from_the_origin() -> float:
     planted=(
         "propagation/geometry.py",
         "w, a = velocity - start.velocity, acceleration - start.acceleration",
-        "w, a = velocity + 0.0, acceleration - start.acceleration",
+        "w, a = velocity - 0 * start.velocity, acceleration - start.acceleration",
     ),
 )
 def doppler_of_a_moving_transmitter() -> float:
