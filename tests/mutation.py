@@ -412,6 +412,7 @@ def check_sample(mutants: list[Mutant], copy: Copy, record: Record, report: Path
 
 def check_planted(words: str) -> int:
     """Plant the bug of every case; print those that do not make it fail by its number."""
+    sys.path.insert(0, str(ROOT))  # the cases of this checkout, whichever is installed
     from isac_rt.validation import all_cases
 
     wrong, count = 0, 0
