@@ -269,7 +269,7 @@ def test_two_echoes_in_one_cell_at_the_active_terminal():
 
 @pytest.mark.parametrize(("level_db", "looked_at"), [(-22.0, True), (-29.0, False)])
 def test_what_is_too_weak_beside_a_path_is_not_looked_at(level_db: float, looked_at: bool):
-    """Beside an echo nearly 60 dB over the noise another direction holds a second one, well over the noise in both cases: on this side of 25 dB it
+    """Beside an echo nearly 60 dB over the noise another direction holds a second one, well over the noise too: on this side of 25 dB it
     is a path to fit, on the other it is left. Planted bug: the first one's energy not over all samples."""
     w, schedule, payload = frame(waveform=LONGER)
     weak = [NEAR[0] + 0.2 * w.range_cell(2), NEAR[1], -0.4, 0.35, 0.1, 10 ** (level_db / 20)]
