@@ -116,6 +116,7 @@ EXCUSED = [
     ("gridding.py", "lag[:, 1]", "and of one offset"),
     ("separable.py", "* fast) % 2)", "whole turns, one or two"),
     ("propagation/penumbra.py", "lift / side", "a quotient by a sign"),
+    ("propagation/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
     ("receive/doppler.py", "support] = -2", "less than any modulus, as -1 is"),
     ("rangecells.py", "*plan(2), np.zeros((0", "the transform of no band, which is never made"),
 ]

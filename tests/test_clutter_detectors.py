@@ -332,6 +332,20 @@ def test_receiver_finds_what_clutter_hides():
     assert len(d) and np.abs(bins - np.round(bins)).max() < 1e-9
 
 
+def test_snr_of_a_detection_in_clutter_is_power_over_background():
+    """A lone echo where the mesh foretells next to nothing: the highest cell of the mean map over the mean of noise that went the same way.
+    Planted bug: times the background."""
+    w, schedule, payload = frame(waveform=SHORT)
+    guess = expected(scatterers(7, 5, (8.0, 26.0)))
+    guess = replace(guess, power=1e-9 * guess.power)
+    echo = [Path(2 * 17.3, 2 * 3.3, 2.0, (0.2, 0.1), (0.2, 0.1))]
+    received = cube(w, schedule, payload, echo, FEW, 20.0, 1)
+    settings = Receivers(clutter_detector="map")
+    d = receive_active(received, payload, FEW, settings, clutter=guess).detections
+    powers = [(np.abs(maps_of(w, schedule, payload, p, FEW, 110, noise=20.0, seed=1)) ** 2).mean(axis=(0, 1)) for p in (echo, [])]
+    assert d.snr.max() == pytest.approx(powers[0].max() / powers[1].mean(), rel=0.1)  # the level is a median of a third of the cells
+
+
 def test_a_mesh_detector_without_a_mesh_says_so():
     w, schedule, payload = frame(waveform=SHORT)
     with pytest.raises(ValueError, match="clutter that the mesh predicts"):

@@ -12,7 +12,7 @@ from receiver_cubes import ANTENNAS, frame
 from isac_rt.ifsignal import IFCube
 from isac_rt.payload import unmodulated
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.receive.joint import Frame, JointPath, _normal_equations, element_delays, fit, residual_channels, tone_sums
+from isac_rt.receive.joint import Frame, JointPath, _moments, _normal_equations, _tone, element_delays, fit, residual_channels, tone_sums
 from isac_rt.receive.phases import decide_phases
 from isac_rt.receive.separate import _beams, _earlier_reference, _hidden
 from isac_rt.scenario import Receivers
@@ -126,6 +126,20 @@ def test_normal_equations_are_those_of_the_signal(passes: int):
     assert np.abs((gradient - (J.conj().T @ left).real) / size).max() < apart * np.linalg.norm(received)
     assert np.abs((J.conj().T @ left).real / size).max() > 0.2 * np.linalg.norm(left)
     assert power == pytest.approx((np.abs(left) ** 2).mean(), rel=0.01)
+
+
+def test_a_path_against_its_own_template_has_no_slope():
+    """Every chirp at every receiver sums to its amplitude, and weighed by the sample's number to nothing: the template has each element's
+    own delay over the whole chirp, and the data. Planted bug: the receivers' ramps turned the other way."""
+    w, schedule, payload = frame(waveform=LONGER)
+    wide = replace(ANTENNAS, spacing=5 * ANTENNAS.spacing)
+    clean = samples(w, schedule, payload, wide, np.array(NEAR), 2)
+    cube = IFCube(samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0)
+    one = Frame(cube, payload.delay_symbols, payload.phases, wide, 2)
+    path = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
+    zeroth, first = _moments(one, _tone(one, path))
+    assert np.abs(zeroth) == pytest.approx(np.abs(zeroth).mean(), rel=1e-3)
+    assert np.abs(first).max() < 1e-3 * np.abs(zeroth).mean() * w.num_samples
 
 
 @pytest.mark.parametrize("passes", [2, 1])
