@@ -22,10 +22,10 @@ PACKAGES = (
 
 @lru_cache(maxsize=1)
 def program_fingerprint() -> str:
-    """Version of this package and a digest of its source: two runs with the same one were made by the same program."""
+    """Version of this package and a digest of its source and tables: two runs with the same one were made by the same program."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent
-    for file in sorted(package.rglob("*.py")):
+    for file in sorted(file for file in package.rglob("*") if file.suffix in (".py", ".json")):  # JSON: costs decide between methods
         digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes() + b"\0")
     return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
 

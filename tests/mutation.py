@@ -43,6 +43,7 @@ TESTS_OF = {
     "lanefft.py": "test_gridding test_receive_transform",
     "separable.py": "test_separable",
     "ifsignal.py": "test_ifsignal test_hard_signal",
+    "costs.py": "test_costs",
     "noise.py": "test_noise",
     "linkbudget.py": "test_linkbudget",
     "propagation/free_space.py": "test_propagation",
