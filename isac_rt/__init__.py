@@ -32,7 +32,7 @@ _HOME = {
     "ActiveTerminal": "terminal",
     "PassiveTerminal": "terminal",
     "standard_terminal": "simulate",
-    "city_of": "simulate",
+    "city_of": "surroundings",
     "scene_3d": "interactive",
     "animate": "animate",
     "write_animation": "animate",

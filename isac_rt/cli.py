@@ -8,12 +8,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
-import time
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,14 +21,13 @@ from isac_rt.console import err as _err
 from isac_rt.console import out as _out
 from isac_rt.console import table as _table
 from isac_rt.console import with_progress as _with_progress
+from isac_rt.interruption import Terminated, ending_soon_after_interrupt, say_interrupted
 
 if TYPE_CHECKING:
     from isac_rt.results import Results
     from isac_rt.scenario import Scenario
 
 DEBUG = "ISAC_RT_DEBUG"
-_GRACE = 1.2
-"""After Ctrl-C a run may tidy up for so long [s]; then the process ends whatever it is doing."""
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich",
                   help="Integrated sensing and communication of a UAV swarm over a ray-traced city.")  # fmt: skip
@@ -66,7 +62,7 @@ def run(
     """Simulate a scenario: results, summary, figures and a report."""
     loaded = _load(scenario, overrides, frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
-    with _ending_soon_after_interrupt(folder):
+    with ending_soon_after_interrupt(folder):
         _run(loaded, folder, snapshots, check_budget)
     _out().print(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/", soft_wrap=True)
 
@@ -76,14 +72,20 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
 
     check_folder(folder)
     from isac_rt import simulate
+    from isac_rt.surroundings import run_content
+    from isac_rt.unfinished import Unfinished
 
     with _err().status("setting up"):
         setup = simulate.prepare(loaded)
         budget = simulate.link_budgets(setup)
     _print_budget(budget)
+    unfinished = Unfinished(folder, run_content(loaded, snapshots))
+    if unfinished.begun:
+        _err().print(f"going on after the frames in {unfinished.file}", soft_wrap=True)
     results = _with_progress(
-        lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots), "frames", loaded.frames
-    )
+        lambda report: simulate.run(loaded, setup=setup, progress=report, snapshots=snapshots, unfinished=unfinished),
+        "frames", loaded.frames,
+    )  # fmt: skip
     if check_budget:
         from isac_rt.budget import check
 
@@ -95,6 +97,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
         from isac_rt.report import write_report
 
         write_report(results, folder, make_figures(results, folder, setup.city))
+    unfinished.remove()
     _print_summary(results)
 
 
@@ -107,7 +110,7 @@ def plan(
 ) -> None:
     """What a run will model, what it leaves out, and the estimated error and time of each; traces a few frames only."""
     loaded = _load(scenario, overrides)
-    with _ending_soon_after_interrupt(Path()), _err().status("tracing a few frames"):
+    with ending_soon_after_interrupt(Path()), _err().status("tracing a few frames"):
         from isac_rt import simulate
         from isac_rt.budget import make_plan
 
@@ -150,7 +153,7 @@ def paths(
     """Write the path ledger of a frame, all links."""
     loaded = _load(scenario, overrides)
     _check_frame(loaded, frame)
-    with _ending_soon_after_interrupt(out.parent), _err().status("tracing"):
+    with ending_soon_after_interrupt(out.parent), _err().status("tracing"):
         from isac_rt import simulate
         from isac_rt.interchange import write_ledger
 
@@ -174,7 +177,7 @@ def view(
         raise InputProblem(f"--out {out}: a view is a .png picture or an .html page; name it so")
     loaded = _load(scenario, overrides)
     _check_frame(loaded, frame)
-    with _ending_soon_after_interrupt(out.parent), _err().status("tracing and drawing"):
+    with ending_soon_after_interrupt(out.parent), _err().status("tracing and drawing"):
         import numpy as np
 
         from isac_rt import simulate
@@ -214,7 +217,7 @@ def reproduce(
         raise InputProblem(f"{', '.join(unknown)}: no such table or figure; choose from {', '.join(experiments())}")
     for name in dict.fromkeys(names):
         folder = out if out is not None else Path("runs") / "reproduction" / name
-        with _ending_soon_after_interrupt(folder):
+        with ending_soon_after_interrupt(folder):
             _reproduce(name, folder, quick, seed)
 
 
@@ -261,7 +264,7 @@ def sweep(
     plan = load_sweep(file, max_points)
     folder = out if out is not None else Path("runs") / plan.sweep.name
     check_folder(folder)
-    with _ending_soon_after_interrupt(folder):
+    with ending_soon_after_interrupt(folder):
         try:
             _with_points(lambda report: run_sweep(plan, folder, workers=workers, scheduler=scheduler,
                                                   retry_failed=retry_failed, progress=report))  # fmt: skip
@@ -325,7 +328,7 @@ def validate(
         raise InputProblem(f"--only {only}: no case has these words in its group or name; leave it out to see them all")
     for folder in {file for file in (out, json_file.parent if json_file else None) if file is not None}:
         check_folder(folder)
-    with _ending_soon_after_interrupt(out if out is not None else Path("runs")):
+    with ending_soon_after_interrupt(out if out is not None else Path("runs")):
         verdicts = _validate(cases)
     if out is not None:
         write_json(verdicts, out / "validation.json")
@@ -381,7 +384,7 @@ def bench(
     if unknown := [name for name in chosen if name not in report.stages()]:
         raise InputProblem(f"{', '.join(unknown)}: no such stage; choose from {', '.join(report.stages())}")
     check_folder(out)
-    with _ending_soon_after_interrupt(out):
+    with ending_soon_after_interrupt(out):
         found = _with_progress(lambda moved: report.measure(list(dict.fromkeys(chosen)), quick, moved), "stages", len(chosen))
         files = report.write(found, out)
         if json is not None:
@@ -467,10 +470,10 @@ def animate(
     if observer is not None and observer not in names:
         raise InputProblem(f"--observer {observer}: no such observer in {folder}; choose from {', '.join(names)}")
     from isac_rt.animate import write_animation
-    from isac_rt.simulate import city_of
+    from isac_rt.surroundings import city_of
 
     target = out if out is not None else folder / "run.gif"
-    with _ending_soon_after_interrupt(folder), _err().status("drawing"):
+    with ending_soon_after_interrupt(folder), _err().status("drawing"):
         write_animation(results, target, names.index(observer) if observer else 0, city_of(results.scenario), rate)
     _out().print(f"{target}", soft_wrap=True)
 
@@ -504,56 +507,10 @@ def _print_summary(results: Results) -> None:
     _out().print(f"paths: {found}; {number(results.summary['timing_s']['total'])} s")
 
 
-@contextmanager
-def _ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM end the process within `_GRACE` even inside a long native call, leaving no half-written file in `folder`.
-
-    Python runs its own handler only between byte codes; the wake-up pipe is written by the C handler at once, and a thread
-    waits for it.
-    """
-    receive, send = os.pipe()
-    os.set_blocking(send, False)
-
-    def wait() -> None:
-        while (heard := os.read(receive, 1)) and heard[0] not in (signal.SIGINT, signal.SIGTERM):
-            pass
-        os.close(receive)
-        if not heard:
-            return
-        time.sleep(_GRACE)
-        for unfinished in folder.rglob(f".*.{os.getpid()}.tmp"):
-            unfinished.unlink(missing_ok=True)
-        _say_interrupted()
-        os._exit(128 + heard[0])
-
-    before = signal.set_wakeup_fd(send, warn_on_full_buffer=False)
-    default = signal.signal(signal.SIGTERM, _terminated)
-    threading.Thread(target=wait, daemon=True).start()
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(before)
-        signal.signal(signal.SIGTERM, default)
-        os.close(send)
-
-
-class _Terminated(BaseException):
-    """SIGTERM: unwinds as Ctrl-C does, so that temporary files are taken away."""
-
-
-def _terminated(*_: Any) -> None:
-    raise _Terminated
-
-
-def _say_interrupted() -> None:
-    sys.stderr.write("\ninterrupted\n")
-    sys.stderr.flush()
-
-
 def _user_problems() -> tuple[type[BaseException], ...]:
     """What the user can mend. Imported only once something was raised: a module that is not loaded raised nothing."""
     names = {"scenario_file": "ScenarioError", "city.materials": "CityError", "runtime": "RuntimeProblem", "results": "ResultsError",
-             "sweep": "SweepError"}  # fmt: skip
+             "sweep": "SweepError", "unfinished": "UnfinishedError"}  # fmt: skip
     loaded = {name: sys.modules.get(f"isac_rt.{name}") for name in names}
     return (InputProblem, *(getattr(module, names[name]) for name, module in loaded.items() if module is not None))
 
@@ -569,13 +526,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="isac-rt", standalone_mode=False)
         if status == 130:  # what typer makes of Ctrl-C
-            _say_interrupted()
+            say_interrupted()
         return status if isinstance(status, int) else 0
     except KeyboardInterrupt:
-        _say_interrupted()
+        say_interrupted()
         return 130
-    except _Terminated:
-        _say_interrupted()
+    except Terminated:
+        say_interrupted()
         return 128 + signal.SIGTERM
     except Exception as problem:
         if os.environ.get(DEBUG):

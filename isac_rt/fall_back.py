@@ -23,15 +23,16 @@ class Schedules:
 
     scenario: Scenario
     usual: Schedule
-    _sparse: dict[Link, bool] = field(default_factory=dict)
+    advice: dict[Link, bool] = field(default_factory=dict)
+    """Whether each receiver last found the scene sparse."""
 
     def of(self, active: str) -> Schedule:
         """The schedule of an active terminal's next frame."""
-        dense = any(tx == active and not sparse for (tx, _), sparse in self._sparse.items())
+        dense = any(tx == active and not sparse for (tx, _), sparse in self.advice.items())
         groups, chirps = self.usual.shape
         return conventional_schedule(groups, chirps, self.scenario.num_tx) if dense else self.usual
 
     def heed(self, receptions: Mapping[Link, Reception]) -> None:
         """Note what the receivers of a frame advise. One that could not tell keeps its last advice."""
         if self.scenario.array.fall_back:
-            self._sparse |= {link: r.sparse for link, r in receptions.items() if r.sparse is not None}
+            self.advice |= {link: r.sparse for link, r in receptions.items() if r.sparse is not None}

@@ -160,6 +160,19 @@ class Recorder:
         rows = {name: _slim(o, record.snapshot) for name, o in record.observers.items()}
         self._frames.append(_SlimFrame(**{**vars(record), "observers": rows}))
 
+    @property
+    def count(self) -> int:
+        """Frames so far."""
+        return len(self._frames)
+
+    def since(self, first: int) -> list[Any]:
+        """The frames from number `first` on, for `restore`."""
+        return self._frames[first:]
+
+    def restore(self, frames: list[Any]) -> None:
+        """Append frames that `since` gave."""
+        self._frames += frames
+
     def finish(
         self,
         *,

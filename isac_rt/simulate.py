@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
@@ -10,8 +9,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from isac_rt.access import Connections, connect, exchange
 from isac_rt.arrays import Antennas, Schedule, antennas_of, schedule_of
-from isac_rt.city import City, load_city
+from isac_rt.city import City
 from isac_rt.fall_back import Schedules
 from isac_rt.fidelity import Plan, Use, decisions, extent, mechanisms, used
 from isac_rt.ifsignal import IFCube, RangeProfiles, Transmission, add_noise, if_signal, range_profiles
@@ -40,17 +37,16 @@ from isac_rt.preflight import check_flights, check_memory, check_reference
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, Propagation, make_propagation
 from isac_rt.propagation.cache import CachedPropagation, PathStore
 from isac_rt.propagation.expected import ClutterExpectation, ExpectedClutter, make_expectation
-from isac_rt.provenance import program_fingerprint
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import Reception
 from isac_rt.results import TIMINGS, FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
-from isac_rt.scenario import City as CityTree
 from isac_rt.scenario import Scenario
-from isac_rt.scenario_file import plain_tree
+from isac_rt.surroundings import city_of, flight_centre, path_content
 from isac_rt.swarm import Pose, Swarm
 from isac_rt.terminal import ActiveTerminal, PassiveTerminal, TerminalState
-from isac_rt.timetable import Link, Timetable
+from isac_rt.timetable import Link, Timetable, snapshot_frames
 from isac_rt.tracking import TrackSet
+from isac_rt.unfinished import Unfinished
 from isac_rt.waveform import Waveform, waveform_of
 
 Progress = Callable[[int, int], None]
@@ -187,7 +183,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     check_flights(scenario, swarm, timetable)
     check_reference(scenario, timetable)
     plan = Plan(scenario, waveform, antennas, timetable, swarm)
-    city = city_of(scenario, plan.mesh_radius(_centre(scenario)))
+    city = city_of(scenario, plan.mesh_radius(flight_centre(scenario)))
     setup = Setup(
         scenario,
         waveform,
@@ -218,46 +214,6 @@ def _connected(setup: Setup) -> Setup:
     )
     timetable = replace(setup.timetable, blocks=found.blocks(), refused=found.refused())
     return replace(setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable))
-
-
-def city_of(scenario: Scenario, radius: float = np.inf) -> City:
-    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object again for like scenarios."""
-    centre, carrier = tuple(_centre(scenario).tolist()), waveform_of(scenario).carrier_frequency
-    text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
-    return _near_city(radius, text, scenario.folder, _city_digest(scenario), carrier, centre)
-
-
-@lru_cache(maxsize=2)
-def _near_city(radius: float, *of: Any) -> City:
-    return _loaded_city(*of).within(radius)
-
-
-def _centre(scenario: Scenario) -> np.ndarray:
-    return Swarm.from_scenario(scenario).middle(scenario.frames * (scenario.frame_interval_s or waveform_of(scenario).frame_duration))
-
-
-@lru_cache(maxsize=2)
-def _loaded_city(text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]) -> City:
-    tree = CityTree.model_validate(json.loads(text)) if text else None
-    return load_city(tree, folder, carrier, centre)
-
-
-def _city_digest(scenario: Scenario) -> str:
-    """Of the city's file, "" without one."""
-    if scenario.city is None or scenario.city.file is None:
-        return ""
-    with scenario.city_path().open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
-"""Parts of a scenario on which its paths do not depend."""
-
-
-def path_content(scenario: Scenario) -> str:
-    """All that a scenario's paths depend on, but the instant, as text; the city's file by its content."""
-    tree = {key: value for key, value in scenario.model_dump(mode="json").items() if key not in UNSEEN_BY_PATHS}
-    return json.dumps([tree, _city_digest(scenario), program_fingerprint()], sort_keys=True)
 
 
 def _propagation(
@@ -356,6 +312,7 @@ def run(
     threads: int | None = None,
     snapshots: int = 3,
     terminal: Callable[[Setup, Link], Terminal] = standard_terminal,
+    unfinished: Unfinished | None = None,
 ) -> Results:
     """Simulate every frame of a scenario.
 
@@ -367,12 +324,13 @@ def run(
     threads : receivers at work at once; None: as many as the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path ledger are kept
     terminal : makes the receiver of a link; one of one's own is a subclass of `ActiveTerminal` or `PassiveTerminal` with another `receive`
+    unfinished : where the frames are kept meanwhile and from where a run that was stopped goes on; with the terminals of this package
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
-    flight = _fly(scenario, progress, setup, threads, _snapshot_frames(scenario, snapshots), terminal)
+    flight = _fly(scenario, progress, setup, threads, snapshot_frames(scenario, snapshots), terminal, unfinished)
     return flight.recorder.finish(
         **flight.figures(),
         materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in flight.setup.city.materials},
@@ -405,21 +363,67 @@ def stage_seconds(
     return out
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Flight:
-    """All frames of a run, recorded and scored."""
+    """The frames of a run so far, recorded and scored."""
 
     setup: Setup
     recorder: Recorder
     observers: dict[Link, _Observer]
+    schedules: Schedules
     seconds: dict[str, float]
+    contradicted: dict[int, int] = field(default_factory=dict)
+    """Traced paths of each frame that the float64 geometry contradicted."""
+    _safe: int = 0
+    """Frames already in the file of the unfinished run."""
+
+    def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
+        """`Setup.trace`, the contradicted paths counted."""
+        before = self.setup.propagation.dropped
+        found = self.setup.trace(frame)
+        self.contradicted[frame] = self.setup.propagation.dropped - before
+        return found
+
+    def kept(self) -> dict[str, Any]:
+        """What an unfinished run needs to go on after the frames so far: those since the last call, and all that receivers carry over.
+
+        Only while no receiver is at work. Paths and samples are functions of the frame alone and are made anew.
+        """
+        first, self._safe = self._safe, self.recorder.count
+        return {
+            "first": first,
+            "frames": self.recorder.since(first),
+            "observers": {link: (o.terminal, o.score, o.feedback) for link, o in self.observers.items()},
+            "advice": self.schedules.advice,
+            "uses": {key: use for key, use in self.setup.uses.items() if first <= key[0] < self._safe},
+            "contradicted": {frame: self.contradicted[frame] for frame in range(first, self._safe)},
+            "seconds": self.seconds,
+        }
+
+    def go_on(self, unfinished: Unfinished) -> int:
+        """Take up what an earlier call of the same run kept; the number of the next frame."""
+        for entry in unfinished.entries():
+            if entry["first"] != self.recorder.count:
+                break  # two calls wrote into one folder
+            self.recorder.restore(entry["frames"])
+            self.setup.uses.update(entry["uses"])
+            self.contradicted.update(entry["contradicted"])
+            last = entry
+        if self.recorder.count:
+            for link, (terminal, score, feedback) in last["observers"].items():
+                o = self.observers[link]
+                o.terminal, o.score, o.feedback = terminal, score, feedback
+            self.schedules.advice.update(last["advice"])
+            self.seconds.update({stage: self.seconds[stage] + seconds for stage, seconds in last["seconds"].items()})
+        self._safe = self.recorder.count
+        return self._safe
 
     def figures(self) -> dict[str, Any]:
         """What a summary needs beside the frames."""
         return {
             "scores": {link: o.score for link, o in self.observers.items()},
             "timing": self.seconds,
-            "fidelity": _fidelity(self.setup),
+            "fidelity": _fidelity(self.setup, sum(self.contradicted.values())),
             "access": self._access(),
         }
 
@@ -438,6 +442,7 @@ def _fly(
     threads: int | None,
     snapshots: set[int],
     terminal: Callable[[Setup, Link], Terminal],
+    unfinished: Unfinished | None = None,
 ) -> _Flight:
     """Frame after frame; while the receivers work on one the next is traced."""
     clock, begin = _Clock(), time.perf_counter()
@@ -448,14 +453,20 @@ def _fly(
             observers = {link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links}
             schedules = Schedules(scenario, setup.schedule)
             recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
+        flight = _Flight(setup, recorder, observers, schedules, clock.seconds)
+        first = flight.go_on(unfinished) if unfinished else 0
+        begin -= clock.seconds["total"]
         waiting: tuple[_Frame, dict[Link, Future[_Heard]]] | None = None
-        for number in range(scenario.frames):
+        for number in range(first, scenario.frames):
             with clock.stage("trace"):
-                poses, paths = setup.trace(number)
+                poses, paths = flight.trace(number)
             if waiting is not None:
                 schedules.heed(_collect(recorder, observers, *waiting, clock))
-                if progress:
-                    progress(number, scenario.frames)
+                clock.seconds["total"] = time.perf_counter() - begin
+                if unfinished and unfinished.due():
+                    unfinished.append(flight.kept())
+            if progress and number:
+                progress(number, scenario.frames)
             active = timetable.with_role("active", number)
             sent = {name: setup.transmission(name, number, poses[name], schedules.of(name)) for name in active}
             frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), number in snapshots)
@@ -465,7 +476,7 @@ def _fly(
         if progress:
             progress(scenario.frames, scenario.frames)
     clock.seconds["total"] = time.perf_counter() - begin
-    return _Flight(setup, recorder, observers, clock.seconds)
+    return flight
 
 
 @dataclass(frozen=True)
@@ -478,13 +489,6 @@ class _Frame:
     sent: dict[str, Transmission]
     expected: dict[str, ExpectedClutter]
     snapshot: bool
-
-
-def _snapshot_frames(scenario: Scenario, count: int) -> set[int]:
-    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those that the active terminal processes."""
-    step = scenario.receivers.active_every_frames
-    heard = [f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames] or [0]
-    return {heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)}
 
 
 def _collect(
@@ -584,12 +588,12 @@ def _estimates(count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen
     return _values(rows)
 
 
-def _fidelity(setup: Setup) -> dict[str, object]:
+def _fidelity(setup: Setup, contradicted: int) -> dict[str, object]:
     """What was modelled, for the summary."""
     return {
         **mechanisms(setup.scenario),
         **decisions(setup.plan),
         "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
-        "paths_contradicted": setup.propagation.dropped,
+        "paths_contradicted": contradicted,
         **extent(setup.city, setup.propagation, setup.scenario.clutter),
     }

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from isac_rt.arrays import Schedule
 from isac_rt.payload import Payload, random_payload, unmodulated
 from isac_rt.randomness import generator
@@ -113,3 +115,10 @@ class Timetable:
             return unmodulated(self.waveform)
         rng = generator(self.scenario.seed, "payload", active, frame)
         return random_payload(self.waveform, self.schedule if schedule is None else schedule, self.scenario.modulation.dpsk_order, rng)
+
+
+def snapshot_frames(scenario: Scenario, count: int) -> set[int]:
+    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those that the active terminal processes."""
+    step = scenario.receivers.active_every_frames
+    heard = [f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames] or [0]
+    return {heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)}

@@ -44,7 +44,7 @@ def simulation(monkeypatch):
         return types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(scenario),
                                      timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))  # fmt: skip
 
-    def run(scenario, *, setup, progress, snapshots):
+    def run(scenario, *, setup, progress, snapshots, unfinished):
         for k in range(scenario.frames):
             progress(k + 1, scenario.frames)
         return fake_run(scenario)

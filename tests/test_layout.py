@@ -14,9 +14,9 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # a module may import those before it
 ORDER = (
     "scenario_base scenario_accuracy scenario_clutter scenario_doubts scenario scenario_file provenance runtime randomness waveform arrays "
-    "payload timetable city swarm preflight linkbudget propagation simd lanefft synthesis separable noise rangecells gridding costs "
-    "ifsignal receive tracking ghosts terminal baselines access metrics fidelity fall_back results simulate budget sweep experiments "
-    "validation bench figures render interactive animate report interchange starter console cli"
+    "payload timetable city swarm surroundings preflight linkbudget propagation simd lanefft synthesis separable noise rangecells gridding "
+    "costs ifsignal receive tracking ghosts terminal baselines access metrics fidelity fall_back results unfinished simulate budget sweep "
+    "experiments validation bench figures render interactive animate report interchange starter console interruption cli"
 ).split()
 ALONE = {"runtime", "randomness"}
 MAX_MODULE_LINES = 600
