@@ -44,10 +44,12 @@ def _loaded_city(text: str, folder: Path, digest: str, carrier: float, centre: t
 
 def city_digest(scenario: Scenario) -> str:
     """Of the city's file, "" without one."""
-    if scenario.city is None or scenario.city.file is None:
-        return ""
-    with scenario.city_path().open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return "" if scenario.city is None or scenario.city.file is None else _digest(scenario.city_path())
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
@@ -62,5 +64,6 @@ def path_content(scenario: Scenario) -> str:
 
 def run_content(scenario: Scenario, snapshots: int) -> str:
     """All that the results of a run depend on, as text."""
-    tree = scenario.model_dump(mode="json")
-    return json.dumps([tree, city_digest(scenario), program_fingerprint(), versions(), snapshots], sort_keys=True)
+    costs = scenario.cost_model_path()
+    files = [city_digest(scenario), "" if costs is None else _digest(costs)]
+    return json.dumps([scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots], sort_keys=True)

@@ -16,6 +16,7 @@ import pytest
 from test_fall_back import scenario as dense_scenario
 
 from isac_rt import simulate
+from isac_rt.cli import main
 from isac_rt.results import load as open_results
 from isac_rt.scenario_file import load, to_yaml
 from isac_rt.surroundings import run_content
@@ -50,7 +51,7 @@ def scenarios():
     return {
         "dense": lambda: dense_scenario(frames=7),
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
-        "canyon": lambda: load(SCENES / "street_canyon.yaml", frames=4),
+        "canyon": lambda: load(SCENES / "street_canyon.yaml", ["modulation.acquisition_frames=1"], frames=3),
     }
 
 
@@ -58,18 +59,18 @@ def scenarios():
     "name", ["dense", pytest.param("access", marks=pytest.mark.slow), pytest.param("canyon", marks=pytest.mark.sionna)]
 )
 def test_a_stopped_run_goes_on_to_the_same_bits(name, tmp_path):
-    """Stopped twice, each time in the midst of its frames. Planted bugs: the terminals, the scores or the advice not taken up."""
+    """Stopped after two frames, and once more before the last one. Planted bugs: the terminals, the scores or the advice not taken up."""
     scenario = scenarios()[name]()
     whole = simulate.run(scenario, snapshots=2)
-    parts = 0
-    for stop in (2, scenario.frames - 1, None):
+    parts, stops = 0, sorted({2, scenario.frames - 1})
+    for stop in (*stops, None):
         unfinished = Unfinished(tmp_path, run_content(scenario, 2), every=0.0)
         assert unfinished.begun == (parts > 0)
         try:
             again = simulate.run(scenario, snapshots=2, unfinished=unfinished, progress=stopping_at(stop))
         except Stopped:
             parts += 1
-    assert parts == 2
+    assert parts == len(stops)
     assert_equal_results(again, whole)
     assert len(Unfinished(tmp_path, run_content(scenario, 2)).entries()) == scenario.frames - 1
 
@@ -162,7 +163,32 @@ def test_entries_are_some_time_apart(tmp_path):
     assert unfinished.due()
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
+def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsys):
+    """Ctrl-C after three frames: exit 130 and where they are; the next call says that it goes on, and leaves no such file behind."""
+    (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
+    monkeypatch.setattr(Unfinished.__init__, "__defaults__", (0.0,))
+    monkeypatch.setattr("isac_rt.figures.make_figures", lambda *_: [])
+
+    def stopped(work, *_):
+        def report(done, total):
+            if done == 3:
+                raise KeyboardInterrupt
+
+        return work(report)
+
+    command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
+    with monkeypatch.context() as once:
+        once.setattr("isac_rt.cli._with_progress", stopped)
+        assert main(command) == 130
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'out' / FILE} keeps the frames so far" in said and "interrupted" in said and "going on" not in said
+    assert main(command) == 0
+    assert "going on after the frames" in capsys.readouterr().err
+    assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_the_command_goes_on_after_it_was_stopped(tmp_path, how):
     """From outside, once an entry is written: the message, the frames taken up, the same results, and no file left behind."""
     scenario = tmp_path / "scene.yaml"
@@ -180,8 +206,8 @@ sys.exit(main(["run", {str(scenario)!r}, "--out", {str(out)!r}]))
         pass
     os.kill(child.pid, how)
     _, said = child.communicate(timeout=60)
-    if how == signal.SIGINT:
-        assert child.returncode == 130 and "keeps the frames so far" in said
+    if how != signal.SIGKILL:
+        assert child.returncode == 128 + how and "keeps the frames so far" in said
     assert (out / FILE).exists() and not (out / "results.nc").exists()
     again = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert again.returncode == 0 and "going on after the frames" in again.stderr
