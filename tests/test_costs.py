@@ -86,7 +86,11 @@ def test_the_costs_decide():
     shipped = read(SHIPPED)
     free = CostModel("made up", shipped.chirp_ns | {DIRECT: 0.1}, shipped.path_ns | {DIRECT: 1e-3})
     assert decide(1000, model=free)[1].all()
-    assert not decide(1000, num_paths=3)[1].any() == decide(1000)[1].any()
+    assert decide(1000, num_paths=3)[1].all()
+    job = Job(3)
+    links, options = job.paths(30), {"start_time": 0.0, "filter_transition": 0.4e6, "noise_power": np.inf}
+    found = if_signal(job.waveform, links, job.pose, job.antennas, costs=free, **options).samples
+    np.testing.assert_array_equal(found, job.samples(links, "direct"))
 
 
 def test_speed_is_the_largest_in_the_frame():
