@@ -111,19 +111,21 @@ def write(found: Mapping[str, Any], folder: Path) -> list[Path]:
     return files
 
 
+_MARKERS = "os^D"
+
+
 def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
     """Cost against error and against size of one stage; the oracle is marked, the floor is the line at one."""
     import matplotlib.pyplot as plt
 
+    drawn = [(method, unit, rows) for (of_kind, method, unit), rows in curves(found["rows"]).items() if of_kind == kind]
     with plt.rc_context({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3}):
-        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 4.4), layout="constrained")
-        for (of_kind, method, unit), rows in curves(found["rows"]).items():
-            if of_kind != kind:
-                continue
+        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.9 + 0.08 * len(drawn)), layout="constrained")
+        for number, (method, unit, rows) in enumerate(drawn):
             cost = [row["cost"] for row in rows]
             oracle = any(row.get("oracle") for row in rows)
             error = [max(row["error"] or 0.0, 1e-8) for row in rows]
-            marker = "*" if oracle else "o"
+            marker = "*" if oracle else _MARKERS[number // 10 % len(_MARKERS)]  # there are ten colours
             (line,) = right.loglog([r["size"] for r in rows], cost, marker=marker, label=f"{method} ({unit})" if unit else method)
             if rows[0]["error"] is not None and (not oracle or max(error) > 1e-8):
                 left.loglog(error, cost, ls="none", marker=marker, color=line.get_color())
@@ -133,7 +135,7 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
             _whole_decades(axis)
         left.set_xlabel("error (1e-8 and less at the edge)")
         right.set_xlabel("size")
-        canvas.legend(fontsize=6.5, loc="outside lower center", ncols=3)
+        canvas.legend(fontsize=6.5, loc="outside lower center", ncols=2)
         canvas.suptitle(f"{kind}: {found['machine']['processor']}; star: oracle; dotted: floor")
         canvas.savefig(file, dpi=130)
         plt.close(canvas)
