@@ -30,6 +30,12 @@ def program_fingerprint() -> str:
     return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
 
 
+def file_digest(file: Path) -> str:
+    """SHA-256 of a file's content."""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
 @lru_cache(maxsize=1)
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}

@@ -282,6 +282,7 @@ class Noise(Node):
 
 class Receivers(Node):
     """How terminals detect and demodulate."""
+
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
     """omp: the paper's, for sparse sampling. pursuit: OMP off the grid, path by path. latin_union: all groups as one uniform sampling, for
     M = L_tx. conventional: the DFT over each antenna's equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the

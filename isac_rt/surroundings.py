@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.city import City, load_city
-from isac_rt.provenance import program_fingerprint, versions
+from isac_rt.provenance import file_digest, program_fingerprint, versions
 from isac_rt.scenario import City as CityTree
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_file import plain_tree
@@ -44,12 +43,7 @@ def _loaded_city(text: str, folder: Path, digest: str, carrier: float, centre: t
 
 def city_digest(scenario: Scenario) -> str:
     """Of the city's file, "" without one."""
-    return "" if scenario.city is None or scenario.city.file is None else _digest(scenario.city_path())
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
+    return "" if scenario.city is None or scenario.city.file is None else file_digest(scenario.city_path())
 
 
 UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
@@ -65,5 +59,5 @@ def path_content(scenario: Scenario) -> str:
 def run_content(scenario: Scenario, snapshots: int) -> str:
     """All that the results of a run depend on, as text."""
     costs = scenario.cost_model_path()
-    files = [city_digest(scenario), "" if costs is None else _digest(costs)]
+    files = [city_digest(scenario), "" if costs is None else file_digest(costs)]
     return json.dumps([scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots], sort_keys=True)

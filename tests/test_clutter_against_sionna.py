@@ -10,15 +10,16 @@ import pytest
 
 from isac_rt import scenario
 from isac_rt.arrays import antennas_of
-from isac_rt.city import City, load_city
+from isac_rt.city import load_city
 from isac_rt.city.mesh import distance_to_triangles
 from isac_rt.propagation import make_propagation
 from isac_rt.propagation.cells import area_for
 from isac_rt.swarm import Swarm
+from isac_rt.validation.clutter import sionna_power
 from isac_rt.waveform import waveform_of
 
 pytestmark = pytest.mark.sionna
-C, F_C = 299_792_458.0, 77e9
+F_C = 77e9
 RAYS = 10_000_000
 CLEARANCE = 10.0
 FRAMES = 400  # of 7.8 ms
@@ -57,23 +58,6 @@ def flown(name: str, per_metre: float):
 
 
 POWERS: dict[tuple[str, int, str], np.ndarray] = {}
-
-
-def sionna_power(city: City, start: np.ndarray, end: np.ndarray, edges: np.ndarray, rays: int) -> np.ndarray:
-    """Power gain of Sionna's diffuse paths between two isotropic, vertically polarised points, by cells of length [m]."""
-    import mitsuba as mi
-    import sionna.rt as rt
-
-    from isac_rt.city.scene import build_scene
-
-    scene = build_scene(city, F_C).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    scene.add(rt.Transmitter("tx", mi.Point3f(*start.tolist())))
-    scene.add(rt.Receiver("rx", mi.Point3f(*end.tolist())))
-    options = {"los": False, "specular_reflection": False, "diffuse_reflection": True, "refraction": False}
-    found = rt.PathSolver()(scene, max_depth=1, samples_per_src=rays, max_num_paths_per_src=rays, **options)
-    real, imag = (np.asarray(x, np.float64).ravel() for x in found.a)
-    return np.histogram(C * np.asarray(found.tau, np.float64).ravel(), edges, weights=real**2 + imag**2)[0]
 
 
 def compare(name: str, per_metre: float, rays: int = RAYS, places: int = 5) -> tuple[np.ndarray, np.ndarray, int]:

@@ -22,6 +22,7 @@ from isac_rt.propagation import make_propagation
 from isac_rt.propagation.expectation import MeshExpectation, Mistakes
 from isac_rt.randomness import generator
 from isac_rt.swarm import Pose, Swarm
+from isac_rt.validation.clutter import sionna_power
 from isac_rt.waveform import waveform_of
 
 pytestmark = pytest.mark.sionna
@@ -238,25 +239,6 @@ def street(material: str):
     return city, make_propagation(s, w, antennas_of(s, w), city), Swarm.from_scenario(s)
 
 
-def sionnas_mirror_then_scatter(city: City, start: np.ndarray, end: np.ndarray, edges: np.ndarray, rays: int) -> np.ndarray:
-    """Power gain of Sionna's paths of one mirror and one diffuse reflection, in this order, by cells of length [m]."""
-    import mitsuba as mi
-    import sionna.rt as rt
-
-    from isac_rt.city.scene import build_scene
-
-    scene = build_scene(city, F_C).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    scene.add(rt.Transmitter("tx", mi.Point3f(*start.tolist())))
-    scene.add(rt.Receiver("rx", mi.Point3f(*end.tolist())))
-    options = {"los": False, "specular_reflection": True, "diffuse_reflection": True, "refraction": False}
-    found = rt.PathSolver()(scene, max_depth=2, samples_per_src=rays, max_num_paths_per_src=2 * rays, **options)
-    kind = np.asarray(found.interactions).reshape(2, -1)
-    wanted = (kind[0] == rt.InteractionType.SPECULAR) & (kind[1] == rt.InteractionType.DIFFUSE)
-    real, imag = (np.asarray(x, np.float64).ravel()[wanted] for x in found.a)
-    return np.histogram(C * np.asarray(found.tau, np.float64).ravel()[wanted], edges, weights=real**2 + imag**2)[0]
-
-
 @pytest.mark.parametrize(("material", "rays"), [("concrete", 3_000_000), pytest.param("metal", 3_000_000, marks=pytest.mark.slow)])
 def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
     """A street with all its mirrors, monostatic and bistatic, by 4 m of range: median and total within 0.05 dB, 90th percentile of the
@@ -271,7 +253,7 @@ def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
     pairs = [("A", "A", True, "A", "A"), ("A", "P", True, "A", "P")] + [("A", "P", False, "P", "A")] * (material == "metal")
     for tx, rx, before, source, sink in pairs:
         edges = np.arange(0, 1500, 8 if tx == rx else 4)
-        theirs = sionnas_mirror_then_scatter(city, poses[source].position, poses[sink].position, edges, rays)
+        theirs = sionna_power(city, poses[source].position, poses[sink].position, edges, rays, by_mirror=True)
         ours = np.zeros(edges.size - 1)
         for part in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.13):
             if part.before == before:

@@ -332,15 +332,8 @@ def _figure(table: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame):
         edges = np.array([-100.0, 0, 10, 15, 20, 25, 30, 60])
         bins = np.digitize(targets.clutter_db, edges)
         at = [float(np.clip(targets.clutter_db[bins == b].mean(), -10, 60)) for b in range(1, edges.size) if (bins == b).sum() > 4]
-        for n, mark in (
-            ("cfar", "v"),
-            ("notch", "<"),
-            ("sample", "x"),
-            ("map", "s"),
-            ("arms", "o"),
-            ("arms_wrong", "D"),
-            ("bound_arms", "+"),
-        ):
+        marks = {"cfar": "v", "notch": "<", "sample": "x", "map": "s", "arms": "o", "arms_wrong": "D", "bound_arms": "+"}
+        for n, mark in marks.items():
             if n in names:
                 values = [hits[n][bins == b].mean() for b in range(1, edges.size) if (bins == b).sum() > 4]
                 curve.plot(at, values, mark + "-", label=text[n])

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
 from isac_rt.metrics import RATES, SensingScore, SymbolCount, summary_block
-from isac_rt.provenance import program_fingerprint
+from isac_rt.provenance import file_digest, program_fingerprint
 from isac_rt.randomness import seed_sequence
 from isac_rt.scenario import Scenario
 from isac_rt.scenario_base import Key, Node, Problem, dotted
@@ -193,21 +193,19 @@ class Plan:
 
     def key_of(self, tree: dict[str, Any]) -> str:
         """Under which a point is kept."""
-        return _digest([tree, self._city_file(tree), self._cost_model(tree), program_fingerprint()])
+        files = self._named_file(tree, "city", "file"), self._named_file(tree, "accuracy", "cost_model")
+        return _digest([tree, *files, program_fingerprint()])
 
     def _paths_key(self, tree: dict[str, Any]) -> str | None:
         if (tree.get("propagation") or {}).get("model") != "ray_traced":
             return None
         unseen = ("modulation", "noise", "receivers", "tracking")
-        return _digest([{k: v for k, v in tree.items() if k not in unseen}, self._city_file(tree)])
+        return _digest([{k: v for k, v in tree.items() if k not in unseen}, self._named_file(tree, "city", "file")])
 
-    def _city_file(self, tree: dict[str, Any]) -> str:
-        city = tree.get("city") or {}
-        file = city.get("file") if isinstance(city, dict) else None
-        return "" if file is None else _file_digest(self.base.folder / str(file))
-
-    def _cost_model(self, tree: dict[str, Any]) -> str:
-        file = (tree.get("accuracy") or {}).get("cost_model")
+    def _named_file(self, tree: dict[str, Any], part: str, key: str) -> str:
+        """Digest of the file that a key names, "" without one."""
+        node = tree.get(part)
+        file = node.get(key) if isinstance(node, dict) else None
         return "" if file is None else _file_digest(self.base.folder / str(file))
 
 
@@ -252,7 +250,7 @@ def _digest(value: Any) -> str:
 @lru_cache(maxsize=64)
 def _file_digest(file: Path) -> str:
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        return file_digest(file)
     except OSError:
         return ""  # the point's own check says that it is missing
 

@@ -294,7 +294,7 @@ def mean_power_of_a_street() -> float:
         poses = {n: replace(p, position=p.position - city.origin) for n, p in swarm.poses(time).items()}
         for rx, step in (("A", 8.0), ("P", 4.0)):
             edges = np.arange(0, 4000, step)
-            truth = _sionna(city, poses["A"].position, poses[rx].position, edges)
+            truth = sionna_power(city, poses["A"].position, poses[rx].position, edges)
             seen = field.seen("A", rx, poses["A"], poses[rx], time)
             found = np.histogram(seen.length, edges, weights=seen.magnitude**2)[0]
             filled = truth > 1e-3 * truth.sum()
@@ -304,8 +304,11 @@ def mean_power_of_a_street() -> float:
     return float(max(abs(np.median(off)) / 0.05, np.quantile(np.abs(off), 0.9) / 0.2, np.abs(totals).max() / 0.05))
 
 
-def _sionna(city: City, start: np.ndarray, end: np.ndarray, edges: np.ndarray, rays: int = 1_000_000) -> np.ndarray:
-    """Power of Sionna's diffuse paths between two isotropic, vertically polarised points, by length [m]."""
+def sionna_power(
+    city: City, start: np.ndarray, end: np.ndarray, edges: np.ndarray, rays: int = 1_000_000, *, by_mirror: bool = False
+) -> np.ndarray:
+    """Power gain of Sionna's diffuse paths between two isotropic, vertically polarised points, by cells of length [m]; `by_mirror`: of
+    those that one mirror sends on to the scatterer."""
     import mitsuba as mi
     import sionna.rt as rt
 
@@ -315,7 +318,13 @@ def _sionna(city: City, start: np.ndarray, end: np.ndarray, edges: np.ndarray, r
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     scene.add(rt.Transmitter("tx", mi.Point3f(*start.tolist())))
     scene.add(rt.Receiver("rx", mi.Point3f(*end.tolist())))
-    options = {"los": False, "specular_reflection": False, "diffuse_reflection": True, "refraction": False}
-    found = rt.PathSolver()(scene, max_depth=1, samples_per_src=rays, max_num_paths_per_src=rays, **options)
+    options = {"los": False, "specular_reflection": by_mirror, "diffuse_reflection": True, "refraction": False}
+    depth = 2 if by_mirror else 1
+    found = rt.PathSolver()(scene, max_depth=depth, samples_per_src=rays, max_num_paths_per_src=depth * rays, **options)
     real, imag = (np.asarray(x, np.float64).ravel() for x in found.a)
-    return np.histogram(299_792_458.0 * np.asarray(found.tau, np.float64).ravel(), edges, weights=real**2 + imag**2)[0]
+    length, power = 299_792_458.0 * np.asarray(found.tau, np.float64).ravel(), real**2 + imag**2
+    if by_mirror:
+        kind = np.asarray(found.interactions).reshape(2, -1)
+        wanted = (kind[0] == rt.InteractionType.SPECULAR) & (kind[1] == rt.InteractionType.DIFFUSE)
+        length, power = length[wanted], power[wanted]
+    return np.histogram(length, edges, weights=power)[0]
