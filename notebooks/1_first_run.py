@@ -15,7 +15,7 @@
 import matplotlib.pyplot as plt
 
 import isac_rt as irt
-from isac_rt import figures
+from isac_rt.views import figures
 
 scenario = irt.load("../scenes/street_canyon.yaml", frames=6)
 results = irt.run(scenario)

@@ -16,7 +16,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import isac_rt as irt
-from isac_rt.receive import cfar, demodulate, doppler, spectrum
+from isac_rt.receive import cfar, spectrum
+from isac_rt.receive import maps as doppler
+from isac_rt.receive.symbols import powers as demodulate
 
 scenario = irt.load("../scenes/paper_swarm_consistent.yaml", ["propagation.leakage.enabled=false"], frames=200)
 setup = irt.prepare(scenario)

@@ -20,7 +20,7 @@ from tempfile import mkdtemp
 import matplotlib.pyplot as plt
 
 import isac_rt as irt
-from isac_rt import figures
+from isac_rt.views import figures
 
 folder = Path(mkdtemp())
 base = Path("../scenes/paper_swarm_consistent.yaml").resolve()

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
-from isac_rt.payload import Payload
-from isac_rt.waveform import Waveform
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.payload import Payload
+from isac_rt.frame.waveform import Waveform
 
 C = 299_792_458.0
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import antennas_of, conventional_schedule
-from isac_rt.metrics import SensingScore, SymbolCount, Truth, resolutions
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
-from isac_rt.results import FrameRecord, ObserverRecord, Recorder, Results, TrackTable, UavValues
-from isac_rt.scenario import Scenario, Uav
-from isac_rt.swarm import Swarm
-from isac_rt.timetable import Timetable
-from isac_rt.waveform import waveform_of
+from isac_rt.results.metrics import SensingScore, SymbolCount, Truth, resolutions
+from isac_rt.results.recorder import Recorder, Results
+from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
+from isac_rt.scenario.swarm import Uav
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.swarm import Swarm
 
 STATES = ("acquiring", "tracking", "lost")
 TIMING = {"setup": 1.25, "trace": 2.5, "synthesis": 3.75, "receive": 4.5, "track": 0.125, "total": 12.125}

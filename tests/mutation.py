@@ -33,73 +33,72 @@ import numpy as np
 
 ROOT = Path(__file__).parent.parent
 TESTS_OF = {
-    "waveform.py": "test_waveform test_ifsignal",
-    "payload.py": "test_payload test_receive_data",
-    "arrays.py": "test_arrays test_ifsignal",
-    "synthesis.py": "test_ifsignal",
-    "simd.py": "test_gridding test_receive_transform test_ifsignal",
-    "gridding.py": "test_ifsignal test_gridding",
-    "rangecells.py": "test_gridding test_ifsignal",
-    "lanefft.py": "test_gridding test_receive_transform",
-    "separable.py": "test_separable",
-    "ifsignal.py": "test_ifsignal test_hard_signal",
-    "costs.py": "test_costs",
-    "noise.py": "test_noise",
-    "linkbudget.py": "test_linkbudget",
+    "frame/waveform.py": "test_waveform test_ifsignal",
+    "frame/payload.py": "test_payload test_receive_data",
+    "frame/antennas.py": "test_arrays test_ifsignal",
+    "signal/direct.py": "test_ifsignal",
+    "kernels/vector.py": "test_gridding test_receive_transform test_ifsignal",
+    "signal/gridded.py": "test_ifsignal test_gridding",
+    "signal/profiles.py": "test_gridding test_ifsignal",
+    "kernels/fourier.py": "test_gridding test_receive_transform",
+    "signal/separable.py": "test_separable",
+    "signal/if_signal.py": "test_ifsignal test_hard_signal",
+    "signal/choice.py": "test_costs",
+    "signal/noise.py": "test_noise",
+    "frame/level.py": "test_linkbudget",
     "propagation/free_space.py": "test_propagation",
-    "propagation/geometry.py": "test_propagation test_raytrace_scenes",
+    "propagation/legs/geometry.py": "test_propagation test_raytrace_scenes",
     "propagation/rcs.py": "test_propagation",
     "propagation/raytrace.py": "test_raytrace_scenes",
-    "propagation/clearance.py": "test_hard_geometry",
-    "propagation/expected.py": "test_clutter_field test_clutter_detectors",
-    "propagation/statistical.py": "test_clutter_models",
-    "propagation/clutter.py": "test_clutter_field",
-    "propagation/cells.py": "test_clutter_field",
-    "propagation/twice.py": "test_clutter_twice",
-    "propagation/images.py": "test_clutter_twice",
-    "propagation/penumbra.py": "test_penumbra",
-    "propagation/visibility.py": "test_penumbra test_clutter_field test_clutter_coherence",
+    "propagation/legs/clearance.py": "test_hard_geometry",
+    "propagation/clutter/rayleigh.py": "test_clutter_models",
+    "propagation/clutter/field.py": "test_clutter_field",
+    "propagation/clutter/cells.py": "test_clutter_field",
+    "propagation/clutter/two_bounces.py": "test_clutter_twice",
+    "propagation/clutter/mirrors.py": "test_clutter_twice",
+    "propagation/clutter/penumbra.py": "test_penumbra",
+    "propagation/clutter/sight.py": "test_penumbra test_clutter_field test_clutter_coherence",
     "propagation/elements.py": "test_propagation",
-    "propagation/diffuse.py": "test_raytrace_scenes test_clutter_field",
-    "propagation/between.py": "test_between",
-    "propagation/mirrors.py": "test_mirrors test_between",
+    "propagation/clutter/resampled.py": "test_raytrace_scenes test_clutter_field",
+    "propagation/legs/between.py": "test_between",
+    "propagation/legs/reflection.py": "test_mirrors test_between",
     "propagation/pathset.py": "test_propagation test_ifsignal",
-    "propagation/bodies.py": "test_diffraction test_shadow_edges",
-    "propagation/diffraction.py": "test_diffraction",
-    "propagation/direct.py": "test_shadow_edges test_diffraction",
-    "propagation/edges.py": "test_shadow_edges test_diffraction",
-    "propagation/expectation.py": "test_clutter_field",
+    "propagation/legs/bodies.py": "test_diffraction test_shadow_edges",
+    "propagation/legs/diffraction.py": "test_diffraction",
+    "propagation/legs/direct.py": "test_shadow_edges test_diffraction",
+    "propagation/legs/edges.py": "test_shadow_edges test_diffraction",
+    "terminal/expectation.py": "test_clutter_field",
     "receive/active.py": "test_receive_detection",
     "receive/cfar.py": "test_receive_detection",
-    "receive/clutter_filter.py": "test_clutter_filter",
-    "receive/common.py": "test_receive_detection test_receive_data",
-    "receive/demodulate.py": "test_receive_data test_receive_hard",
-    "receive/doppler.py": "test_receive_detection test_receive_schemes",
+    "receive/clutter/filter.py": "test_clutter_filter",
+    "receive/sense.py": "test_receive_detection test_receive_data",
+    "receive/symbols/powers.py": "test_receive_data test_receive_hard",
+    "receive/maps.py": "test_receive_detection test_receive_schemes",
     "receive/estimate.py": "test_receive_detection test_receive_data",
     "receive/passive.py": "test_receive_data",
     "receive/spectrum.py": "test_receive_data test_receive_detection",
     "receive/transform.py": "test_receive_transform",
-    "receive/in_clutter.py": "test_clutter_detectors",
-    "receive/joint.py": "test_receive_joint",
-    "receive/phases.py": "test_receive_joint",
-    "receive/separate.py": "test_receive_joint",
-    "receive/beams.py": "test_receive_beams",
+    "receive/clutter/sense.py": "test_clutter_detectors",
+    "receive/joint/fit.py": "test_receive_joint",
+    "receive/symbols/phases.py": "test_receive_joint",
+    "receive/joint/separate.py": "test_receive_joint",
+    "receive/symbols/beams.py": "test_receive_beams",
     "receive/pursuit.py": "test_receive_pursuit",
-    "receive/profile.py": "test_profile_decision",
-    "receive/adaptive.py": "test_clutter_detectors",
-    "receive/clutter_fit.py": "test_clutter_fit",
-    "receive/clutter_map.py": "test_clutter_detectors",
-    "receive/detectors.py": "test_clutter_detectors",
+    "receive/symbols/profile.py": "test_profile_decision",
+    "receive/clutter/adaptive.py": "test_clutter_detectors",
+    "receive/clutter/correction.py": "test_clutter_fit",
+    "receive/clutter/power.py": "test_clutter_detectors",
+    "receive/clutter/detectors.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
 COMPILED_FROM = {
-    "simd.py": ("synthesis.py", "gridding.py", "receive/transform.py"),
-    "lanefft.py": ("gridding.py", "receive/transform.py"),
-    "rangecells.py": ("gridding.py",),
-    "synthesis.py": ("gridding.py",),
-    "noise.py": ("gridding.py",),
-    "propagation/clutter.py": ("propagation/twice.py",),
-    "propagation/images.py": ("propagation/twice.py",),
+    "kernels/vector.py": ("signal/direct.py", "signal/gridded.py", "receive/transform.py"),
+    "kernels/fourier.py": ("signal/gridded.py", "receive/transform.py"),
+    "signal/profiles.py": ("signal/gridded.py",),
+    "signal/direct.py": ("signal/gridded.py",),
+    "signal/noise.py": ("signal/gridded.py",),
+    "propagation/clutter/field.py": ("propagation/clutter/two_bounces.py",),
+    "propagation/clutter/mirrors.py": ("propagation/clutter/two_bounces.py",),
 }
 """The modules in whose compiled code a module's own is held; their cache does not know that it changed."""
 LIMIT = 400
@@ -107,19 +106,19 @@ LIMIT = 400
 BUDGET = 60.0
 """Seconds of tests, as they were recorded, that are tried on one mutant: what only a slower one would notice counts as missed."""
 EXCUSED = [
-    ("propagation/cells.py", "np.repeat(code[large], 2) * np.uint64(4)", "names of cells, for the hash: different all the same"),
-    ("propagation/statistical.py", "- (inside if clutter.place", "a draw from -0.5 to 0.5: the same law"),
+    ("propagation/clutter/cells.py", "np.repeat(code[large], 2) * np.uint64(4)", "names of cells, for the hash: different all the same"),
+    ("propagation/clutter/rayleigh.py", "- (inside if clutter.place", "a draw from -0.5 to 0.5: the same law"),
     ("receive/estimate.py", "step / np.sign([gx, gy])", "a product with a sign is the quotient"),
-    ("propagation/bodies.py", "reach / np.sqrt(wavelength * (before[i]", "a wider first look at a body; the exact one follows"),
-    ("propagation/bodies.py", "+ radius) * 2)", "wider as well"),
-    ("propagation/direct.py", "(which.size, 2, 3)) for name in pair]", "a part of no length, which nothing shades"),
-    ("gridding.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
-    ("gridding.py", "lag[:, 1]", "and of one offset"),
-    ("separable.py", "* fast) % 2)", "whole turns, one or two"),
-    ("propagation/penumbra.py", "lift / side", "a quotient by a sign"),
-    ("propagation/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
-    ("receive/doppler.py", "support] = -2", "less than any modulus, as -1 is"),
-    ("rangecells.py", "*plan(2), np.zeros((0", "the transform of no band, which is never made"),
+    ("propagation/legs/bodies.py", "reach / np.sqrt(wavelength * (before[i]", "a wider first look at a body; the exact one follows"),
+    ("propagation/legs/bodies.py", "+ radius) * 2)", "wider as well"),
+    ("propagation/legs/direct.py", "(which.size, 2, 3)) for name in pair]", "a part of no length, which nothing shades"),
+    ("signal/gridded.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
+    ("signal/gridded.py", "lag[:, 1]", "and of one offset"),
+    ("signal/separable.py", "* fast) % 2)", "whole turns, one or two"),
+    ("propagation/clutter/penumbra.py", "lift / side", "a quotient by a sign"),
+    ("propagation/legs/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
+    ("receive/maps.py", "support] = -2", "less than any modulus, as -1 is"),
+    ("signal/profiles.py", "*plan(2), np.zeros((0", "the transform of no band, which is never made"),
 ]
 """Mutants (file, what the changed line holds and the line did not, why) that are not sampled: what follows is as right."""
 
@@ -415,7 +414,7 @@ def check_sample(mutants: list[Mutant], copy: Copy, record: Record, report: Path
 def check_planted(words: str) -> int:
     """Plant the bug of every case; print those that do not make it fail by its number."""
     sys.path.insert(0, str(ROOT))  # the cases of this checkout, whichever is installed
-    from isac_rt.validation import all_cases
+    from isac_rt.studies.validation import all_cases
 
     wrong, count = 0, 0
     with tempfile.TemporaryDirectory() as folder:
@@ -432,7 +431,7 @@ def check_planted(words: str) -> int:
                 print(f"STALE    {one.name}: {p.file} holds {p.old!r} {source.count(p.old)} times", flush=True)
                 continue
             program = (
-                "from isac_rt.validation import all_cases, run_case; "
+                "from isac_rt.studies.validation import all_cases, run_case; "
                 f"v = run_case(next(c for c in all_cases() if c.name == {one.name!r})); print(v.passed, v.error, v.note)"
             )
             with copy.changed(p.file, source.replace(p.old, p.new)):

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import Payload, random_payload
-from isac_rt.waveform import Waveform
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import Payload, random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 
 C = 299_792_458.0
 ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * C / 77e9, pattern="sector")

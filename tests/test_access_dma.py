@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from isac_rt.access.dma import isolation, mix, raised_cosine
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.ifsignal import Transmission, if_signal
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.scenario import Receivers
-from isac_rt.swarm import Pose
-from isac_rt.synthesis import filter_gain
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.signal.direct import filter_gain
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
 W = Waveform()

@@ -10,11 +10,11 @@ from receiver_cubes import ANTENNAS, Path, cube
 from scipy import stats
 
 from isac_rt.access.feedback import Feedback, correct, frames_to_repair, summarise
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.payload import random_payload
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.scenario.receivers import Receivers
 
 W = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2, spacing=0.5774 * W.wavelength)

@@ -8,7 +8,7 @@ from scipy import integrate, special, stats
 
 from isac_rt.access.identify import HOT_RATE, choose_run, consensus, hot_chirps, hot_threshold, needed_chirps
 from isac_rt.access.ook import Codebook, Message, keyed, read, repeats, threshold
-from isac_rt.waveform import Waveform
+from isac_rt.frame.waveform import Waveform
 
 SIGMAS = 4.5  # statistical: fails by chance once in 10^5
 

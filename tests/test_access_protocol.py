@@ -10,11 +10,12 @@ import pytest
 from isac_rt.access.ook import Message
 from isac_rt.access.protocol import Clock, Network, establish, scan
 from isac_rt.access.synchronise import EXTERNAL
-from isac_rt.arrays import Antennas, pseudo_random_schedule
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.scenario import Receivers
-from isac_rt.swarm import Pose
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
 W = Waveform(num_samples=256, num_chirps=60)

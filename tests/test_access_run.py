@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt import simulate
 from isac_rt.access import Clock, ClockEstimate, Connections, Establishment, LinkState
-from isac_rt.scenario import Access, Array, Modulation, Noise, Propagation, Radio, Receivers, RoleChange, Scenario, Uav
+from isac_rt.run import simulate
+from isac_rt.scenario.environment import Propagation
+from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.scenario.swarm import Access, RoleChange, Uav
+from isac_rt.scenario.tree import Scenario
 
 C = 299792458.0
 SMALL = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60)
@@ -129,7 +133,7 @@ def test_feedback_undoes_a_slip(monkeypatch, feedback):
     the active terminal answers, or to the end. The active terminal processes every second frame.
 
     Planted bug: the range moved the other way."""
-    from isac_rt import terminal
+    from isac_rt.terminal import terminal
 
     monkeypatch.setattr(terminal, "slip_cells", lambda ends, size: 0)
     step, times = terminal.PassiveTerminal.step, []

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock, round_of
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.ifsignal import Transmission, add_noise, if_signal
-from isac_rt.payload import unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.randomness import seed_sequence
 from isac_rt.receive import receive_passive
-from isac_rt.scenario import Receivers
-from isac_rt.swarm import Pose
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
 OFFSET, DRIFT = -23.7e-9, 0.0131e-6

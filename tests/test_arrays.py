@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
-from isac_rt.arrays import Antennas, conventional_schedule, is_latin, l_shape, pseudo_random_schedule
-from isac_rt.scenario_file import load
-from isac_rt.simulate import prepare
+from isac_rt.frame.antennas import Antennas, l_shape
+from isac_rt.frame.schedule import conventional_schedule, is_latin, pseudo_random_schedule
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.file import load
 
 SCENES = Path(__file__).parents[1] / "scenes"
 PAPER = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=2.2480e-3)

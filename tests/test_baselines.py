@@ -10,8 +10,11 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 from scipy import stats
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.baselines import (
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.studies.baselines import (
     Echoes,
     LoRadar,
     detect_symbols,
@@ -24,9 +27,6 @@ from isac_rt.baselines import (
     resolution,
     symbol_tones,
 )
-from isac_rt.ifsignal import IFCube
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
 
 SETTINGS = Receivers()
 

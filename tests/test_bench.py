@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from isac_rt.bench import REQUIRED, report
-from isac_rt.bench.measure import cpu_seconds, floor_seconds
-from isac_rt.bench.scenes import town
-from isac_rt.cli import main
-from isac_rt.fidelity import faintest
-from isac_rt.simulate import prepare
+from isac_rt.cli.cli import main
+from isac_rt.run.plan import faintest
+from isac_rt.run.setup import prepare
+from isac_rt.studies.bench import REQUIRED, report
+from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
+from isac_rt.studies.bench.scenes import town
 
 LINEAR = 1.3  # measured exponents scatter by 0.1 to 0.2 on a busy machine; n log n is 1.1 here, n^2 would be 2
 
@@ -63,7 +63,7 @@ def test_leaving_out_the_faintest_grows_no_faster_than_sorting():
 def test_the_command_measures_the_stages_that_are_asked_for(tmp_path, monkeypatch, capsys):
     """With measurements that take no time. Planted bug: all stages measured whatever was asked for."""
     rows = [{"kind": "tracing", "method": "traced", "size": k, "error": 0.0, "cost": 1.5 * k, "floor_s": 0.04} for k in (2, 4)]
-    monkeypatch.setattr("isac_rt.bench.tracing.rows", lambda quick: rows)
+    monkeypatch.setattr("isac_rt.studies.bench.tracing.rows", lambda quick: rows)
     assert main(["bench", "trace", "--quick", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "rows.json")]) == 0
     assert json.loads((tmp_path / "rows.json").read_text())["rows"] == rows
     assert "tracing: traced" in capsys.readouterr().out

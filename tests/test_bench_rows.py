@@ -8,9 +8,9 @@ import os
 
 import pytest
 
-from isac_rt.bench import REQUIRED, hermes, reception, synthesis
-from isac_rt.cli import main
-from isac_rt.gridding import ACCURATE_ERROR, GRIDDED_ERROR
+from isac_rt.cli.cli import main
+from isac_rt.signal.gridded import ACCURATE_ERROR, GRIDDED_ERROR
+from isac_rt.studies.bench import REQUIRED, hermes, reception, synthesis
 
 
 def test_errors_of_the_synthesis_are_as_stated():

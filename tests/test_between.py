@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City, Material, load_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, PathSet
-from isac_rt.swarm import Swarm
-from isac_rt.waveform import waveform_of
+from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -46,8 +46,8 @@ def tracer(s: scenario.Scenario, city: City, instants=()):
 
 def test_sets_of_chains_are_padded_with_minus_one():
     """What `PathSet` promises of faces where there is none, and NaN for their points. Planted bug: padded with another number."""
-    from isac_rt.propagation.between import leg_set
-    from isac_rt.propagation.geometry import Legs
+    from isac_rt.propagation.legs.between import leg_set
+    from isac_rt.propagation.legs.geometry import Legs
 
     def some(count: int, depth: int) -> tuple:
         legs = Legs(np.ones(count), np.ones(count), np.ones(count), np.ones((count, 3)), np.ones((count, 3)), np.ones((count, depth, 3)))

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.budget import check, delays, make_plan, present
-from isac_rt.cli import main
-from isac_rt.fidelity import decisions
+from isac_rt.cli.cli import main
 from isac_rt.propagation import PathKind
-from isac_rt.scenario import Scenario
-from isac_rt.scenario_file import load
+from isac_rt.run import simulate
+from isac_rt.run.audit import check, delays, make_plan, present
+from isac_rt.run.plan import decisions
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.file import load
+from isac_rt.scenario.tree import Scenario
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -23,9 +24,9 @@ SCENES = Path(__file__).parents[1] / "scenes"
 def test_the_plan_is_what_the_summary_says_was_done():
     """Decisions of `isac-rt plan` before, `fidelity` of the summary after. Planted bug: `decisions` of the default budget in the run."""
     s = load(SCENES / "paper_swarm.yaml", ["accuracy.max_phase_error_rad=0.031", "propagation.weakest_path_db=33"], frames=4)
-    planned = make_plan(simulate.prepare(s))
+    planned = make_plan(prepare(s))
     done = simulate.summarise(s)["fidelity"]
-    for key in decisions(simulate.prepare(s).plan):
+    for key in decisions(prepare(s).plan):
         assert planned[key] == done[key], key
     assert planned["max_phase_error_rad"] == 0.031
     assert planned["weakest_path_db"] == 33
@@ -40,7 +41,7 @@ def test_the_plan_is_what_the_summary_says_was_done():
 def test_the_truth_of_a_flight_in_free_space_stays_within_the_bounds():
     """The bounds of the frames checked against exact positions and point sources. Planted bug: delays at the ends of half a frame."""
     s = load(SCENES / "paper_swarm.yaml", ["accuracy.max_phase_error_rad=0.4"], frames=12)
-    setup = simulate.prepare(s)
+    setup = prepare(s)
     for row in check(setup)["links"].values():
         assert row["left_out_db"] is None
         assert row["plane_rad"] <= row["plane_bound_rad"]
@@ -93,7 +94,7 @@ def test_estimates_bound_the_truth_and_exceed_it_by_ten_at_most_in_nine_of_ten()
     left out where a link's strongest missed path is above the weakest that matters. Planted bug: POWER_MARGIN of 0.1."""
     within, cases = 0, 0
     for seed in (101, 102):
-        setup = simulate.prepare(town(seed))
+        setup = prepare(town(seed))
         items = {(item["what"], item["link"]): item["estimate"] for item in make_plan(setup)["items"]}
         for link, row in check(setup)["links"].items():
             pairs = [(items["wavefronts", link], row["plane_rad"]), (items["flight in a frame", link], row["flight_rad"])]
@@ -111,7 +112,7 @@ def test_delays_of_a_frame_are_found_again_from_its_chains():
     """`delays` at the frame's own epoch gives the tracer's: line of sight, mirrors, echoes, ghosts, scatterers. Planted bug: the chain back
     from a UAV taken in the order of the way there."""
     s = town(7).model_copy(update={"frames": 1})
-    setup = simulate.prepare(s)
+    setup = prepare(s)
     poses, found = setup.find(0)
     kinds = set()
     for paths in found.values():
@@ -126,7 +127,7 @@ def test_delays_of_a_frame_are_found_again_from_its_chains():
 def test_a_path_is_present_where_its_like_is():
     """Planted bug: kinds not compared."""
     s = load(SCENES / "paper_swarm.yaml", frames=4)
-    paths = next(iter(simulate.prepare(s).find(0)[1].values()))
+    paths = next(iter(prepare(s).find(0)[1].values()))
     assert present(paths, paths).all()
     assert not present(paths, replace(paths, kind=np.full(len(paths), PathKind.SPECULAR, np.int8))).any()
     assert not present(paths, replace(paths, delay=paths.delay + 2e-14)).any()

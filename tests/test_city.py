@@ -13,11 +13,11 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
-from isac_rt.city import City, CityError, load_city
-from isac_rt.city.extrude import building
-from isac_rt.city.footprints import is_lonlat
-from isac_rt.city.materials import KNOWN_MATERIALS, MaterialUse, material_at, water_permittivity
-from isac_rt.city.mesh import Surface, clean, distance_to_triangles
+from isac_rt.world.city import City, CityError, load_city
+from isac_rt.world.city.extrude import building
+from isac_rt.world.city.footprints import is_lonlat
+from isac_rt.world.city.materials import KNOWN_MATERIALS, MaterialUse, material_at, water_permittivity
+from isac_rt.world.city.mesh import Surface, clean, distance_to_triangles
 
 F_C = 77e9
 ORIGIN = (0.0, 0.0, 0.0)
@@ -46,7 +46,7 @@ def solid(city: City, chosen: np.ndarray) -> trimesh.Trimesh:
 
 def test_import_leaves_the_ray_tracer_alone():
     """Seen failing with `import mitsuba` at the top of mitsuba_xml.py."""
-    code = "import sys, isac_rt.city; print(sorted({'sionna', 'mitsuba', 'drjit'} & set(sys.modules)))"
+    code = "import sys, isac_rt.world.city; print(sorted({'sionna', 'mitsuba', 'drjit'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.city import City, load_city
+from isac_rt.world.city import City, load_city
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -53,7 +53,7 @@ def assert_points_lie_in_their_faces(city: City, faces: np.ndarray, points: np.n
 def test_known_wall_of_floor_wall():
     """The mirror point on each of the two planes, by the image construction. Seen failing with the primitives reversed in
     `faces_of_object`."""
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     centre = np.array([0.31, -0.17, 0.9])
     city = load_city(scenario.City(source="builtin", name="floor_wall"), ".", F_C, centre)
@@ -73,7 +73,7 @@ def test_known_wall_of_floor_wall():
 @pytest.mark.parametrize("name", ["simple_reflector", "double_reflector", "triple_reflector", "box", "simple_street_canyon"])
 def test_every_hit_lies_in_its_face(name):
     """Seen failing with the primitives reversed in `faces_of_object`."""
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     centre = np.array([0.4, 0.3, 1.2])
     city = load_city(scenario.City(source="builtin", name=name), ".", F_C, centre)
@@ -91,7 +91,7 @@ def test_reflection_from_the_ground_has_the_slabs_fresnel_coefficient():
 
     Seen failing with the conductivity left at zero.
     """
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     keys = {"street_width_m": 200.0, "building_height_m": 5.0, "ground_material": "concrete"}
     city = load_city(scenario.City(source="canyon", **keys, materials={"concrete": {"conductivity_s_per_m": 11.7}}), ".", F_C, (0, 0, 3.0))
@@ -116,7 +116,7 @@ def test_reflection_from_the_ground_has_the_slabs_fresnel_coefficient():
 def test_scattering_patterns_reach_sionna():
     import sionna.rt as rt
 
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     changes = {
         "concrete": {"scattering_pattern": "directive", "pattern_exponent": 7, "scattering_coefficient": 0.23},
@@ -136,7 +136,7 @@ def test_scattering_patterns_reach_sionna():
 
 
 def test_free_space_has_the_line_of_sight_alone():
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     handle = build_scene(load_city(None, ".", F_C, (0, 0, 0)), F_C)
     faces, _, _, gain = trace(handle, (0.0, 0.0, 0.0), (3.1, 11.7, -2.3), depth=1)

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from isac_rt.arrays import Antennas
-from isac_rt.experiments import claims_access, claims_angle, claims_cost, claims_recovery, claims_signal
-from isac_rt.metrics import binomial_interval
-from isac_rt.waveform import Waveform
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import Waveform
+from isac_rt.results.metrics import binomial_interval
+from isac_rt.studies.paper import claims_access, claims_angle, claims_cost, claims_recovery, claims_signal
 
 C = 299_792_458.0
 
@@ -205,8 +205,8 @@ def test_terminals_share_the_band_unless_in_one_block():
 @pytest.mark.slow
 def test_all_claims(tmp_path):
     """The whole quick run: every table, every verdict, the figure; the verdicts that do not depend on the machine's speed."""
-    from isac_rt.experiments import claims
-    from isac_rt.experiments.outcome import write
+    from isac_rt.studies.paper import claims
+    from isac_rt.studies.paper.outcome import write
 
     outcome = claims.run(True, 20260, silent)
     assert all(v.finding for v in outcome.verdicts) and len(outcome.verdicts) == 31

@@ -18,10 +18,10 @@ from fake_run import fake_records, fake_run, fake_scenario
 from matplotlib.image import imread
 
 import isac_rt
-from isac_rt.cli import main
-from isac_rt.linkbudget import LinkBudget
-from isac_rt.scenario_file import to_yaml
-from isac_rt.swarm import Swarm
+from isac_rt.cli.cli import main
+from isac_rt.frame.level import LinkBudget
+from isac_rt.scenario.file import to_yaml
+from isac_rt.world.swarm import Swarm
 
 ROOT = Path(__file__).parent.parent
 
@@ -35,11 +35,11 @@ def scenario_file(tmp_path):
 
 @pytest.fixture
 def simulation(monkeypatch):
-    """A stand-in for isac_rt.simulate that reports progress and hands back made-up results."""
-    fake = types.ModuleType("isac_rt.simulate")
+    """A stand-in for isac_rt.run.simulate that reports progress and hands back made-up results."""
+    fake = types.ModuleType("isac_rt.run.simulate")
 
     def prepare(scenario):
-        from isac_rt.city.mesh import empty_city
+        from isac_rt.world.city.mesh import empty_city
 
         return types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(scenario),
                                      timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))  # fmt: skip
@@ -52,7 +52,7 @@ def simulation(monkeypatch):
     fake.prepare, fake.run = prepare, run
     fake.link_budgets = lambda setup: [LinkBudget("AT->PT1", "line of sight", 34.4, -71.2, -88.9, 17.7, 47.1, 64.8)]
     fake.trace = lambda s, frame, setup=None: {("AT", n): o.paths for n, o in fake_records(s)[frame].observers.items()}
-    monkeypatch.setitem(sys.modules, "isac_rt.simulate", fake)
+    monkeypatch.setitem(sys.modules, "isac_rt.run.simulate", fake)
     monkeypatch.setattr(isac_rt, "simulate", fake, raising=False)
     return fake
 
@@ -68,7 +68,7 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
 
 
 def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypatch):
-    monkeypatch.setattr("isac_rt.figures.make_figures", lambda *_: [])
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
     assert main(["run", str(scenario_file), "--out", str(tmp_path / "o"), "--set", "modulation.dpsk_order=4"]) == 0
     assert "dpsk_order: 4" in (tmp_path / "o" / "scenario.yaml").read_text()
 
@@ -148,7 +148,7 @@ def test_doctor_says_what_to_do_and_fails_with_2(capsys, monkeypatch):
 def test_help_loads_nothing_heavy():
     """Seen to fail with `import numpy` at the top of cli.py."""
     heavy = ("numpy", "xarray", "matplotlib", "pydantic", "mitsuba")
-    code = f"import sys; from isac_rt.cli import main; main(['--help']); print([m for m in {heavy} if m in sys.modules], file=sys.stderr)"
+    code = f"import sys; from isac_rt.cli.cli import main; main(['--help']); print([m for m in {heavy} if m in sys.modules], file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stderr.strip() == "[]" and "doctor" in done.stdout
 
@@ -158,9 +158,9 @@ def test_interrupt_ends_within_two_seconds(stuck, scenario_file, tmp_path):
     """Also inside a native call that Python cannot interrupt, with an unfinished file on disk. Seen to fail without the thread."""
     program = f"""
 import ctypes, sys, time, types, os, pathlib
-import isac_rt.results
+import isac_rt.results.files
 from isac_rt.cli import main
-fake = types.ModuleType("isac_rt.simulate")
+fake = types.ModuleType("isac_rt.run.simulate")
 def native():
     libc = ctypes.CDLL(None)
     end = time.time() + 60
@@ -173,7 +173,7 @@ def prepare(scenario):
     {stuck}
 fake.prepare = prepare
 import isac_rt
-sys.modules["isac_rt.simulate"] = isac_rt.simulate = fake
+sys.modules["isac_rt.run.simulate"] = isac_rt.run.simulate = fake
 sys.exit(main(["run", {str(scenario_file)!r}, "--out", {str(tmp_path / 'o')!r}]))
 """
     for _ in range(5):  # others may keep the machine busy: one try in time shows that the program can

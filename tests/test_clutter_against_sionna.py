@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import load_city
-from isac_rt.city.mesh import distance_to_triangles
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import make_propagation
-from isac_rt.propagation.cells import area_for
-from isac_rt.swarm import Swarm
-from isac_rt.validation.clutter import sionna_power
-from isac_rt.waveform import waveform_of
+from isac_rt.propagation.clutter.cells import area_for
+from isac_rt.studies.validation.clutter import sionna_power
+from isac_rt.world.city import load_city
+from isac_rt.world.city.mesh import distance_to_triangles
+from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9

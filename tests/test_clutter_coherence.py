@@ -11,11 +11,11 @@ import trimesh
 from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City, load_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, make_propagation
-from isac_rt.swarm import Swarm
-from isac_rt.waveform import waveform_of
+from isac_rt.world.city import City, load_city
+from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 C, F_C = 299_792_458.0, 77e9

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import load_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import make_propagation
-from isac_rt.swarm import Swarm
-from isac_rt.waveform import waveform_of
+from isac_rt.world.city import load_city
+from isac_rt.world.swarm import Swarm
 
 pytestmark = [pytest.mark.sionna, pytest.mark.slow]
 FRAME = 7.7824e-3

@@ -10,18 +10,18 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import stats
 
-from isac_rt.propagation.expected import ExpectedClutter
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
-from isac_rt.receive.adaptive import Matched, beams_of, expected_count, like_exponential, map_factor, sampled, scan_threshold
 from isac_rt.receive.cfar import detect
-from isac_rt.receive.clutter_map import Taper, arm_channels, covariances, joint_channels, power_map, steering
-from isac_rt.receive.detectors import cfar_ratio, judge, noise_level
-from isac_rt.receive.doppler import accumulate, channel_maps
+from isac_rt.receive.clutter.adaptive import Matched, beams_of, expected_count, like_exponential, map_factor, sampled, scan_threshold
+from isac_rt.receive.clutter.detectors import cfar_ratio, judge, noise_level
+from isac_rt.receive.clutter.power import Taper, arm_channels, covariances, joint_channels, power_map, steering
+from isac_rt.receive.clutter.sense import _beam, _direction
 from isac_rt.receive.estimate import Estimate
-from isac_rt.receive.in_clutter import _beam, _direction
+from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.types import ExpectedClutter
+from isac_rt.scenario.receivers import Receivers
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)
@@ -145,7 +145,7 @@ def draw(R: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
 
 def one_beam(a: np.ndarray):
     """A beam set of one direction."""
-    from isac_rt.receive.adaptive import Beams
+    from isac_rt.receive.clutter.adaptive import Beams
 
     return Beams(np.zeros((1, 3)), a[None].astype(np.complex64), (0.0,), 0.0)
 
@@ -153,7 +153,7 @@ def one_beam(a: np.ndarray):
 def test_matched_filter_is_exponential_and_has_the_optimal_sinr():
     """Clutter 40 dB over the noise with its own covariance: T is exponential (Kolmogorov-Smirnov), and a target of amplitude s gives
     E T = 1 + s^2 a^H R^-1 a, Brennan and Reed's optimum. Planted bug: R transposed (mean of T without a target 4e3)."""
-    from isac_rt.receive.adaptive import Scan
+    from isac_rt.receive.clutter.adaptive import Scan
 
     rng, size, draws = np.random.default_rng(11), 12, 20000
     R, a = interference(size, rng), np.exp(1j * 1.3 * np.arange(size))

@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.experiments.clutter import PT_SNR, Bench, Kind, _found, earlier, pt_errors, resting, strongest_mean, weeded
-from isac_rt.experiments.clutter_statistics import statistics
-from isac_rt.experiments.detectors import RATE, Tally, summarise
-from isac_rt.propagation.expected import ExpectedClutter
-from isac_rt.swarm import Pose, attitude
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.types import ExpectedClutter
+from isac_rt.studies.paper.clutter import PT_SNR, Bench, Kind, _found, earlier, pt_errors, resting, strongest_mean, weeded
+from isac_rt.studies.paper.clutter_statistics import statistics
+from isac_rt.studies.paper.detectors import RATE, Tally, summarise
+from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform()
 

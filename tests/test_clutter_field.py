@@ -15,14 +15,14 @@ from scipy import stats
 from scipy.integrate import dblquad
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City, Material, load_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, make_propagation
-from isac_rt.propagation.cells import Density, _mixed, cut
-from isac_rt.propagation.diffuse import scatterer_phase
+from isac_rt.propagation.clutter.cells import Density, _mixed, cut
+from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.randomness import seed_sequence
-from isac_rt.swarm import Pose, Swarm
-from isac_rt.waveform import waveform_of
+from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.swarm import Pose, Swarm
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
 LAMBDA = C / F_C
@@ -299,8 +299,8 @@ def test_each_scatterer_against_an_oracle(name):
 
 def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     """A terminal's own copy of the mesh and its pose; isotropic elements of 0 dBi."""
-    from isac_rt.city.scene import shared_scene
-    from isac_rt.propagation.expectation import MeshExpectation
+    from isac_rt.terminal.expectation import MeshExpectation
+    from isac_rt.world.city.scene import shared_scene
 
     tree = {
         "frames": 40,
@@ -322,7 +322,7 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
     mesh whose faces lie off along their normals: all points of a face agree on how far, by the distance to the moved points. Planted
     bugs: amplitude for power; a level in amplitudes' decibels; the velocity's error with the other sign; the face's error taken along
     the ray."""
-    from isac_rt.propagation.expectation import Mistakes
+    from isac_rt.terminal.expectation import Mistakes
 
     city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
     at, speed, amplitude = np.array([1.3, 28.3, 2.1]), np.array([3.7, -8.1, 1.9]), 0.37
@@ -353,7 +353,7 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
 def test_knots_of_a_flight_and_their_blend():
     """A straight flight has its knots evenly along it, ends included, and a B-spline reproduces a straight line: the weighted knots are the
     place. Planted bugs: the last piece of the way left out; knots counted from the one behind."""
-    from isac_rt.propagation.visibility import KNOT_SPACING, Flight
+    from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight
 
     start, speed, duration, origin = np.array([1.7, -3.1, 8.9]), np.array([3.3, 7.1, -0.7]), 1.83, np.array([0.4, 0.2, -0.3])
     tree = {"swarm": {"A": {"role": "active", "position_m": list(start), "velocity_mps": list(speed)}}}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active
-from isac_rt.receive.clutter_filter import occupied_factor, remove_standing, runs
-from isac_rt.receive.demodulate import demodulate
+from isac_rt.receive.clutter.filter import occupied_factor, remove_standing, runs
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.scenario.receivers import Receivers
 
 SHORT = Waveform(num_samples=256)  # the paper's range cells, a quarter of its range and time
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)

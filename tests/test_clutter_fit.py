@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, frame
 
-from isac_rt.propagation.expected import ExpectedClutter
-from isac_rt.receive.clutter_fit import fit
-from isac_rt.receive.clutter_map import power_map
-from isac_rt.receive.detectors import judge
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.clutter.correction import fit
+from isac_rt.receive.clutter.detectors import judge
+from isac_rt.receive.clutter.power import power_map
 from isac_rt.receive.estimate import window_length
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.types import ExpectedClutter
+from isac_rt.scenario.receivers import Receivers
 
 C = 299_792_458.0
 W = Waveform(num_samples=256)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isac_rt import simulate
 from isac_rt.propagation import PathKind
-from isac_rt.propagation.statistical import rayleigh_cells
-from isac_rt.scenario import Clutter
-from isac_rt.scenario_file import ScenarioError, load
+from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
+from isac_rt.run.setup import prepare, trace
+from isac_rt.scenario.file import ScenarioError, load
+from isac_rt.scenario.tree import Clutter
 
 SCENES = Path(__file__).parents[1] / "scenes"
 C = 299_792_458.0
@@ -87,7 +87,7 @@ def scene(*overrides, frames=4):
 
 
 def diffuse(scenario, frame, link):
-    paths = simulate.trace(scenario, frame)[link]
+    paths = trace(scenario, frame)[link]
     return paths.select(paths.kind == PathKind.DIFFUSE)
 
 
@@ -96,7 +96,7 @@ def test_paths_of_a_run(link, passes):
     """In every link: delays of the run, no Doppler whatever flies (exact), level over the reference path's amplitude, directions in view.
     Planted bug: one pass for an echo."""
     s = scene("clutter.place=grid", "clutter.centre_m=[24, 24]", "clutter.cells=[45, 45]")
-    setup = simulate.prepare(s)
+    setup = prepare(s)
     poses, every = setup.trace(0)
     found = every[link]
     d = found.select(found.kind == PathKind.DIFFUSE)
@@ -139,7 +139,7 @@ def test_gaussian_clutter_is_noise_beside_the_noise():
             overrides = [f"noise.model={model}", *clutter]
             if model == "link_budget":
                 overrides += [f"swarm.{name}.rcs.model=constant" for name in ("AT", "PT1", "PT2")]
-            setup = simulate.prepare(load(SCENES / "paper_swarm_consistent.yaml", overrides, frames=4))
+            setup = prepare(load(SCENES / "paper_swarm_consistent.yaml", overrides, frames=4))
             levels.append(setup.noise_power(setup.swarm.poses(0.0), ("AT", "PT1")))
         assert levels[0] > 0
         assert levels[1] / levels[0] == pytest.approx(1 + 10**0.32, rel=1e-12, abs=0)

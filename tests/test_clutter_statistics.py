@@ -10,10 +10,10 @@ from scipy import stats
 from test_clutter_coherence import F_C, LAMBDA, C, crossing
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import make_propagation
-from isac_rt.swarm import Swarm
-from isac_rt.waveform import waveform_of
+from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 CELL = 0.25

@@ -15,15 +15,15 @@ from test_clutter_coherence import STREETS, correlation, crossing, profile
 from test_clutter_field import EPS_0, F_C, LAMBDA, METAL, C, flown, hemisphere, lobe, rectangle, slab
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City, Material, load_city
-from isac_rt.city.scene import shared_scene
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import make_propagation
-from isac_rt.propagation.expectation import MeshExpectation, Mistakes
 from isac_rt.randomness import generator
-from isac_rt.swarm import Pose, Swarm
-from isac_rt.validation.clutter import sionna_power
-from isac_rt.waveform import waveform_of
+from isac_rt.studies.validation.clutter import sionna_power
+from isac_rt.terminal.expectation import MeshExpectation, Mistakes
+from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city.scene import shared_scene
+from isac_rt.world.swarm import Pose, Swarm
 
 pytestmark = pytest.mark.sionna
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from isac_rt.bench import clutter, synthesis
-from isac_rt.bench.measure import cpu_seconds
-from isac_rt.bench.scenes import alone, town
-from isac_rt.budget import tracer_of
-from isac_rt.simulate import prepare
+from isac_rt.run.audit import tracer_of
+from isac_rt.run.setup import prepare
+from isac_rt.studies.bench import clutter, synthesis
+from isac_rt.studies.bench.measure import cpu_seconds
+from isac_rt.studies.bench.scenes import alone, town
 
 
 def test_synthesis_grows_no_faster_than_its_paths():

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt.bench.fit import fit
-from isac_rt.bench.measure import cpu_seconds
-from isac_rt.bench.synthesis import Job, relative
-from isac_rt.cli import main
-from isac_rt.costs import CANDIDATES, DIRECT, NAMES, SHIPPED, CostModel, choose, read, speed_of
-from isac_rt.fidelity import decisions
-from isac_rt.gridding import DEFAULT
-from isac_rt.ifsignal import if_signal
-from isac_rt.scenario_file import ScenarioError, load, to_yaml
-from isac_rt.simulate import prepare
-from isac_rt.waveform import SPEED_OF_LIGHT
+from isac_rt.cli.cli import main
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.run.plan import decisions
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.file import ScenarioError, load, to_yaml
+from isac_rt.signal.choice import CANDIDATES, DIRECT, NAMES, SHIPPED, CostModel, choose, read, speed_of
+from isac_rt.signal.gridded import DEFAULT
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.studies.bench.fit import fit
+from isac_rt.studies.bench.measure import cpu_seconds
+from isac_rt.studies.bench.synthesis import Job, relative
 
 SCENES = Path(__file__).parents[1] / "scenes"
 SHAPE = (3, 15, 120, 1024)
@@ -102,7 +102,7 @@ def test_speed_is_the_largest_in_the_frame():
 def test_a_fit_is_a_model(tmp_path, capsys, monkeypatch):
     """Thirty chirps, three times: the file is read, and 1000 paths are dearer one by one (35 times). A run names it, by a path
     from where its scenario is saved. Planted bug: `record` of the shipped model whatever the scenario names."""
-    monkeypatch.setattr("isac_rt.bench.fit.fit", lambda progress: fit(30, 3, progress))
+    monkeypatch.setattr("isac_rt.studies.bench.fit.fit", lambda progress: fit(30, 3, progress))
     file = tmp_path / "here" / "mine.json"
     assert main(["bench", "--fit", str(file)]) == 0
     assert "mine.json" in capsys.readouterr().out

@@ -7,8 +7,8 @@ import pytest
 from scipy import special
 from scipy.integrate import quad
 
-from isac_rt.propagation.bodies import Bodies
-from isac_rt.propagation.diffraction import LIT_REACH, SHADOW_REACH, disc, edge_factor, knife_edge
+from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH, disc, edge_factor, knife_edge
 
 LAMBDA = 299_792_458.0 / 77e9
 

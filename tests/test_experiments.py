@@ -10,16 +10,16 @@ import pytest
 import xarray as xr
 from matplotlib.image import imread
 
-from isac_rt import experiments
-from isac_rt.arrays import conventional_schedule
-from isac_rt.cli import main
-from isac_rt.experiments import fig1, fig5, fig13, flight, onepath, table1, table2, tracks
-from isac_rt.experiments.outcome import Outcome, Verdict, blank, proportion, style, write
-from isac_rt.metrics import truth_of
-from isac_rt.payload import random_payload
-from isac_rt.results import ResultsError
-from isac_rt.swarm import Swarm
-from isac_rt.waveform import Waveform, waveform_of
+from isac_rt.cli.cli import main
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.waveform import Waveform, waveform_of
+from isac_rt.results.files import ResultsError
+from isac_rt.results.metrics import truth_of
+from isac_rt.studies import paper as experiments
+from isac_rt.studies.paper import fig1, fig5, fig13, flight, onepath, table1, table2, tracks
+from isac_rt.studies.paper.outcome import Outcome, Verdict, blank, proportion, style, write
+from isac_rt.world.swarm import Swarm
 
 
 def silent(done, total):

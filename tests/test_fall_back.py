@@ -7,13 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.arrays import conventional_schedule, pseudo_random_schedule
-from isac_rt.fall_back import Schedules
+from isac_rt.access.fall_back import Schedules
+from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.receive import Reception
 from isac_rt.receive.types import no_detections
-from isac_rt.report import write_report
-from isac_rt.scenario import Array, Modulation, Noise, Propagation, Radio, Scenario, Uav
+from isac_rt.run import simulate
+from isac_rt.scenario.environment import Propagation
+from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.swarm import Uav
+from isac_rt.scenario.tree import Scenario
+from isac_rt.views.report import write_report
 
 COUNT = 9
 

@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt.arrays import antennas_of, schedule_of
-from isac_rt.fidelity import Plan, faintest, frame_reach, missed_chains, plane_bound, straight_bound
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.schedule import schedule_of
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator
-from isac_rt.scenario_file import load
-from isac_rt.swarm import Swarm
-from isac_rt.synthesis import sources
-from isac_rt.timetable import Timetable
-from isac_rt.waveform import SPEED_OF_LIGHT, waveform_of
+from isac_rt.run.plan import Plan, faintest, frame_reach, missed_chains, plane_bound, straight_bound
+from isac_rt.scenario.file import load
+from isac_rt.signal.direct import sources
+from isac_rt.world.swarm import Swarm
 
 SCENES = Path(__file__).parents[1] / "scenes"
 K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [rad/m]

@@ -11,8 +11,8 @@ from fake_run import fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from isac_rt.figures import KIND_COLOURS, error_cdf, make_figures, over_time, range_doppler, scene_map
-from isac_rt.results import KINDS
+from isac_rt.results.records import KINDS
+from isac_rt.views.figures import KIND_COLOURS, error_cdf, make_figures, over_time, range_doppler, scene_map
 
 INK_VARIANCE = 1e-3
 """Of pixel values in [0, 1]: an empty framed axis has about 1e-4, one line more than this."""
@@ -106,7 +106,7 @@ def test_scene_shows_every_uav(run):
 
 def test_report_is_one_self_contained_page(run, written):
     """No address of any kind is followed. Seen to fail with names in place of the pictures' data."""
-    from isac_rt.report import write_report
+    from isac_rt.views.report import write_report
 
     folder, files = written
     page = write_report(run, folder, files).read_text()

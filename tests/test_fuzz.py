@@ -22,10 +22,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from isac_rt import scenario as tree
-from isac_rt.city import CityError, load_city
-from isac_rt.cli import main
-from isac_rt.scenario_file import ScenarioError, ScenarioWarning, load
+from isac_rt.cli.cli import main
+from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load
 from isac_rt.sweep import SweepError, load_sweep
+from isac_rt.world.city import CityError, load_city
 
 ROOT = Path(__file__).parent.parent
 SCENES = sorted((ROOT / "scenes").glob("*.yaml"))
@@ -276,7 +276,7 @@ def test_an_empty_mesh_is_refused(tmp_path):
 def test_a_mesh_too_large_for_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
     """A sparse file of 2 GB against 1 GB free; a file that is large but fits is read. Written against: no look at
     the size (not to be planted: the reader takes the memory)."""
-    from isac_rt.city import meshfiles
+    from isac_rt.world.city import meshfiles
 
     with (tmp_path / "m.ply").open("wb") as out:
         out.truncate(2_000_000_000)

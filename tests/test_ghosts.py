@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 import trimesh
 
-from isac_rt.city.mesh import City
-from isac_rt.experiments.ghosts import explained_tracks, run, verdicts, whole_tracks
-from isac_rt.ghosts import Walls, echoes, reflections, suspicion
-from isac_rt.swarm import Pose
-from isac_rt.tracking import Gaussian, Track, track_set
+from isac_rt.studies.paper.ghosts import explained_tracks, run, verdicts, whole_tracks
+from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.ghosts import Walls, echoes, reflections, suspicion
+from isac_rt.terminal.tracker import Track, track_set
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose
 
 ORIGIN = np.array([310.7, -120.3, 41.9])
 RESOLUTION = np.array([0.25, 0.249, 0.108, 0.108])

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 from numba import njit
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.gridding import ACCURATE, ACCURATE_ERROR, DEFAULT, Setting, add_gridded, add_plain
-from isac_rt.ifsignal import Transmission, _tones
-from isac_rt.lanefft import ROW, plan, transform
-from isac_rt.payload import random_payload
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.fourier import ROW, plan, transform
+from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.simd import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
-from isac_rt.swarm import Pose, attitude
-from isac_rt.synthesis import add_direct, exact
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.signal.direct import add_direct, exact
+from isac_rt.signal.gridded import ACCURATE, ACCURATE_ERROR, DEFAULT, Setting, add_gridded, add_plain
+from isac_rt.signal.if_signal import _tones
+from isac_rt.world.swarm import Pose, attitude
 
 SKIRT = 0.41e6
 SETTINGS = [DEFAULT, ACCURATE, Setting(1.25, 6, False), Setting(1.25, 10, True, True), Setting(2.0, 4, False)]

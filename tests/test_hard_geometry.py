@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario as tree
-from isac_rt.city import City, load_city
-from isac_rt.city.materials import CityError, MaterialUse
-from isac_rt.city.mesh import Surface, clean
-from isac_rt.preflight import aliases, check_flights
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, PathSet
-from isac_rt.propagation.clearance import CLEARANCE, ClearanceWarning
-from isac_rt.propagation.geometry import unfold
-from isac_rt.scenario import Scenario
-from isac_rt.scenario_file import ScenarioError, ScenarioWarning, load, to_yaml
-from isac_rt.simulate import prepare
-from isac_rt.swarm import Swarm
-from isac_rt.timetable import Timetable
-from isac_rt.validation import stage
-from isac_rt.validation.truths import WAVELENGTH, chain_length
-from isac_rt.waveform import waveform_of
+from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
+from isac_rt.propagation.legs.geometry import unfold
+from isac_rt.run.preflight import aliases, check_flights
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load, to_yaml
+from isac_rt.scenario.tree import Scenario
+from isac_rt.studies.validation import stage
+from isac_rt.studies.validation.truths import WAVELENGTH, chain_length
+from isac_rt.world.city import City, load_city
+from isac_rt.world.city.materials import CityError, MaterialUse
+from isac_rt.world.city.mesh import Surface, clean
+from isac_rt.world.swarm import Swarm
 
 C = 299_792_458.0
 NANOMETRE = 1e-9  # rounding of float64 over a kilometre is a thousandth of it

@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.arrays import Antennas
-from isac_rt.gridding import GRIDDED_ERROR
-from isac_rt.payload import unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation import PathKind, PathSet, make_paths
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.scenario import Receivers, Scenario
-from isac_rt.validation import stage
-from isac_rt.validation.stage import FEW, SMALL
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.gridded import GRIDDED_ERROR
+from isac_rt.studies.validation import stage
+from isac_rt.studies.validation.stage import FEW, SMALL
 
 C = SPEED_OF_LIGHT
 COMPLEX64 = 1e-6  # rounding of complex64 samples, in both of what is compared

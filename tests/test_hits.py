@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.baselines import resolution
-from isac_rt.experiments import fig14, hits
-from isac_rt.experiments.hits import Case, Target, count_hits, draw_target, make_cube, make_noise, one_atom_power, strongest
-from isac_rt.experiments.montecarlo import Curve
-from isac_rt.payload import random_payload
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.randomness import generator
 from isac_rt.receive import receive_active
-from isac_rt.receive.doppler import omp_power
 from isac_rt.receive.estimate import Estimate
-from isac_rt.waveform import SPEED_OF_LIGHT
+from isac_rt.receive.omp import omp_power
+from isac_rt.studies.baselines import resolution
+from isac_rt.studies.paper import fig14, hits
+from isac_rt.studies.paper.hits import Case, Target, count_hits, draw_target, make_cube, make_noise, one_atom_power, strongest
+from isac_rt.studies.paper.montecarlo import Curve
 
 LOUD = 20.0
 

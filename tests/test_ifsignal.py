@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from oracles import mixed_chirps
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.gridding import GRIDDED_ERROR
-from isac_rt.ifsignal import Transmission, _tones, if_signal
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.swarm import Pose, attitude
-from isac_rt.synthesis import exact
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.signal.direct import exact
+from isac_rt.signal.gridded import GRIDDED_ERROR
+from isac_rt.signal.if_signal import _tones, if_signal
+from isac_rt.world.swarm import Pose, attitude
 
 C = SPEED_OF_LIGHT
 START = 3.217

@@ -8,21 +8,16 @@ import json
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.ifsignal import IFCube
-from isac_rt.interchange import (
-    cube_dataset,
-    from_sionna,
-    load_cube,
-    read_sigmf,
-    save_cube,
-    stonesoup_detections,
-    write_sigmf,
-)
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.results import ResultsError
-from isac_rt.scenario import Array, Modulation, Noise, Propagation, Radio, Scenario, Uav
-from isac_rt.waveform import Waveform
+from isac_rt.results.files import ResultsError
+from isac_rt.run import simulate
+from isac_rt.scenario.environment import Propagation
+from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.swarm import Uav
+from isac_rt.scenario.tree import Scenario
+from isac_rt.views.interchange import cube_dataset, from_sionna, load_cube, read_sigmf, save_cube, stonesoup_detections, write_sigmf
 
 W = Waveform(num_samples=64, num_chirps=12)
 
@@ -86,9 +81,9 @@ def test_paths_of_sionna_are_those_of_geometry():
     import mitsuba as mi
     import sionna.rt as rt
 
-    from isac_rt.city import load_city
-    from isac_rt.city.scene import build_scene
-    from isac_rt.scenario import City
+    from isac_rt.scenario.environment import City
+    from isac_rt.world.city import load_city
+    from isac_rt.world.city.scene import build_scene
 
     scene = build_scene(load_city(City(source="builtin", name="floor_wall"), ".", 77e9, (0.0, 0.0, 0.0)), 77e9).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")

@@ -19,11 +19,12 @@ import pytest
 import xarray as xr
 from fake_run import fake_run, fake_scenario
 
-from isac_rt import results, simulate
-from isac_rt.cli import main
-from isac_rt.results import ResultsError, save
-from isac_rt.scenario import Scenario
-from isac_rt.scenario_file import load, to_yaml
+from isac_rt.cli.cli import main
+from isac_rt.results import files as results
+from isac_rt.results.files import ResultsError, save
+from isac_rt.run import simulate
+from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.tree import Scenario
 
 ROOT = Path(__file__).parent.parent
 WHOLE = {"results.nc", "summary.json", "scenario.yaml"}
@@ -32,21 +33,21 @@ WITHOUT_A_NUMBER = {"dask", "distributed", "jinja2", "matplotlib", "pandas", "py
 
 PROGRAM = """
 import sys, time, types
-import isac_rt.results
+import isac_rt.results.files
 from isac_rt.cli import main
 sys.path.insert(0, {tests!r})
 from fake_run import fake_run
 import numpy as np
 from isac_rt.city.mesh import empty_city
 from isac_rt.swarm import Swarm
-fake = types.ModuleType("isac_rt.simulate")
+fake = types.ModuleType("isac_rt.run.simulate")
 fake.prepare = lambda s: types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(s),
                                                timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))
 fake.link_budgets = lambda setup: []
 fake.run = lambda s, **_: fake_run(s)
 import isac_rt
-sys.modules["isac_rt.simulate"] = isac_rt.simulate = fake
-whole = isac_rt.results._atomically
+sys.modules["isac_rt.run.simulate"] = isac_rt.run.simulate = fake
+whole = isac_rt.results.files._atomically
 def slowly(file, write):
     def writing(temporary):
         temporary.write_text("half")
@@ -54,7 +55,7 @@ def slowly(file, write):
         time.sleep(300 if file.name == {when!r} else 0)
         write(temporary)
     whole(file, writing)
-isac_rt.results._atomically = slowly
+isac_rt.results.files._atomically = slowly
 sys.exit(main(["run", {scenario!r}, "--out", {out!r}]))
 """
 

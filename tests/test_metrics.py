@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from isac_rt.arrays import Antennas, conventional_schedule
-from isac_rt.metrics import (
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.types import Detections, Reception
+from isac_rt.results.metrics import (
     ERROR_KEYS,
     SensingScore,
     SymbolCount,
@@ -23,12 +28,8 @@ from isac_rt.metrics import (
     summary_block,
     truth_of,
 )
-from isac_rt.payload import random_payload, unmodulated
-from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.receive.types import Detections, Reception
-from isac_rt.swarm import Pose, attitude
-from isac_rt.tracking import TrackSet
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.terminal.tracker import TrackSet
+from isac_rt.world.swarm import Pose, attitude
 
 WAVEFORM = Waveform()
 ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * WAVEFORM.wavelength)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.city import City, Material
-from isac_rt.propagation.geometry import unfold
-from isac_rt.propagation.mirrors import mirror_amplitude, slab_coefficients, vertical
-from isac_rt.swarm import Pose
+from isac_rt.propagation.legs.geometry import unfold
+from isac_rt.propagation.legs.reflection import mirror_amplitude, slab_coefficients, vertical
+from isac_rt.world.city import City, Material
+from isac_rt.world.swarm import Pose
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
 LAMBDA = C / F_C

@@ -9,27 +9,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from isac_rt.experiments import fig8, fig11, fig12, montecarlo
-from isac_rt.experiments.montecarlo import (
-    Curve,
-    Precision,
-    Steps,
-    crossing,
-    delay_error_rate,
-    dpsk_error_rate,
-    interval,
-    kept_in,
-    sample,
-)
-from isac_rt.experiments.symbols import Link, cell_noise, count_errors, draw_frame, link_waveform, make_cells
-from isac_rt.ifsignal import IFCube
-from isac_rt.metrics import binomial_interval
-from isac_rt.payload import MODULATION_ORDERS, running_phases
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import MODULATION_ORDERS, running_phases
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive import Prediction
-from isac_rt.receive.clutter_filter import chirp_runs
-from isac_rt.receive.demodulate import demodulate
+from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.estimate import beat_cells
-from isac_rt.waveform import SPEED_OF_LIGHT
+from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.results.metrics import binomial_interval
+from isac_rt.studies.paper import fig8, fig11, fig12, montecarlo
+from isac_rt.studies.paper.montecarlo import Curve, Precision, Steps, crossing, delay_error_rate, dpsk_error_rate, interval, kept_in, sample
+from isac_rt.studies.paper.symbols import Link, cell_noise, count_errors, draw_frame, link_waveform, make_cells
 
 
 def silent(done, total):

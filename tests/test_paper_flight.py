@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.scenario_file import load
+from isac_rt.run import simulate
+from isac_rt.scenario.file import load
 
 SCENES = Path(__file__).parents[1] / "scenes"
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.payload import by_antenna, demodulate_bits, modulate, random_payload, unmodulated
-from isac_rt.waveform import Waveform
+from isac_rt.frame.payload import by_antenna, demodulate_bits, modulate, random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -13,8 +13,8 @@ from test_clutter_coherence import flown as flown_round
 from test_clutter_field import LAMBDA, METAL, flown, rectangle, slab
 from test_clutter_twice import joined
 
-from isac_rt.propagation.diffraction import edge_factor
-from isac_rt.propagation.edges import ShadowEdges
+from isac_rt.propagation.legs.diffraction import edge_factor
+from isac_rt.propagation.legs.edges import ShadowEdges
 
 pytestmark = pytest.mark.sionna
 SCREEN = ((-80.0, 31.0, -90.0), (160.0, 0, 0), (0, 0, 90.0))

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from test_interchange import flight
 
-from isac_rt import simulate
-from isac_rt.animate import animate, tracked_positions, write_animation
-from isac_rt.cli import main
-from isac_rt.ifsignal import IFCube
-from isac_rt.results import Results, ResultsError, save
-from isac_rt.scenario_file import load
-from isac_rt.starter import schema_text, starter_text
-from isac_rt.waveform import Waveform
+from isac_rt.cli.cli import main
+from isac_rt.cli.starter import schema_text, starter_text
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import Waveform
+from isac_rt.results.files import ResultsError, save
+from isac_rt.results.recorder import Results
+from isac_rt.run.setup import prepare, trace
+from isac_rt.scenario.file import load
+from isac_rt.views.animate import animate, tracked_positions, write_animation
+from isac_rt.world.area import city_of
 
 ROOT = Path(__file__).parent.parent
 
@@ -61,11 +63,11 @@ def test_what_cannot_move_is_refused(results, tmp_path, capsys):
 def test_a_scene_to_turn_about_is_one_page():
     """Every kind of path and every UAV is a trace; corners of a path lie on its points; the page asks for nothing from a network."""
     pytest.importorskip("plotly")
-    from isac_rt.interactive import scene_3d
+    from isac_rt.views.interactive import scene_3d
 
     scenario = load(ROOT / "scenes" / "access_swarm.yaml", ["access.establish=false", "access.synchronisation=external"])
-    setup = simulate.prepare(scenario)
-    paths = simulate.trace(scenario, 0, setup=setup)
+    setup = prepare(scenario)
+    paths = trace(scenario, 0, setup=setup)
     figure = scene_3d(setup.city, setup.swarm, np.linspace(0, 1, 5), setup.timetable.epoch(0), paths)
     names = [trace.name for trace in figure.data]
     for kind in ("line_of_sight", "target"):
@@ -101,7 +103,7 @@ def test_new_over_ones_own_buildings(tmp_path):
     file = tmp_path / "quarter.yaml"
     assert main(["new", str(file), "--footprints", str(ROOT / "scenes" / "data" / "quarter.geojson")]) == 0
     scenario = load(file)
-    city = simulate.city_of(scenario)
+    city = city_of(scenario)
     top = (city.corners + city.origin)[..., 2].max()
     assert scenario.swarm["AT"].position_m[2] == pytest.approx(top + 10, abs=0.1)
     assert starter_text("x").count("\n") > 30
@@ -114,7 +116,7 @@ def test_every_scene_names_the_schema_and_the_schema_is_today_s():
 
 
 def test_objects_print_themselves_in_short(results):
-    setup = simulate.prepare(results.scenario)
+    setup = prepare(results.scenario)
     paths = setup.trace(2)[1]["A", "P"]
     assert repr(paths).startswith("<PathSet A -> P at 0.0030 s: 1 line of sight")
     assert "hit rate" in repr(results)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
-from isac_rt.payload import unmodulated
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction
-from isac_rt.receive.demodulate import confidence_threshold, demodulate
-from isac_rt.receive.profile import correlate, learn_profile
-from isac_rt.waveform import Waveform
+from isac_rt.receive.symbols.powers import confidence_threshold, demodulate
+from isac_rt.receive.symbols.profile import correlate, learn_profile
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 

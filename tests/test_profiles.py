@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.gridding import ACCURATE, GRIDDED_ERROR, PROFILES
-from isac_rt.ifsignal import Transmission, add_noise, if_signal, range_profiles
-from isac_rt.payload import random_payload
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.receive import receive_active
 from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
-from isac_rt.scenario import Receivers
-from isac_rt.scenario_file import ScenarioError, load
-from isac_rt.simulate import run
-from isac_rt.swarm import Pose, attitude
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.run.simulate import run
+from isac_rt.scenario.file import ScenarioError, load
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES
+from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
+from isac_rt.world.swarm import Pose, attitude
 
 SKIRT = 0.41e6
 SCENES = Path(__file__).parents[1] / "scenes"

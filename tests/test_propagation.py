@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.arrays import Antennas
-from isac_rt.city.mesh import City
+from isac_rt.frame.antennas import Antennas
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.legs.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
-from isac_rt.scenario import Rcs, Uav
-from isac_rt.swarm import Pose, attitude
+from isac_rt.scenario.swarm import Rcs, Uav
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose, attitude
 
 C = 299_792_458.0
 LAMBDA = C / 77e9

@@ -11,12 +11,12 @@ from scipy.integrate import dblquad
 from scipy.spatial.transform import Rotation
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City, Material, load_city
-from isac_rt.city.mesh import empty_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import FreeSpace, PathKind, PathSet, make_propagation
-from isac_rt.swarm import Pose, attitude
-from isac_rt.waveform import waveform_of
+from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city.mesh import empty_city
+from isac_rt.world.swarm import Pose, attitude
 
 pytestmark = pytest.mark.sionna
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
@@ -476,7 +476,7 @@ def test_composed_echoes_are_those_of_sionnas_rcs_solver():
     import sionna.rt as rt
     from sionna.rt.rcs import ConstantRCSSensingTarget, RCSSolver
 
-    from isac_rt.city.scene import build_scene
+    from isac_rt.world.city.scene import build_scene
 
     *places, bounces = SCENES["floor_wall"]
     city, poses = builtin("floor_wall"), swarm_of(*places)

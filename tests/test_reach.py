@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.budget import make_plan
-from isac_rt.city.mesh import City
-from isac_rt.fidelity import extent, mechanisms
 from isac_rt.propagation import PathKind, PathSet, make_propagation
-from isac_rt.propagation.cells import Density, area_for, error_for
-from isac_rt.scenario import Scenario
+from isac_rt.propagation.clutter.cells import Density, area_for, error_for
+from isac_rt.run import simulate
+from isac_rt.run.audit import make_plan
+from isac_rt.run.plan import extent, mechanisms
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.area import city_of
+from isac_rt.world.city.mesh import City
 
 SHORT = {"groups": 1, "samples_per_chirp": 256, "chirps_per_frame": 12}
 """A waveform that hears no farther than 66 m."""
@@ -51,8 +53,8 @@ def places(paths: PathSet, city: City, kind: PathKind) -> set[tuple[int, ...]]:
 def test_a_cut_mesh_returns_all_that_is_heard(seed: int):
     """Whole and cut meshes of two districts: the same line of sight, echoes, ghosts, mirror images and scatterers within the filter,
     with the same gains. Planted bug: the reach counted one way, half of it."""
-    setup = simulate.prepare(district(seed))
-    whole = simulate.city_of(setup.scenario)
+    setup = prepare(district(seed))
+    whole = city_of(setup.scenario)
     assert setup.city.num_faces + setup.city.num_beyond == whole.num_faces
     assert setup.city.num_beyond > 0.3 * whole.num_faces
     full = make_propagation(setup.scenario, setup.waveform, setup.antennas, whole, ())
@@ -77,7 +79,7 @@ def test_a_cut_mesh_returns_all_that_is_heard(seed: int):
 
 def test_a_city_within_a_radius():
     """Faces that come near enough stay whole with their materials. Planted bug: the distance of centroids."""
-    city = simulate.city_of(district(313))
+    city = city_of(district(313))
     part = city.within(61.7)
     nearest = np.linalg.norm(city.corners, axis=2).min(axis=1)
     assert part.num_faces + part.num_beyond == city.num_faces
@@ -96,16 +98,16 @@ def test_a_city_within_a_radius():
 
 def test_the_reach_follows_the_groups():
     """One group hears up to T_d and the filter's skirt, three up to 4 T_d more. Planted bug: the number of groups for their distance."""
-    w = simulate.prepare(district(314)).waveform
+    w = prepare(district(314)).waveform
     for groups in (1, 3):
-        plan = simulate.prepare(district(314, radio=SHORT | {"groups": groups})).plan
+        plan = prepare(district(314, radio=SHORT | {"groups": groups})).plan
         expected = (w.max_delay + 0.4e6 / w.slope + (groups - 1) * 2 * w.max_delay) * 299_792_458 / 2
         assert plan.reach == pytest.approx(expected, rel=1e-9)
         far = max(np.linalg.norm(plan.swarm.poses(plan.timetable.epoch(f))[n].position) for f in range(3) for n in "AP")
         assert plan.mesh_radius(np.zeros(3)) - far - expected == pytest.approx(1.6, abs=1.2)  # whole metres, a metre, the way in a frame
     free = district(314, propagation={"model": "free_space"}, city=None, clutter={"model": "none"})
-    assert simulate.prepare(free).plan.mesh_radius(np.zeros(3)) == np.inf
-    everything = simulate.prepare(district(314, accuracy={"preset": "everything"}))
+    assert prepare(free).plan.mesh_radius(np.zeros(3)) == np.inf
+    everything = prepare(district(314, accuracy={"preset": "everything"}))
     assert everything.city.num_beyond == 0
 
 
@@ -113,7 +115,7 @@ def test_the_reach_follows_the_groups():
 def test_the_plan_counts_what_the_summary_counts():
     """Faces and scatterers. Planted bug: the candidates of the field in place of its scatterers in the plan."""
     s = district(315, frames=2)
-    setup = simulate.prepare(s)
+    setup = prepare(s)
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
     record = extent(setup.city, setup.propagation, s.clutter)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
@@ -135,11 +137,11 @@ def test_the_plan_counts_mirrors():
     error that of the terminal with the least."""
     s = district(315, frames=2)
     some, all_of_them = (s.model_copy(update={"clutter": s.clutter.model_copy(update={"mirrors": n})}) for n in (3, 64))
-    setup = simulate.prepare(some)
+    setup = prepare(some)
     planned, done = make_plan(setup), simulate.summarise(some)["fidelity"]
     assert planned["mirrors"] == done["mirrors"] and planned["clutter_bounces"] == done["clutter_bounces"] == 2
     assert set(planned["mirrors"]) == {"A", "P"}
-    most = extent(setup.city, simulate.prepare(all_of_them).propagation, s.clutter)["mirrors"]
+    most = extent(setup.city, prepare(all_of_them).propagation, s.clutter)["mirrors"]
     for name, row in planned["mirrors"].items():
         assert row["count"] == len(setup.propagation.twice.mirrors[name]) == 3
         whole = most[name]["share"] + most[name]["share_left_out"]

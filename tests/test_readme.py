@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from isac_rt.cli import main
+from isac_rt.cli.cli import main
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -10,13 +10,13 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import special, stats
 
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import gray_bits
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import gray_bits
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.beams import _likelihood, demodulate_beams
-from isac_rt.receive.demodulate import demodulate
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.symbols.beams import _likelihood, demodulate_beams
+from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.scenario.receivers import Receivers
 
 LENGTH, RATE, ARRIVAL = 43.817, -11.37, (0.31, -0.22)
 SHORT = Waveform(num_samples=256, num_chirps=120)

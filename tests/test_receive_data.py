@@ -11,14 +11,14 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
 import isac_rt.receive
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import Payload, random_payload, unmodulated
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import Payload, random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_passive
-from isac_rt.receive.demodulate import Symbols, confidence_threshold, decide_transitions, demodulate, known_cycles, moves_as_predicted
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.symbols.powers import Symbols, confidence_threshold, decide_transitions, demodulate, known_cycles, moves_as_predicted
+from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 LENGTH, RATE, ARRIVAL, DEPARTURE = 43.817, -11.37, (0.31, -0.22), (-0.17, 0.26)
@@ -53,8 +53,8 @@ def link():
 
 
 def test_receivers_import_nothing_that_knows_the_truth():
-    """Planted bug: `from isac_rt.swarm import Pose` in passive.py. Mean powers of clutter are no truth: a terminal may have the mesh."""
-    allowed = "isac_rt.propagation.expected.ExpectedClutter"
+    """Planted bug: `from isac_rt.world.swarm import Pose` in passive.py. Mean powers of clutter are no truth: a terminal may have the mesh."""
+    allowed = "isac_rt.receive.types.ExpectedClutter"
     for source in File(isac_rt.receive.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(source.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

@@ -10,9 +10,10 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import stats
 from scipy.integrate import quad
 
-from isac_rt.arrays import conventional_schedule
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import unmodulated
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active, receive_passive
 from isac_rt.receive.cfar import (
     background,
@@ -27,8 +28,6 @@ from isac_rt.receive.cfar import (
     threshold,
     without_sidelobes,
 )
-from isac_rt.receive.common import sense, velocity_method
-from isac_rt.receive.doppler import accumulate, channel_maps, correlation_operator, omp, slow_times, slow_window, union_operator
 from isac_rt.receive.estimate import (
     LocalSpectra,
     beat_cells,
@@ -39,9 +38,11 @@ from isac_rt.receive.estimate import (
     standard_deviations,
     start_point,
 )
+from isac_rt.receive.maps import accumulate, channel_maps, correlation_operator, slow_times, slow_window, union_operator
+from isac_rt.receive.omp import omp
+from isac_rt.receive.sense import sense, velocity_method
 from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 SETTINGS = Receivers()

@@ -9,16 +9,16 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 from scipy import stats
 
-from isac_rt.arrays import conventional_schedule, pseudo_random_schedule
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import receive_active, receive_passive
 from isac_rt.receive.cfar import detect
-from isac_rt.receive.common import num_looks
-from isac_rt.receive.doppler import accumulate, channel_maps, conventional_power, own_bins
+from isac_rt.receive.maps import accumulate, channel_maps, conventional_power, own_bins
+from isac_rt.receive.sense import num_looks
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)
 ALIKE = 3

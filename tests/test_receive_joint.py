@@ -9,14 +9,24 @@ import pytest
 from crb_model import C, bound, samples
 from receiver_cubes import ANTENNAS, frame
 
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import unmodulated
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.receive.joint import Frame, JointPath, _moments, _normal_equations, _tone, element_delays, fit, residual_channels, tone_sums
-from isac_rt.receive.phases import decide_phases
-from isac_rt.receive.separate import _beams, _earlier_reference, _hidden
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.joint.fit import (
+    Frame,
+    JointPath,
+    _moments,
+    _normal_equations,
+    _tone,
+    element_delays,
+    fit,
+    residual_channels,
+    tone_sums,
+)
+from isac_rt.receive.joint.separate import _beams, _earlier_reference, _hidden
+from isac_rt.receive.symbols.phases import decide_phases
+from isac_rt.scenario.receivers import Receivers
 
 ONE_DB = 10**0.1
 FEW = replace(ANTENNAS, rx_x=3, rx_z=4)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.payload import random_payload
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
 from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.receive.pursuit import _take_out
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=3, rx_z=3)
 W = Waveform(num_samples=256, num_groups=1)

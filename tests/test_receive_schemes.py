@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.arrays import conventional_schedule, pseudo_random_schedule
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.receive.common import velocity_method
-from isac_rt.receive.doppler import conventional_power, own_bins, recovery_limit
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import Waveform
+from isac_rt.receive.maps import conventional_power, own_bins
+from isac_rt.receive.omp import recovery_limit
+from isac_rt.receive.sense import velocity_method
+from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 SETTINGS = Receivers()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from isac_rt.arrays import pseudo_random_schedule
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.cfar import peaks
-from isac_rt.receive.doppler import power_map, slow_times, slow_window
+from isac_rt.receive.maps import power_map, slow_times, slow_window
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform, transform_plain
-from isac_rt.waveform import Waveform
 
 ROUNDING = 1e-6
 """Of sums in float32 over some hundred terms, relative RMS: some eps = 6e-8 times the root of the stages."""

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from fake_run import fake_run
 
-from isac_rt.figures import make_figures
-from isac_rt.report import write_report
-from isac_rt.scenario_file import load
+from isac_rt.scenario.file import load
+from isac_rt.views.figures import make_figures
+from isac_rt.views.report import write_report
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")

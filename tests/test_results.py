@@ -10,13 +10,15 @@ import pytest
 import xarray as xr
 from fake_run import TIMING, fake_recorder, fake_records, fake_run, fake_scenario
 
-from isac_rt import provenance
-from isac_rt.arrays import antennas_of
-from isac_rt.interchange import write_ledger
-from isac_rt.metrics import SensingScore, resolutions
-from isac_rt.results import KINDS, ResultsError, check_folder, errors_of, load, save
-from isac_rt.scenario_file import to_yaml
-from isac_rt.waveform import waveform_of
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
+from isac_rt.results import provenance
+from isac_rt.results.dataset import errors_of
+from isac_rt.results.files import ResultsError, check_folder, load, save
+from isac_rt.results.metrics import SensingScore, resolutions
+from isac_rt.results.records import KINDS
+from isac_rt.scenario.file import to_yaml
+from isac_rt.views.interchange import write_ledger
 
 TERMINAL_KEYS = {"counts", "role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased",
                  "matched", "matched_tracked", "false_per_frame", "clutter_per_frame"}  # fmt: skip

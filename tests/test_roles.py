@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt import simulate
-from isac_rt.metrics import SensingScore, pool
-from isac_rt.scenario import Array, Modulation, Noise, Propagation, Radio, Receivers, RoleChange, Scenario, Uav
+from isac_rt.results.metrics import SensingScore, pool
+from isac_rt.run import simulate
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.environment import Propagation
+from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.scenario.swarm import RoleChange, Uav
+from isac_rt.scenario.tree import Scenario
 
 SMALL = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60)
 """A frame of an eighth of the paper's samples: range cells of half a metre one way, 16 m of data range per 2 dB."""
@@ -62,7 +67,7 @@ def test_streams_reach_their_terminals():
     streams = {"P1": (1,), "P2": (0, 2)}
     s = scenario({"A": A, "P1": P1, "P2": P2}, modulation=Modulation(acquisition_frames=2, pilot_every_frames=None, streams=streams))
     run = simulate.run(s)
-    per_group = simulate.prepare(s).waveform.bits_per_frame(8) // 3
+    per_group = prepare(s).waveform.bits_per_frame(8) // 3
     for name, groups in streams.items():
         block = run.summary["terminals"][name]
         assert block["ser_delay"] == block["ser_dpsk"] == block["erased"] == 0, name

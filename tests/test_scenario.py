@@ -14,9 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from isac_rt.scenario import CITY_KEYS, City, Scenario, Uav, json_schema
-from isac_rt.scenario_file import MAX_MESSAGES, ScenarioError, ScenarioWarning, load, to_yaml
-from isac_rt.waveform import waveform_of
+from isac_rt.frame.waveform import waveform_of
+from isac_rt.scenario.environment import CITY_KEYS, City
+from isac_rt.scenario.file import MAX_MESSAGES, ScenarioError, ScenarioWarning, load, to_yaml
+from isac_rt.scenario.swarm import Uav
+from isac_rt.scenario.tree import Scenario, json_schema
 
 SCENES = Path(__file__).parent.parent / "scenes"
 BASE = """\

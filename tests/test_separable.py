@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from receiver_cubes import Path, cube
 
-from isac_rt.arrays import Antennas, pseudo_random_schedule
-from isac_rt.ifsignal import Transmission, if_signal
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.swarm import Pose
-from isac_rt.waveform import Waveform
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0
 ONE = Antennas(tx_x=2, tx_z=2, rx_x=1, rx_z=1, spacing=0.5774 * C / 77e9, pattern="isotropic")

@@ -12,14 +12,14 @@ from test_clutter_field import METAL, flown, rectangle
 from test_diffraction import chopped
 
 from isac_rt import scenario
-from isac_rt.arrays import antennas_of
-from isac_rt.city import City
-from isac_rt.city.mesh import empty_city
+from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, make_propagation
-from isac_rt.propagation.bodies import Bodies
-from isac_rt.propagation.direct import direct_legs
-from isac_rt.swarm import Pose
-from isac_rt.waveform import waveform_of
+from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.direct import direct_legs
+from isac_rt.world.city import City
+from isac_rt.world.city.mesh import empty_city
+from isac_rt.world.swarm import Pose
 
 pytestmark = pytest.mark.sionna
 C, F_C = 299_792_458.0, 77e9

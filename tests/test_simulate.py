@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt import simulate
 from isac_rt.propagation import PathKind
-from isac_rt.results import load as open_results
-from isac_rt.results import save
-from isac_rt.scenario_file import load
-from isac_rt.terminal import PassiveTerminal, flat, save_capture
+from isac_rt.results.files import load as open_results
+from isac_rt.results.files import save
+from isac_rt.run import simulate
+from isac_rt.run.setup import prepare
+from isac_rt.scenario.file import load
+from isac_rt.terminal.terminal import PassiveTerminal, flat, save_capture
 
 SCENES = Path(__file__).parents[1] / "scenes"
 FRAMES = {"frames": 6}
@@ -75,7 +76,7 @@ def test_results_are_the_same_whatever_the_threads(paper, monkeypatch, tmp_path)
 def test_receivers_use_no_truth(tmp_path):
     """Samples of a run and public parameters in a file, PT1 run on it in a fresh process: bit-identical to PT1 in this one."""
     scenario = load(SCENES / "paper_swarm_consistent.yaml", ["modulation.acquisition_frames=1"], frames=3)
-    setup = simulate.prepare(scenario)
+    setup = prepare(scenario)
     live = PassiveTerminal(setup.waveform, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0)
     cubes, poses, expected = [], [], {}
     for frame in range(3):
@@ -86,7 +87,7 @@ def test_receivers_use_no_truth(tmp_path):
     times, modulated = [setup.timetable.epoch(f) for f in range(3)], [setup.timetable.modulated(f) for f in range(3)]
     file, out = tmp_path / "capture.npz", tmp_path / "out.npz"
     save_capture(file, cubes, poses, times, modulated, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0)
-    subprocess.run([sys.executable, "-m", "isac_rt.terminal", str(file), str(out)], check=True, timeout=300)
+    subprocess.run([sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)], check=True, timeout=300)
     with np.load(out) as found:
         assert expected["2/bits"].size
         for name, value in expected.items():

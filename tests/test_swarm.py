@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.scenario import Uav, Waypoint
-from isac_rt.swarm import Trajectory, attitude
+from isac_rt.scenario.swarm import Uav, Waypoint
+from isac_rt.world.swarm import Trajectory, attitude
 
 WAYPOINTS = tuple(
     Waypoint(time_s=t, position_m=p)

@@ -18,11 +18,12 @@ import pytest
 import xarray as xr
 
 import isac_rt
-from isac_rt.cli import main
-from isac_rt.metrics import binomial_interval
-from isac_rt.propagation.cache import CachedPropagation, PathStore
-from isac_rt.scenario_file import ScenarioError, load
-from isac_rt.simulate import prepare, summarise
+from isac_rt.cli.cli import main
+from isac_rt.propagation.store import CachedPropagation, PathStore
+from isac_rt.results.metrics import binomial_interval
+from isac_rt.run.setup import prepare
+from isac_rt.run.simulate import summarise
+from isac_rt.scenario.file import ScenarioError, load
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, status
 from isac_rt.sweep.execute import Job, run_job
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.payload import random_payload, unmodulated
-from isac_rt.scenario import Receivers, Tracking
-from isac_rt.swarm import Pose, attitude
-from isac_rt.terminal import ActiveTerminal, PassiveTerminal, TerminalState, flat, save_capture
-from isac_rt.waveform import Waveform
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
+from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState, flat, save_capture
+from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)
 SCHEDULE = pseudo_random_schedule(3, W.num_chirps, 3, np.random.default_rng(8))
@@ -165,7 +165,7 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
     payloads = [p for _, p in frames] if active else None
     modulated = [f > 1 for f in range(4)]
     save_capture(file, [c for c, _ in frames], poses, times, modulated, ANTENNAS, Receivers(), Tracking(), 8, 1.0, payloads)
-    subprocess.run([sys.executable, "-m", "isac_rt.terminal", str(file), str(out)], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)], check=True, timeout=120)
     with np.load(out) as found:
         assert sorted(found.files) == sorted(expected)
         for name, value in expected.items():

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.arrays import pseudo_random_schedule
-from isac_rt.payload import demodulate_bits, random_payload
-from isac_rt.scenario import Modulation, Radio, RoleChange, Scenario, Uav
-from isac_rt.scenario_file import ScenarioWarning, load, to_yaml
-from isac_rt.timetable import Timetable
-from isac_rt.waveform import Waveform, waveform_of
+from isac_rt.frame.payload import demodulate_bits, random_payload
+from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import Waveform, waveform_of
+from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
+from isac_rt.scenario.radio import Modulation, Radio
+from isac_rt.scenario.swarm import RoleChange, Uav
+from isac_rt.scenario.tree import Scenario
 
 AT, PT1, PT2 = (Uav(role=role, position_m=(3.1 * i, 7.7, 20.0)) for i, role in enumerate(("active", "passive", "passive")))
 SECOND = Uav(role="active", position_m=(-9.3, 1.2, 33.0))

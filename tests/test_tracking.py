@@ -9,15 +9,11 @@ import pytest
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
-from isac_rt.scenario import Tracking
-from isac_rt.swarm import Pose, attitude
-from isac_rt.tracking import (
+from isac_rt.scenario.receivers import Tracking
+from isac_rt.terminal.filter import (
     BIRTH_SPEED_STD,
     STD_FLOOR,
     Gaussian,
-    Track,
-    Tracker,
-    assign,
     birth,
     bistatic_distance,
     expected,
@@ -30,6 +26,8 @@ from isac_rt.tracking import (
     update,
     wrapped,
 )
+from isac_rt.terminal.tracker import Track, Tracker, assign
+from isac_rt.world.swarm import Pose, attitude
 
 OWN = Pose(np.array([3.1, -2.7, 31.3]), np.array([4.3, 7.9, -0.6]), np.zeros(3), attitude(np.array([0.5, 1.2, -0.15])))
 BODY = np.array([14.7, 28.9, 27.1, -3.7, 6.1, 1.3])

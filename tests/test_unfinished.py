@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from test_fall_back import scenario as dense_scenario
 
-from isac_rt import simulate
-from isac_rt.cli import main
-from isac_rt.results import load as open_results
-from isac_rt.scenario_file import load, to_yaml
-from isac_rt.surroundings import run_content
-from isac_rt.unfinished import FILE, Unfinished, UnfinishedError
+from isac_rt.cli.cli import main
+from isac_rt.results.files import load as open_results
+from isac_rt.run import simulate
+from isac_rt.run.content import run_content
+from isac_rt.run.resume import FILE, Unfinished, UnfinishedError
+from isac_rt.scenario.file import load, to_yaml
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -167,7 +167,7 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
     """Ctrl-C after three frames: exit 130 and where they are; the next call says that it goes on, and leaves no such file behind."""
     (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
     monkeypatch.setattr(Unfinished.__init__, "__defaults__", (0.0,))
-    monkeypatch.setattr("isac_rt.figures.make_figures", lambda *_: [])
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
 
     def stopped(work, *_):
         def report(done, total):
@@ -178,7 +178,7 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
 
     command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
     with monkeypatch.context() as once:
-        once.setattr("isac_rt.cli._with_progress", stopped)
+        once.setattr("isac_rt.cli.cli._with_progress", stopped)
         assert main(command) == 130
     said = capsys.readouterr().err
     assert f"{tmp_path / 'out' / FILE} keeps the frames so far" in said and "interrupted" in said and "going on" not in said
@@ -195,8 +195,8 @@ def test_the_command_goes_on_after_it_was_stopped(tmp_path, how):
     scenario.write_text(to_yaml(dense_scenario(frames=8)))
     out = tmp_path / "out"
     program = f"""
-import sys, isac_rt.unfinished
-isac_rt.unfinished.Unfinished.__init__.__defaults__ = (0.0,)
+import sys, isac_rt.run.resume
+isac_rt.run.resume.Unfinished.__init__.__defaults__ = (0.0,)
 from isac_rt.cli import main
 sys.exit(main(["run", {str(scenario)!r}, "--out", {str(out)!r}]))
 """

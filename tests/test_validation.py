@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-import isac_rt.validation
-from isac_rt.cli import main
-from isac_rt.validation import Planted, Skipped, all_cases, run_case
-from isac_rt.validation.case import case
-from isac_rt.validation.table import as_data, as_markdown
+import isac_rt.studies.validation
+from isac_rt.cli.cli import main
+from isac_rt.studies.validation import Planted, Skipped, all_cases, run_case
+from isac_rt.studies.validation.case import case
+from isac_rt.studies.validation.table import as_data, as_markdown
 
-PACKAGE = Path(isac_rt.validation.__file__).parent
+PACKAGE = Path(isac_rt.studies.validation.__file__).parent
 CASES = all_cases()
 
 
-@case(truth="zero", unit="m", bound=0.5, why="one half", planted=("waveform.py", "a", "b"))
+@case(truth="zero", unit="m", bound=0.5, why="one half", planted=("frame/waveform.py", "a", "b"))
 def a_case() -> float:
     """A claim | with a bar."""
     return 0.25
@@ -41,7 +41,7 @@ def test_the_quick_selection_is_a_part_of_every_group():
 
 
 def test_truths_take_nothing_from_the_program():
-    """Written against: `from isac_rt.waveform import SPEED_OF_LIGHT` in truths.py."""
+    """Written against: `from isac_rt.frame.waveform import SPEED_OF_LIGHT` in truths.py."""
     tree = ast.parse((PACKAGE / "truths.py").read_text())
     names = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
     names += [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
@@ -92,7 +92,7 @@ def test_the_command_writes_its_tables_and_fails_with_a_case(tmp_path, capsys, m
     assert json.loads((tmp_path / "validation.json").read_text())["passed"] == 1
     assert json.loads((tmp_path / "x" / "t.json").read_text())["cases"][0]["name"] == "binomial intervals"
     assert "binomial intervals" in (tmp_path / "validation.md").read_text()
-    monkeypatch.setattr(isac_rt.validation, "all_cases", lambda quick: [replace(a_case, bound=0.1)])
+    monkeypatch.setattr(isac_rt.studies.validation, "all_cases", lambda quick: [replace(a_case, bound=0.1)])
     assert main(["validate"]) == 1
     assert main(["validate", "--only", "nonsense"]) == 2
     assert "nonsense" in capsys.readouterr().err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 
 PRINTED = 5e-5  # published: the settings are printed with five to seven digits
 

@@ -65,7 +65,7 @@ def reference(schema: dict[str, Any]) -> str:
 
 
 def write(app: Any) -> None:
-    from isac_rt.scenario import json_schema
+    from isac_rt.scenario.tree import json_schema
 
     folder = Path(app.srcdir) / "generated"
     folder.mkdir(exist_ok=True)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from isac_rt.access.protocol import Clock, Establishment, Link, Network, Scene, establish, scan
-from isac_rt.arrays import Antennas, Schedule
-from isac_rt.linkbudget import transmit_amplitude
-from isac_rt.scenario import Scenario
-from isac_rt.waveform import Waveform
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.level import transmit_amplitude
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import Waveform
+from isac_rt.scenario.tree import Scenario
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from isac_rt.waveform import Waveform
+from isac_rt.frame.waveform import Waveform
 
 OVERSAMPLING = 32
 """Samples of the mixer's output per IF sample: beats within +-16 f_s, seven blocks to either side."""

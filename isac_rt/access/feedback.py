@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from isac_rt.receive.demodulate import EXTRA_CELLS
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.receive.types import Reception
-from isac_rt.tracking import TrackSet
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.terminal.tracker import TrackSet
 
 LARGEST_SLIP = 16  # cells; what is farther off was never acquired
 CONFIDENT_RATE = 1e-3

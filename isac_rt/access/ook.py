@@ -13,7 +13,7 @@ import numpy as np
 import scipy.fft
 from scipy import stats
 
-from isac_rt.waveform import Waveform
+from isac_rt.frame.waveform import Waveform
 
 FRACTIONS = 4
 """Fractions of a cell tried: the worst loss, an eighth of a cell off, is 0.22 dB."""

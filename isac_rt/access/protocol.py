@@ -23,16 +23,18 @@ import numpy as np
 from isac_rt.access.identify import choose_run, consensus, hot_chirps, needed_chirps
 from isac_rt.access.ook import Codebook, Message, keyed, read
 from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, Round, estimate_clock, round_of
-from isac_rt.arrays import Antennas, Schedule
-from isac_rt.ifsignal import IFCube, Transmission, add_noise, if_signal
-from isac_rt.payload import random_payload, unmodulated
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import receive_passive
 from isac_rt.receive.types import Detections
-from isac_rt.scenario import Receivers
-from isac_rt.swarm import Pose
-from isac_rt.waveform import Waveform
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.world.swarm import Pose
 
 Link = tuple[str, str]
 Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, PathSet]]]

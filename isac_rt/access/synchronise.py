@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.types import Detections
-from isac_rt.waveform import SPEED_OF_LIGHT
 
 ACCELERATION_STD = 5.0
 """Spread of the range's acceleration [m/s^2]: manoeuvres, and v^2/R of passing by."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from isac_rt.arrays import Antennas
-from isac_rt.city.mesh import City
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
-from isac_rt.propagation.statistical import RayleighClutter
-from isac_rt.scenario import Scenario
-from isac_rt.swarm import Pose
-from isac_rt.waveform import Waveform
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose
 
 __all__ = ["FreeSpace", "PathKind", "PathSet", "Propagation", "make_paths", "make_propagation", "merge"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
-from isac_rt.swarm import Pose
+from isac_rt.frame.antennas import Antennas
+from isac_rt.world.swarm import Pose
 
 
 def element_amplitude(antennas: Antennas, tx: Pose, rx: Pose, departure: np.ndarray, arrival: np.ndarray) -> np.ndarray:

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.geometry import straight
+from isac_rt.propagation.legs.geometry import straight
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
-from isac_rt.scenario import Uav
-from isac_rt.swarm import Pose
-from isac_rt.waveform import SPEED_OF_LIGHT
+from isac_rt.scenario.swarm import Uav
+from isac_rt.world.swarm import Pose
 
 
 def friis_amplitude(wavelength: float, distance: Any) -> Any:

@@ -31,25 +31,25 @@ import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
 
-from isac_rt.arrays import Antennas
-from isac_rt.city.mesh import City
-from isac_rt.city.scene import shared_scene
-from isac_rt.propagation.between import Between, LegSet, leg_set, pick
-from isac_rt.propagation.bodies import Bodies
-from isac_rt.propagation.clearance import Clearance
-from isac_rt.propagation.clutter import ClutterField
-from isac_rt.propagation.diffuse import scatterer_phase
-from isac_rt.propagation.direct import past_edges_and_bodies
-from isac_rt.propagation.edges import ShadowEdges
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.clutter.field import ClutterField
+from isac_rt.propagation.clutter.resampled import scatterer_phase
+from isac_rt.propagation.clutter.sight import Shadows
+from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.legs.between import Between, LegSet, leg_set, pick
+from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.clearance import Clearance
+from isac_rt.propagation.legs.direct import past_edges_and_bodies
+from isac_rt.propagation.legs.edges import ShadowEdges
+from isac_rt.propagation.legs.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
-from isac_rt.propagation.twice import TwoBounces
-from isac_rt.propagation.visibility import Shadows
-from isac_rt.scenario import Scenario
-from isac_rt.swarm import Pose, Swarm
-from isac_rt.waveform import SPEED_OF_LIGHT
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.city.mesh import City
+from isac_rt.world.city.scene import shared_scene
+from isac_rt.world.swarm import Pose, Swarm
 
 POINT_TOLERANCE = 1e-3
 """Share of a path's length by which its points may differ from Sionna's; beyond, it is another path. Sionna's mirrors are float32

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.randomness import generator
-from isac_rt.scenario import Rcs
+from isac_rt.scenario.swarm import Rcs
 
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
 LARGE_BISTATIC = (6.05, 1.33)  # k_1, k_2 of eq. 7.9.2-3 for the large UAV

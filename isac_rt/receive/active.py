@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import Antennas
-from isac_rt.ifsignal import IFCube, RangeProfiles
-from isac_rt.payload import Payload
-from isac_rt.propagation.expected import ExpectedClutter
-from isac_rt.receive.clutter_filter import remove_standing
-from isac_rt.receive.common import make_maps, sense
-from isac_rt.receive.in_clutter import sense_in_clutter
-from isac_rt.receive.joint import Frame
-from isac_rt.receive.separate import separate
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.payload import Payload
+from isac_rt.receive.clutter.filter import remove_standing
+from isac_rt.receive.clutter.sense import sense_in_clutter
+from isac_rt.receive.joint.fit import Frame
+from isac_rt.receive.joint.separate import separate
+from isac_rt.receive.sense import make_maps, sense
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import Reception
-from isac_rt.scenario import Receivers
+from isac_rt.receive.types import ExpectedClutter, Reception
+from isac_rt.scenario.receivers import Receivers
 
 
 def receive_active(
@@ -32,7 +31,7 @@ def receive_active(
     Parameters
     ----------
     cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which there is no `joint` refinement
-    clutter : what the city is expected to return, for the detectors that need it (`isac_rt.receive.detectors`)
+    clutter : what the city is expected to return, for the detectors that need it (`isac_rt.receive.clutter.detectors`)
     maps : also return pictures
 
     Returns

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from scipy import ndimage, optimize, stats
 
-from isac_rt.scenario import Receivers
+from isac_rt.scenario.receivers import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 """Correlation of the powers of cells one and two apart along a Hann-windowed axis."""

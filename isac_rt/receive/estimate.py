@@ -16,10 +16,11 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-from isac_rt.arrays import Antennas, Schedule
-from isac_rt.receive.doppler import slow_window
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.maps import slow_window
 from isac_rt.receive.spectrum import window_length
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
 
 HALF_WIDTH = 3  # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
 

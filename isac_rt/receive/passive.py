@@ -7,21 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from isac_rt.arrays import Antennas, Schedule
-from isac_rt.ifsignal import IFCube
-from isac_rt.payload import unmodulated
-from isac_rt.receive.beams import demodulate_beams, usable_paths
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.cfar import row_factors, threshold
-from isac_rt.receive.common import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
-from isac_rt.receive.demodulate import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
 from isac_rt.receive.estimate import Estimate, LocalSpectra
-from isac_rt.receive.joint import Frame, JointPath
-from isac_rt.receive.phases import decide_phases
-from isac_rt.receive.separate import separate
+from isac_rt.receive.joint.fit import Frame, JointPath
+from isac_rt.receive.joint.separate import separate
+from isac_rt.receive.sense import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
 from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.symbols.beams import demodulate_beams, usable_paths
+from isac_rt.receive.symbols.phases import decide_phases
+from isac_rt.receive.symbols.powers import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
 
 REFERENCE_SPAN_DB = 20.0  # the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
 GATE_CELLS = 1  # range rows searched on each side of the predicted one: the fraction is known, the whole cell is the prediction's
@@ -49,7 +50,7 @@ def receive_passive(
     modulated : whether the frame carries data (public)
     groups : that carry data for this terminal, None for all. It decodes these, and senses with these alone while there are
         data: what the others carry it does not know
-    profile : range profile with which the delay symbols are decided (`isac_rt.receive.profile`), None: by the strongest cell
+    profile : range profile with which the delay symbols are decided (`isac_rt.receive.symbols.profile`), None: by the strongest cell
     maps : also return pictures
 
     Returns

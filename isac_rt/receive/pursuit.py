@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.arrays import Antennas, Schedule
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.cfar import detect, first_row
-from isac_rt.receive.doppler import power_map
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -23,10 +24,10 @@ from isac_rt.receive.estimate import (
     start_point,
     window_middle,
 )
-from isac_rt.receive.joint import element_delays
+from isac_rt.receive.joint.fit import element_delays
+from isac_rt.receive.maps import power_map
 from isac_rt.receive.spectrum import window_length
-from isac_rt.scenario import Receivers
-from isac_rt.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.receivers import Receivers
 
 REACH = 24
 """Range rows on each side in which a path is taken out; Hann's lobes are 90 dB down there."""

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from isac_rt.ifsignal import IFCube
-from isac_rt.rangecells import data_phase, shift_of, window_length
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import data_phase, shift_of, window_length
 from isac_rt.receive.transform import transform
 
 

@@ -2,7 +2,7 @@ r"""Range transforms of many chirps at once: the FFTs of a reception, with what 
 
 .. math:: Y[r, i, p] = g[i, p] \sum_n h[p, n]\, s[r, p, n]\, e^{-j 2 \pi c_i n / N}
 
-Sixteen chirps lie side by side in a table that stays in the second-level cache from the first factor to the last (`isac_rt.lanefft`);
+Sixteen chirps lie side by side in a table that stays in the second-level cache from the first factor to the last (`isac_rt.kernels.fourier`);
 the samples are read once and only the cells that are wanted are written. `transform_plain` is the same by `scipy.fft`: the oracle, and
 what is used for an N that is no product of 8 and twos, threes and fives.
 """
@@ -13,9 +13,9 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
-from isac_rt import lanefft
-from isac_rt.lanefft import ROW
-from isac_rt.simd import LANES, aligned, load, store, transpose, zip_high, zip_low
+from isac_rt.kernels import fourier as lanefft
+from isac_rt.kernels.fourier import ROW
+from isac_rt.kernels.vector import LANES, aligned, load, store, transpose, zip_high, zip_low
 
 
 def transform(

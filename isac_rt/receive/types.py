@@ -119,8 +119,8 @@ class Reception:
     soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or decided from powers
     confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many exponentials; 0 when not decoded
     sparse : where the velocities came from sparse sampling with OMP or from a conventional schedule, whether the scene is sparse
-        enough for OMP (`isac_rt.receive.doppler.sparse_enough`); False advises the transmitter to fall back from a pseudo-random
-        schedule to a conventional one (`isac_rt.fall_back`). None elsewhere
+        enough for OMP (`isac_rt.receive.omp.sparse_enough`); False advises the transmitter to fall back from a pseudo-random
+        schedule to a conventional one (`isac_rt.access.fall_back`). None elsewhere
     """
 
     detections: Detections
@@ -142,3 +142,34 @@ class Reception:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"
         sight = "line of sight, " if self.line_of_sight else ""
         return f"<Reception {len(self.detections)} detections, {sight}{data}>"
+
+
+@dataclass(frozen=True)
+class ExpectedClutter:
+    """K independent scatterers of known mean power, as one receiver expects them at the middle of a frame.
+
+    Attributes
+    ----------
+    delay, delay_rate : (K,) [s, 1]
+    power : (K,) mean received power per sample and antenna pair [W], elements included
+    departure, arrival : (K, 3) unit vectors in the body frame of the transmitter and of the receiver
+    """
+
+    delay: np.ndarray
+    delay_rate: np.ndarray
+    power: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+    def __len__(self) -> int:
+        return self.delay.size
+
+    def select(self, which: np.ndarray) -> ExpectedClutter:
+        """The scatterers that a mask or an index array chooses."""
+        return ExpectedClutter(*(a[which] for a in vars(self).values()))
+
+
+def joined(parts: list[ExpectedClutter]) -> ExpectedClutter:
+    """Several kinds of clutter as one."""
+    names = ("delay", "delay_rate", "power", "departure", "arrival")
+    return ExpectedClutter(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))

@@ -17,12 +17,13 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
-from isac_rt.metrics import RATES, SensingScore, SymbolCount, summary_block
-from isac_rt.provenance import file_digest, program_fingerprint
 from isac_rt.randomness import seed_sequence
-from isac_rt.scenario import Scenario
-from isac_rt.scenario_base import Key, Node, Problem, dotted
-from isac_rt.scenario_file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
+from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
+from isac_rt.results.provenance import program_fingerprint
+from isac_rt.scenario.file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
+from isac_rt.scenario.node import Key, Node, Problem, dotted
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.area import file_digest
 
 MAX_POINTS = 100_000
 """More points than this are taken for a slip unless asked for."""
@@ -220,7 +221,7 @@ def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 @lru_cache(maxsize=1)
 def quantities() -> tuple[str, ...]:
-    """Names of what a link's outcome holds (see `isac_rt.metrics.summary_block`), the pooled rates included."""
+    """Names of what a link's outcome holds (see `isac_rt.results.metrics.summary_block`), the pooled rates included."""
     block = summary_block("passive", SensingScore(np.ones(4)), SymbolCount(), 1.0)
     names = [name for name, _ in flat_numbers(block)]
     return (*names, *(f"{name}_{end}" for name in RATES for end in ("pooled", "low", "high")), "paths")

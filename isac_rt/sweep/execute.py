@@ -76,15 +76,16 @@ def run_job(job: Job) -> tuple[str, bool]:
 
 
 def _simulate(job: Job) -> dict[str, Any]:
-    from isac_rt import simulate
-    from isac_rt.propagation.cache import PathStore
-    from isac_rt.scenario import Scenario
+    from isac_rt.propagation.store import PathStore
+    from isac_rt.run import simulate
+    from isac_rt.run.setup import prepare
+    from isac_rt.scenario.tree import Scenario
 
     scenario = Scenario.model_validate(job.tree).in_folder(Path(job.scenario_folder))
     store = PathStore(Path(job.folder) / "paths", CACHE_BYTES)
     if scenario.propagation.model == "ray_traced":
         _limit_tracer(job.threads)
-    setup = simulate.prepare(scenario, store)
+    setup = prepare(scenario, store)
     return simulate.summarise(scenario, setup=setup, threads=job.threads)
 
 
@@ -162,7 +163,7 @@ def run_sweep(
     ------
     SweepError  If the scheduler cannot be reached.
     SchedulerLost  If it is lost on the way.
-    isac_rt.results.ResultsError  If the folder cannot be written.
+    isac_rt.results.files.ResultsError  If the folder cannot be written.
     """
     outcomes = Outcomes(Path(folder).resolve())
     outcomes.save_definition(plan)

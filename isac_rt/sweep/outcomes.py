@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from isac_rt.metrics import binomial_interval
-from isac_rt.provenance import commit, program_fingerprint, versions
-from isac_rt.results import ResultsError, write_bytes, write_text
-from isac_rt.scenario import Scenario
-from isac_rt.scenario_file import plain_tree
+from isac_rt.results.files import ResultsError, write_bytes, write_text
+from isac_rt.results.metrics import binomial_interval
+from isac_rt.results.provenance import commit, program_fingerprint, versions
+from isac_rt.scenario.file import plain_tree
+from isac_rt.scenario.tree import Scenario
 from isac_rt.sweep.definition import Plan, Point, Sweep, flat_numbers
 
 FILE, DEFINITION = "sweep.nc", "sweep.json"

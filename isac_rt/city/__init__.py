@@ -1,8 +1,0 @@
-"""The city: where its mesh comes from, what it is made of, and its ray-traced twin (`isac_rt.city.scene`, which needs Sionna)."""
-
-from isac_rt.city.materials import CityError, Material
-from isac_rt.city.mesh import City
-from isac_rt.city.mesh import City as Mesh
-from isac_rt.city.sources import load_city
-
-__all__ = ["City", "CityError", "Material", "Mesh", "load_city"]

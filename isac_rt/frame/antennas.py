@@ -1,0 +1,123 @@
+"""L-shaped arrays in the body frame, element patterns, and the antenna schedules of TDM-MIMO.
+
+Body frame: X to the right, Y along the boresight, Z up. Each of the two arrays is given about its own
+centroid, which is the body's position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from isac_rt.frame.waveform import Waveform
+from isac_rt.scenario.tree import Scenario
+
+PatternModel = Literal["isotropic", "sector", "cosine"]
+
+
+def l_shape(num_x: int, num_z: int, spacing: float) -> np.ndarray:
+    """Elements of an L (num_x + num_z - 1, 3) [m] about their centroid.
+
+    Order as in the paper: element 0 is farthest along X, then inwards to the corner (index
+    ``num_x - 1``), then up along Z.
+    """
+    x = np.concatenate([np.arange(num_x)[::-1], np.zeros(num_z - 1)])
+    z = np.concatenate([np.zeros(num_x), np.arange(1, num_z)])
+    positions = spacing * np.stack([x, np.zeros_like(x), z], axis=1)
+    return positions - positions.mean(axis=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Antennas:
+    """The transmit and receive arrays of a terminal and the pattern of their elements.
+
+    Attributes
+    ----------
+    tx_x, tx_z, rx_x, rx_z : elements along each arm, the corner counted in both
+    spacing : distance of neighbouring receive elements d_a [m]; transmit elements stand rx_x (rx_z)
+        of these apart, so that an echo sees a gapless virtual L
+    gain : power gain of an element on boresight (linear); with ``isotropic`` everywhere
+    pattern : "isotropic"; "sector": `gain` inside the field of view, nothing outside;
+        "cosine": gain * cos(angle)^q in the front hemisphere, q = gain/2 - 1 so that it radiates its own
+        power, and at least 0
+    half_view : half of the field of view per axis [rad]; what lies outside has no place in the estimates
+        (for "sector" nothing is sent or received there)
+    """
+
+    tx_x: int
+    tx_z: int
+    rx_x: int
+    rx_z: int
+    spacing: float
+    gain: float = 1.0
+    pattern: PatternModel = "isotropic"
+    half_view: float = np.pi / 3
+
+    @property
+    def num_tx(self) -> int:
+        return self.tx_x + self.tx_z - 1
+
+    @property
+    def num_rx(self) -> int:
+        return self.rx_x + self.rx_z - 1
+
+    @property
+    def tx_positions(self) -> np.ndarray:
+        """(num_tx, 3) [m] body frame, about the centroid."""
+        x = np.concatenate([np.arange(self.tx_x)[::-1] * self.rx_x, np.zeros(self.tx_z - 1)])
+        z = np.concatenate([np.zeros(self.tx_x), np.arange(1, self.tx_z) * self.rx_z])
+        positions = self.spacing * np.stack([x, np.zeros_like(x), z], axis=1)
+        return positions - positions.mean(axis=0)
+
+    @property
+    def rx_positions(self) -> np.ndarray:
+        """(num_rx, 3) [m] body frame, about the centroid."""
+        return l_shape(self.rx_x, self.rx_z, self.spacing)
+
+    def in_view(self, direction: np.ndarray) -> np.ndarray:
+        """Whether body-frame unit vectors (..., 3) lie inside the field of view of both arms."""
+        limit = np.sin(self.half_view)
+        return (
+            (direction[..., 1] > 0)
+            & (np.abs(direction[..., 0]) <= limit)
+            & (np.abs(direction[..., 2]) <= limit)
+        )
+
+    def element_gain(self, direction: np.ndarray) -> np.ndarray:
+        """Power gain of an element towards body-frame unit vectors (..., 3) (linear)."""
+        if self.pattern == "isotropic":
+            return np.full(direction.shape[:-1], self.gain)
+        if self.pattern == "sector":
+            return np.where(self.in_view(direction), self.gain, 0.0)
+        exponent = max(self.gain / 2 - 1, 0.0)
+        forward = np.clip(direction[..., 1], 0.0, None)
+        return self.gain * np.where(forward > 0, forward**exponent, 0.0)
+
+
+
+
+
+
+
+
+
+
+def antennas_of(scenario: Scenario, waveform: Waveform) -> Antennas:
+    """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
+    a = scenario.array
+    return Antennas(
+        tx_x=a.tx_x,
+        tx_z=a.tx_z,
+        rx_x=a.rx_x,
+        rx_z=a.rx_z,
+        spacing=a.spacing_wavelengths * waveform.wavelength,
+        gain=10 ** (a.element_gain_dbi / 10),
+        pattern=a.element_pattern,
+        half_view=np.deg2rad(a.field_of_view_deg) / 2,
+    )
+
+
+
+

@@ -1,0 +1,92 @@
+"""One transmitter's frame, and what a receiver's converters deliver of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.payload import Payload
+from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.waveform import Waveform
+from isac_rt.world.swarm import Pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transmission:
+    """One transmitter's frame.
+
+    Attributes
+    ----------
+    name : of the terminal
+    pose : at the epoch (the middle of the frame)
+    antennas : its arrays
+    schedule : (M, P) transmit antenna of each group and chirp
+    payload : what it modulates
+    amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
+    clock_offset, clock_drift : of the transmitter's clock against the receiver's [s, 1]; they add to every delay
+    active : (M, P) bool, False where nothing is sent (on-off keying)
+    first_block : resource block of its group 0; block b starts 2 b T_d into every slot
+    """
+
+    name: str
+    pose: Pose
+    antennas: Antennas
+    schedule: Schedule
+    payload: Payload
+    amplitude: float = 1.0
+    clock_offset: float = 0.0
+    clock_drift: float = 0.0
+    active: np.ndarray | None = None
+    first_block: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class IFCube:
+    """What a receiver's converters deliver in one frame. It never holds the payload.
+
+    Attributes
+    ----------
+    samples : (M, L_rx, P, N) complex64 [sqrt(W)]
+    waveform, schedule : public parameters of the frame
+    start_time : of the frame's first reference chirp [s]
+    """
+
+    samples: np.ndarray
+    waveform: Waveform
+    schedule: Schedule
+    start_time: float
+
+    def __repr__(self) -> str:
+        groups, antennas, chirps, size = self.samples.shape
+        rms = float(np.sqrt(np.mean(np.abs(self.samples) ** 2)))
+        shape = f"{groups} groups x {antennas} antennas x {chirps} chirps x {size} samples"
+        return f"<IFCube {shape} at {self.start_time:.4f} s, RMS {rms:.2e} sqrt(W)>"
+
+    def of_groups(self, groups: Sequence[int]) -> IFCube:
+        """What a receiver of these groups alone has."""
+        chosen = list(groups)
+        return IFCube(
+            samples=self.samples[chosen],
+            waveform=self.waveform.of_groups(groups),
+            schedule=self.schedule[chosen],
+            start_time=self.start_time,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeProfiles:
+    """What a terminal that knows the data makes of its samples first, made directly.
+
+    Attributes
+    ----------
+    spectra : (M, L_rx, cells, P) complex64, the data taken out, under Hann's window: see `isac_rt.receive.spectrum.clean_spectrum`
+    waveform, schedule, start_time : as of an `IFCube`
+    """
+
+    spectra: np.ndarray
+    waveform: Waveform
+    schedule: Schedule
+    start_time: float

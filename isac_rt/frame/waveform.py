@@ -1,0 +1,216 @@
+"""Numbers of the chirp, the frame and the resource blocks, and all that derives from them (Table I)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from isac_rt.scenario.radio import ChirpTimes, chirp_times, num_resource_blocks
+from isac_rt.scenario.tree import Scenario
+
+SPEED_OF_LIGHT = 299_792_458.0
+BOLTZMANN = 1.380649e-23
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waveform:
+    """One frame of the chirp signal: M groups (resource blocks) of P chirps with N samples each.
+
+    The chirp lasts longer than the sampled window by two maximal delays, so that an echo of the
+    window's first sample is still the same chirp: T~ = T + 2 T_d, T_d = f_s T~ / B, hence
+    T_d = f_s T / (B - 2 f_s). (The paper prints f_s T / B, which its own settings contradict.)
+
+    Attributes
+    ----------
+    carrier_frequency, bandwidth : start frequency of the chirp and its full sweep [Hz]
+    sampling_rate : complex IF sampling rate f_s [Hz]
+    num_samples : N, samples per chirp
+    num_chirps : P, slots per frame
+    num_groups : M, resource blocks that are used at once
+    num_tx : L_tx, transmit antennas that share the slots
+    blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A receiver that reads some of
+        the groups only sees a waveform of these (`of_groups`)
+    """
+
+    carrier_frequency: float = 77e9
+    bandwidth: float = 640e6
+    sampling_rate: float = 20e6
+    num_samples: int = 1024
+    num_chirps: int = 120
+    num_groups: int = 3
+    num_tx: int = 3
+    blocks: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.bandwidth <= 2 * self.sampling_rate:
+            raise ValueError(
+                f"bandwidth {self.bandwidth:g} Hz must exceed twice the sampling rate "
+                f"{self.sampling_rate:g} Hz; raise the bandwidth or lower the sampling rate"
+            )
+        if self.num_chirps % self.num_tx:
+            raise ValueError(
+                f"{self.num_chirps} chirps per frame are not a multiple of the {self.num_tx} transmit "
+                "antennas; every antenna needs the same number of slots"
+            )
+        if not 1 <= self.num_groups <= self.num_tx:
+            raise ValueError(
+                f"{self.num_groups} groups: the Latin schedule needs 1 to {self.num_tx} (the transmit antennas)"
+            )
+
+    @cached_property
+    def _times(self) -> ChirpTimes:
+        return chirp_times(self.bandwidth, self.sampling_rate, self.num_samples, self.num_tx)
+
+    @property
+    def sampled_duration(self) -> float:
+        """T [s], the sampled part of a chirp."""
+        return self._times.sampled
+
+    @property
+    def max_delay(self) -> float:
+        """T_d [s], the delay whose beat is the sampling rate."""
+        return self._times.max_delay
+
+    @property
+    def chirp_duration(self) -> float:
+        """T~ [s]."""
+        return self._times.chirp
+
+    @property
+    def guard_interval(self) -> float:
+        """T_GI [s], room for the resource blocks of all transmit antennas."""
+        return 2 * self.num_tx * self.max_delay
+
+    @property
+    def slot_duration(self) -> float:
+        """T- [s], from one chirp of a group to its next."""
+        return self._times.slot
+
+    @property
+    def frame_duration(self) -> float:
+        """P T- [s]."""
+        return self.num_chirps * self.slot_duration
+
+    @property
+    def slope(self) -> float:
+        """alpha = B / T~ [Hz/s]."""
+        return self.bandwidth / self.chirp_duration
+
+    @property
+    def sample_interval(self) -> float:
+        """T_s [s]."""
+        return 1.0 / self.sampling_rate
+
+    @property
+    def window_start(self) -> float:
+        """T~ - T [s], where sampling starts after the start of the reference chirp."""
+        return self.chirp_duration - self.sampled_duration
+
+    @property
+    def group_spacing(self) -> float:
+        """2 T_d [s], from one resource block to the next."""
+        return 2 * self.max_delay
+
+    @property
+    def num_resource_blocks(self) -> int:
+        """Resource blocks in a slot: as many chirps, 2 T_d apart, start in it."""
+        return num_resource_blocks(self.bandwidth, self.sampling_rate, self.num_tx)
+
+    @property
+    def wavelength(self) -> float:
+        """c / f_c [m], the unit of the array spacing."""
+        return SPEED_OF_LIGHT / self.carrier_frequency
+
+    @property
+    def effective_carrier(self) -> float:
+        """Frequency at the middle of the sampled window [Hz]: what Doppler and steering scale with."""
+        return self.carrier_frequency + self.slope * (self.window_start + self.sampled_duration / 2)
+
+    @property
+    def delay_step(self) -> float:
+        """1 / (alpha T) [s]: the delay of one range cell and of one data symbol step."""
+        return 1.0 / (self.slope * self.sampled_duration)
+
+    @property
+    def num_delay_symbols(self) -> int:
+        """N/2, size of the delay alphabet."""
+        return self.num_samples // 2
+
+    @property
+    def bits_per_delay_symbol(self) -> int:
+        return self.num_delay_symbols.bit_length() - 1
+
+    def bits_per_frame(self, dpsk_order: int) -> int:
+        """N_bit = M P floor(log2(N/2)) + M (P - L_tx) log2(D)."""
+        return self.num_groups * (
+            self.num_chirps * self.bits_per_delay_symbol
+            + (self.num_chirps - self.num_tx) * (dpsk_order.bit_length() - 1)
+        )
+
+    def range_cell(self, passes: int) -> float:
+        """Range of one cell [m]: c T~ / (B T) for one pass (PT), half of it for an echo (passes = 2, AT)."""
+        return SPEED_OF_LIGHT * self.delay_step / passes
+
+    def velocity_cell(self, passes: int) -> float:
+        """Radial velocity of one Doppler bin [m/s], with the effective carrier."""
+        return SPEED_OF_LIGHT / (passes * self.frame_duration * self.effective_carrier)
+
+    def max_velocity(self, passes: int) -> float:
+        """Largest unambiguous radial speed [m/s] of a full (Latin) slow-time sampling."""
+        return SPEED_OF_LIGHT / (2 * passes * self.slot_duration * self.effective_carrier)
+
+    @cached_property
+    def fast_time(self) -> np.ndarray:
+        """u = n T_s + T~ - T [s] (num_samples,): time since the start of the reference chirp."""
+        u = np.arange(self.num_samples) * self.sample_interval + self.window_start
+        u.setflags(write=False)
+        return u
+
+    def of_groups(self, groups: Sequence[int]) -> Waveform:
+        """The same frame seen by a receiver that reads only these groups."""
+        blocks = self.blocks or tuple(range(self.num_groups))
+        return replace(self, num_groups=len(groups), blocks=tuple(blocks[m] for m in groups))
+
+    @cached_property
+    def chirp_time(self) -> np.ndarray:
+        """Start of each reference chirp [s] (num_groups, num_chirps) since the start of the first block's first."""
+        blocks = range(self.num_groups) if self.blocks is None else self.blocks
+        m, p = np.array(blocks)[:, None], np.arange(self.num_chirps)[None, :]
+        t = p * self.slot_duration + m * self.group_spacing
+        t.setflags(write=False)
+        return t
+
+
+def waveform_of(scenario: Scenario) -> Waveform:
+    """The waveform that a scenario states."""
+    r, a = scenario.radio, scenario.array
+    return Waveform(
+        carrier_frequency=r.carrier_hz,
+        bandwidth=r.bandwidth_hz,
+        sampling_rate=r.sampling_rate_hz,
+        num_samples=r.samples_per_chirp,
+        num_chirps=r.chirps_per_frame,
+        num_groups=r.groups,
+        num_tx=a.tx_x + a.tx_z - 1,
+    )
+
+
+def window_length(waveform: Waveform) -> float:
+    """Samples that the range window may cover, whatever the data: N less the largest time shift."""
+    return waveform.num_samples - shift_of(waveform, waveform.num_delay_symbols)
+
+
+def shift_of(waveform: Waveform, delay_symbol: Any) -> Any:
+    """s_D, the data delay in samples."""
+    return np.asarray(delay_symbol) * waveform.delay_step * waveform.sampling_rate
+
+
+def data_phase(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
+    """f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2/2 [cycles mod 1], float64."""
+    w = waveform
+    tau = np.asarray(delay_symbols) * w.delay_step
+    return (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (w.window_start - tau / 2)) % 1.0

@@ -1,0 +1,169 @@
+r"""Which walls a terminal sees the city in: the mirrors of two-bounce clutter, chosen once for a run, and what shows in them.
+
+A mirror is all faces of one plane and one material. Of all mirrors a terminal keeps those that send on the most of what it radiates,
+
+.. math:: \overline{\sum R\,(1 - S^2)\,\Omega / 4\pi},
+
+the share of an isotropic antenna's power that meets the mirror's faces in sight (solid angle Omega) and leaves them as from a
+mirror (R is the mean of the slab's TE and TM power reflectivity), averaged over places along its flight. By reciprocity it is also
+the mirror's share of what can reach the terminal. Being shares of one whole, they say what the mirrors left out could have held.
+
+Local coordinates. Import only after `isac_rt.runtime.activate()`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from isac_rt.propagation.clutter.cells import Density, cut
+from isac_rt.propagation.clutter.sight import LIFT, Flight, Shadows
+from isac_rt.propagation.legs.geometry import plane_of_each_face
+from isac_rt.propagation.legs.reflection import slab_coefficients
+from isac_rt.world.city.materials import Material
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose
+
+PLACES = 16
+"""Places along a flight from which mirrors are weighed."""
+COARSE = Density(0.3, 2.0)
+"""Cells by which solid angles are taken [m, m^2]: some 500 of them over a plane that fills half of the view."""
+APART = 0.01
+"""A point this near to the plane of a mirror [m] does not show in it: it lies on the wall, or in its corner."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """One plane of one material.
+
+    Attributes
+    ----------
+    normal, offset : points x of the plane obey normal.x = offset
+    faces : (T,) of the city, the largest first
+    corners : (T, 3, 3)
+    material : Material
+    share : of the power that the terminal radiates, which this mirror sends on
+    """
+
+    normal: np.ndarray
+    offset: float
+    faces: np.ndarray
+    corners: np.ndarray
+    material: Material
+    share: float
+
+    def image(self, pose: Pose) -> np.ndarray:
+        """(3, 3) position, velocity and acceleration of a pose's image."""
+        n = self.normal
+        motion = np.stack([pose.position, pose.velocity, pose.acceleration])
+        motion = motion - 2 * (motion @ n)[:, None] * n
+        motion[0] += 2 * self.offset * n
+        return motion
+
+
+def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int) -> tuple[list[Mirror], float]:
+    """The mirrors that send on the most of what a terminal radiates on its flight, strongest first, at most `most`; and the share that
+    all others send on."""
+    if not most or not city.num_faces:
+        return [], 0.0
+    places = flight.knots[np.unique(np.linspace(0, len(flight.knots) - 1, PLACES).round().astype(int))]
+    cells = cut(city, np.ones(city.num_faces, bool), places, COARSE, seed)
+    _, group = np.unique(np.stack([city.plane_of_face, city.face_material.astype(np.int64)], axis=1), axis=0, return_inverse=True)
+    group = group.ravel()
+    normals, offsets = plane_of_each_face(city)
+    share = np.zeros(group.max() + 1)
+    sent = [_reflected(m, wavelength) for m in city.materials]
+    for place in places:
+        seen = np.flatnonzero(shadows.sees(place, cells.points, city.normals[cells.face]))
+        span = cells.points[seen] - place
+        r = np.linalg.norm(span, axis=1)
+        face = cells.face[seen]
+        cosine = np.minimum(np.abs((span * city.normals[face]).sum(1)) / r, 1.0)
+        back = np.zeros(seen.size)
+        for number, table in enumerate(sent):
+            here = city.face_material[face] == number
+            back[here] = np.interp(cosine[here], np.linspace(0, 1, table.size), table)
+        # a cell near by is no point: its solid angle is at most a half-space
+        angle = np.minimum(cells.area[seen] * cosine / r**2, 2 * np.pi)
+        share += np.bincount(group[face], back * angle / (4 * np.pi), share.size) / len(places)
+    out = []
+    order = np.argsort(-share, kind="stable")
+    for number in order[:most]:
+        if share[number] > 0:
+            faces = np.flatnonzero(group == number)
+            faces = faces[np.argsort(-city.areas[faces], kind="stable")]
+            first = faces[0]
+            material = city.materials[city.face_material[first]]
+            out.append(Mirror(normals[first], float(offsets[first]), faces, city.corners[faces], material, float(share[number])))
+    return out, float(share[order[most:]].sum())
+
+
+def _reflected(material: Material, wavelength: float) -> np.ndarray:
+    """Mean of the TE and TM power that a slab mirrors, over the cosine of incidence from 0 to 1, evenly."""
+    te, tm = slab_coefficients(material, np.linspace(0.0, 1.0, 257), wavelength)
+    return (np.abs(te) ** 2 + np.abs(tm) ** 2) / 2
+
+
+def shown(shadows: Shadows, place: np.ndarray, mirrors: list[Mirror], points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
+    """Of points (N, 3) on surfaces with unit normals (N, 3), the indices of those that `place` sees in each mirror.
+
+    The wave must meet the mirror on one of its faces, and both legs must be free.
+    """
+    found = [_on_the_wall(points, place, m.normal, m.offset, m.corners) for m in mirrors]
+    which = np.concatenate([f[0] for f in found])
+    if not which.size:
+        return [f[0] for f in found]
+    at = np.concatenate([f[1] for f in found])
+    side = [np.sign(m.normal @ place - m.offset) * m.normal for m in mirrors]
+    wall = np.repeat(side, [f[0].size for f in found], axis=0)
+    free = shadows.sees(place, at, wall)
+    left = np.flatnonzero(free)
+    here, there, own = points[which[left]], at[left], normals[which[left]]
+    own = np.sign(((there - here) * own).sum(1))[:, None] * own
+    free[left] = shadows.clear(here + LIFT * own, there + LIFT * wall[left])
+    ends = np.cumsum([f[0].size for f in found])
+    return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
+
+
+@numba.njit(cache=True, nogil=True)
+def _on_the_wall(points, place, normal, offset, corners):
+    """Points on the viewer's side of a mirror whose way to it meets one of its triangles, and where."""
+    above = (normal * place).sum() - offset
+    which, where = [0 for _ in range(0)], [0.0 for _ in range(0)]
+    low, high = np.empty(3), np.empty(3)
+    for k in range(3):
+        low[k], high[k] = corners[:, :, k].min() - 1e-6, corners[:, :, k].max() + 1e-6
+    foot = place - above * normal
+    for i in range(points.shape[0]):
+        up = points[i, 0] * normal[0] + points[i, 1] * normal[1] + points[i, 2] * normal[2] - offset
+        if up * above <= 0 or abs(up) < APART or abs(above) < APART:
+            continue
+        share = above / (above + up)
+        x = foot[0] + share * (points[i, 0] - up * normal[0] - foot[0])
+        y = foot[1] + share * (points[i, 1] - up * normal[1] - foot[1])
+        z = foot[2] + share * (points[i, 2] - up * normal[2] - foot[2])
+        if x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]:
+            continue
+        for t in range(corners.shape[0]):
+            if _inside(x, y, z, corners[t], normal):
+                which.append(i)
+                where.append(x)
+                where.append(y)
+                where.append(z)
+                break
+    return np.array(which, np.int32), np.array(where).reshape(-1, 3)
+
+
+@numba.njit(inline="always")
+def _inside(x, y, z, corners, normal):
+    """Whether a point of the plane is in a triangle, whichever way round its corners go; seams belong to both sides."""
+    least, most = np.inf, -np.inf
+    for k in range(3):
+        a, b = corners[k], corners[(k + 1) % 3]
+        ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        px, py, pz = x - a[0], y - a[1], z - a[2]
+        turn = (ey * pz - ez * py) * normal[0] + (ez * px - ex * pz) * normal[1] + (ex * py - ey * px) * normal[2]
+        least, most = min(least, turn), max(most, turn)
+    return least >= -1e-9 or most <= 1e-9

@@ -1,0 +1,173 @@
+r"""Where a flight carries the sight of scatterers across shadow edges, and how wide the penumbra is there.
+
+A scatterer that is seen from one knot of a flight and not from the next has crossed a shadow edge in between. Rays bisect
+the place; the ray that just fails hits what is in the way within millimetres of its edge, so that the edge is that of the triangle
+hit which is nearest. From it come the distances d_1 (to the terminal) and d_2 (to the scatterer) and the direction
+m across the edge and the ray, and with them the flight that takes the scatterer one Fresnel unit into the shadow,
+
+.. math:: \sigma = \frac{d_1}{d_2\,|v \cdot m|} \sqrt{\frac{\lambda d_2 (d_1 + d_2)}{2 d_1} + w^2},
+
+v the unit vector of the flight and w half the width of the scatterer's cell across the edge: a cell is no point, and the shadow's
+edge takes that long to cross it. About the crossing the Fresnel parameter is taken linear in the flight.
+
+Import only after `isac_rt.runtime.activate()`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from isac_rt.propagation.legs.diffraction import knife_edge
+
+HALVINGS = 6
+"""Of the flight between two knots; what is left is 8 mm of half a metre."""
+REACH = 4.0
+"""Fresnel units on either side after which a scatterer is dark or lit; the ripple and the tail are 6 % there, and tapered."""
+HALF_WIDTH = 0.7
+"""Half the width of a cell over the root of its area: half a side of a right triangle with two equal ones."""
+_UNITS = np.linspace(-REACH, REACH, 1025)
+
+
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """Knife-edge factor over Fresnel units into the light, exactly 0 and 1 at both ends."""
+    x = np.clip((np.abs(_UNITS) - REACH / 2) / (REACH / 2), 0, 1)
+    far = x * x * (3 - 2 * x)
+    factor = (1 - far) * knife_edge(-_UNITS) + far * (_UNITS > 0)
+    return factor.real, factor.imag
+
+
+_REAL, _IMAG = _tables()
+
+
+def penumbra(units: np.ndarray) -> np.ndarray:
+    """(N,) complex factor of an edge; `units` (N,) from the edge of the shadow into the light."""
+    return np.interp(units, _UNITS, _REAL) + 1j * np.interp(units, _UNITS, _IMAG)
+
+
+class Triangles:
+    """All triangles of a scene, and which of them a ray has hit. Asking the scene's meshes at each hit takes as long as a million rays."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        parts = [np.zeros((0, 3, 3), np.float32)]
+        self._first: dict[int, int] = {}
+        for shape in scene.shapes():
+            values = mi.traverse(shape)
+            place = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
+            number = int(np.asarray(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
+            self._first[number] = sum(map(len, parts))
+            parts.append(place[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
+        self.corners = np.concatenate(parts)
+        """(T, 3, 3) float32"""
+
+    def rows(self, hit: mi.PreliminaryIntersection3f) -> np.ndarray:
+        """(K,) int64 into `corners`, -1 where nothing was hit."""
+        shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
+        prim, out = np.asarray(hit.prim_index, np.int64), np.full(shape.size, -1)
+        for number, first in self._first.items():
+            here = shape == number
+            out[here] = first + prim[here]
+        return out
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """K scatterers that come into sight or are lost between two knots.
+
+    Attributes
+    ----------
+    index : (K,) int32
+    where : (K,) float32 share of the way from knot to knot
+    width : (K,) float32 flight per Fresnel unit [m]; inf where the edge was not found
+    gained : (K,) bool, seen from the second knot
+    """
+
+    index: np.ndarray
+    where: np.ndarray
+    width: np.ndarray
+    gained: np.ndarray
+
+
+def crossings(
+    scene: mi.Scene,
+    triangles: Triangles,
+    knots: np.ndarray,
+    seen: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    lift: float,
+    area: np.ndarray,
+    wavelength: float,
+) -> Crossings:
+    """What changes between two knots (2, 3), of N points on surfaces, seen (2, N) from either.
+
+    Parameters
+    ----------
+    lift : rays start this far off the surface [m]
+    area : (N,) of the cells that the points stand for [m^2]
+    """
+    index = np.flatnonzero(seen[0] != seen[1]).astype(np.int32)
+    gained = seen[1][index].astype(bool)
+    p, n = points[index], normals[index]
+    low, high = np.zeros(index.size), np.ones(index.size)
+    for _ in range(HALVINGS if index.size else 0):
+        middle = (low + high) / 2
+        now = ~np.asarray(scene.ray_test(_rays(p, n, _between(knots, middle), lift)))
+        after = now == gained
+        low, high = np.where(after, low, middle), np.where(after, middle, high)
+    where = (low + high) / 2
+    width = _widths(scene, triangles, knots, np.where(gained, low, high), p, n, lift, area[index], wavelength)
+    return Crossings(index, where.astype(np.float32), width.astype(np.float32), gained)
+
+
+def _between(knots: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return knots[0] + share[:, None] * (knots[1] - knots[0])
+
+
+def _rays(points: np.ndarray, normals: np.ndarray, places: np.ndarray, lift: float) -> mi.Ray3f:
+    """From points lifted off their surfaces to a place each."""
+    side = np.sign(((places - points) * normals).sum(1))
+    start = points + lift * side[:, None] * normals
+    span = places - start
+    length = np.linalg.norm(span, axis=1)
+    span /= length[:, None]
+    ray = mi.Ray3f(mi.Point3f(*np.ascontiguousarray(start.T, np.float32)), mi.Vector3f(*np.ascontiguousarray(span.T, np.float32)))
+    ray.maxt = mi.Float((length - lift).astype(np.float32))  # type: ignore[assignment]
+    return ray
+
+
+def _widths(scene, triangles, knots, dark, points, normals, lift, area, wavelength):  # type: ignore[no-untyped-def]
+    """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way between two knots."""
+    if not points.shape[0]:
+        return np.zeros(0)
+    places = _between(knots, dark)
+    hit = scene.ray_intersect_preliminary(_rays(points, normals, places, lift))
+    dr.eval(hit)  # once, not for each of its parts
+    near, triangle = np.asarray(hit.t, np.float64), triangles.rows(hit)
+    found = triangle >= 0
+    corners = triangles.corners[triangle].astype(float)
+    span = points - places
+    length = np.linalg.norm(span, axis=1)
+    ray = span / length[:, None]
+    behind = np.clip(near, lift, length - lift)
+    at = points - behind[:, None] * ray
+    along = np.roll(corners, -1, axis=1) - corners
+    size = np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)
+    along = along / size
+    way = at[:, None] - corners
+    share = np.clip((way * along).sum(2, keepdims=True), 0, size)
+    edge = along[np.arange(len(at)), np.linalg.norm(way - share * along, axis=2).argmin(axis=1)]
+    across = np.cross(edge, ray)
+    size = np.linalg.norm(across, axis=1)
+    across /= np.maximum(size, 1e-9)[:, None]
+    flight = knots[1] - knots[0]
+    pace = np.abs(across @ (flight / np.linalg.norm(flight)))
+    before = length - behind
+    unit = wavelength * behind * length / (2 * before)
+    cell = HALF_WIDTH**2 * area * (1 - (across * normals).sum(1) ** 2)
+    with np.errstate(divide="ignore"):
+        width = before / (behind * pace) * np.sqrt(unit + cell)
+    return np.where(found & (size > 1e-6), width, np.inf)

@@ -1,0 +1,124 @@
+"""The paper's urban clutter: a run of range cells with Rayleigh amplitudes that stand still, on top of any propagation model.
+
+The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1", on average 10 dB over the target's; 40 to 50 consecutive
+range cells; their centre drawn between 20 and 30 m; velocity 0. What it leaves open is a key of `clutter`:
+
+- 10 dB of mean power or of mean amplitude (`level_of`), over the link's reference path: at a PT its line of sight, which the paper
+  calls its target;
+- where the centre is (`centre`, `centre_m`); a run that would begin before cell 1 is moved out, not cut;
+- whether all is drawn anew in every frame (`redraw`) - independent amplitudes from frame to frame, but constant, so coherent, within one;
+- scatterers on the range grid, or anywhere in their cells (`place`), where their sidelobes show;
+- directions (`direction`); uniform in azimuth and elevation over the field of view. At a terminal's own link a wave leaves where it
+  comes from, between two terminals the two directions are independent;
+- "strong correlation between adjacent distance grids" (`cell_correlation`, a first-order autoregression along the cells).
+
+Each scatterer is a path of kind DIFFUSE with a delay rate of exactly 0: clutter that stands still relative to the receiver, which a
+city does for a hovering one only. Being a path of the transmitter's chirps it carries their data, as the paper does not say.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from scipy.signal import lfilter
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.randomness import generator
+from isac_rt.scenario.tree import Clutter
+from isac_rt.world.swarm import Pose
+
+Link = tuple[str, str]
+
+
+class _Paths(Protocol):
+    @property
+    def dropped(self) -> int: ...
+
+    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> dict[Link, PathSet]: ...
+
+
+def rayleigh_cells(
+    clutter: Clutter, range_cell: float, reference_range: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """One draw of the run.
+
+    Parameters
+    ----------
+    range_cell : [m]
+    reference_range : of the reference path [m], the centre where `clutter.centre` says so
+
+    Returns
+    -------
+    ranges : (K,) [m], one in each of K consecutive cells from cell 1 on
+    amplitudes : (K,) complex, circular Gaussian - Rayleigh magnitude, uniform phase - relative to the reference path's amplitude
+    """
+    low, high = clutter.cells
+    count = int(rng.integers(low, high + 1))
+    drawn = rng.uniform(*clutter.centre_m)
+    centre = (drawn if clutter.centre == "drawn" else reference_range) / range_cell
+    first = max(round(centre - (count - 1) / 2), 1)
+    inside = rng.uniform(-0.5, 0.5, count)
+    ranges = (first + np.arange(count) + (inside if clutter.place == "drawn" else 0.0)) * range_cell
+    white = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+    rho = clutter.cell_correlation
+    white[1:] *= np.sqrt(1 - rho**2)
+    mean_power = 10 ** (clutter.level_db / 10) * (4 / np.pi if clutter.level_of == "amplitude" else 1.0)
+    return ranges, np.sqrt(mean_power) * lfilter([1.0], [1.0, -rho], white)
+
+
+class RayleighClutter:
+    """A propagation model with the paper's clutter on every link."""
+
+    def __init__(
+        self, model: _Paths, reference: FreeSpace, clutter: Clutter, waveform: Waveform, antennas: Antennas, seed: int
+    ) -> None:
+        self._model, self._reference, self._clutter = model, reference, clutter
+        self._waveform, self._antennas, self._seed = waveform, antennas, seed
+
+    @property
+    def dropped(self) -> int:
+        """Of the model below."""
+        return self._model.dropped
+
+    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> dict[Link, PathSet]:
+        """The model's paths and the clutter's; the draw depends on seed, link and, unless drawn once, epoch."""
+        found = self._model.paths(poses, epoch, links)
+        return {link: merge([p, self._scatterers(p, poses, epoch)]) for link, p in found.items()}
+
+    def _scatterers(self, paths: PathSet, poses: dict[str, Pose], epoch: float) -> PathSet:
+        tx, rx = paths.tx, paths.rx
+        passes = 2 if tx == rx else 1
+        other = self._reference.strongest_target(poses, tx) if tx == rx else rx
+        between = poses[other].position - poses[tx].position
+        distance = float(np.linalg.norm(between))
+        when = "run" if self._clutter.redraw == "once" else repr(float(epoch))
+        rng = generator(self._seed, "rayleigh clutter", tx, rx, when)
+        ranges, amplitudes = rayleigh_cells(self._clutter, self._waveform.range_cell(passes), distance, rng)
+        departure = arrival = np.tile(between / distance, (ranges.size, 1))
+        if tx != rx:
+            arrival = -departure
+        if self._clutter.direction == "field_of_view":
+            departure = arrival = poses[tx].to_world(self._directions(ranges.size, rng))
+            if tx != rx:
+                arrival = poses[rx].to_world(self._directions(ranges.size, rng))
+        return make_paths(
+            gain=self._reference.reference_amplitude(poses, tx, rx) * amplitudes,
+            delay=passes * ranges / SPEED_OF_LIGHT,
+            departure=departure,
+            arrival=arrival,
+            kind=PathKind.DIFFUSE,
+            epoch=epoch,
+            tx=tx,
+            rx=rx,
+            target_names=paths.target_names,
+        )
+
+    def _directions(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within half the field of view."""
+        azimuth, elevation = rng.uniform(-self._antennas.half_view, self._antennas.half_view, (2, count))
+        flat = np.cos(elevation)
+        return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=1)

@@ -1,0 +1,1 @@
+"""Ways from one end to the other over walls, edges and bodies, in float64: what a path of several legs is made of."""

@@ -1,0 +1,100 @@
+"""The swarm's own bodies in the way of waves: each an opaque disc across the path, with its Fresnel shadow."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
+from isac_rt.scenario.swarm import Uav
+from isac_rt.world.swarm import Pose
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """All bodies at one instant, local coordinates.
+
+    Attributes
+    ----------
+    names : of the N bodies that have a size
+    places : (N, 3) [m]
+    radii : (N,) [m]
+    """
+
+    names: tuple[str, ...]
+    places: np.ndarray
+    radii: np.ndarray
+
+    @classmethod
+    def of(cls, uavs: dict[str, Uav], poses: dict[str, Pose]) -> Bodies:
+        """Bodies of a scenario's UAVs where they are."""
+        names = tuple(name for name, uav in uavs.items() if uav.body_radius_m > 0 and name in poses)
+        places = np.array([poses[name].position for name in names]).reshape(-1, 3)
+        return cls(names, places, np.array([uavs[name].body_radius_m for name in names]))
+
+    def factor(self, chain: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
+        """Amplitude factor of paths past the bodies: the product of `disc` over the bodies and the straight parts.
+
+        Parameters
+        ----------
+        chain : (K, B + 2, 3) both ends and the B points between them at which each path is mirrored or bent
+        wavelength : [m]
+        spared : names of the bodies at the ends and of the one that echoes; a body does not shadow itself
+
+        Returns
+        -------
+        (K,) complex128
+        """
+        out = np.ones(len(chain), complex)
+        lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
+        total, before = lengths.sum(axis=1), np.cumsum(lengths, axis=1) - lengths
+        for k in range(chain.shape[1] - 1):
+            self._shade(out, chain[:, k], chain[:, k + 1], before[:, k], total, wavelength, spared)
+        return out
+
+    def sight(self, place: np.ndarray, points: np.ndarray, distance: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
+        """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,) [m]."""
+        out = np.ones(len(points), complex)
+        self._shade(out, np.broadcast_to(place, points.shape), points, np.zeros(len(points)), distance, wavelength, spared)
+        return np.abs(out)
+
+    def _shade(self, out, starts, ends, before, total, wavelength: float, spared: Collection[str]) -> None:
+        """Multiply `out` by the factors of straight parts that begin `before` along paths of length `total`."""
+        for name, place, radius in zip(self.names, self.places, self.radii, strict=True):
+            if name in spared:
+                continue
+            path, off, along = _near(starts, ends, before, total, place, radius, wavelength, LIT_REACH)
+            if path.size:
+                far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
+                unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
+                nu, size = off / unit, radius / unit
+                out[path] *= tapered(disc(nu, size), nu - size)
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(starts, ends, before, total, place, radius, wavelength, reach):
+    """Paths whose straight part passes the body within its shadow's reach, the distance of its centre, and that along the path."""
+    which, off, along = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
+    for i in range(starts.shape[0]):
+        sx, sy, sz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]
+        wx, wy, wz = place[0] - starts[i, 0], place[1] - starts[i, 1], place[2] - starts[i, 2]
+        square, dot = sx * sx + sy * sy + sz * sz, sx * wx + sy * wy + sz * wz
+        if dot <= 0 or dot >= square:
+            continue
+        away = wx * wx + wy * wy + wz * wz
+        across = away - dot * dot / square
+        # a Fresnel unit is at most that of an endless path
+        edge = radius + reach * np.sqrt(wavelength * (before[i] + np.sqrt(away) + radius) / 2)
+        if across > edge * edge:
+            continue
+        at = before[i] + dot / np.sqrt(square)
+        near, far = max(at, radius), max(total[i] - at, radius)
+        h = np.sqrt(max(across, 0.0))
+        if h - radius < reach * np.sqrt(wavelength * near * far / (2 * (near + far))):
+            which.append(i)
+            off.append(h)
+            along.append(at)
+    return np.array(which, np.int64), np.array(off), np.array(along)

@@ -1,0 +1,65 @@
+"""What mirror reflections do to a vertically polarised wave: slab coefficients along chains of walls, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.legs.geometry import Legs
+from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
+from isac_rt.world.city.mesh import City
+
+
+def slab_coefficients(material: Material, cosine: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Complex reflection coefficients of a slab for TE and TM waves over the cosine of incidence (ITU-R P.2040-3, eqs. 37, 43, 44),
+    less what the material scatters."""
+    omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
+    eta = material.relative_permittivity - 1j * material.conductivity / (omega * VACUUM_PERMITTIVITY)
+    root = np.sqrt(eta - (1 - cosine**2))
+    turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
+    mirrored = np.sqrt(1 - material.scattering_coefficient**2)
+    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
+    first, second = (mirrored * r * (1 - turn) / (1 - r**2 * turn) for r in (te, tm))
+    return first, second
+
+
+def vertical(direction: np.ndarray) -> np.ndarray:
+    """(K, 3) the spherical unit vector theta of directions (K, 3): the field of a vertically polarised isotropic element.
+
+    A vertical direction leaves it open; it is x then.
+    """
+    flat = np.hypot(direction[:, 0], direction[:, 1])
+    safe = np.where(flat > 0, flat, 1.0)
+    x, y = np.where(flat > 0, direction[:, 0] / safe, 1.0), direction[:, 1] / safe
+    return np.stack([direction[:, 2] * x, direction[:, 2] * y, -flat], axis=1)
+
+
+def mirror_amplitude(city: City, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float) -> np.ndarray:
+    """(K,) complex amplitudes of unfolded chains between isotropic vertical elements, without the carrier phase.
+
+    Parameters
+    ----------
+    normals : (K, B, 3) unit normals of the chains' planes
+    faces : (K, B) faces, which say the material
+    legs : K legs
+    """
+    count, depth = faces.shape
+    field = vertical(legs.departure).astype(complex)
+    along = legs.departure
+    for b in range(depth):
+        normal = normals[:, b]
+        into = (along * normal).sum(1)
+        out = along - 2 * into[:, None] * normal
+        across = np.cross(along, normal)
+        size = np.linalg.norm(across, axis=1, keepdims=True)
+        level = np.cross(along, np.where(np.abs(along[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))  # any, at normal incidence
+        across = np.where(size > 1e-9, across / np.maximum(size, 1e-9), level / np.linalg.norm(level, axis=1, keepdims=True))
+        te, tm = np.empty(count, complex), np.empty(count, complex)
+        material = city.face_material[faces[:, b]]
+        for index in np.unique(material):
+            here = material == index
+            te[here], tm[here] = slab_coefficients(city.materials[index], np.minimum(np.abs(into[here]), 1.0), wavelength)
+        first, second = (field * across).sum(1), (field * np.cross(across, along)).sum(1)
+        field = (te * first)[:, None] * across + (tm * second)[:, None] * np.cross(across, out)
+        along = out
+    return (field * vertical(legs.arrival)).sum(1) * wavelength / (4 * np.pi * legs.length)

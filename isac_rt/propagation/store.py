@@ -1,0 +1,147 @@
+"""Traced paths on disk, by content: runs that differ only in noise, modulation or receivers share them.
+
+A file holds the paths of all links of one instant. Files appear whole (written beside, then renamed) and are touched when read; when
+the folder grows beyond its limit the least recently used go. Several processes may share a folder: a file that another one
+takes away is traced again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isac_rt.propagation.pathset import PathSet
+from isac_rt.world.swarm import Pose
+
+Link = tuple[str, str]
+Paths = dict[Link, PathSet]
+SUFFIX = ".paths.npz"
+LOW_WATER = 0.8
+"""When the limit is passed the folder is brought down to this share of it, so that not every write has to look."""
+
+
+@dataclass(frozen=True)
+class PathStore:
+    """A folder of path sets with a limit on its size [bytes]."""
+
+    folder: Path
+    limit: int = 4 * 1024**3
+
+    def get(self, key: str) -> tuple[Paths, int] | None:
+        """The paths of a key and how many the float64 geometry contradicted; None where they are not (or no longer) here."""
+        file = self._file(key)
+        try:
+            with np.load(file) as data:
+                found = _unpack({name: data[name] for name in data.files})
+            os.utime(file)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return None
+        return found
+
+    def put(self, key: str, paths: Paths, dropped: int) -> None:
+        """Keep the paths of a key. A folder that cannot be written is no reason to fail: nothing is kept then."""
+        file = self._file(key)
+        temporary = file.with_name(f".{uuid.uuid4().hex}.tmp")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with temporary.open("wb") as out:
+                np.savez(out, **_pack(paths, dropped))
+            os.replace(temporary, file)
+            self._make_room()
+        except OSError:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+    def _file(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}{SUFFIX}"
+
+    def _make_room(self) -> None:
+        entries = []
+        for file in self.folder.glob(f"*/*{SUFFIX}"):
+            try:
+                status = file.stat()
+            except OSError:
+                continue
+            entries.append((status.st_mtime_ns, status.st_size, file))
+        total = sum(size for _, size, _ in entries)
+        if total <= self.limit:
+            return
+        for _, size, file in sorted(entries, key=lambda e: e[0]):
+            if total <= LOW_WATER * self.limit:
+                break
+            file.unlink(missing_ok=True)
+            total -= size
+
+
+class CachedPropagation:
+    """A propagation model that looks into a store first, and is made only when something is missing there.
+
+    Parameters
+    ----------
+    make : makes the model
+    store : PathStore
+    content : all that the model's paths depend on but the instant and the links, as text
+    """
+
+    def __init__(self, make: Callable[[], Any], store: PathStore, content: str) -> None:
+        self._make, self._store, self._content = make, store, content
+        self._model: Any = None
+        self.dropped = 0
+
+    @property
+    def field(self) -> Any:
+        """The model's scatterers; None before it is made."""
+        return getattr(self._model, "field", None)
+
+    @property
+    def twice(self) -> Any:
+        """Its mirror images, None as long as all paths came from the store."""
+        return getattr(self._model, "twice", None)
+
+    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
+        """As the model's own, bit for bit."""
+        where = {
+            name: [p.position.tolist(), p.velocity.tolist(), p.acceleration.tolist(), p.rotation.tolist()] for name, p in poses.items()
+        }
+        text = json.dumps([self._content, epoch, links, where])
+        key = hashlib.sha256(text.encode()).hexdigest()
+        found = self._store.get(key)
+        if found is None:
+            if self._model is None:
+                self._model = self._make()
+            before = self._model.dropped
+            paths = self._model.paths(poses, epoch, links)
+            found = paths, self._model.dropped - before
+            self._store.put(key, *found)
+        self.dropped += found[1]
+        return found[0]
+
+
+def _pack(paths: Paths, dropped: int) -> dict[str, Any]:
+    """Flat arrays of path sets; what is no array goes into a JSON text."""
+    out: dict[str, Any] = {}
+    about = []
+    for i, p in enumerate(paths.values()):
+        about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
+        out |= {f"{i}/{f.name}": value for f in fields(p) if isinstance(value := getattr(p, f.name), np.ndarray)}
+    return out | {"about": np.array(json.dumps({"links": about, "dropped": dropped}))}
+
+
+def _unpack(data: dict[str, np.ndarray]) -> tuple[Paths, int]:
+    about = json.loads(str(data["about"]))
+    out = {}
+    for i, link in enumerate(about["links"]):
+        arrays = {f.name: data[f"{i}/{f.name}"] for f in fields(PathSet) if f"{i}/{f.name}" in data}
+        names = tuple(link["target_names"])
+        out[link["tx"], link["rx"]] = PathSet(**arrays, tx=link["tx"], rx=link["rx"], epoch=link["epoch"], target_names=names)
+    return out, about["dropped"]

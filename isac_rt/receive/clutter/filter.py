@@ -1,0 +1,105 @@
+"""The paper's clutter filter: find consecutive occupied range cells, then filter what lies in them.
+
+The paper (section V.A) says no more than that. Here a cell is occupied if its power exceeds the median over all cells, which
+most of the noise-only cells share, by `occupied_factor`; gaps of up to `GAP` cells are closed (Rayleigh amplitudes fade); a run
+counts as clutter from a least number of cells on. What happens in a run:
+
+- the AT, which has taken its data out, subtracts from each range cell what stands still over the chirps of each antenna and group.
+  A target at rest relative to the radar goes with it;
+  `zero_doppler` does so in all range cells, for clutter that is too weak or too short to make a run;
+- a PT, which does not know the data yet, leaves the run out of the symbol decision, chirp by chirp. A line of sight within
+  the run is left out too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from scipy import ndimage, stats
+
+from isac_rt.frame.schedule import Schedule
+from isac_rt.receive.spectrum import hann
+
+GAP = 3
+MARGIN = 2
+"""Cells that the window's main lobe reaches beyond a run."""
+FALSE_RATE = 1e-3
+LEAST_FACTOR = 2.0
+
+
+def occupied_factor(looks: float) -> float:
+    """Power over the median of noise, a mean of `looks` exponentials, from which on a cell is occupied; at least 3 dB."""
+    noise = stats.gamma(looks, scale=1 / looks)
+    return max(float(noise.isf(FALSE_RATE) / noise.median()), LEAST_FACTOR)
+
+
+def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
+    """Range cells in runs of at least `least` occupied ones, with a margin.
+
+    Parameters
+    ----------
+    power : (..., cells) mean power over `looks` independent channels, of a windowed spectrum (without a window the sidelobes of
+        strong clutter make one endless run)
+
+    Returns
+    -------
+    inside : as `power`, bool
+    """
+    lines = power.reshape(-1, power.shape[-1])
+    floor = np.median(lines, axis=1, keepdims=True)
+    occupied = lines > occupied_factor(looks) * floor
+    bridge = np.ones((1, GAP + 1), bool)
+    padded = np.pad(occupied, [(0, 0), (GAP, GAP)])
+    closed = ndimage.binary_closing(padded, bridge)[:, GAP:-GAP]
+    long = ndimage.binary_opening(closed, np.ones((1, least), bool))
+    return ndimage.binary_dilation(long, np.ones((1, 2 * MARGIN + 1), bool)).reshape(power.shape)
+
+
+def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
+    """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna and group.
+
+    Parameters
+    ----------
+    spectra : (M, L_rx, rows, P) windowed, data removed
+    least : cells of a run; None: every cell is filtered, in a run or not
+
+    Returns
+    -------
+    rows : (rows,) bool, those that were filtered
+    """
+    num_groups, num_rx, num_rows, num_chirps = spectra.shape
+    rows = np.ones(num_rows, bool)
+    if least is not None:
+        power = np.zeros(num_rows)
+        for channel in spectra.reshape(-1, num_rows, num_chirps):
+            power += (channel.real**2 + channel.imag**2).mean(axis=1)
+        rows = runs(power / (num_groups * num_rx), num_groups * num_rx * num_chirps, least)
+    chosen = np.flatnonzero(rows)
+    for m in range(num_groups):
+        part = spectra[m][:, chosen]
+        for tx in np.unique(schedule[m]):
+            sent = schedule[m] == tx
+            part[..., sent] -= part[..., sent].mean(axis=-1, keepdims=True)
+        spectra[m][:, chosen] = part
+    return rows
+
+
+def chirp_runs(samples: np.ndarray, turn: np.ndarray, least: int) -> np.ndarray:
+    """Cells of each chirp that lie in a run, before any data are known.
+
+    Parameters
+    ----------
+    samples : (L_rx, P, N) of one group
+    turn : (P, N) by which the decision derotates them
+
+    Returns
+    -------
+    inside : (P, N) bool
+    """
+    num_rx, _, num_samples = samples.shape
+    window = (turn * hann(np.arange(num_samples), num_samples)).astype(np.complex64)
+    power = np.zeros(samples.shape[1:], np.float32)
+    for one in samples:
+        spectrum = scipy.fft.fft(one * window, axis=-1, workers=1)
+        power += spectrum.real**2 + spectrum.imag**2
+    return runs(power / num_rx, num_rx, least)

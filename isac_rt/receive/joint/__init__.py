@@ -1,0 +1,1 @@
+"""All paths at once on the samples, at the Cramer-Rao bound."""

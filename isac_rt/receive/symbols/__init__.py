@@ -1,0 +1,1 @@
+"""How a passive terminal reads symbols."""

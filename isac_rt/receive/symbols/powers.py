@@ -1,0 +1,167 @@
+"""Delay symbols and DPSK symbols of a frame, given a prediction of the reference path.
+
+Every chirp is derotated by the predicted beat, fraction and migration included, so that the symbol is the number of the
+strongest cell. A prediction that is a whole cell off gives symbols that are all one off: the same signal. That is why
+the search runs a few cells past the alphabet (`raw`), where such a slip shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import stats
+
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.clutter.filter import chirp_runs
+from isac_rt.receive.estimate import beat_cells, middle_phase
+from isac_rt.receive.spectrum import data_phase, tones, window_length
+from isac_rt.receive.symbols.profile import correlate
+from isac_rt.receive.transform import transform
+from isac_rt.receive.types import Prediction
+
+EXTRA_CELLS = 4
+WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do not vote on the symbol
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """Decisions of a frame; shapes as in `Reception`.
+
+    `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a transition, the cosine-like share
+    |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions from their symbols [rad].
+    `looks` receivers are added in power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
+    """
+
+    raw: np.ndarray
+    delay: np.ndarray
+    delay_confidence: np.ndarray
+    transitions: np.ndarray
+    transition_confidence: np.ndarray
+    phase_spread: float
+    phases: np.ndarray
+    bits: np.ndarray
+    looks: int
+    soft_bits: np.ndarray | None = None
+
+
+@lru_cache(maxsize=64)
+def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
+    """Median delay confidence over a frame that noise alone exceeds in fewer than one frame in a million.
+
+    In noise the confidence is the largest of `num_cells` Gamma(L_rx) means. Its median over the chirps exceeds the level
+    that one chirp exceeds with probability q in P[Binomial(num_chirps, q) >= num_chirps/2].
+    """
+    share = np.linspace(0.01, 0.5, 491)
+    tail = stats.binom.sf(num_chirps // 2 - 1, num_chirps, share)
+    q = float(share[np.flatnonzero(tail < 1e-6)[-1]])
+    return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
+
+
+def symbol_cells(waveform: Waveform) -> np.ndarray:
+    """Where a derotated chirp may have its symbol: the alphabet and `EXTRA_CELLS` on both sides."""
+    return np.arange(-EXTRA_CELLS, waveform.num_delay_symbols + EXTRA_CELLS)
+
+
+def demodulate(
+    cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells: int | None = None, profile: np.ndarray | None = None
+) -> Symbols:
+    """Decide all symbols of a frame.
+
+    Parameters
+    ----------
+    cube : IFCube of a modulated frame
+    prediction : row 0 is the reference path; further rows vote with their predicted power
+    dpsk_order : D
+    run_cells : leave runs of so many occupied cells out of the decision (`isac_rt.receive.clutter.filter`); None: do not look
+    profile : (N,) power over noise in the cells from the reference on; given, the delay symbols are decided by correlation with it
+        (`isac_rt.receive.symbols.profile`), and predicted paths do not vote
+    """
+    w = cube.waveform
+    delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
+    beats = beat_cells(w, delays[0], rates[0])
+    others = [
+        (float(prediction.weight[k]), np.round(beat_cells(w, delays[k], rates[k]) - beats).astype(int))
+        for k in range(1, delays.size)
+        if prediction.weight[k] >= WEAKEST_WEIGHT
+    ]
+    shape = cube.schedule.shape
+    raw, sure = np.empty(shape, np.int64), np.empty(shape)
+    picked = np.empty((shape[0], cube.samples.shape[1], shape[1]), np.complex128)
+    cells = symbol_cells(w)
+    spectra = np.empty((picked.shape[1], cells.size, shape[1]), np.complex64)
+    for m in range(shape[0]):
+        turn = tones(-beats[m] / w.num_samples, w.num_samples)
+        power = np.zeros(turn.shape, np.float32)
+        transform(cube.samples[m], turn, cells, spectra, power=power)
+        if run_cells is not None:
+            power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
+        if profile is not None:
+            power = correlate(power, profile)
+        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others] if profile is None else [], w)
+        if profile is not None:  # next to the right symbol the template still overlaps itself: the mean of the rest is not the noise's
+            sure[m] = power.max(axis=1) / np.median(power, axis=1)
+        picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
+    delay = np.clip(raw, 0, w.num_delay_symbols - 1)
+    known = known_cycles(w, delays[0], rates[0], raw)
+    picked *= np.exp(-2j * np.pi * known)[:, None, :]
+    transitions, share, spread = decide_transitions(picked, cube.schedule, w.num_tx, dpsk_order)
+    return Symbols(
+        raw=raw,
+        delay=delay,
+        delay_confidence=sure,
+        transitions=transitions,
+        transition_confidence=share,
+        phase_spread=spread,
+        phases=running_phases(transitions, cube.schedule, dpsk_order),
+        bits=demodulate_bits(delay, transitions, w, dpsk_order),
+        looks=cube.samples.shape[1],
+    )
+
+
+def known_cycles(waveform: Waveform, delay: float, delay_rate: float, raw: np.ndarray) -> np.ndarray:
+    """(M, P) phase [cycles] of the picked cells of a path that is as predicted and carries the symbols `raw`, but for its DPSK."""
+    w, beats = waveform, beat_cells(waveform, delay, delay_rate)
+    cycles = middle_phase(w, delay, delay_rate) - beats * (window_length(w) / 2 / w.num_samples)
+    return cycles + data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay
+
+
+def decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+    """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from (P, N) power."""
+    cells = symbol_cells(waveform)
+    metric = power[:, cells % waveform.num_samples].astype(np.float64)
+    chirps = np.arange(power.shape[0])[:, None]
+    for weight, offset in others:
+        metric += weight * power[chirps, (cells[None, :] + offset[:, None]) % waveform.num_samples]
+    best = metric.argmax(axis=1)
+    peak = metric[chirps[:, 0], best]
+    rest = (metric.sum(axis=1) - peak) / (cells.size - 1)
+    return cells[best], peak / np.maximum(rest, 1e-300)
+
+
+def decide_transitions(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of the earlier one."""
+    chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
+    product = chains[..., 1:] * chains[..., :-1].conj()
+    summed = product.sum(axis=2)
+    steps = np.angle(summed) / (2 * np.pi / order)
+    symbols = np.round(steps).astype(np.int64) % order
+    spread = float(np.sqrt(np.mean((steps - np.round(steps)) ** 2)) * 2 * np.pi / order)
+    share = np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
+    return symbols, share, spread
+
+
+def moves_as_predicted(symbols: Symbols, order: int) -> bool:
+    """Whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
+
+    The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole symbols of its Doppler, so that
+    a reflection always ends up near the predicted cell. But unless it moves as predicted its phases lie anywhere between the symbols:
+    a spread of pi/D/sqrt(3). The spread from noise is sqrt((1 + 1/(2 g)) / (L_rx g)) with g the SNR of a cell.
+    """
+    anywhere = np.pi / order / np.sqrt(3)
+    g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)
+    from_noise = np.sqrt((1 + 1 / (2 * g)) / (symbols.looks * g))
+    return bool(from_noise > 0.6 * anywhere or symbols.phase_spread < 0.8 * anywhere)

@@ -1,0 +1,408 @@
+r"""The error budget: what a scene needs, link by link and frame by frame, with the bound of what is left out.
+
+Phases. Two approximations turn the phase of a path that is kept; each may use half of ``accuracy.max_phase_error_rad``:
+
+- plane for spherical wavefronts: an element at r from its array's centroid errs by :math:`k r^2/(2R)\,(1 + r/R)` at most, at a
+  wavefront of radius R; a line of sight also by :math:`k\, r_{tx} r_{rx}/R` (the joint term);
+- straight for accelerated flight within a frame: :math:`\pi f_c |\ddot\tau| t^2`, t to the farthest chirp of the frame.
+
+Left out. Paths the IF filter stops in every group, chirp and symbol are left out at no error. Ghosts and paths of the city so weak that
+all that are left out of one range cell together stay ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna
+cell: powers add, whatever the phases, on average. Between traced instants chains of walls are unfolded anew without error
+(`isac_rt.propagation.legs.between`) but for those that live for less than the way between two instants. Of n chains, of which b are born
+and d die from one instant to the next, with lives that end at random, b d / (6 n) are missed in a frame in between on average.
+
+What is not modelled whatever the budget (`standing`): directions that turn within a frame, jerk, motion during the flight of light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.level import transmit_amplitude
+from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.clutter.cells import Density, error_for
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.scenario.environment import Clutter
+from isac_rt.scenario.file import ScenarioError
+from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.choice import SHIPPED, CostModel
+from isac_rt.signal.choice import read as read_costs
+from isac_rt.signal.gridded import GRIDDED_ERROR
+from isac_rt.signal.if_signal import Method
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Swarm
+
+FASTEST_UNTRACED_M = 4.0
+"""Flight between traced instants under the preset fastest."""
+FASTEST_WEAKEST_DB = 0.0
+MOST_DIRECT = 2000
+"""Paths up to which the preset everything takes the direct synthesis, whose time grows with them; beyond, "auto"."""
+
+
+REACH_MARGIN_M = 1.0
+"""Of the mesh, for accelerations within a frame."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """What was kept of the paths of one link in one frame, and the bounds of the rest.
+
+    Attributes
+    ----------
+    found, unheard, weak : number of paths found, stopped by the IF filter and left out as too weak
+    kept : by kind
+    bounces : most bounces of a kept path
+    left_out : largest power left out of one range cell over the noise of a cell (linear)
+    plane, straight : kept paths with a plane wavefront, without acceleration
+    plane_error, straight_error : bounds of their phase errors [rad]
+    """
+
+    found: int
+    unheard: int
+    weak: int
+    kept: dict[str, int]
+    bounces: int
+    left_out: float
+    plane: int
+    straight: int
+    plane_error: float
+    straight_error: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The decisions of a run that are taken before it."""
+
+    scenario: Scenario
+    waveform: Waveform
+    antennas: Antennas
+    timetable: Timetable
+    swarm: Swarm
+
+    @property
+    def preset(self) -> str:
+        return self.scenario.accuracy.preset
+
+    @property
+    def phase_share(self) -> float:
+        """Most that either approximation may turn a phase [rad]."""
+        return {"everything": 0.0, "fastest": np.inf}.get(self.preset, self.scenario.accuracy.max_phase_error_rad / 2)
+
+    @property
+    def weakest(self) -> float:
+        """Power that may be left out of a range cell over the noise of a cell (linear)."""
+        if self.preset == "everything":
+            return 0.0
+        db = self.scenario.propagation.weakest_path_db
+        return float(10 ** (-(min(db, FASTEST_WEAKEST_DB) if self.preset == "fastest" else db) / 10))
+
+    @property
+    def max_untraced(self) -> float:
+        """Most flight between traced instants [m]."""
+        return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(self.preset, self.scenario.accuracy.max_untraced_m)
+
+    def __post_init__(self) -> None:
+        _ = self.costs  # a bad file is told of before anything runs
+
+    def synthesis(self, num_paths: int) -> Method:
+        """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths."""
+        if self.preset == "fastest":
+            return "gridded"
+        return "direct" if self.preset == "everything" and num_paths <= MOST_DIRECT else "auto"
+
+    @property
+    def synthesis_error(self) -> float:
+        """Relative RMS error that the samples may have."""
+        return GRIDDED_ERROR if self.preset == "fastest" else self.scenario.accuracy.synthesis_error
+
+    @cached_property
+    def costs(self) -> CostModel:
+        """What the methods of synthesis are taken to cost.
+
+        Raises
+        ------
+        ScenarioError  If the file of accuracy.cost_model is none.
+        """
+        try:
+            return read_costs(self.scenario.cost_model_path() or SHIPPED)
+        except ValueError as problem:
+            raise ScenarioError(f"accuracy.cost_model: {problem}") from None
+
+    @cached_property
+    def traced_frames(self) -> tuple[int, ...]:
+        """Frames at whose epochs the city is traced: the first, the last, and as few in between as `max_untraced` allows.
+
+        Every frame is traced where frames are farther apart than that, or where nothing is to be traced.
+        """
+        frames = self.scenario.frames
+        if self.scenario.propagation.model != "ray_traced" or self.max_untraced == 0:
+            return tuple(range(frames))
+        places = np.array([[p.position for p in self.swarm.poses(self.timetable.epoch(f)).values()] for f in range(frames)])
+        flown = np.concatenate([np.zeros((1, places.shape[1])), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=2), axis=0)])
+        out = [0]
+        while out[-1] < frames - 1:
+            ahead = np.flatnonzero((flown[out[-1] + 1 :] - flown[out[-1]]).max(axis=1) <= self.max_untraced)
+            out.append(out[-1] + 1 + (int(ahead[-1]) if ahead.size else 0))
+        return tuple(out)
+
+    @property
+    def instants(self) -> tuple[float, ...]:
+        """Traced instants [s]; () if every frame is traced."""
+        if len(self.traced_frames) == self.scenario.frames:
+            return ()
+        return tuple(self.timetable.epoch(frame) for frame in self.traced_frames)
+
+    @cached_property
+    def longest_delay(self) -> float:
+        """A path with more delay than this reaches no receiver: the IF filter stops it in every group [s]."""
+        w = self.waveform
+        chosen = self.scenario.first_blocks() if self.timetable.blocks is None else self.timetable.blocks
+        blocks = list(chosen.values()) or [0]
+        apart = max(blocks) - min(blocks) + w.num_groups - 1
+        last = self.timetable.epoch(self.scenario.frames)
+        clocks = 2 * max(abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last for u in self.scenario.swarm.values())
+        return w.max_delay + self.scenario.radio.filter_transition_hz / w.slope + apart * w.group_spacing + clocks
+
+    @property
+    def reach(self) -> float:
+        """Farthest from its terminal that a surface can be heard [m]."""
+        return self.longest_delay * SPEED_OF_LIGHT / 2
+
+    def mesh_radius(self, centre: np.ndarray) -> float:
+        """A surface farther than this from a place takes part in nothing that is heard, whole metres [m].
+
+        All points of a path of length L, what shadows it included, lie within L/2 of the middle between its ends, which is no farther from
+        the place than the farther end. What moves during a frame adds its way. The field of view cuts nothing: a second wall may stand
+        outside it. Infinite where nothing is to be left out, and where the blocks, and with them the reach, are found out in the run.
+        """
+        s = self.scenario
+        if self.preset == "everything" or s.access.establish or s.propagation.model != "ray_traced":
+            return float(np.inf)
+        terminals = [name for name, uav in s.swarm.items() if uav.role != "target"]
+        poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(s.frames)]
+        farthest = max(float(np.linalg.norm(pose[name].position - centre)) for pose in poses for name in terminals)
+        fastest = max(float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values())
+        return float(np.ceil(farthest + self.reach + 2 * fastest * frame_reach(self.waveform) + REACH_MARGIN_M))
+
+    def cell_noise_gain(self) -> float:
+        """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell, per watt of noise in a sample."""
+        return transmit_amplitude(self.scenario.noise) ** 2 * self.waveform.num_samples * self.waveform.num_chirps
+
+    def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a range cell loses over the noise."""
+        over_noise = paths.power * self.cell_noise_gain() / noise_power
+        everything = self.preset == "everything"
+        heard = np.full(len(paths), True) if everything else paths.delay - motion(paths, self.waveform) <= self.longest_delay
+        always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
+        cell = np.floor(paths.delay / self.waveform.delay_step).astype(np.int64)
+        weak, left_out = faintest(np.where(heard & ~always, over_noise, np.inf), cell, self.weakest)
+        return heard, weak, left_out
+
+    def apply(self, paths: PathSet, noise_power: float) -> tuple[PathSet, Use]:
+        """What a link's frame needs of its paths.
+
+        Parameters
+        ----------
+        paths : all that were found
+        noise_power : of a sample at the receiver [W]
+        """
+        w = self.waveform
+        heard, weak, left_out = self.chosen(paths, noise_power)
+        kept = paths.select(heard & ~weak)
+        plane_error, straight_error = plane_bound(kept, self.antennas, w), straight_bound(kept, w)
+        plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
+        use = Use(
+            found=len(paths),
+            unheard=int((~heard).sum()),
+            weak=int(weak.sum()),
+            kept={name: count for name, count in kept.counts().items() if count},
+            bounces=int(kept.bounces.max(initial=0)),
+            left_out=left_out,
+            plane=int(plane.sum()),
+            straight=int(straight.sum()),
+            plane_error=float(plane_error[plane].max(initial=0.0)),
+            straight_error=float(straight_error[straight].max(initial=0.0)),
+        )
+        left = replace(
+            kept,
+            tx_radius=np.where(plane, np.inf, kept.tx_radius),
+            rx_radius=np.where(plane, np.inf, kept.rx_radius),
+            delay_accel=np.where(straight, 0.0, kept.delay_accel),
+        )
+        return left, use
+
+
+def frame_reach(waveform: Waveform) -> float:
+    """From the middle of a frame to its farthest sample [s]."""
+    return waveform.frame_duration / 2 + (waveform.num_groups - 1) * waveform.group_spacing
+
+
+def motion(paths: PathSet, waveform: Waveform) -> np.ndarray:
+    """(K,) most by which motion changes a delay within the frame [s]."""
+    t = frame_reach(waveform)
+    return np.abs(paths.delay_rate) * t + np.abs(paths.delay_accel) * t**2 / 2
+
+
+def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
+    """The faintest of each cell whose powers together stay within a limit.
+
+    Parameters
+    ----------
+    power : (K,); inf for what must stay
+    cell : (K,) int
+
+    Returns
+    -------
+    mask : (K,) bool
+    most : largest sum that a cell lost
+    """
+    if not len(power):
+        return np.zeros(0, bool), 0.0
+    order = np.lexsort([power, cell])
+    sorted_cell, sorted_power = cell[order], power[order]
+    total = np.zeros(len(power))
+    first = np.flatnonzero(np.diff(sorted_cell, prepend=sorted_cell[:1] - 1))
+    for begin, end in zip(first, np.append(first[1:], len(power)), strict=True):
+        total[begin:end] = np.cumsum(sorted_power[begin:end])
+    gone = total <= limit
+    mask = np.zeros(len(power), bool)
+    mask[order] = gone
+    return mask, float(total[gone].max(initial=0.0))
+
+
+def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.ndarray:
+    """(K,) bound of the phase error of a plane wavefront at the farthest elements [rad]."""
+    reach = [np.linalg.norm(positions, axis=1).max() for positions in (antennas.tx_positions, antennas.rx_positions)]
+    k = 2 * np.pi * (waveform.carrier_frequency + waveform.bandwidth) / SPEED_OF_LIGHT
+    out = np.zeros(len(paths))
+    for r, radius in zip(reach, (paths.tx_radius, paths.rx_radius), strict=True):
+        out += k * r**2 / (2 * radius) * (1 + r / radius)
+    return out + np.where(paths.kind == PathKind.LINE_OF_SIGHT, k * reach[0] * reach[1] / paths.rx_radius, 0.0)
+
+
+def straight_bound(paths: PathSet, waveform: Waveform) -> np.ndarray:
+    """(K,) bound of the phase error of leaving the acceleration out, at the ends of the frame [rad]."""
+    highest = waveform.carrier_frequency + waveform.bandwidth
+    return np.pi * highest * np.abs(paths.delay_accel) * frame_reach(waveform) ** 2
+
+
+def standing(paths: PathSet, antennas: Antennas, waveform: Waveform, speed: float) -> dict[str, float]:
+    """Phase errors of what is not modelled in any run, estimated [rad]: {what: largest over the paths}.
+
+    Parameters
+    ----------
+    speed : of the fastest body [m/s]
+    """
+    k = 2 * np.pi * waveform.carrier_frequency / SPEED_OF_LIGHT
+    t = frame_reach(waveform)
+    r = max(np.linalg.norm(positions, axis=1).max() for positions in (antennas.tx_positions, antennas.rx_positions))
+    nearest = np.minimum(paths.tx_radius, paths.rx_radius)
+    finite = nearest[np.isfinite(nearest)]
+    turning = float((k * r * speed * t / finite).max(initial=0.0))
+    flight = float((k * speed * paths.delay).max(initial=0.0))
+    return {"directions that turn within the frame": turning, "motion during the flight of light": flight}
+
+
+def missed_chains(found: float, born: float, died: float) -> float:
+    """Chains missed in a frame between two traced instants, on average (module docstring)."""
+    return born * died / (6 * found) if found else 0.0
+
+
+def decibels(ratio: float) -> float | None:
+    """10 log10; None for nothing."""
+    return round(float(10 * np.log10(ratio)), 2) if ratio > 0 else None
+
+
+def decisions(plan: Plan) -> dict[str, Any]:
+    """What is fixed before a run: the same in `isac-rt plan` and in summary.json."""
+    everything = plan.preset == "everything"
+    return {
+        "preset": plan.preset,
+        "max_phase_error_rad": None if np.isinf(plan.phase_share) else 2 * plan.phase_share,
+        "weakest_path_db": None if everything else round(float(-10 * np.log10(plan.weakest)), 6),
+        "traced_frames": len(plan.traced_frames) if plan.scenario.propagation.model == "ray_traced" else 0,
+        "max_untraced_m": plan.max_untraced,
+        "reach_m": None if everything else round(plan.reach, 3),
+        "synthesis": plan.synthesis(0),
+        "synthesis_error": plan.synthesis_error,
+        "cost_model": plan.costs.record(),
+    }
+
+
+def mechanisms(scenario: Scenario) -> dict[str, Any]:
+    """What is modelled of the propagation, as the scenario says."""
+    p, c = scenario.propagation, scenario.clutter
+    traced = p.model == "ray_traced"
+    return {
+        "propagation": p.model,
+        "max_bounces": p.max_bounces if traced and p.specular else 0,
+        "ghosts": traced and p.ghosts,
+        "leakage": traced and p.leakage.enabled,
+        "clutter": c.model,
+        "clutter_bounces": None if c.model not in ("field", "diffuse") else 2 if c.mirrors else 1,
+        "rays": p.rays if traced else None,
+        "clutter_rays": c.rays if c.model == "diffuse" else None,
+    }
+
+
+def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
+    """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
+
+    Parameters
+    ----------
+    model : the propagation, whose `field` is None where there is none, or where paths came from a store and it was not made; the same holds
+        for its `twice`
+
+    Returns
+    -------
+    record : area of a scatterer over its distance [m] and the error of the mean power that this brings, None without a field; faces
+        traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
+        without a field, and cells of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and the shares of
+        its power that they and all others send on, None without mirrors
+    """
+    field, twice = getattr(model, "field", None), getattr(model, "twice", None)
+    area = Density.of(clutter).per_metre if clutter.model == "field" else None
+    return {
+        "cell_area_per_metre_m": area,
+        "clutter_error_db": None if area is None else round(error_for(area), 4),
+        "city_faces": city.num_faces,
+        "city_faces_beyond_reach": city.num_beyond,
+        "scatterers": None if field is None else len(field.cells),
+        "scatterer_cells": None if field is None else field.num_candidates,
+        "mirrors": None
+        if twice is None
+        else {
+            name: {"count": len(kept), "share": round(sum(m.share for m in kept), 6), "share_left_out": round(twice.left_out[name], 6)}
+            for name, kept in twice.mirrors.items()
+        },
+    }
+
+
+def used(uses: Mapping[tuple[int, Link], Use], names: Mapping[Link, str]) -> dict[str, dict[str, Any]]:
+    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds of all frames."""
+    out = {}
+    for link in dict.fromkeys(link for _, link in uses):
+        rows = [asdict(use) for (_, of), use in uses.items() if of == link]
+        kinds = dict.fromkeys(kind for row in rows for kind in row["kept"])
+        per_frame = {
+            f"{name}_per_frame": round(float(np.mean([row[name] for row in rows])), 2)
+            for name in ("found", "unheard", "weak", "plane", "straight")
+        }
+        out[names.get(link, "->".join(link))] = {
+            "frames": len(rows),
+            **per_frame,
+            "kept_per_frame": {kind: round(float(np.mean([row["kept"].get(kind, 0) for row in rows])), 2) for kind in kinds},
+            "bounces": max(row["bounces"] for row in rows),
+            "left_out_db": decibels(max(row["left_out"] for row in rows)),
+            "plane_error_rad": max(row["plane_error"] for row in rows),
+            "straight_error_rad": max(row["straight_error"] for row in rows),
+        }
+    return out

@@ -1,0 +1,152 @@
+"""What a synthesis costs and how far off it may be, and from both what `auto` does with a cube's paths.
+
+Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K paths, fitted by `isac-rt bench --fit FILE`:
+
+.. math:: C L \\frac{N}{1024} (a_d + K b_d) \\text{ (direct)}, \\qquad C \\lceil L/16 \\rceil \\left(a_s \\frac{N}{1024} + K b_s\\right)
+    \\text{ (gridded, each setting)}
+
+Data do not enter: the delay symbols move paths over the grid. The coefficients that ship with the program stand in `cost_model.json`, with
+the machine they were measured on. Others are read only where a scenario names their file (``accuracy.cost_model``), so that a run
+depends on no machine unless its user says so.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.signal.gridded import ACCURATE, DEFAULT, LANES, Setting
+
+FORMAT = "isac_rt cost model 1"
+DIRECT = "direct"
+SHIPPED = Path(__file__).with_name("cost_model.json")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A setting of the gridded method that `auto` may take.
+
+    Attributes
+    ----------
+    name : of its coefficients
+    setting : `isac_rt.signal.gridded.Setting`
+    error : coefficients of 1, v and v^2 [m/s] in a bound of the relative RMS error against the full model of a path whose delay changes
+        by 2 v/c, up to |u| = 0.87 and the paper's 640 MHz (measured: `docs/performance_synthesis.md`)
+    """
+
+    name: str
+    setting: Setting
+    error: tuple[float, float, float]
+
+    def error_at(self, speed: np.ndarray) -> np.ndarray:
+        """The bound at each speed [m/s]."""
+        return np.polynomial.polynomial.polyval(speed, self.error)
+
+
+CANDIDATES = (
+    Candidate("gridded, 2.25 N, width 4", Setting(2.25, 4, True), (3e-4, 1.2e-6, 0.0)),
+    Candidate("gridded, 1.25 N, width 6", Setting(1.25, 6, True), (3e-4, 1.2e-6, 0.0)),
+    Candidate("gridded, 1.5 N, width 6", DEFAULT, (4e-5, 1.0e-6, 0.0)),
+    Candidate("gridded, 1.5 N, width 8, cubic", ACCURATE, (3e-6, 0.0, 4e-9)),
+)
+"""The first two alone go beyond 1e-4; the errors of the others meet it up to 60 and 155 m/s."""
+NAMES = (DIRECT, *(c.name for c in CANDIDATES))
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """Coefficients a and b of each method by its name [ns], and where they are from."""
+
+    source: str
+    chirp_ns: dict[str, float]
+    path_ns: dict[str, float]
+
+    def seconds(self, method: str, shape: tuple[int, ...], num_paths: float) -> float:
+        """CPU time of a cube of shape (M, L_rx, P, N) with so many paths [s]."""
+        groups, elements, chirps, samples = shape
+        fixed, each = self.chirp_ns[method], self.path_ns[method] * num_paths
+        if method == DIRECT:
+            return 1e-9 * groups * chirps * elements * samples / 1024 * (fixed + each)
+        return 1e-9 * groups * chirps * -(-elements // LANES) * (fixed * samples / 1024 + each)
+
+    def record(self) -> dict[str, Any]:
+        """For summary.json."""
+        return {"source": self.source, "chirp_ns": self.chirp_ns, "path_ns": self.path_ns}
+
+
+@lru_cache(maxsize=8)
+def read(file: Path) -> CostModel:
+    """The model of a file that `isac-rt bench --fit` wrote.
+
+    Raises
+    ------
+    ValueError  If the file cannot be read or is no such model: file, what is wrong, remedy.
+    """
+    remedy = f"make one with isac-rt bench --fit {file.name}"
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        methods = {name: data["methods"][name] for name in NAMES}
+        chirp, path = ({name: float(row[key]) for name, row in methods.items()} for key in ("chirp_ns", "path_ns"))
+    except OSError as problem:
+        raise ValueError(f"{file}: {problem.strerror or problem}; {remedy}") from None
+    except (ValueError, KeyError, TypeError) as problem:
+        raise ValueError(f"{file}: is no cost model ({type(problem).__name__}: {problem}); {remedy}") from None
+    if data.get("format") != FORMAT:
+        raise ValueError(f"{file}: format {data.get('format')!r} is not {FORMAT!r}; {remedy}")
+    values = np.array([*chirp.values(), *path.values()])
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        raise ValueError(f"{file}: costs must be above 0 ns; {remedy}")
+    return CostModel("shipped" if file == SHIPPED else file.name, chirp, path)
+
+
+def choose(
+    model: CostModel,
+    shape: tuple[int, ...],
+    power: np.ndarray,
+    speed: np.ndarray,
+    sight: np.ndarray,
+    *,
+    noise_power: float,
+    max_error: float,
+    max_direct: int,
+    num_paths: int | None = None,
+) -> tuple[Setting, np.ndarray]:
+    """The cheapest way of making a cube within an error: the setting of the grid, and which paths go direct past it.
+
+    With a setting go direct: lines of sight (their joint curvature is not gridded); paths too fast for `max_error`; and of those whose
+    error, integrated coherently over the cube, could exceed the noise of a cell, the `max_direct` strongest. All direct is a way too.
+
+    Parameters
+    ----------
+    power, speed, sight : (K,) of each path: received power [W], c |delay rate| / 2 [m/s], whether it is a line of sight
+    noise_power : per sample [W]
+    max_error : relative RMS error of the samples, at least that of the direct method (1e-6)
+    num_paths : whose cost decides, where those given are some of them
+    """
+    scale = 1.0 if num_paths is None else num_paths / max(power.size, 1)
+    best, least = (DEFAULT, np.ones(power.size, bool)), model.seconds(DIRECT, shape, scale * power.size)
+    top = np.zeros(power.size, bool)
+    top[np.argsort(-power, kind="stable")[:max_direct]] = True
+    for candidate in CANDIDATES:
+        error = candidate.error_at(speed)
+        strong = power * error**2 * float(np.prod(shape)) > noise_power
+        alone = (strong & top) | sight | (error > max_error)
+        if alone.all():
+            continue
+        cost = model.seconds(candidate.name, shape, scale * int((~alone).sum()))
+        if alone.any():
+            cost += model.seconds(DIRECT, shape, scale * int(alone.sum()))
+        if cost < least:
+            best, least = (candidate.setting, alone), cost
+    return best
+
+
+def speed_of(rate: np.ndarray, accel: np.ndarray, duration: float) -> np.ndarray:
+    """c/2 times the largest rate of delay within a frame [m/s], from rate and acceleration at its middle."""
+    return (np.abs(rate) + np.abs(accel) * duration / 2) * (SPEED_OF_LIGHT / 2)

@@ -1,0 +1,283 @@
+r"""IF samples of a flat list of paths: the exact model and the direct kernel.
+
+Cycles of the IF of one path (reference times conjugate of the received chirp), notes section 2:
+
+.. math:: \Phi = f_c\tau + \alpha\tau\,(u - \tau/2)
+
+with the delay tau counted from the reference chirp and u the time since its start. Every delay is float64 and every
+phase is reduced to one cycle in float64; f_c t is never formed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.vector import LANES, aligned, cos_sin_exact, floor, load, narrow, splat, store, zip_high, zip_low
+
+FAST = {"contract", "nnan", "ninf", "nsz"}
+"""Freedoms of the compiler that do not depend on the vector width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tones:
+    """K paths of Q links as plain arrays. Times are seconds since the middle of the frame.
+
+    Attributes
+    ----------
+    link : (K,) int64
+    factor : (K,) complex128, conj(path gain)
+    delay, rate, accel : (K,) float64, the clock of the transmitter included
+    begin, end : (K,) when the path lives
+    tx_delay, rx_delay : (K, L_tx), (K, L_rx) what an element adds to the delay [s]
+    cross_row : (K,) int64 row of `cross`
+    cross : (R, L_tx, L_rx) joint part of the element delays [s]; row 0 is zero
+    symbol_delay : (Q, M, P) delay of the data [s]
+    send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
+    antenna : (Q, M, P) int64 transmit element
+    """
+
+    link: np.ndarray
+    factor: np.ndarray
+    delay: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    tx_delay: np.ndarray
+    rx_delay: np.ndarray
+    cross_row: np.ndarray
+    cross: np.ndarray
+    symbol_delay: np.ndarray
+    send: np.ndarray
+    antenna: np.ndarray
+
+    def __len__(self) -> int:
+        return self.delay.shape[0]
+
+    def select(self, which: np.ndarray) -> Tones:
+        """The paths that a mask or an index array chooses."""
+        per_path = ("link", "factor", "delay", "rate", "accel", "begin", "end", "tx_delay", "rx_delay", "cross_row")
+        return Tones(**{k: v[which] if k in per_path else v for k, v in vars(self).items()})
+
+
+def filter_gain(beat: np.ndarray, sampling_rate: float, transition: float) -> np.ndarray:
+    """Amplitude gain of the IF filter: 1 on [0, f_s], a raised-cosine skirt of width `transition` [Hz] on both sides."""
+    outside = np.clip(np.maximum(-beat, beat - sampling_rate) / transition, 0.0, 1.0)
+    return 0.5 + 0.5 * np.cos(np.pi * outside)
+
+
+def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
+    """The model itself in float64, path by path, sample by sample: the oracle of the faster methods.
+
+    Returns
+    -------
+    samples : (M, L_rx, P, N) complex128
+
+    Notes
+    -----
+    Temporary memory is a few (P, N) arrays. The gain of the filter follows the beat at the middle of each chirp, seen from
+    the arrays' centroids; the filter's own transient is not modelled. Nor is the end of a chirp: at the edge of the skirt
+    (a negative beat) the received chirp ends transition/slope before the window does, 0.7 samples for 0.4 MHz.
+    """
+    w, t = waveform, tones
+    out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
+    for k in range(len(t)):
+        q = t.link[k]
+        for m in range(w.num_groups):
+            time = w.chirp_time[m][:, None] - w.frame_duration / 2 + w.fast_time
+            path = t.delay[k] + t.rate[k] * time + t.accel[k] * time**2 / 2
+            alive = (time >= t.begin[k]) & (time < t.end[k])
+            for source in range(w.num_groups):
+                base = path + t.symbol_delay[q, source][:, None] - (m - source) * w.group_spacing
+                passed = filter_gain(w.slope * base[:, w.num_samples // 2], w.sampling_rate, transition)
+                weight = (t.factor[k] * t.send[q, source] * passed)[:, None] * alive
+                if not weight.any():
+                    continue
+                antenna = t.antenna[q, source]
+                for rx in range(out.shape[1]):
+                    element = t.tx_delay[k, antenna] + t.rx_delay[k, rx] + t.cross[t.cross_row[k], antenna, rx]
+                    tau = base + element[:, None]
+                    cycles = (w.carrier_frequency * tau) % 1 + (w.slope * tau * (w.fast_time - tau / 2)) % 1
+                    out[m, rx] += weight * np.exp(2j * np.pi * cycles)
+    return out
+
+
+def sources(waveform: Waveform, tones: Tones, transition: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`, offsets. Both (C,) int64."""
+    w, t = waveform, tones
+    half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
+    motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
+    longest = float(t.symbol_delay.max(initial=0.0))
+    margin = transition / w.slope
+    paths, offsets = [], []
+    for offset in range(1 - w.num_groups, w.num_groups):
+        delay = t.delay - offset * w.group_spacing
+        passes = (delay + motion + longest >= -margin) & (delay - motion <= w.max_delay + margin)
+        paths.append(np.flatnonzero(passes))
+        offsets.append(np.full(paths[-1].size, offset))
+    return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
+
+
+def numbers(waveform: Waveform, transition: float) -> np.ndarray:
+    """The waveform as a vector for the kernels; the order is that of `chirp_terms` and its callers."""
+    w = waveform
+    middle = w.fast_time[w.num_samples // 2]
+    return np.array(
+        [
+            w.carrier_frequency,
+            w.slope,
+            w.sample_interval,
+            middle,
+            w.slot_duration,
+            w.group_spacing,
+            middle - w.frame_duration / 2,
+            w.sampling_rate,
+            transition,
+        ]
+    )
+
+
+@njit(inline="always")
+def chirp_terms(w, tau, rate, accel):
+    """Start phase [cycles], frequency [cycles/sample] and quadratic term of a path about the middle sample.
+
+    `tau`, `rate`: there, elements included. What is left out is cubic, below 1e-8 cycles for 10 m/s^2.
+    """
+    f_c, slope, ts, u = w[0], w[1], w[2], w[3]
+    b = rate * ts
+    a = accel * ts * ts / 2
+    phase = f_c * tau + slope * tau * (u - tau / 2)
+    frequency = (f_c + slope * (u - tau)) * b + slope * ts * tau
+    quadratic = (f_c + slope * (u - tau)) * a + slope * b * (ts - b / 2)
+    return phase - np.floor(phase), frequency, quadratic
+
+
+@njit(inline="always")
+def passed(w, tau):
+    """Gain of the IF filter for the centroid's delay `tau`."""
+    beat = w[1] * tau
+    outside = max(-beat, beat - w[7]) / w[8]
+    if outside <= 0.0:
+        return 1.0
+    if outside >= 1.0:
+        return 0.0
+    return 0.5 + 0.5 * np.cos(np.pi * outside)
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _turn(out, at, cycles, amplitude):
+    """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at + 16:]."""
+    c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
+    re, im = splat(np.float32(amplitude.real)), splat(np.float32(amplitude.imag))
+    store(out, at, re * c - im * s)
+    store(out, at + 16, re * s + im * c)
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadratic):
+    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`: of each 16 samples real parts, then
+    imaginary ones.
+
+    With X the middle of 16 samples and i = x - X the tone is exp(phase + frequency X + quadratic X^2) exp(frequency i + quadratic i^2)
+    (1 + j 4 pi quadratic X i), all phases reduced in float64; what is left out is the square of the last term, 1e-8 at 15 m/s.
+    """
+    within = load(places, 0)
+    _turn(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
+    lr, li, offset = load(lane, 0), load(lane, 16), narrow(within)
+    mr, mi = offset * lr, offset * li
+    blocks, bend = sums.shape[0] // 32, np.float32(4 * np.pi * quadratic)
+    for first in range(0, blocks, LANES):
+        x = load(places, 16) + splat(first * LANES - half)
+        _turn(starts, 0, splat(phase) + x * (splat(frequency) + x * splat(quadratic)), amplitude)
+        cross = narrow(x) * splat(bend)
+        store(starts, 32, splat(np.float32(0)) - cross * load(starts, 16))
+        store(starts, 48, cross * load(starts, 0))
+        for i in range(min(LANES, blocks - first)):
+            at = 32 * (first + i)
+            pr, pi, qr, qi = splat(starts[i]), splat(starts[16 + i]), splat(starts[32 + i]), splat(starts[48 + i])
+            store(sums, at, (load(sums, at) + pr * lr - pi * li) + (qr * mr - qi * mi))
+            store(sums, at + 16, (load(sums, at + 16) + pr * li + pi * lr) + (qr * mi + qi * mr))
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _flush(out, to, num_samples, sums, fresh):
+    """Write the sums of one chirp to its samples, from out[to] on, or add them, and clear them."""
+    zero = splat(np.float32(0))
+    for at in range(0, 2 * num_samples, 32):
+        re, im, here = load(sums, at), load(sums, at + 16), to + at
+        if at + 32 > 2 * num_samples:
+            for i in range(num_samples - at // 2):
+                out[here + 2 * i] = sums[at + i] if fresh else out[here + 2 * i] + sums[at + i]
+                out[here + 2 * i + 1] = sums[at + 16 + i] if fresh else out[here + 2 * i + 1] + sums[at + 16 + i]
+        elif fresh:
+            store(out, here, zip_low(re, im))
+            store(out, here + 16, zip_high(re, im))
+        else:
+            store(out, here, load(out, here) + zip_low(re, im))
+            store(out, here + 16, load(out, here + 16) + zip_high(re, im))
+        store(sums, at, zero)
+        store(sums, at + 16, zero)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _direct(out, shape, w, path, offset, link, factor, delay, rate, accel, begin, end, tx, rx, row, cross, symbol, send, antenna,
+            fresh, sums, starts, lane, places):  # fmt: skip
+    """Add the listed (path, group offset) to the samples of `shape`, or write them."""
+    groups, num_rx, chirps, num_samples = shape
+    half = float(num_samples // 2)
+    terms = np.empty((path.shape[0], 3))
+    weight = np.empty(path.shape[0], np.complex128)
+    chosen = np.empty(path.shape[0], np.int64)
+    for m in range(groups):
+        for p in range(chirps):
+            time = w[6] + p * w[4] + m * w[5]
+            count = 0
+            for i in range(path.shape[0]):
+                k, source = path[i], m - offset[i]
+                if source < 0 or source >= groups or time < begin[k] or time >= end[k]:
+                    continue
+                q = link[k]
+                tau = symbol[q, source, p] + delay[k] + (rate[k] + accel[k] * time / 2) * time - offset[i] * w[5]
+                amplitude = factor[k] * send[q, source, p] * passed(w, tau)
+                if amplitude == 0:
+                    continue
+                chosen[count], weight[count] = i, amplitude
+                terms[count, 0], terms[count, 1], terms[count, 2] = tau, rate[k] + accel[k] * time, antenna[q, source, p]
+                count += 1
+            if count == 0 and not fresh:
+                continue
+            for r in range(num_rx):
+                for i in range(count):
+                    k, a = path[chosen[i]], int(terms[i, 2])
+                    element = terms[i, 0] + tx[k, a] + rx[k, r] + cross[row[k], a, r]
+                    phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], accel[k])
+                    _tone(sums, starts, lane, places, half, weight[i], phase, frequency, quadratic)
+                _flush(out, 2 * num_samples * ((m * num_rx + r) * chirps + p), num_samples, sums, fresh)
+
+
+def add_direct(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, *, fresh: bool = False) -> None:
+    """Add paths one by one, every element with its own delay (wideband, spherical).
+
+    Relative error against `exact` below 1e-6: roundings of float32 (`_tone`). A path lives in whole chirps (it does where the
+    middle of the window lies in its life). Runs in one thread without the interpreter's lock.
+
+    Parameters
+    ----------
+    samples : (M, L_rx, P, N) complex64, contiguous, added to
+    fresh : write instead of adding, whatever `samples` held
+    """
+    path, offset = sources(waveform, tones, transition)
+    if path.size == 0:
+        if fresh:
+            samples[:] = 0
+        return
+    t, lanes = tones, np.arange(LANES)
+    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat([-1.0, 1.0], LANES)
+    blocks = -(-samples.shape[3] // LANES)
+    _direct(samples.reshape(-1).view(np.float32), samples.shape, numbers(waveform, transition), path, offset, t.link, t.factor, t.delay,
+            t.rate, t.accel, t.begin, t.end, t.tx_delay, t.rx_delay, t.cross_row, t.cross, t.symbol_delay, t.send, t.antenna,
+            fresh, aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)  # fmt: skip

@@ -1,0 +1,577 @@
+r"""IF samples of many paths through an oversampled grid of fast-time frequency (a non-uniform FFT per chirp).
+
+In each chirp every path is a tone of known start phase and frequency (float64). It is spread with a few weights on a grid of
+frequencies, all receive elements at once; one FFT and one division make the samples. Further sets of weights on the same
+grid points carry x and x^2 (x: time from the middle of the chirp), so that the quadratic phase of motion and the wideband
+delay of each receive element need no second transform:
+
+.. math:: z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx
+    z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
+
+with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the frequency sent tau earlier), c the
+mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa x). A cubic setting has a fourth set for x^3 - 3/5 x, of strength
+theta_l (jq - theta_l^2/6), and theta_l (1 - theta_l^2/10 + jq kappa) with x. The narrowband model has theta_l = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.fft
+from numba import njit
+
+from isac_rt.frame.waveform import Waveform, data_phase, shift_of, window_length
+from isac_rt.kernels.fourier import ROW, plan, transform
+from isac_rt.kernels.vector import (
+    LANES,
+    aligned,
+    cos_sin,
+    cos_sin_exact,
+    cube_memory,
+    floor,
+    load,
+    narrow,
+    splat,
+    store,
+    transpose,
+    zip_high,
+    zip_low,
+)
+from isac_rt.signal.direct import FAST, Tones, chirp_terms, filter_gain, numbers, passed, sources
+from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a grid is made. Errors and costs: docs/performance.md.
+
+    Attributes
+    ----------
+    oversampling : grid points per sample, at least
+    width : grid points per path, 2 to 16, even
+    wideband : delays of the receive elements applied to the whole chirp (to second order), not to its middle alone
+    cubic : the third order in x too, of a wideband setting
+    """
+
+    oversampling: float
+    width: int
+    wideband: bool
+    cubic: bool = False
+
+
+DEFAULT = Setting(1.5, 6, True)
+"""For runs: error below `GRIDDED_ERROR`."""
+GRIDDED_ERROR = 1e-4
+"""Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see tests/test_ifsignal.py)."""
+PROFILES = Setting(1.25, 6, True)
+"""For range cells made directly: error below `GRIDDED_ERROR` under the window, 3e-4 of samples."""
+ACCURATE = Setting(1.5, 8, True, True)
+"""Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square of the speed."""
+ACCURATE_ERROR = 5e-6
+_MANY = 4000  # paths that no longer stay in the second-level cache beside the grid; they are read once for several chirps
+_TOGETHER = 6
+_MARGIN = LANES  # rows beyond the grid
+_EXTRA = 2  # degree of the weights' polynomials above the width
+_STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
+_DOPPLER = 4 / 1024  # cycles per sample, more than motion and elements move a frequency
+_FIELDS = 3  # float64 of a path before its transmit elements' delays
+_ONE, _HALF, _SIXTH, _TENTH = np.float32(1), np.float32(0.5), np.float32(1 / 6), np.float32(1 / 10)
+_SKEW = np.float32(4 / 15)  # x (x^2 - 1/3) is nearest to 4/15 x
+_MEAN_CUBE = 3 / 5  # and x^3 to 3/5 x
+_BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on the grid
+
+
+@lru_cache(maxsize=16)
+def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.ndarray, np.ndarray]:
+    r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
+
+    A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2, weights such that
+    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c, j (x^3 - 3/5 x) for the four sets, x = -N/2 .. N/2
+    scaled to [-1, 1]. Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
+
+    Returns
+    -------
+    grid : G, number of grid frequencies
+    polynomials : (4, degree + 1, WIDTH) float32, highest power first
+    deconvolution : (N,) float32, D at x = n - N//2
+    """
+    half, degree = num_samples // 2, width + _EXTRA
+    grid = scipy.fft.next_fast_len(max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True)
+    x = np.arange(-half, half + 1)
+    nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
+    steps = np.arange(width) - (width - 1) / 2
+    basis = np.exp(2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None]))
+    scaled = x / half
+    skew = scaled**3 - _MEAN_CUBE * scaled
+    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 - mean_square(num_samples) + 0j, 1j * skew], axis=1)
+    beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * width
+    bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / width) ** 2, 0, None)))
+    for _ in range(12):
+        response = np.einsum("rxj,rj->rx", basis, bell)
+        deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
+        fits = [_real_least_squares(deconvolution[:, None] * b, goals) for b in basis]
+        bell = np.array([f[:, 0] for f in fits])
+    polynomials = np.array([np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(4)])
+    return grid, polynomials.astype(np.float32), deconvolution[:num_samples].astype(np.float32)
+
+
+def mean_square(num_samples: int) -> float:
+    """Mean of x^2 over the samples, x scaled to [-1, 1]."""
+    half = num_samples // 2
+    return float(((np.arange(num_samples) - half) ** 2).mean()) / half**2
+
+
+def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Real solution of a complex least-squares problem."""
+    both = np.concatenate([matrix.real, matrix.imag]), np.concatenate([goals.real, goals.imag])
+    return np.linalg.lstsq(*both, rcond=None)[0]
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _prepare(work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size):
+    """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the middle of the cell, complex factor
+    (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to `work`. `view`: see `views_of`."""
+    f_c, slope, ts, u = w[0], w[1], w[2], w[3] + view[1] * w[2]
+    delay, rate, accel, extra = load(table, at), load(table, at + 16), load(table, at + 32), load(table, at + tx)
+    tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
+    element = tau + extra
+    b, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
+    carrier = splat(f_c + slope * u)
+    sent = carrier - splat(slope) * element
+    cycles = element * (carrier - splat(slope / 2) * element)
+    frequency = sent * b + splat(slope * ts) * element
+    wanted = frequency - splat(view[0])
+    fold = floor(wanted + splat(view[3]))
+    wanted, cycles = wanted - fold, cycles - fold * splat(view[1])
+    store(places, 16, wanted)
+    wanted = wanted * splat(view[2])
+    place = (wanted - floor(wanted)) * splat(size * _BELOW)
+    cell = floor(place)
+    store(places, 0, cell)
+    store(work, 0, narrow(place - cell) - splat(_HALF))
+    bend = narrow((sent * a + splat(slope) * b * (splat(ts) - splat(0.5) * b)) * splat(half * half))
+    c, s = cos_sin(narrow(cycles - floor(cycles + splat(0.5))) + bend * splat(np.float32(centre)))
+    br, bi = load(factor, f), load(factor, f + 16)
+    sr, si = splat(np.float32(send.real)), splat(np.float32(send.imag))
+    ar, ai = br * sr - bi * si, br * si + bi * sr
+    store(work, 16, ar * c - ai * s)
+    store(work, 32, ar * s + ai * c)
+    store(work, 48, bend * splat(np.float32(2 * np.pi)))
+    store(work, 64, narrow((tau - splat(view[1] * ts)) * splat(1 / (ts * half))))
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _gate(work, table, at, life, f, w, time, symbol):
+    """Multiply the factors of 16 paths by the filter's gain, and by 0 when they are not alive."""
+    for i in range(16):
+        tau = table[at + i] + symbol + (table[at + 16 + i] + table[at + 32 + i] * time / 2) * time
+        alive = life[f + i] <= time < life[f + 16 + i]
+        gain = np.float32(passed(w, tau)) if alive else np.float32(0)
+        work[16 + i] *= gain
+        work[32 + i] *= gain
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _weigh(work, scratch, poly, taps, wideband, cubic):
+    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as they are."""
+    r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
+    width, degree = len(taps), len(taps) + _EXTRA
+    set_size = (degree + 1) * width
+    for j in range(width):
+        v0, v1, v2 = splat(poly[j]), splat(poly[set_size + j]), splat(poly[2 * set_size + j])
+        for d in range(1, degree + 1):
+            v0 = v0 * r + splat(poly[d * width + j])
+            v2 = v2 * r + splat(poly[2 * set_size + d * width + j])
+            if wideband:
+                v1 = v1 * r + splat(poly[set_size + d * width + j])
+        if wideband:
+            store(scratch, _STEP * j, v0)
+            store(scratch, _STEP * j + 16, v1)
+            store(scratch, _STEP * j + 32, v2)
+        else:
+            bent = q * v2
+            store(scratch, _STEP * j, c * v0 - s * bent)
+            store(scratch, _STEP * j + 16, s * v0 + c * bent)
+        if cubic:
+            v3 = splat(poly[3 * set_size + j])
+            for d in range(1, degree + 1):
+                v3 = v3 * r + splat(poly[3 * set_size + d * width + j])
+            store(scratch, _STEP * j + 48, v3)
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread(grid, base, places, scratch, count, taps, steer, k):
+    """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        ar, ai = load(steer, k), load(steer, k + 16)
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
+            c, s = splat(scratch[j]), splat(scratch[j + 16])
+            store(grid, at, load(grid, at) + c * ar - s * ai)
+            store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
+            at += ROW
+        k += 32
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _centred(steer, work, i, k):
+    """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary), theta and q."""
+    ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
+    c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
+    pr, pi = c * ar - s * ai, c * ai + s * ar
+    square = late * late
+    cosine, sine = splat(_ONE) - square * splat(_HALF), late - late * square * splat(_SIXTH)
+    return pr * cosine + pi * sine, pi * cosine - pr * sine, theta, splat(work[48 + i])
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, centre):
+    """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        er, ei, theta, q = _centred(steer, work, i, k)
+        minus = theta * theta * splat(-_HALF)
+        gr, gi = minus * er - q * ei, minus * ei + q * er
+        bow = minus * splat(centre)
+        skew = q * splat(_SKEW)
+        br, bi = theta * (er - skew * ei), theta * (ei + skew * er)
+        er, ei = er + bow * er, ei + bow * ei
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
+            u, v, w = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32])
+            store(grid, at, load(grid, at) + u * er + v * br + w * gr)
+            store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi + w * gi)
+            at += ROW
+        k += 48
+
+
+@njit(nogil=True, fastmath=FAST, error_model="numpy")
+def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, centre):
+    """The same to the third order: strengths of 1, j x, x^2 - c and j (x^3 - 3/5 x)."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        er, ei, theta, q = _centred(steer, work, i, k)
+        square = theta * theta
+        minus = square * splat(-_HALF)
+        gr, gi = minus * er - q * ei, minus * ei + q * er
+        third = square * splat(-_SIXTH)
+        tr, ti = theta * (third * er - q * ei), theta * (third * ei + q * er)
+        bow, skew, less = minus * splat(centre), q * splat(_SKEW), splat(_ONE) - square * splat(_TENTH)
+        br, bi = theta * (less * er - skew * ei), theta * (less * ei + skew * er)
+        er, ei = er + bow * er, ei + bow * ei
+        for tap in range(len(taps)):
+            j = i + _STEP * tap
+            u, v, w, x = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32]), splat(scratch[j + 48])
+            store(grid, at, (load(grid, at) + u * er + v * br) + (w * gr + x * tr))
+            store(grid, at + 16, (load(grid, at + 16) + u * ei + v * bi) + (w * gi + x * ti))
+            at += ROW
+        k += 48
+
+
+@njit(nogil=True)
+def _fold(grid, size, low, width):
+    """Wrap the margins: row g + low is frequency g, taken modulo the size of the grid."""
+    for i in range(0, low * ROW, 16):
+        store(grid, size * ROW + i, load(grid, size * ROW + i) + load(grid, i))
+    for i in range(low * ROW, width * ROW, 16):
+        store(grid, i, load(grid, i) + load(grid, size * ROW + i))
+
+
+@njit(nogil=True)
+def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolution, tile, fresh):
+    """Write the rows of the samples, divided by the kernel's response: channel r of sample n to out[at + r stride + 2 n]."""
+    half, size = num_samples // 2, order.shape[0]
+    for start in range(0, num_samples, 16):
+        count = min(16, num_samples - start)
+        for i in range(count):
+            mode = start + i - half
+            row = (low + order[mode if mode >= 0 else mode + size]) * ROW
+            d = splat(deconvolution[start + i])
+            store(tile, 16 * i, d * load(grid, row))
+            store(tile, 256 + 16 * i, d * load(grid, row + 16))
+        transpose(tile, 0)
+        transpose(tile, 256)
+        for r in range(channels):
+            to = at + r * stride + 2 * start
+            re, im = load(tile, 16 * r), load(tile, 256 + 16 * r)
+            if count == 16 and fresh:
+                store(out, to, zip_low(re, im))
+                store(out, to + 16, zip_high(re, im))
+            elif count == 16:
+                store(out, to, load(out, to) + zip_low(re, im))
+                store(out, to + 16, load(out, to + 16) + zip_high(re, im))
+            else:
+                for i in range(count):
+                    re_i, im_i = tile[16 * r + i], tile[256 + 16 * r + i]
+                    out[to + 2 * i] = re_i if fresh else out[to + 2 * i] + re_i
+                    out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
+
+
+@njit(nogil=True)
+def _in_band(work, places, count, limit):
+    """Strike out the paths from the frequency `limit` on; the number up to the last one that stays."""
+    last = 0
+    for i in range(count):
+        if places[16 + i] < limit:
+            last = i + 1
+        else:
+            work[16 + i], work[32 + i], places[i] = np.float32(0), np.float32(0), 0.0
+    return last
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, centre, taps, wideband, cubic, poly, deconvolution,
+            radices, twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, band, grid, work, scratch,
+            tile):  # fmt: skip
+    """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
+    _, num_rx, num_chirps, num_samples = shape
+    groups, size, low = send.shape[1], rows.shape[0], len(taps) // 2 - 1
+    channels, per_block, cells = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1), band.turn.shape[0]
+    top, skirt, per_delay = w[7] / w[1], w[8] / w[1], w[1] * w[2]
+    cut = top + skirt
+    stride, places = (size + _MARGIN) * ROW, np.zeros(32)
+    for start in range(0, chirps.shape[0], together):
+        now = chirps[start : start + together]
+        grid[:] = np.float32(0)
+        for b in range(blocks.shape[0]):
+            at, count = b * per_block, blocks[b, 2]
+            for g in range(now.shape[0]):
+                m, p, view = now[g] // num_chirps, now[g] % num_chirps, views[now[g]]
+                q, source = blocks[b, 0], m - blocks[b, 1]
+                if source < 0 or source >= groups or send[q, source, p] == 0:
+                    continue
+                time, delay = w[6] + view[1] * w[2] + p * w[4] + m * w[5], symbol[q, source, p]
+                tx = (_FIELDS + antenna[q, source, p]) * 16
+                least, most = bounds[b, 0] + delay, bounds[b, 1] + delay
+                if least > cut or most < -skirt:
+                    continue
+                low_end, high_end = least * per_delay - view[0], most * per_delay - view[0]
+                if low_end > view[4] + _DOPPLER and high_end < 1 - view[3] - _DOPPLER:
+                    continue
+                sent = send[q, source, p] * turns[now[g]]
+                _prepare(work, places, table, at, tx, factor, 32 * b, w, view, time, delay, sent, half, centre, size)
+                if blocks[b, 3] or least < 0 or most > top:
+                    _gate(work, table, at, life, 32 * b, w, time, delay)
+                used = _in_band(work, places, count, view[4]) if cells else count
+                _weigh(work, scratch, poly, taps, wideband, cubic)
+                if cubic:
+                    _spread_cubic(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
+                elif wideband:
+                    _spread_wideband(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
+                else:
+                    _spread(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 32)
+        for g in range(now.shape[0]):
+            m, p = now[g] // num_chirps, now[g] % num_chirps
+            table_g = grid[g * stride : (g + 1) * stride]
+            _fold(table_g, size, low, len(taps))
+            transform(table_g, low * ROW, size, radices, twiddles)
+            if cells == 0:
+                to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
+                _emit(out, to, 2 * num_samples * num_chirps, channels, num_samples, table_g, low, rows, deconvolution, tile, fresh)
+                continue
+            block = (first_channel // 16 * shape[0] + m) * num_chirps + p
+            to_cells(table_g, low, rows, deconvolution, band, block * deconvolution.shape[0] * LANES, p % CHIRPS)
+            if p % CHIRPS == CHIRPS - 1 or p == num_chirps - 1:
+                to = 2 * ((m * num_rx + first_channel) * cells * num_chirps + p - p % CHIRPS)
+                write_cells(out, to, 2 * cells * num_chirps, channels, p % CHIRPS + 1, num_chirps, cells, band.stage, tile)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
+    """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from the last element on."""
+    count = min(LANES, rx_delay.shape[1] - first)
+    for i in range(path.shape[0]):
+        for r in range(count):
+            delay[r] = rx_delay[path[i], first + r]
+        late, at = load(delay, 0), i * planes * LANES
+        cycles = late * (splat(frequency) - splat(slope / 2) * late)
+        c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
+        store(out, at, c)
+        store(out, at + LANES, s)
+        if planes == 3:
+            store(out, at + 2 * LANES, narrow(late * splat(turn)))
+
+
+def _steering(waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first: int, wideband: bool) -> np.ndarray:
+    """Of each listed path the phasors of the up to 16 receive elements from `first` on at mid-window (real, imaginary) and, `wideband`,
+    their turn over half a chirp [rad]: (32 or 48 n,) float32."""
+    w, planes = waveform, 3 if wideband else 2
+    out = aligned(len(path) * planes * LANES)
+    middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
+    turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
+    _steer(out, planes, path, rx_delay, first, middle, w.slope, turn, np.zeros(LANES))
+    return out
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one offset.
+
+    Attributes
+    ----------
+    path : (16 B,) index into the tones, the last repeated where a block is not full
+    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit element
+    factor : float32, of each block 16 real and 16 imaginary parts
+    life : float64, of each block 16 begins and 16 ends
+    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
+    bounds : (B, 2) least and greatest delay in the frame, without data
+    """
+
+    path: np.ndarray
+    table: np.ndarray
+    factor: np.ndarray
+    life: np.ndarray
+    blocks: np.ndarray
+    bounds: np.ndarray
+
+
+def _blocks(waveform: Waveform, t: Tones, transition: float) -> _Blocks:
+    w = waveform
+    path, offset = sources(w, t, transition)
+    order = np.lexsort((t.delay[path], offset, t.link[path]))
+    path, offset = path[order], offset[order]
+    segment = np.cumsum(np.r_[True, np.diff(t.link[path] * (2 * w.num_groups) + offset) != 0]) - 1 if path.size else path
+    _, starts, counts = np.unique(segment, return_index=True, return_counts=True)
+    full = -(-counts // LANES)
+    first = np.concatenate([s + LANES * np.arange(f) for s, f in zip(starts, full, strict=True)] or [starts])
+    last = np.repeat(starts + counts, full) - 1
+    index = np.minimum(first[:, None] + np.arange(LANES), last[:, None])
+    k, lag = path[index], offset[index]
+    delay = t.delay[k] - lag * w.group_spacing
+    table = np.stack([delay, t.rate[k], t.accel[k], *np.moveaxis(t.tx_delay[k], 2, 0)], axis=1)
+    life = np.stack([t.begin[k], t.end[k]], axis=1)
+    reach = w.frame_duration / 2
+    motion = np.abs(t.rate[k]) * reach + np.abs(t.accel[k]) * reach**2 / 2
+    bounds = np.stack([(delay - motion).min(axis=1), (delay + motion).max(axis=1)], axis=1)
+    mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
+    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], np.minimum(last - first + 1, LANES), mortal], axis=1)
+    factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
+    return _Blocks(k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds)
+
+
+def add_gridded(
+    samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT, *, fresh: bool = False
+) -> None:
+    """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and 15 elements of the L).
+
+    Left out: the joint curvature `Tones.cross`; with `DEFAULT` the third order of the wideband term. A path lives in whole chirps. Runs
+    in one thread without the interpreter's lock; the result depends on nothing but the arguments.
+
+    Parameters
+    ----------
+    samples : (M, L_rx, P, N) complex64, contiguous, added to
+    fresh : write instead of adding, whatever `samples` held
+    """
+    if not _synthesise(samples, samples.shape, waveform, tones, transition, setting, fresh, no_band(), *_as_it_is(waveform)) and fresh:
+        samples[:] = 0
+
+
+def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+    """`views` and `turns` of `_synthesise` for samples."""
+    count = waveform.num_groups * waveform.num_chirps
+    return np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (count, 1)), np.ones(count, complex)
+
+
+def range_cells(waveform: Waveform, tones: Tones, transition: float, delay_symbols: np.ndarray, phases: np.ndarray, num_cells: int,
+                setting: Setting = PROFILES, power: float = 0.0, key: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
+    """Range cells under Hann's window, made directly (`isac_rt.signal.profiles`): what a transform of the windowed samples gives.
+
+    The window of a chirp with delay symbol D starts D / (alpha T) (the delay) after its first sample, and cell k is read at k + D, its
+    phase counted from the start of the window.
+
+    Parameters
+    ----------
+    delay_symbols : (M, P) int, D
+    phases : (M, P) complex, beta^(D), taken out with the symbols
+    num_cells : from cell 0, at most 3/4 of N: beyond the band a path's tail has no right phase
+    power, key : of white noise per IF sample [W], and its stream; no noise without a key
+
+    Returns
+    -------
+    cells : (M, L_rx, num_cells, P) complex64
+    """
+    w = waveform
+    if 4 * num_cells > 3 * w.num_samples:
+        raise ValueError(f"{num_cells} range cells of {w.num_samples} samples: at most three quarters can be made directly; take samples")
+    length = window_length(w)
+    band = make_band(w.num_samples, num_cells, length, 0.0 if key is None else power, np.zeros(2) if key is None else key)
+    start = np.ravel(shift_of(w, delay_symbols))
+    size = len(band.window)
+    pad = (size - num_cells) // 2 / w.num_samples
+    limit = num_cells / w.num_samples + pad if size < w.num_samples else 1.0
+    middle = start + length / 2 - w.num_samples // 2
+    one = np.ones(start.size)
+    views = np.stack([delay_symbols.ravel() / w.num_samples, middle, w.num_samples / size * one, pad * one, limit * one], axis=1)
+    shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
+    out = cube_memory((*shape[:2], num_cells, w.num_chirps))
+    cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(data_phase(w, delay_symbols))
+    turns = np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0))
+    _synthesise(out, shape, w, tones, transition, setting, True, band, views, turns)
+    return out
+
+
+def _synthesise(
+    out: np.ndarray, shape: tuple[int, ...], w: Waveform, t: Tones, transition: float, setting: Setting, fresh: bool, band: Band,
+    views: np.ndarray, turns: np.ndarray,
+) -> bool:  # fmt: skip
+    """Run the kernel over all elements; False, and nothing done, where no path can be heard and there is no band.
+
+    Parameters
+    ----------
+    views : (M P, 5) what of a chirp is wanted: cycles per sample taken off every frequency; samples from the middle one to the
+        origin; samples of the chirp to one of the grid's; frequencies below zero that are kept; first frequency left out
+    turns : (M P,) complex, factors of the chirps' paths
+    """
+    b = _blocks(w, t, transition)
+    if b.path.size == 0 and band.turn.size == 0:
+        return False
+    num_samples = len(band.window) or w.num_samples
+    size, poly, deconvolution = weights(num_samples, setting.oversampling, setting.width)
+    radices, twiddles, rows = plan(size)
+    together = _TOGETHER if b.path.size > _MANY else 1
+    buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(_STEP * setting.width), aligned(512)
+    chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(num_samples)
+    for first in range(0, shape[1], LANES):
+        steer = _steering(w, t.rx_delay, b.path, first, setting.wideband)
+        _chirps(out.reshape(-1).view(np.float32), shape, first, chirps, together, numbers(w, transition), views, turns,
+                float(w.num_samples // 2), centre, (0,) * setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(),
+                deconvolution, radices, twiddles, rows, b.table, b.factor, b.life, b.blocks, b.bounds, steer, t.symbol_delay,
+                t.send, t.antenna, fresh, band, *buffers)  # fmt: skip
+    return True
+
+
+def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT) -> None:
+    """What `add_gridded` does, path by path in numpy float64: its oracle, slow."""
+    w, t, half = waveform, tones, waveform.num_samples // 2
+    size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
+    values, centre, steps = numbers(w, transition), mean_square(w.num_samples), np.arange(setting.width) - setting.width // 2 + 1
+    e = t.rx_delay
+    steer = np.exp(2j * np.pi * (((w.carrier_frequency + w.slope * w.fast_time[half]) * e - w.slope * e**2 / 2) % 1))
+    theta = 2 * np.pi * w.slope * w.sample_interval * half * e
+    for m, p in np.ndindex(w.num_groups, w.num_chirps):
+        grid = np.zeros((size, samples.shape[1]), complex)
+        time = values[6] + p * values[4] + m * values[5]
+        for k, offset in zip(*sources(w, t, transition), strict=True):
+            q, source = t.link[k], m - offset
+            if not (0 <= source < w.num_groups and t.begin[k] <= time < t.end[k]):
+                continue
+            tau = t.symbol_delay[q, source, p] + t.delay[k] + (t.rate[k] + t.accel[k] * time / 2) * time - offset * w.group_spacing
+            gain = filter_gain(np.array(w.slope * tau), w.sampling_rate, transition)
+            sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
+            phase, frequency, bend = chirp_terms(values, sent, t.rate[k] + t.accel[k] * time, t.accel[k])
+            z = gain * t.factor[k] * t.send[q, source, p] * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
+            turn, lag = 2 * np.pi * bend * half**2, tau / (w.sample_interval * half)
+            cell, r = divmod(frequency % 1 * size, 1)
+            one, x, square, cube = (np.polyval(poly[i], r - 0.5) for i in range(4))
+            slant = theta[k] if setting.wideband else np.zeros_like(theta[k])
+            third = slant if setting.cubic else np.zeros_like(slant)
+            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(x, slant * (1 - third**2 / 10 + 4j / 15 * turn))
+            strengths += np.outer(cube, third * (1j * turn - third**2 / 6))
+            strengths += np.outer(square, 1j * turn - slant**2 / 2)
+            strengths = strengths * steer[k] * np.exp(-1j * lag * slant)
+            np.add.at(grid, (int(cell) + steps) % size, z * strengths)
+        modes = (np.arange(w.num_samples) - half) % size
+        samples[m, :, p] += (np.fft.ifft(grid, axis=0, norm="forward")[modes] * deconvolution[:, None]).T

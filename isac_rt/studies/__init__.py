@@ -1,0 +1,1 @@
+"""Programs about the program: the paper again, what it compares with, validation and benchmarks."""

@@ -1,0 +1,75 @@
+"""Whole runs of `scenes/street_canyon.yaml` under the three presets of the budget, with 300 rays of clutter: 100 scatterers a link.
+
+Error: of the noise-free samples of the frame in the middle against those under the preset everything, ||Y - Y_full||/||Y_full||, the
+largest of the links. Cost: CPU time of a run per frame, receivers and trackers included, set-up left out. In a short run more of the frames
+are traced than in a long one.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from isac_rt.frame.timetable import Link
+from isac_rt.run.setup import Setup, prepare
+from isac_rt.run.simulate import summarise
+from isac_rt.scenario.file import load
+from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.studies.bench.measure import floor_seconds
+
+PRESETS = ("fastest", "budget", "everything")
+FRAMES = (4, 8, 16)
+SCENE = Path(__file__).parents[3] / "scenes" / "street_canyon.yaml"
+JOB = "street_canyon.yaml, clutter.rays 300, run without set-up"
+
+
+def rows(quick: bool) -> list[dict[str, object]]:
+    """Cost of runs against their number of frames, and their error."""
+    floor, out = floor_seconds((3, 15, 120, 1024)), []
+    for frames in FRAMES[:1] if quick else FRAMES:
+        scenarios = {preset: scenario(preset, frames) for preset in PRESETS}
+        cubes = {preset: samples(prepare(s)) for preset, s in scenarios.items()}
+        full = cubes["everything"]
+        seconds_per_frame(scenario("fastest", FRAMES[0]), 1)  # compiles what the runs share
+        for preset, s in scenarios.items():
+            error = max(float(np.linalg.norm(cubes[preset][link] - full[link]) / np.linalg.norm(full[link])) for link in full)
+            seconds = seconds_per_frame(s, 1 if quick else 3)
+            out.append({"kind": "endtoend", "method": preset, "size": frames, "unit": "frames", "error": error, "cost": seconds / floor,
+                        "seconds": seconds, "floor_s": floor, "oracle": preset == "everything", "job": JOB,
+                        "error_of": "samples of a frame", "traced_frames": len(prepare(s).plan.traced_frames)})  # fmt: skip
+    return out
+
+
+def scenario(preset: str, frames: int) -> Scenario:
+    """The scene under a preset."""
+    return load(SCENE, [f"accuracy.preset={preset}", f"frames={frames}", "clutter.rays=300"])
+
+
+def seconds_per_frame(of: Scenario, repeats: int) -> float:
+    """Median CPU time of a run per frame; every run has a set-up of its own, since set-ups remember what was traced."""
+    times = []
+    for _ in range(repeats):
+        setup = prepare(of)
+        begin = time.process_time()
+        summarise(of, setup=setup)
+        times.append((time.process_time() - begin) / of.frames)
+    return median(times)
+
+
+def samples(setup: Setup) -> dict[Link, np.ndarray]:
+    """Noise-free samples of the frame in the middle of a run, by link, by the method that the run would take."""
+    number = setup.scenario.frames // 2
+    poses, paths = setup.trace(number)
+    out = {}
+    for link in setup.timetable.links(number):
+        sent = setup.transmission(link[0], number, poses[link[0]])
+        out[link] = if_signal(
+            setup.waveform, [(sent, paths[link])], poses[link[1]], setup.antennas,
+            start_time=setup.timetable.start_time(number, link[0]), filter_transition=setup.scenario.radio.filter_transition_hz,
+            noise_power=setup.noise_power(poses, link), method=setup.plan.synthesis(len(paths[link])),
+        ).samples  # fmt: skip
+    return out

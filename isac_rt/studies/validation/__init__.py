@@ -1,0 +1,15 @@
+"""Every physical and numerical claim of the program as a case with an independent truth: what `isac-rt validate` runs."""
+
+from isac_rt.studies.validation.case import Case, Planted, Skipped, Verdict, run_case, run_cases
+
+__all__ = ["Case", "Planted", "Skipped", "Verdict", "all_cases", "run_case", "run_cases"]
+
+
+def all_cases(quick: bool = False) -> list[Case]:
+    """All cases, or the quick selection, in the order of their groups."""
+    from isac_rt.studies.validation import amplitude, clutter, crosschecks, geometry, noise, receivers, signal, tracking
+    from isac_rt.studies.validation.case import cases_of
+
+    modules = (geometry, amplitude, clutter, signal, noise, receivers, tracking, crosschecks)
+    cases = [case for module in modules for case in cases_of(module)]
+    return [case for case in cases if case.quick or not quick]

@@ -1,0 +1,87 @@
+"""The table of a validation as JSON and Markdown."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from isac_rt.results.files import write_text
+from isac_rt.results.provenance import commit, program_fingerprint, versions
+from isac_rt.studies.validation.case import Verdict
+
+STATES = {True: "passes", False: "FAILS", None: "left out"}
+
+
+def as_data(verdicts: Sequence[Verdict]) -> dict[str, object]:
+    """All of the table as plain data, with what it was made by; an error that is no finite number is null."""
+    rows = []
+    for v in verdicts:
+        c = v.case
+        planted = {"file": c.planted.file, "old": c.planted.old, "new": c.planted.new}
+        rows.append(
+            {"name": c.name, "group": c.group, "claim": c.claim, "truth": c.truth, "error": v.error if math.isfinite(v.error) else None,
+             "bound": c.bound, "unit": c.unit, "why": c.why, "state": STATES[v.passed], "seconds": round(v.seconds, 3), "note": v.note,
+             "planted": planted}
+        )  # fmt: skip
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "program": program_fingerprint(),
+        "commit": commit(),
+        "versions": versions(),
+        "passed": sum(v.passed is True for v in verdicts),
+        "failed": sum(v.passed is False for v in verdicts),
+        "left_out": sum(v.passed is None for v in verdicts),
+        "cases": rows,
+    }
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def shown(value: float) -> str:
+    """A number with two digits, or a dash."""
+    return "-" if not math.isfinite(value) else f"{value:.2g}"
+
+
+def as_markdown(verdicts: Sequence[Verdict]) -> str:
+    """A table per group: claim, truth, error, bound and why; then how each case has been seen to fail."""
+    data = as_data(verdicts)
+    counts = f"{data['passed']} cases pass, {data['failed']} fail, {data['left_out']} were left out"
+    lines = [f"{counts} ({data['date']}, {data['program']}).", ""]
+    for group in dict.fromkeys(v.case.group for v in verdicts):
+        lines += [f"### {group}", "", "| case | claim | truth | error | bound | why that bound | s |", "|---|---|---|---|---|---|---|"]
+        for v in verdicts:
+            c = v.case
+            if c.group == group:
+                found = shown(v.error) if v.passed is not None else f"left out: {v.note}"
+                note = f" ({v.note})" if v.note and v.passed is not None else ""
+                failed = "**FAILS** " if v.passed is False else ""
+                cells = (c.name, c.claim + note, c.truth, failed + found, f"{shown(c.bound)} {c.unit}", c.why, f"{v.seconds:.1f}")
+                lines.append("| " + " | ".join(_cell(str(x)) for x in cells) + " |")
+        lines.append("")
+    lines += ["### Planted bugs", ""]
+    lines += ["The bug with which a case is to fail; `python tests/mutation.py --planted` plants them and looks.", ""]
+    lines += ["| case | file | instead of | planted |", "|---|---|---|---|"]
+    for v in verdicts:
+        p = v.case.planted
+        lines.append("| " + " | ".join(_cell(x) for x in (v.case.name, p.file, f"`{_one_line(p.old)}`", f"`{_one_line(p.new)}`")) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _one_line(code: str) -> str:
+    text = " ".join(code.split())
+    return text if len(text) <= 110 else text[:60] + " ... " + text[-40:]
+
+
+def write_json(verdicts: Sequence[Verdict], file: Path) -> None:
+    """The table as JSON; the file appears whole or not at all."""
+    write_text(file, json.dumps(as_data(verdicts), indent=1, allow_nan=False) + "\n")
+
+
+def write_markdown(verdicts: Sequence[Verdict], file: Path) -> None:
+    """The table as Markdown; the file appears whole or not at all."""
+    write_text(file, as_markdown(verdicts))

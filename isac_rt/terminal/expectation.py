@@ -1,0 +1,128 @@
+"""The clutter that a terminal predicts from its own copy of the mesh. Import only after `isac_rt.runtime.activate()`.
+
+Its surfaces are cut as finely as the scenario's field, its points are its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import mitsuba as mi
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.clutter.field import ClutterField, Seen
+from isac_rt.propagation.clutter.two_bounces import TwoBounces
+from isac_rt.propagation.elements import element_amplitude
+from isac_rt.randomness import generator, seed_sequence
+from isac_rt.receive.types import ExpectedClutter, joined
+from isac_rt.scenario.tree import Scenario
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose
+
+
+@dataclass(frozen=True)
+class Mistakes:
+    """How wrong a terminal is about itself and the mesh; all zero by default.
+
+    Attributes
+    ----------
+    velocity : (3,) added to its own velocity [m/s]
+    level_db : added to all levels
+    mesh_std : of the error of each face along its normal, Gaussian, independent from face to face [m]
+    seed : of the faces' errors
+    """
+
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    level_db: float = 0.0
+    mesh_std: float = 0.0
+    seed: int = 1
+
+
+class MeshExpectation:
+    """Expected clutter along the flights of one scenario."""
+
+    def __init__(self, scenario: Scenario, city: City, scene: mi.Scene, antennas: Antennas, wavelength: float) -> None:
+        own = scenario.model_copy(update={"seed": int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])})
+        self._field = ClutterField.plan(own, city, scene, wavelength)
+        self._twice = TwoBounces.plan(own, city, self._field, wavelength) if scenario.clutter.mirrors else None
+        self._city, self._antennas = city, antennas
+
+    def __len__(self) -> int:
+        return len(self._field.cells)
+
+    def clutter(self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None) -> ExpectedClutter:
+        """What the terminal's own link returns at a time, from where it believes to be.
+
+        Parameters
+        ----------
+        name : of the terminal
+        pose : in world coordinates
+        amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
+        """
+        wrong = mistakes or Mistakes()
+        local = replace(pose, position=pose.position - self._city.origin, velocity=pose.velocity + np.array(wrong.velocity))
+        amplitude = amplitude * 10 ** (wrong.level_db / 20)
+        error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
+        once = self._field.seen(name, name, local, local, time)
+        parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
+        for part in [] if self._twice is None else self._twice.seen(name, name, local, local, time):
+            n, s = part.mirror.normal, part.seen
+            met = s.departure if part.before else s.arrival
+            turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
+            there, back = (turned, s.arrival) if part.before else (s.departure, turned)
+            moved = 2 * error[part.mirror.faces[0]] * (met @ n)
+            parts.append(self._expected(s, there, back, error, amplitude, local, moved))
+        return joined(parts)
+
+    def _expected(
+        self,
+        seen: Seen,
+        there: np.ndarray,
+        back: np.ndarray,
+        error: np.ndarray,
+        amplitude: float,
+        local: Pose,
+        moved: np.ndarray | float = 0.0,
+    ) -> ExpectedClutter:
+        """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the scatterers, on faces that are each in error,
+        and ways made longer by `moved` as a mirror is in error [m]."""
+        elements = element_amplitude(self._antennas, local, local, seen.departure, seen.arrival)
+        face = self._field.cells.face[seen.index]
+        length = seen.length + moved + error[face] * (self._city.normals[face] * (there + back)).sum(axis=1)
+        power = (amplitude * seen.magnitude * elements) ** 2
+        some = power > 0
+        return ExpectedClutter(
+            length[some] / SPEED_OF_LIGHT,
+            seen.rate[some] / SPEED_OF_LIGHT,
+            power[some],
+            local.to_body(seen.departure)[some],
+            local.to_body(seen.arrival)[some],
+        )
+
+
+MESH_DETECTORS = ("map", "angle_doppler")
+"""Values of `receivers.clutter_detector` that predict clutter from the mesh."""
+
+
+class ClutterExpectation(Protocol):
+    """What simulate needs of a terminal's copy of the mesh."""
+
+    def clutter(self, name: str, pose: Pose, time: float, amplitude: float) -> ExpectedClutter:
+        """Clutter of the own link of a terminal at a pose, in world coordinates; amplitude is sqrt(transmit power) [sqrt(W)]."""
+        ...
+
+
+def make_expectation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City) -> ClutterExpectation | None:
+    """The receivers' copy of the mesh where their detector needs one; starts the JIT back end."""
+    if scenario.receivers.clutter_detector not in MESH_DETECTORS:
+        return None
+    from isac_rt import runtime
+
+    runtime.activate()
+    from isac_rt.world.city.scene import shared_scene
+
+    scene = shared_scene(city, waveform.carrier_frequency).scene.mi_scene
+    return MeshExpectation(scenario, city, scene, antennas, waveform.wavelength)

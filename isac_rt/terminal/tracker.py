@@ -1,0 +1,242 @@
+"""Extended Kalman filter, association and the life of tracks.
+
+A track is the world position and velocity of one body. The terminal that keeps it knows its own pose, so what is
+reported is relative to it. Names outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from isac_rt.receive.types import Detections, Prediction
+from isac_rt.scenario.receivers import Tracking
+from isac_rt.terminal.filter import (
+    STD_FLOOR,
+    Gaussian,
+    birth,
+    expected,
+    jacobian,
+    mahalanobis,
+    measure,
+    measurement_covariance,
+    predict,
+    transmitter_jacobian,
+    update,
+    wrapped,
+)
+from isac_rt.world.swarm import Pose
+
+
+def assign(cost: np.ndarray) -> list[tuple[int, int]]:
+    """Global nearest neighbour: as many pairs (row, column) as the finite costs allow, of the least total."""
+    if not np.isfinite(cost).any():
+        return []
+    finite = np.isfinite(cost)
+    span = np.ptp(cost[finite]) + 1.0
+    refused = cost[finite].max() + span * (min(cost.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(finite, cost, refused))
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if finite[i, j]]
+
+
+@dataclass
+class Track:
+    """One body that a terminal follows.
+
+    Attributes
+    ----------
+    id : never used again
+    state : Gaussian, world
+    snr : of the last detection (linear)
+    age : frames since the first detection
+    recent : whether each of the latest frames held a detection, newest last, the first detection included
+    missed : frames since the last detection
+    confirmed : M hits in N frames were reached
+    """
+
+    id: int
+    state: Gaussian
+    snr: float
+    age: int = 0
+    recent: list[bool] = field(default_factory=lambda: [True])
+    missed: int = 0
+    confirmed: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackSet:
+    """What a terminal knows after a frame, relative to its own known pose, at the middle of the frame.
+
+    Attributes
+    ----------
+    ids : (K,) int
+    mean : (K, 6) position and velocity relative to the terminal, world axes [m, m/s]
+    covariance : (K, 6, 6)
+    range, velocity : (K,) as in `Detections` (path length and its rate for a PT's reflectors) [m, m/s]
+    direction : (K, 2) u_x, u_z
+    std : (K, 4) standard deviations of range, velocity, u_x, u_z
+    age : (K,) int, frames since the first detection
+    confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
+    """
+
+    ids: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    range: np.ndarray
+    velocity: np.ndarray
+    direction: np.ndarray
+    std: np.ndarray
+    age: np.ndarray
+    confirmed: np.ndarray
+    is_reference: np.ndarray
+
+    def __len__(self) -> int:
+        return self.ids.shape[0]
+
+
+def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None) -> TrackSet:
+    """Report tracks relative to `own`; a PT's `reference` comes first and makes the others bistatic."""
+    everyone = ([] if reference is None else [reference]) + list(tracks)
+    count = len(everyone)
+    mean = np.array([t.state.mean for t in everyone]).reshape(count, 6)
+    covariance = np.array([t.state.covariance for t in everyone]).reshape(count, 6, 6)
+    is_reference = np.arange(count) < (reference is not None)
+    z, std = np.zeros((count, 4)), np.zeros((count, 4))
+    for k, track in enumerate(everyone):
+        transmitter = None if reference is None or track is reference else reference.state
+        t = None if transmitter is None else transmitter.mean
+        z[k] = measure(track.state.mean, own, t)
+        H = jacobian(track.state.mean, own, t)
+        S = H @ track.state.covariance @ H.T
+        if transmitter is not None:
+            J = transmitter_jacobian(track.state.mean, transmitter.mean)
+            S = S + J @ transmitter.covariance @ J.T
+        std[k] = np.sqrt(np.diag(S))
+    return TrackSet(
+        ids=np.array([t.id for t in everyone], np.int64),
+        mean=mean - np.concatenate([own.position, own.velocity]),
+        covariance=covariance,
+        range=z[:, 0],
+        velocity=z[:, 1],
+        direction=z[:, 2:],
+        std=std,
+        age=np.array([t.age for t in everyone], np.int64),
+        confirmed=np.array([t.confirmed for t in everyone], bool),
+        is_reference=is_reference,
+    )
+
+
+class Tracker:
+    """All tracks of one terminal but a PT's reference: prediction, association, birth, confirmation and death.
+
+    Parameters
+    ----------
+    settings : Tracking
+    velocity_period : span of unambiguous velocities [m/s], twice `Waveform.max_velocity`
+    """
+
+    def __init__(self, settings: Tracking, velocity_period: float) -> None:
+        self.settings = settings
+        self.velocity_period = velocity_period
+        self.tracks: list[Track] = []
+        self.time = -np.inf
+        self._next_id = 0
+
+    def new_id(self) -> int:
+        """Numbers in order of birth."""
+        self._next_id += 1
+        return self._next_id - 1
+
+    def clear(self) -> None:
+        """Forget all tracks (their numbers stay used)."""
+        self.tracks = []
+
+    def predict(self, time: float) -> None:
+        """Bring all tracks to `time` [s]."""
+        for track in self.tracks:
+            track.state = predict(track.state, time - self.time, self.settings.acceleration_std_mps2)
+        self.time = time
+
+    def update(self, detections: Detections, own: Pose, transmitter: Gaussian | None = None) -> None:
+        """Associate one frame's detections (confirmed tracks choose first), update, start and drop tracks.
+
+        Detections that are a PT's reference are passed over. With a transmitter all are taken as bistatic.
+        """
+        z = np.column_stack([detections.range, detections.velocity, detections.direction])
+        free = [int(q) for q in np.flatnonzero(~detections.is_reference)]
+        cost = self._costs(z, detections.std, own, transmitter)
+        hit: dict[int, int] = {}
+        for confirmed in (True, False):
+            rows = [k for k, t in enumerate(self.tracks) if t.confirmed is confirmed]
+            pairs = assign(cost[np.ix_(rows, free)])
+            hit |= {rows[i]: free[j] for i, j in pairs}
+            taken = {free[j] for _, j in pairs}
+            free = [q for q in free if q not in taken]
+        for k, track in enumerate(self.tracks):
+            q = hit.get(k)
+            self._live(track, q is not None)
+            if q is not None:
+                R = measurement_covariance(detections.std[q], track.state.mean, transmitter)
+                t = None if transmitter is None else transmitter.mean
+                track.state = update(track.state, z[q], R, own, t, velocity_period=self.velocity_period)
+                track.snr = float(detections.snr[q])
+        self.tracks = [t for t in self.tracks if not self._dead(t)]
+        for q in free:
+            state = birth(z[q], detections.std[q], own, transmitter)
+            if state is not None:
+                track = Track(self.new_id(), state, float(detections.snr[q]))
+                track.confirmed = self.settings.confirm_hits == 1
+                self.tracks.append(track)
+
+    def snapshot(self, own: Pose, reference: Track | None = None) -> TrackSet:
+        """All tracks, tentative ones included, relative to `own`."""
+        return track_set(self.tracks, own, reference)
+
+    def to_prediction(self, own: Pose, reference: Track) -> Prediction:
+        """What a PT expects of this frame: row 0 its line of sight, then the confirmed reflectors seen in the last
+        frame, weighted by their last SNR over the strongest's."""
+        seen = [t for t in self.tracks if t.confirmed and t.missed == 0]
+        report = track_set(seen, own, reference)
+        snr = np.array([reference.snr] + [t.snr for t in seen])
+        return Prediction(
+            range=report.range,
+            velocity=report.velocity,
+            direction=report.direction,
+            range_std=report.std[:, 0],
+            velocity_std=report.std[:, 1],
+            weight=snr / snr.max(),
+        )
+
+    def _costs(self, z: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None) -> np.ndarray:
+        """(tracks, detections) d^2 + ln det S, minus twice the log likelihood but for a constant; inf outside the gate."""
+        if not self.tracks or not len(z):
+            return np.full((len(self.tracks), len(z)), np.inf)
+        mean = np.stack([t.state.mean for t in self.tracks])
+        covariance = np.stack([t.state.covariance for t in self.tracks])
+        z_mean, S = expected(mean, covariance, own, transmitter)
+        R = np.fmax(std, STD_FLOOR)[:, :, None] ** 2 * np.eye(4)
+        residual = wrapped(z[None] - z_mean[:, None], self.velocity_period)
+        d2, log_det = mahalanobis(residual, S[:, None] + R[None])
+        gate = chi2.ppf(self.settings.gate_probability, np.isfinite(residual).sum(axis=-1))
+        return np.where(d2 <= gate, d2 + log_det, np.inf)
+
+    def _live(self, track: Track, hit: bool) -> None:
+        s = self.settings
+        track.age += 1
+        track.missed = 0 if hit else track.missed + 1
+        track.recent = [*track.recent, hit][-s.confirm_window :]
+        track.confirmed = track.confirmed or sum(track.recent) >= s.confirm_hits
+
+    def _dead(self, track: Track) -> bool:
+        """A confirmed track dies of `drop_misses` misses in a row; a tentative one as soon as it can no longer be
+        confirmed within its first `confirm_window` frames."""
+        s = self.settings
+        if track.confirmed:
+            return track.missed >= s.drop_misses
+        return sum(track.recent) + s.confirm_window - len(track.recent) < s.confirm_hits
+
+

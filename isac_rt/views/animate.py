@@ -1,0 +1,124 @@
+"""A run as a moving picture: the map view and a terminal's range-Doppler map in step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.animation import FuncAnimation, writers
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from isac_rt.results.files import ResultsError, write_bytes
+from isac_rt.results.recorder import Results
+from isac_rt.views.figures import STYLE, range_doppler, scene_map, uav_colour
+from isac_rt.world.city.mesh import City
+
+WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
+_STYLE = STYLE | {"figure.constrained_layout.use": False}
+_LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
+
+
+def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
+    """(K, 3) where a terminal's confirmed tracks lie in the world [m], as it sees them: its own pose, a range and a direction.
+
+    Of a passive terminal the line of sight alone: the other ranges are path lengths.
+    """
+    name = str(dataset.receiver.values[observer])
+    own, monostatic = list(dataset.uav.values).index(name), str(dataset.transmitter.values[observer]) == name
+    mine = (dataset.track_frame.values == frame) & (dataset.track_observer.values == observer) & dataset.track_confirmed.values
+    if not monostatic:
+        sender = list(dataset.uav.values).index(str(dataset.transmitter.values[observer]))
+        mine &= dataset.track_uav.values == sender
+    u = np.column_stack([dataset.track_u_x.values[mine], dataset.track_u_z.values[mine]])
+    forward = np.sqrt(np.maximum(1 - (u**2).sum(axis=1), 0.0))
+    body = np.column_stack([u[:, 0], forward, u[:, 1]])
+    rotation = dataset.uav_attitude.values[frame, own]
+    return dataset.uav_position.values[frame, own] + dataset.track_range.values[mine, None] * (body @ rotation.T)
+
+
+def animate(results: Results, observer: int = 0, city: City | None = None) -> tuple[Figure, FuncAnimation]:
+    """A picture per frame whose maps were kept (`run(snapshots=)`): left the swarm so far with the terminal's tracks, right its map.
+
+    Raises
+    ------
+    ResultsError  If fewer than two frames have maps of this observer.
+    """
+    d = results.dataset
+    shown = [k for k in range(d.sizes["snapshot"]) if np.isfinite(d.map_power.values[k, observer]).any()]
+    if len(shown) < 2:
+        raise ResultsError(f"{len(shown)} frame(s) have maps of {d.observer.values[observer]}; run again with --snapshots 20 or more")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 4.8), dpi=100)
+        left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
+        scene_map(left, d, city)
+        for line in left.lines:
+            line.set_alpha(0.25)
+        moving = _Moving(left, d, observer)
+
+        def draw(k: int) -> list:
+            frame = int(d.snapshot_frame.values[k])
+            moving.show(frame)
+            for ax in figure.axes[2:]:
+                ax.remove()  # the last map's colour bar
+            right.clear()
+            right.set_position(_RIGHT)
+            with matplotlib.rc_context(_STYLE):
+                range_doppler(right, d, k, observer)
+            return []
+
+        return figure, FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
+
+
+class _Moving:
+    """What moves in the map view."""
+
+    def __init__(self, ax: Axes, dataset: xr.Dataset, observer: int) -> None:
+        self._d, self._ax, self._observer = dataset, ax, observer
+        count = dataset.sizes["uav"]
+        self._paths = [ax.plot([], [], color=uav_colour(dataset, u))[0] for u in range(count)]
+        self._here = [ax.plot([], [], "o", color=uav_colour(dataset, u), mec="white")[0] for u in range(count)]
+        (self._tracks,) = ax.plot([], [], "x", color="black", ms=9, mew=1.6, label=f"tracks of {dataset.observer.values[observer]}")
+        ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
+
+    def show(self, frame: int) -> None:
+        position = self._d.uav_position.values
+        for u, (path, here) in enumerate(zip(self._paths, self._here, strict=True)):
+            path.set_data(position[: frame + 1, u, 0], position[: frame + 1, u, 1])
+            here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
+        found = tracked_positions(self._d, frame, self._observer)
+        self._tracks.set_data(found[:, 0], found[:, 1])
+        self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
+
+
+def write_animation(results: Results, file: str | Path, observer: int = 0, city: City | None = None, rate: float = 5.0) -> None:
+    """Write the moving picture as GIF or, where there is ffmpeg, MP4; it appears whole or not at all.
+
+    Parameters
+    ----------
+    rate : pictures per second
+
+    Raises
+    ------
+    ResultsError  If the suffix is another, ffmpeg is missing, too few frames have maps, or the file cannot be written.
+    """
+    file = Path(file)
+    writer = WRITERS.get(file.suffix)
+    if writer is None:
+        raise ResultsError(f"{file}: a moving picture ends in {' or '.join(WRITERS)}; name it so")
+    if not writers.is_available(writer):
+        raise ResultsError(f"{file}: {file.suffix} needs {writer}, which is not on this machine; install it or write a .gif")
+    _, moving = animate(results, observer, city)
+    write_bytes(file, lambda temporary: _save(moving, temporary, file.suffix, writer, rate))
+
+
+def _save(moving: FuncAnimation, temporary: Path, suffix: str, writer: str, rate: float) -> None:
+    """Writers go by the suffix, which a temporary name does not have."""
+    named = temporary.with_name(temporary.name + suffix)
+    try:
+        moving.save(named, writer=writers[writer](fps=rate))  # type: ignore[arg-type]  # a rate need not be whole
+        named.replace(temporary)
+    finally:
+        named.unlink(missing_ok=True)

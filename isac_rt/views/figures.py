@@ -1,0 +1,403 @@
+"""Figures of a run: functions that take Axes and return them, and `make_figures`, which writes them all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.results.dataset import MEASURES, errors_of
+from isac_rt.results.files import write_bytes
+from isac_rt.results.recorder import Results
+from isac_rt.results.records import KINDS
+from isac_rt.world.city.mesh import City
+
+KIND_COLOURS = {
+    "line_of_sight": "#000000", "target": "#D55E00", "ghost": "#CC79A7", "specular": "#0072B2", "diffuse": "#56B4E9",
+    "leakage": "#E69F00",
+}  # fmt: skip
+"""One colour per path kind in every figure (Okabe and Ito, Color Universal Design, 2008)."""
+KIND_MARKERS = {"line_of_sight": "s", "target": "o", "ghost": "D", "specular": "^", "diffuse": ".", "leakage": "P"}
+UNEXPLAINED = "#8C8C8C"
+UAV_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 110, "figure.constrained_layout.use": True, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "grid.color": "#E4E4E4", "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.titlesize": 10,
+    "axes.titlelocation": "left", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.4,
+}  # fmt: skip
+_SHOWN_DB = 60.0
+_TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
+"""Depth of a map's colour scale [dB]."""
+_UNITS = {"range": (1.0, "m"), "velocity": (1.0, "m/s"), "azimuth": (180 / np.pi, "deg"), "elevation": (180 / np.pi, "deg")}
+
+
+def words(kind: str) -> str:
+    """A path kind as people read it."""
+    return kind.replace("_", " ")
+
+
+def uav_colour(dataset: xr.Dataset, index: int) -> str:
+    """The colour of a UAV in every figure."""
+    return UAV_COLOURS[index % len(UAV_COLOURS)]
+
+
+def scene_map(ax: Axes, dataset: xr.Dataset, city: City | None = None) -> Axes:
+    """The swarm from above: tracks, final positions by role, over the city's upward faces shaded by height."""
+    position = dataset.uav_position.values
+    low, high = position[..., :2].min((0, 1)), position[..., :2].max((0, 1))
+    margin = 0.35 * max(*(high - low), 40.0)
+    if city is not None and city.num_faces:
+        _footprints(ax, city)
+    for u, name in enumerate(dataset.uav.values):
+        x, y = position[:, u, 0], position[:, u, 1]
+        role, colour = str(dataset.role.values[u]), uav_colour(dataset, u)
+        ax.plot(x, y, color=colour)
+        ax.plot(x[-1], y[-1], ROLE_MARKERS[role], color=colour, ms=11 if role == "active" else 6, mec="white", mew=0.8)
+        ax.annotate(f"{name}", (x[-1], y[-1]), xytext=(6, 5), textcoords="offset points", fontsize=9, fontweight="bold", color=colour,
+                    bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7})  # fmt: skip
+        facing = dataset.uav_attitude.values[-1, u, :2, 1]
+        if role != "target":
+            ax.annotate("", (x[-1] + 0.25 * margin * facing[0], y[-1] + 0.25 * margin * facing[1]), (x[-1], y[-1]),
+                        arrowprops={"arrowstyle": "->", "color": colour, "lw": 1})  # fmt: skip
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), xlabel="east [m]", ylabel="north [m]")
+    ax.set_aspect("equal")
+    ax.grid(False)
+    ax.set_title("Swarm (star: active, square: passive, circle: target; arrows: boresight)")
+    return ax
+
+
+def _footprints(ax: Axes, city: City) -> None:
+    corners = city.corners + city.origin
+    up = np.abs(city.normals[:, 2]) > 0.2
+    triangles = corners[up]
+    height = triangles[:, :, 2].mean(axis=1)
+    order = np.argsort(height, kind="stable")
+    top = max(float(np.quantile(height, 0.98) - height.min()), 1.0)
+    shade = 0.96 - 0.42 * np.clip((height - height.min()) / top, 0, 1)
+    colours = np.repeat(shade[:, None], 3, axis=1)
+    patches = PolyCollection(list(triangles[order][:, :, :2]), facecolors=colours[order], edgecolors="face", linewidths=0.6, zorder=0)
+    patches.set_rasterized(True)
+    ax.add_collection(patches)
+
+
+def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
+    """Range-Doppler map of one terminal; detections marked by the kind of path that explains them, truth as circles."""
+    power = dataset.map_power.values[snapshot, observer]
+    r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
+    rows, columns = np.isfinite(r), np.isfinite(v)
+    level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], _TINY))
+    level = level - np.median(level)  # most cells hold noise alone; the peak may be the transmitter's own leakage
+    _map(ax, v[columns], r[rows], level, (-5.0, np.clip(level.max(), 5.0, _SHOWN_DB)), "power above the median cell [dB]")
+    if not power.any():
+        ax.text(0.5, 0.5, "no map: the data's delays were not known", color="white", ha="center", transform=ax.transAxes)
+    frame = int(dataset.snapshot_frame.values[snapshot])
+    mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
+    kind = dataset.det_kind.values
+    for k, name in [*enumerate(KINDS), (-1, "unexplained")]:
+        at = mine & (kind == k)
+        if at.any():
+            ax.plot(dataset.det_velocity.values[at], dataset.det_range.values[at], KIND_MARKERS.get(name, "x"), ms=6, mew=1.1, ls="none",
+                    mfc="none" if k >= 0 else None, color="white" if name == "line_of_sight" else KIND_COLOURS.get(name, UNEXPLAINED),
+                    label=f"{words(name)} ({at.sum()})")  # fmt: skip
+    x, y = _expected(dataset, frame, observer)
+    ax.plot(x, y, "o", ms=13, mfc="none", mec="white", mew=1.2, ls="none", label="UAV in view (truth)")
+    far = np.concatenate([dataset.det_range.values[mine], y[np.isfinite(y)], [20.0]])
+    ax.set(xlim=(v[columns].min(), v[columns].max()), ylim=(0, min(1.4 * far.max(), r[rows].max())))
+    ax.set(xlabel="radial velocity [m/s] (receding is positive)", ylabel=_range_label(dataset, observer))
+    ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}")
+    if ax.get_legend_handles_labels()[0]:
+        legend = ax.legend(loc="upper right", frameon=True, facecolor="#303030", edgecolor="none", labelcolor="white", fontsize=7)
+        legend.set_zorder(9)
+    return ax
+
+
+def _range_label(dataset: xr.Dataset, observer: int) -> str:
+    return "range [m]" if dataset.transmitter.values[observer] == dataset.receiver.values[observer] else "path length [m]"
+
+
+def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded into the map's span."""
+    here = {"frame": frame, "observer": observer}
+    seen = dataset.in_view[here].values & ~dataset.shadowed[here].values
+    r, v = dataset.truth_range[here].values[seen], dataset.truth_velocity[here].values[seen]
+    axis = dataset.map_velocity.values[observer]
+    axis = axis[np.isfinite(axis)]
+    span = (axis[1] - axis[0]) * len(axis)
+    return v - span * np.floor((v - axis[0]) / span + 0.5 / len(axis)), r
+
+
+def _map(ax: Axes, x: np.ndarray, y: np.ndarray, level_db: np.ndarray, shown: tuple[float, float], label: str) -> None:
+    image = ax.imshow(level_db, origin="lower", aspect="auto", cmap="magma", vmin=shown[0], vmax=shown[1], interpolation="nearest",
+                      extent=_extent(x, y))  # fmt: skip
+    ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.05)
+    ax.grid(False)
+
+
+def _extent(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float, float]:
+    dx, dy = ((a[-1] - a[0]) / max(len(a) - 1, 1) / 2 for a in (x, y))
+    return x[0] - dx, x[-1] + dx, y[0] - dy, y[-1] + dy
+
+
+def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
+    """Range cell over chirp of the first group before the data are removed: what the delay symbols do to every echo."""
+    magnitude = dataset.map_equivalent_range.values[snapshot, observer]
+    magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
+    level = 20 * np.log10(np.maximum(magnitude, _TINY))
+    level = level - level.max()
+    _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, (-_SHOWN_DB, 0.0), "magnitude [dB below the peak]")
+    cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])
+    ax.plot(chirps, cells, "o", ms=2.5, mfc="none", mec="white", mew=0.4)
+    frame = int(dataset.snapshot_frame.values[snapshot])
+    ax.set(xlabel="chirp", ylabel="range cell (circles: one-dimensional CFAR)")
+    ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, equivalent range before data removal")
+    return ax
+
+
+def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
+    """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed intervals shaded in its colour."""
+    scale, unit = _UNITS[name]
+    here = _processed(dataset, observer)
+    t = here.time.values
+    for u, uav in enumerate(dataset.uav.values):
+        if uav == dataset.receiver.values[observer] or not here.in_view.values[:, u].any():
+            continue
+        colour, seen = uav_colour(dataset, u), here.in_view.values[:, u]
+        ax.plot(t, np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan), color=colour, lw=0.9, label=str(uav))
+        ax.plot(t, here[f"detected_{name}"].values[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
+        ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
+        _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
+    ax.set(xlabel="time [s]", ylabel=f"{name} [{unit}]")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(ncols=4, loc="best")
+    return ax
+
+
+def _processed(dataset: xr.Dataset, observer: int) -> xr.Dataset:
+    """One observer, and only the frames that it processed: an active terminal may skip most."""
+    here = dataset.isel(observer=observer)
+    return here.isel(frame=np.flatnonzero(here.processed.values))
+
+
+def _shade(ax: Axes, t: np.ndarray, active: np.ndarray, colour: str) -> None:
+    """Shade the intervals in which `active` holds, each frame with its half intervals."""
+    half = float(np.median(np.diff(t))) / 2 if len(t) > 1 else 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        ax.axvspan(t[first] - half, t[last - 1] + half, color=colour, alpha=0.10, lw=0)
+
+
+def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
+    """Distribution of the absolute errors of each terminal: raw dashed, tracked solid."""
+    scale, unit = _UNITS[name]
+    for o, terminal in enumerate(dataset.observer.values):
+        for group, dash in (("detected", "--"), ("tracked", "-")):
+            e = np.abs(errors_of(dataset, group, name)[:, o]).ravel() * scale
+            e = np.sort(e[np.isfinite(e) & (dataset["truth_range"].values[:, o].ravel() > 0)])
+            if e.size:
+                ax.plot(np.maximum(e, 1e-9), np.arange(1, e.size + 1) / e.size, dash, color=UAV_COLOURS[o % len(UAV_COLOURS)],
+                        label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})")  # fmt: skip
+    ax.set(xscale="log", ylim=(0, 1.02), xlabel=f"|{name} error| [{unit}]", ylabel="share of errors below")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="best")
+    return ax
+
+
+def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
+    """Power of every path in the ledger of the snapshot frames against its path length ("delay") or rate ("doppler")."""
+    mine = dataset.path_observer.values == observer
+    x = (
+        dataset.path_delay.values * SPEED_OF_LIGHT
+        if against == "delay"
+        else -dataset.attrs["carrier_hz"] * dataset.path_delay_rate.values / 1e3
+    )
+    for k in (4, 3, 2, 5, 1, 0):
+        at = mine & (dataset.path_kind.values == k)
+        if at.any():
+            name, many = KINDS[k], KINDS[k] == "diffuse"
+            ax.plot(x[at], dataset.path_power_db.values[at], KIND_MARKERS[name], ms=2.5 if many else 5, ls="none",
+                    color=KIND_COLOURS[name], alpha=0.5 if many else 0.9, mew=0, label=f"{words(name)} ({at.sum()})")  # fmt: skip
+    ax.set(xlabel="path length [m]" if against == "delay" else "Doppler shift [kHz] (closing is positive)", ylabel="path gain [dB]")
+    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
+    if ax.get_legend_handles_labels()[0]:
+        for handle in ax.legend(loc="best", ncols=2).legend_handles:
+            assert handle is not None
+            handle.set(markersize=5, alpha=1)
+    return ax
+
+
+def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
+    """Symbol error rates of every data frame; frames without a decision and shadowed ones stand out."""
+    d = dataset.isel(observer=observer)
+    t, total = dataset.time.values, d.symbol_total.values
+    for s, colour, mark in ((0, "#0072B2", "o"), (1, "#D55E00", "s")):
+        rate = np.divide(d.symbol_errors.values[:, s], total[:, s], out=np.full(len(t), np.nan), where=total[:, s] > 0)
+        ax.plot(t, rate, f"{mark}-", ms=3, lw=0.8, color=colour, label=f"{'delay' if s == 0 else 'DPSK'} symbols")
+    data = total[:, 0] > 0
+    lost = data & ~d.decoded.values
+    ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=f"not decided ({lost.sum()} of {data.sum()} data frames)")
+    sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
+    _shade(ax, t, d.shadowed.values[:, sender], "#303030")
+    ax.set(ylim=(-0.04, 1.14), xlabel="time [s]", ylabel="symbol error rate")
+    ax.set_title(f"{dataset.observer.values[observer]} (shaded: the city hides {dataset.transmitter.values[observer]})")
+    ax.legend(loc="center right")
+    return ax
+
+
+def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
+    """SNR of the reference path of every terminal, per sample and antenna before processing."""
+    for o, name in enumerate(dataset.observer.values):
+        here = _processed(dataset, o)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            snr = 10 * np.log10(here.reference_snr.values)
+        ax.plot(
+            here.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name
+        )
+    ax.set(xlabel="time [s]", ylabel="SNR of the reference path [dB]")
+    ax.legend(loc="best")
+    return ax
+
+
+def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
+    """Power received by kind of path over time (all paths of a kind added)."""
+    here = _processed(dataset, observer)
+    power, count = here.path_power.values, here.path_count.values
+    for k, name in enumerate(KINDS):
+        shown = count[:, k] > 0
+        if shown.any():
+            level = np.where(shown, 10 * np.log10(np.maximum(power[:, k], 1e-300)), np.nan)
+            ax.plot(here.time.values, level, ".-", ms=3, lw=1, color=KIND_COLOURS[name], label=f"{words(name)} ({count[:, k].sum()})")
+    ax.set(xlabel="time [s]", ylabel="path gain of the kind [dB]")
+    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]} (paths over all frames)")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(ncols=3)
+    return ax
+
+
+def _figure(rows: int, columns: int, height: float, width: float = 8.4) -> tuple[Figure, np.ndarray]:
+    """A figure of its own, outside pyplot, so that none stays open."""
+    figure = Figure(figsize=(width, height))
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
+    d = results.dataset
+    observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
+    shots = sorted({0, kept // 2, kept - 1}) if kept else []
+    figure, axes = _figure(1, 1, 6.4)
+    scene_map(axes[0, 0], d, city)
+    yield "scene", figure
+    for s in shots:
+        with_map = [o for o in observers if np.isfinite(d.map_power.values[s, o]).any()]
+        figure, axes = _figure(len(with_map), 1, 4.1 * len(with_map))
+        for ax, o in zip(axes[:, 0], with_map, strict=True):
+            range_doppler(ax, d, s, o)
+        yield f"range_doppler_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
+        before = [o for o in with_map if np.isfinite(d.map_equivalent_range.values[s, o]).any()]  # none where profiles were made directly
+        if before:
+            figure, axes = _figure(len(before), 1, 3.2 * len(before))
+            for ax, o in zip(axes[:, 0], before, strict=True):
+                equivalent_range(ax, d, s, o)
+            yield f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
+    for o in observers:
+        figure, axes = _figure(3, 1, 7.6)
+        for ax, name in zip(axes[:, 0], ("range", "velocity", "azimuth"), strict=True):
+            over_time(ax, d, o, name)
+        axes[0, 0].set_title(f"{d.observer.values[o]}: truth (line), detections (dots), tracks (broad); shaded where hidden")
+        yield f"tracks_{str(d.observer.values[o]).replace('->', '_to_')}", figure
+    figure, axes = _figure(2, 2, 6.0)
+    for ax, name in zip(axes.flat, MEASURES, strict=True):
+        error_cdf(ax, d, name)
+    yield "errors", figure
+    if d.sizes["path"]:
+        figure, axes = _figure(len(observers), 2, 3.3 * len(observers), 10.0)
+        for o in observers:
+            path_power(axes[o, 0], d, o, "delay")
+            path_power(axes[o, 1], d, o, "doppler")
+        yield "paths", figure
+    decoders = [o for o in observers if (d.symbol_total.values[:, o] > 0).any()]
+    if decoders:
+        figure, axes = _figure(len(decoders), 1, 2.8 * len(decoders))
+        for ax, o in zip(axes[:, 0], decoders, strict=True):
+            decoding(ax, d, o)
+        yield "decoding", figure
+    figure, axes = _figure(1 + len(observers), 1, 2.7 * (1 + len(observers)))
+    reference_snr(axes[0, 0], d)
+    for o in observers:
+        path_counts(axes[1 + o, 0], d, o)
+    yield "link", figure
+
+
+def make_figures(results: Results, folder: str | Path, city: City | None = None) -> list[Path]:
+    """Write all figures of a run as ``figures/*.png`` under `folder`; the scene shows the `city` if it is given.
+
+    Raises
+    ------
+    isac_rt.results.files.ResultsError  If the folder cannot be written.
+    """
+    written = []
+    with matplotlib.rc_context(STYLE):
+        for name, figure in _all(results, city):
+            file = Path(folder) / "figures" / f"{name}.png"
+            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
+            written.append(file)
+    return written
+
+
+def sweep_curves(ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by: str | None = None) -> Axes:
+    """A quantity of a sweep against one of its axes, a curve for each link and each entry of the axis `by`.
+
+    A rate (a quantity with bounds beside it) is pooled over the repetitions and drawn with its bounds, logarithmically; anything else is
+    the mean over them. Of the axes that are neither of the two the first entry is taken.
+    """
+    rate = f"{quantity}_low" in dataset
+    values = dataset[f"{quantity}_pooled"] if rate else dataset[quantity].mean("repetition")
+    rest = {d: 0 for d in values.dims if d not in (against, by, "link")}
+    values = values.isel(rest)
+    x = np.arange(values.sizes[against]) if values[against].dtype == object else values[against].values
+    curve = 0
+    for link in values.link.values:
+        for entry in values[by].values if by else [None]:
+            where = {"link": link} | ({by: entry} if by else {})
+            y = values.sel(where).values
+            if not np.isfinite(y).any():
+                continue
+            colour, label = UAV_COLOURS[curve % len(UAV_COLOURS)], f"{link}" + (f", {by} {entry}" if by else "")
+            ax.plot(x, np.maximum(y, 1e-9) if rate else y, "o-", ms=3.5, color=colour, label=label)
+            if rate:
+                low, high = (dataset[f"{quantity}_{end}"].isel(rest).sel(where).values for end in ("low", "high"))
+                ax.fill_between(x, np.maximum(low, 1e-9), high, color=colour, alpha=0.15, lw=0)
+            curve += 1
+    if rate:
+        found = values.values[values.values > 0]
+        ax.set(yscale="log", ylim=(0.5 * found.min() if found.size else 1e-4, 1.5))
+    if values[against].dtype == object:
+        ax.set_xticks(x, [str(v) for v in values[against].values])
+    kept = ", ".join(f"{d} {values[d].values}" for d in rest)
+    ax.set(xlabel=f"{against} ({dataset.attrs[f'axis_{against}']})", ylabel=quantity.replace("_", " "))
+    ax.set_title(f"{quantity.replace('_', ' ')} against {against}" + (f" ({kept})" if kept else ""))
+    if curve:
+        ax.legend(loc="best")
+    return ax
+
+
+def make_sweep_figures(dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path) -> list[Path]:
+    """Write (quantity, against, by) figures of a sweep as ``figures/*.png`` under `folder`."""
+    written = []
+    with matplotlib.rc_context(STYLE):
+        for quantity, against, by in figures:
+            figure, axes = _figure(1, 1, 4.4)
+            sweep_curves(axes[0, 0], dataset, quantity, against, by)
+            file = Path(folder) / "figures" / f"{quantity}_{against}{f'_{by}' if by else ''}.png"
+            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
+            written.append(file)
+    return written

@@ -1,0 +1,1 @@
+"""The world before any wave: the city's mesh and the swarm's flights."""

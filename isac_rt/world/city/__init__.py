@@ -1,0 +1,8 @@
+"""The city: where its mesh comes from, what it is made of, and its ray-traced twin (`isac_rt.world.city.scene`, which needs Sionna)."""
+
+from isac_rt.world.city.materials import CityError, Material
+from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import City as Mesh
+from isac_rt.world.city.sources import load_city
+
+__all__ = ["City", "CityError", "Material", "Mesh", "load_city"]

@@ -1,0 +1,78 @@
+"""From the scenario's `city` to one recentred float64 mesh."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from isac_rt import scenario
+from isac_rt.world.city.footprints import footprints
+from isac_rt.world.city.materials import CityError, resolve_materials
+from isac_rt.world.city.mesh import City, Surface, clean, empty_city
+from isac_rt.world.city.meshfiles import mesh_file
+from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file
+from isac_rt.world.city.parametric import blocks, canyon
+
+
+def _file(city: scenario.City, folder: Path) -> Path:
+    if not city.file:
+        raise CityError(f"city.source {city.source} needs city.file: a path, relative to the scenario's folder")
+    path = folder / city.file
+    if not path.is_file():
+        raise CityError(f"city.file {city.file!r} does not exist in {folder}; paths are relative to the scenario's folder")
+    return path
+
+
+def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], list[str]]:
+    if city.source == "builtin":
+        if not city.name:
+            raise CityError("city.source builtin needs city.name, such as munich or simple_street_canyon")
+        return city.name, *mitsuba_file(city, builtin_path(city.name))
+    if city.source == "canyon":
+        return city.name or "canyon", canyon(city), []
+    if city.source == "blocks":
+        return city.name or "blocks", blocks(city), []
+    path = _file(city, folder)
+    read = {"mitsuba": mitsuba_file, "mesh": mesh_file, "footprints": footprints}[city.source]
+    return path.name, *read(city, path)
+
+
+def load_city(city: scenario.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike) -> City:
+    """The city of a scenario as one float64 mesh about `centre`.
+
+    Parameters
+    ----------
+    city : scenario.City or None
+        None: free space, a city without faces.
+    folder : path
+        Where the scenario file lies; `city.file` is relative to it.
+    carrier_frequency : float
+        At which the materials are evaluated. [Hz]
+    centre : (3,) array-like
+        World point that becomes the local origin; keep it within 500 m of whatever flies (Sionna traces in float32). [m]
+
+    Returns
+    -------
+    city : isac_rt.world.city.City
+
+    Raises
+    ------
+    CityError
+        With one message: file, what, value, remedy.
+    """
+    origin = np.array(centre, dtype=np.float64).reshape(3)
+    if not np.isfinite(origin).all():
+        raise CityError(f"the centre {origin} is not finite; check the positions of the swarm")
+    if city is None:
+        return empty_city("free space", origin)
+    name, surfaces, notes = _surfaces(city, Path(folder))
+    uses, materials = resolve_materials([s.material for s in surfaces], carrier_frequency, city.materials)
+    vertices, faces, owner, cleaning, tolerance = clean(surfaces, name, origin, city.keep_radius_m)
+    in_use, face_material = np.unique(np.array(uses)[owner], return_inverse=True)
+    counted = [text if n == 1 else f"{text} ({n} times)" for text, n in Counter(notes + cleaning).items()]
+    return City(
+        name, vertices, faces, face_material.astype(np.int16), tuple(materials[i] for i in in_use), origin, tuple(counted), tolerance
+    )

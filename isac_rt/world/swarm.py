@@ -1,0 +1,100 @@
+"""Where every UAV is and how it is turned: trajectories, attitude, frames of reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from isac_rt.scenario.swarm import Uav
+from isac_rt.scenario.tree import Scenario
+
+
+@dataclass(frozen=True)
+class Pose:
+    """State of a body at one instant, in world axes.
+
+    Attributes
+    ----------
+    position, velocity, acceleration : (3,) float64 [m, m/s, m/s^2]
+    rotation : (3, 3) float64; columns are the body's X (right), Y (boresight) and Z (up) in world axes, so
+        world = rotation @ body and body = rotation.T @ world
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    rotation: np.ndarray
+
+    def to_body(self, direction: np.ndarray) -> np.ndarray:
+        """World vectors (..., 3) in body axes."""
+        return direction @ self.rotation
+
+    def to_world(self, direction: np.ndarray) -> np.ndarray:
+        """Body vectors (..., 3) in world axes."""
+        return direction @ self.rotation.T
+
+
+def attitude(boresight: np.ndarray) -> np.ndarray:
+    """Rotation whose Y column is `boresight` and whose Z column is as near to up as it can be.
+
+    A vertical boresight leaves the roll open: then X is east.
+    """
+    y = np.asarray(boresight, float) / np.linalg.norm(boresight)
+    x = np.cross(y, [0.0, 0.0, 1.0])
+    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+class Trajectory:
+    """Position, velocity and acceleration of one UAV at any time: a straight line, or the smooth (C2) spline
+    through its waypoints, prolonged in a straight line beyond them."""
+
+    def __init__(self, uav: Uav) -> None:
+        self._fixed_boresight = None if uav.boresight == "velocity" else np.array(uav.boresight, float)
+        if uav.waypoints is None:
+            assert uav.position_m is not None  # the scenario's own check
+            self._start, self._velocity, self._spline = np.array(uav.position_m), np.array(uav.velocity_mps), None
+        else:
+            times = np.array([w.time_s for w in uav.waypoints])
+            self._span = times[0], times[-1]
+            self._spline = CubicSpline(times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural")
+
+    def pose(self, time: float) -> Pose:
+        """Pose at `time` [s]."""
+        if self._spline is None:
+            position, velocity, acceleration = self._start + time * self._velocity, self._velocity.copy(), np.zeros(3)
+        else:
+            inside = float(np.clip(time, *self._span))
+            velocity = self._spline(inside, 1)
+            position = self._spline(inside) + (time - inside) * velocity
+            acceleration = self._spline(inside, 2) if inside == time else np.zeros(3)
+        boresight = self._fixed_boresight if self._fixed_boresight is not None else velocity
+        if not np.any(boresight):
+            boresight = np.array([0.0, 1.0, 0.0])  # a hovering UAV looks north
+        return Pose(position, velocity, acceleration, attitude(boresight))
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """All UAVs of a scenario by name, in the scenario's order."""
+
+    uavs: dict[str, Uav]
+    trajectories: dict[str, Trajectory]
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario) -> Swarm:
+        return cls(dict(scenario.swarm), {name: Trajectory(uav) for name, uav in scenario.swarm.items()})
+
+    def poses(self, time: float) -> dict[str, Pose]:
+        """Every UAV's pose at `time` [s]."""
+        return {name: trajectory.pose(time) for name, trajectory in self.trajectories.items()}
+
+    def middle(self, duration: float) -> np.ndarray:
+        """(3,) mean position of all UAVs over nine instants of a flight [s, m]."""
+        return np.mean([pose.position for t in np.linspace(0, duration, 9) for pose in self.poses(t).values()], axis=0)
+
+    def with_role(self, role: str) -> list[str]:
+        """Names of the UAVs of one role."""
+        return [name for name, uav in self.uavs.items() if uav.role == role]
