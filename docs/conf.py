@@ -9,7 +9,13 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 project = "isac_rt"
 author = "isac_rt maintainers"
 copyright = "2026, isac_rt maintainers"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+]
 extensions += ["scenario_reference", "licences"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_ext"]

@@ -4,8 +4,8 @@
     scenario = irt.load("scenes/street_canyon.yaml")
     results = irt.run(scenario)
 
-Every stage is callable by itself: `trace`, `if_signal`, `receive_active`, `receive_passive`. Names are imported on first use, so that
-`import isac_rt` starts neither Sionna nor the JIT.
+Every stage is callable by itself: `trace`, `if_signal`, `receive_active`, `receive_passive`. Names
+are imported on first use, so that `import isac_rt` starts neither Sionna nor the JIT.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""One generator per purpose, spawned from the scenario's seed by name, so that no draw depends on the order of work."""
+"""One generator per purpose, spawned from the scenario's seed by name, so that no draw depends on
+the order of work."""
 
 from __future__ import annotations
 

@@ -1,10 +1,13 @@
-"""The Dr.Jit back end: which one this machine can run, checked before anything can abort the process.
+"""The Dr.Jit back end: which one this machine can run, checked before anything can abort the
+process.
 
-Dr.Jit 1.5 refuses LLVM 14, aborts the process with 15 and 16, and works from 17 on; an abort cannot be caught. So every
-module that imports sionna, mitsuba or drjit calls `activate()` first. Sionna RT sets a Mitsuba variant when it is imported
-and none is set; after `activate()` one is, and that import changes nothing.
+Dr.Jit 1.5 refuses LLVM 14, aborts the process with 15 and 16, and works from 17 on; an abort cannot
+be caught. So every module that imports sionna, mitsuba or drjit calls `activate()` first. Sionna RT
+sets a Mitsuba variant when it is imported and none is set; after `activate()` one is, and that
+import changes nothing.
 
-Run as a program (``python isac_rt/runtime.py``) it says which back end there is, with nothing but the standard library.
+Run as a program (``python isac_rt/runtime.py``) it says which back end there is, with nothing but
+the standard library.
 """
 
 from __future__ import annotations
@@ -24,7 +27,18 @@ NEWEST_LLVM = 22
 VARIANTS = {"cuda": "cuda_ad_mono_polarized", "llvm": "llvm_ad_mono_polarized"}
 MEMORY_NEEDED = 6e9
 """What the largest scenario of `scenes/` is held to. [bytes]"""
-PACKAGES = ("numpy", "scipy", "numba", "drjit", "mitsuba", "sionna-rt", "xarray", "h5netcdf", "h5py", "pydantic")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "drjit",
+    "mitsuba",
+    "sionna-rt",
+    "xarray",
+    "h5netcdf",
+    "h5py",
+    "pydantic",
+)
 SYSTEM_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -33,7 +47,9 @@ SYSTEM_FOLDERS = (
     "/usr/local/lib",
     *(f"/usr/lib/llvm-{version}/lib" for version in range(NEWEST_LLVM, OLDEST_LLVM - 1, -1)),
 )
-_INSTALL_LLVM = "install LLVM 19 (Debian 12 and later, Ubuntu 24.04 and later: apt install libllvm19)"
+_INSTALL_LLVM = (
+    "install LLVM 19 (Debian 12 and later, Ubuntu 24.04 and later: apt install libllvm19)"
+)
 
 
 class RuntimeProblem(Exception):
@@ -60,7 +76,8 @@ class Backend:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of `doctor`: what was looked at, whether it will do, what was found, and what to do about it."""
+    """One line of `doctor`: what was looked at, whether it will do, what was found, and what to do
+    about it."""
 
     name: str
     ok: bool
@@ -79,13 +96,18 @@ def _library_folders() -> Iterator[Path]:
 
 
 def _loader_cache() -> dict[str, str]:
-    """Library name -> path, as the dynamic loader's cache has it; empty where there is no such cache."""
+    """Library name -> path, as the dynamic loader's cache has it; empty where there is no such
+    cache."""
     for program in ("/sbin/ldconfig", "/usr/sbin/ldconfig", "ldconfig"):
         try:
-            listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10, check=True).stdout
+            listing = subprocess.run(
+                [program, "-p"], capture_output=True, text=True, timeout=10, check=True
+            ).stdout
         except (OSError, subprocess.SubprocessError):
             continue
-        return {m[1]: m[2] for m in re.finditer(r"^\s*(\S+) \(.*\) => (\S+)$", listing, re.MULTILINE)}
+        return {
+            m[1]: m[2] for m in re.finditer(r"^\s*(\S+) \(.*\) => (\S+)$", listing, re.MULTILINE)
+        }
     return {}
 
 
@@ -114,7 +136,12 @@ def _version_in_name(path: str) -> int | None:
 def _ask(program: str, *arguments: str) -> str | None:
     """What a Python program prints in a process of its own; None when it fails or dies."""
     try:
-        done = subprocess.run([sys.executable, "-I", "-S", "-c", program, *arguments], capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            [sys.executable, "-I", "-S", "-c", program, *arguments],
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
@@ -130,7 +157,8 @@ print('.'.join(str(n.value) for n in numbers))
 
 
 def llvm_version(path: str) -> str | None:
-    """Version of a libLLVM, asked of the library itself in another process; None if it cannot be loaded or is older than 16."""
+    """Version of a libLLVM, asked of the library itself in another process; None if it cannot be
+    loaded or is older than 16."""
     return _ask(_LLVM_PROGRAM, path)
 
 
@@ -140,14 +168,18 @@ def _usable(version: int) -> bool:
 
 def _refusal(path: str, version: str) -> str:
     return (
-        f"{path} is LLVM {version}; the ray tracer (Dr.Jit 1.5) needs LLVM {OLDEST_LLVM} to {NEWEST_LLVM} "
+        f"{path} is LLVM {version}; the ray tracer (Dr.Jit 1.5) needs LLVM {OLDEST_LLVM} to "
+        f"{NEWEST_LLVM} "
         "(14 is refused, 15 and 16 end the process)"
     )
 
 
 def _llvm_from_environment(path: str) -> Backend:
     """The library that DRJIT_LIBLLVM_PATH names, or the reason why it will not do."""
-    remedy = f"unset DRJIT_LIBLLVM_PATH or let it name a libLLVM of version {OLDEST_LLVM} to {NEWEST_LLVM}"
+    remedy = (
+        f"unset DRJIT_LIBLLVM_PATH or let it name a libLLVM of version {OLDEST_LLVM} to "
+        f"{NEWEST_LLVM}"
+    )
     if "/" not in path:
         path = _loader_cache().get(path, path)
     if "/" in path and not os.path.isfile(path):
@@ -157,14 +189,17 @@ def _llvm_from_environment(path: str) -> Backend:
         raise RuntimeProblem(f"DRJIT_LIBLLVM_PATH: {_refusal(path, str(named))}; {remedy}")
     version = llvm_version(path)
     if version is None:
-        raise RuntimeProblem(f"DRJIT_LIBLLVM_PATH: {path} cannot be loaded as LLVM of version 16 or later; {remedy}")
+        raise RuntimeProblem(
+            f"DRJIT_LIBLLVM_PATH: {path} cannot be loaded as LLVM of version 16 or later; {remedy}"
+        )
     if not _usable(int(version.split(".")[0])):
         raise RuntimeProblem(f"DRJIT_LIBLLVM_PATH: {_refusal(path, version)}; {remedy}")
     return Backend("llvm", path, version)
 
 
 def _preference(path: str) -> tuple[bool, int]:
-    """Names that state LLVM 19 first (the version most used here), then newer before older, then names without a version."""
+    """Names that state LLVM 19 first (the version most used here), then newer before older, then
+    names without a version."""
     version = _version_in_name(path)
     return version != 19, -(version or 0)
 
@@ -185,7 +220,8 @@ def _find_llvm() -> Backend:
         unfit.append(f"{path} ({f'LLVM {version}' if version else 'cannot be loaded'})")
     found = f"only {', '.join(unfit)}" if unfit else "none"
     raise RuntimeProblem(
-        f"no usable LLVM: the ray tracer (Dr.Jit 1.5) needs libLLVM {OLDEST_LLVM} to {NEWEST_LLVM} or an NVIDIA GPU; found {found}; "
+        f"no usable LLVM: the ray tracer (Dr.Jit 1.5) needs libLLVM {OLDEST_LLVM} to {NEWEST_LLVM} "
+        f"or an NVIDIA GPU; found {found}; "
         f"{_INSTALL_LLVM}, or set DRJIT_LIBLLVM_PATH to one"
     )
 
@@ -199,7 +235,8 @@ ctypes.CDLL('libnvoptix.so.1')
 count, version, device = ctypes.c_int(), ctypes.c_int(), ctypes.c_int()
 name = ctypes.create_string_buffer(100)
 assert cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
-assert cuda.cuDriverGetVersion(ctypes.byref(version)) == 0 and cuda.cuDeviceGet(ctypes.byref(device), 0) == 0
+assert cuda.cuDriverGetVersion(ctypes.byref(version)) == 0
+assert cuda.cuDeviceGet(ctypes.byref(device), 0) == 0
 cuda.cuDeviceGetName(name, 100, device)
 print(version.value // 1000, version.value % 1000 // 10, name.value.decode(), sep='|')
 """
@@ -207,10 +244,12 @@ print(version.value // 1000, version.value % 1000 // 10, name.value.decode(), se
 
 @functools.cache
 def _cuda() -> tuple[str, str] | None:
-    """Driver interface version and name of the first NVIDIA GPU; None without a GPU, its driver or the driver's OptiX.
+    """Driver interface version and name of the first NVIDIA GPU; None without a GPU, its driver or
+    the driver's OptiX.
 
-    Mitsuba's CUDA variants trace rays by OptiX, which containers often lack although CUDA works. Asked in another process,
-    because a driver once started does not survive a fork. `CUDA_VISIBLE_DEVICES=` (empty) hides the GPU.
+    Mitsuba's CUDA variants trace rays by OptiX, which containers often lack although CUDA works.
+    Asked in another process, because a driver once started does not survive a fork.
+    `CUDA_VISIBLE_DEVICES=` (empty) hides the GPU.
     """
     if not os.path.exists("/dev/nvidiactl") and not os.path.exists("/dev/dxg"):
         return None
@@ -242,7 +281,8 @@ def choose_backend() -> Backend:
 
 @functools.cache
 def activate() -> Backend:
-    """Choose the back end, tell Dr.Jit and set Mitsuba's variant. Called before every import of sionna; later calls are free.
+    """Choose the back end, tell Dr.Jit and set Mitsuba's variant. Called before every import of
+    sionna; later calls are free.
 
     Returns
     -------
@@ -264,11 +304,13 @@ def activate() -> Backend:
             mi.set_variant(VARIANTS[backend.kind])
         except ImportError as error:
             raise RuntimeProblem(
-                f"Mitsuba cannot start its variant {VARIANTS[backend.kind]}: {error}; install the locked packages again (make setup)"
+                f"Mitsuba cannot start its variant {VARIANTS[backend.kind]}: {error}; install the "
+                "locked packages again (make setup)"
             ) from None
     elif variant not in VARIANTS.values():
         raise RuntimeProblem(
-            f"Mitsuba is already set to the variant {variant}, the ray tracer needs {' or '.join(VARIANTS.values())}; "
+            f"Mitsuba is already set to the variant {variant}, the ray tracer needs "
+            f"{' or '.join(VARIANTS.values())}; "
             "call isac_rt.runtime.activate() before anything else sets a variant"
         )
     return backend
@@ -312,14 +354,20 @@ def _number_in(path: str) -> float | None:
 
 
 def available_memory() -> float | None:
-    """Memory that this process may still take: the machine's or its control group's, whichever is less. [bytes]"""
+    """Memory that this process may still take: the machine's or its control group's, whichever is
+    less. [bytes]"""
     try:
-        match = re.search(r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        match = re.search(
+            r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
+        )
     except OSError:
         match = None
     limits = [1024.0 * int(match[1])] if match else []
     group = "/sys/fs/cgroup"
-    for limit_file, use_file in (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
+    for limit_file, use_file in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
         limit, use = _number_in(f"{group}/{limit_file}"), _number_in(f"{group}/{use_file}")
         if limit is not None and use is not None:
             limits.append(limit - use)
@@ -335,8 +383,17 @@ def _check_memory() -> Check:
 
 def _check_cores() -> Check:
     cores = len(os.sched_getaffinity(0))
-    set_variables = [f"{name}={os.environ[name]}" for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS") if name in os.environ]
-    return Check("cores", cores >= 2, ", ".join([str(cores), *set_variables]), "runs on one core, but slowly; give the process two or more")
+    set_variables = [
+        f"{name}={os.environ[name]}"
+        for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+        if name in os.environ
+    ]
+    return Check(
+        "cores",
+        cores >= 2,
+        ", ".join([str(cores), *set_variables]),
+        "runs on one core, but slowly; give the process two or more",
+    )
 
 
 def _check_packages(names: Iterable[str] = PACKAGES) -> Check:
@@ -346,18 +403,29 @@ def _check_packages(names: Iterable[str] = PACKAGES) -> Check:
             found.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
             missing.append(name)
-    return Check("packages", not missing, ", ".join(found), f"missing: {', '.join(missing)}; run make setup")
+    return Check(
+        "packages", not missing, ", ".join(found), f"missing: {', '.join(missing)}; run make setup"
+    )
 
 
 def doctor() -> list[Check]:
-    """Look at everything that a run rests on. Starts no back end, so it answers on a machine that cannot run one.
+    """Look at everything that a run rests on. Starts no back end, so it answers on a machine that
+    cannot run one.
 
     Returns
     -------
     checks : list of Check
         `remedy` is meant for a check that is not ok.
     """
-    looks = (_check_python, _check_backend, _check_llvm, _check_gpu, _check_memory, _check_cores, _check_packages)
+    looks = (
+        _check_python,
+        _check_backend,
+        _check_llvm,
+        _check_gpu,
+        _check_memory,
+        _check_cores,
+        _check_packages,
+    )
     return [look() for look in looks]
 
 

@@ -8,7 +8,8 @@
 
 # %% [markdown]
 # # A first run
-# A street canyon, traced at 77 GHz: one active terminal, one passive terminal that decodes, one target. `irt.run` does all
+# A street canyon, traced at 77 GHz: one active terminal, one passive terminal that decodes, one
+# target. `irt.run` does all
 # of it; the cells after it take one frame apart by hand.
 
 # %%
@@ -34,8 +35,7 @@ results.dataset.path_count.sum("frame").to_pandas()
 setup = irt.prepare(scenario)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4))
 figures.scene_map(left, results.dataset, setup.city)
-figures.over_time(right, results.dataset, 1, "range");
-
+figures.over_time(right, results.dataset, 1, "range")
 # %% [markdown]
 # ## One frame by hand
 # Poses and paths of frame 4 at its middle:

@@ -16,7 +16,9 @@ import numpy as np
 
 import isac_rt as irt
 
-scenario = irt.load("../scenes/street_canyon.yaml", ["clutter.model=field", "accuracy.preset=everything"])
+scenario = irt.load(
+    "../scenes/street_canyon.yaml", ["clutter.model=field", "accuracy.preset=everything"]
+)
 setup = irt.prepare(scenario)
 setup.city
 
@@ -27,13 +29,15 @@ paths = irt.trace(scenario, 0, setup=setup)
 irt.scene_3d(setup.city, setup.swarm, times, epoch, paths)
 
 # %% [markdown]
-# Every link has its paths as flat arrays: gains without the carrier phase, delays and their rates in float64, directions, kinds.
+# Every link has its paths as flat arrays: gains without the carrier phase, delays and their rates
+# in float64, directions, kinds.
 
 # %%
 paths
 
 # %% [markdown]
-# Delay and Doppler shift of the paths to the passive terminal, by kind. The scatterers of the walls form the ridge.
+# Delay and Doppler shift of the paths to the passive terminal, by kind. The scatterers of the walls
+# form the ridge.
 
 # %%
 heard = paths["AT", "PT1"]
@@ -42,16 +46,24 @@ for kind in irt.PathKind:
     one = heard.select(heard.kind == kind)
     if len(one):
         size = 4 if len(one) > 100 else 40
-        ax.scatter(1e9 * one.delay, -scenario.radio.carrier_hz * one.delay_rate, s=size, label=f"{kind.name.lower()} ({len(one)})")
+        ax.scatter(
+            1e9 * one.delay,
+            -scenario.radio.carrier_hz * one.delay_rate,
+            s=size,
+            label=f"{kind.name.lower()} ({len(one)})",
+        )
 ax.set(xlabel="delay [ns]", ylabel="Doppler shift [Hz]")
-ax.legend();
-
+ax.legend()
 # %% [markdown]
-# Delays move with the swarm as their rates say: one frame later the line of sight has become longer by rate times time, and half the
+# Delays move with the swarm as their rates say: one frame later the line of sight has become longer
+# by rate times time, and half the
 # acceleration's share.
 
 # %%
 later = irt.trace(scenario, 1, setup=setup)["AT", "PT1"]
 dt = setup.timetable.epoch(1) - epoch
 rate, accel = heard.delay_rate[0], heard.delay_accel[0]
-print(f"moved {1e12 * (later.delay[0] - heard.delay[0]):.4f} ps, foretold {1e12 * (rate * dt + accel * dt**2 / 2):.4f} ps")
+print(
+    f"moved {1e12 * (later.delay[0] - heard.delay[0]):.4f} ps, foretold "
+    f"{1e12 * (rate * dt + accel * dt**2 / 2):.4f} ps"
+)

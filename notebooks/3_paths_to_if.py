@@ -8,8 +8,10 @@
 
 # %% [markdown]
 # # From paths to the IF signal, term by term
-# One target, one chirp after the other. A path of delay $\\tau(t)$ gives, after mixing with the reference chirp,
-# $f_c\\tau + \\alpha\\tau(u-\\tau/2)$ cycles, $u$ the time since the chirp began. The paper keeps a part of this; here the terms
+# One target, one chirp after the other. A path of delay $\\tau(t)$ gives, after mixing with the
+# reference chirp,
+# $f_c\\tau + \\alpha\\tau(u-\\tau/2)$ cycles, $u$ the time since the chirp began. The paper keeps a
+# part of this; here the terms
 # are added one by one until nothing is left.
 
 # %%
@@ -20,7 +22,12 @@ import isac_rt as irt
 
 scenario = irt.load(
     "../scenes/paper_swarm_consistent.yaml",
-    ["accuracy.preset=everything", "propagation.leakage.enabled=false", "radio.groups=1", "modulation.pilot_every_frames=null"],
+    [
+        "accuracy.preset=everything",
+        "propagation.leakage.enabled=false",
+        "radio.groups=1",
+        "modulation.pilot_every_frames=null",
+    ],
     frames=4,
 )
 setup = irt.prepare(scenario)
@@ -29,20 +36,31 @@ path = paths["AT", "PT1"].select(np.array([0]))
 path
 
 # %% [markdown]
-# Its samples in the first receive antenna, by the exact model. The chirps of transmit antenna 0 alone, without data:
+# Its samples in the first receive antenna, by the exact model. The chirps of transmit antenna 0
+# alone, without data:
 
 # %%
 w = setup.waveform
 sent = setup.transmission("AT", 0, poses["AT"])
 start = setup.timetable.start_time(0, "AT")
-cube = irt.if_signal(w, [(sent, path)], poses["PT1"], setup.antennas, start_time=start, filter_transition=0.4e6, method="exact")
+cube = irt.if_signal(
+    w,
+    [(sent, path)],
+    poses["PT1"],
+    setup.antennas,
+    start_time=start,
+    filter_transition=0.4e6,
+    method="exact",
+)
 chirps = np.flatnonzero(cube.schedule[0] == 0)
 signal = cube.samples[0, 0, chirps]
 signal = signal / np.abs(signal).mean()
 
 # %% [markdown]
-# The paper's separable model: a beat frequency for the delay at the frame's middle, a Doppler phase from chirp to chirp.
-# Each further term is a phase over (chirp, sample); what is left is the relative RMS after the best complex factor.
+# The paper's separable model: a beat frequency for the delay at the frame's middle, a Doppler phase
+# from chirp to chirp.
+# Each further term is a phase over (chirp, sample); what is left is the relative RMS after the best
+# complex factor.
 
 # %%
 p = chirps[:, None]
@@ -51,12 +69,15 @@ middle = w.frame_duration / 2
 slot = p * w.slot_duration
 tau, rate = path.delay[0], path.delay_rate[0]
 beat, doppler = w.slope * tau * u, w.carrier_frequency * rate * slot
-# delay of the two elements against the arrays' middles: they delay the whole chirp, not only its carrier
+# delay of the two elements against the arrays' middles: they delay the whole chirp, not only its
+# carrier
 elements = [
     (poses["AT"], setup.antennas.tx_positions[0], path.departure[0]),
     (poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0]),
 ]
-element = -sum(pose.to_world(place) @ direction for pose, place, direction in elements) / 299792458.0
+element = (
+    -sum(pose.to_world(place) @ direction for pose, place, direction in elements) / 299792458.0
+)
 terms = {
     "paper: beat and Doppler": beat + doppler,
     "+ Doppler within the chirp": w.carrier_frequency * rate * u + 0 * slot,
@@ -81,7 +102,8 @@ ax.set(xscale="log", xlabel="relative RMS that is left")
 ax.invert_yaxis()
 
 # %% [markdown]
-# The fast methods against the exact one. What "gridded" leaves here is the curvature of the line of sight's wavefront over both arrays at
+# The fast methods against the exact one. What "gridded" leaves here is the curvature of the line of
+# sight's wavefront over both arrays at
 # once; the default, "auto", gives lines of sight to "direct".
 
 # %%

@@ -8,7 +8,8 @@
 
 # %% [markdown]
 # # The two receivers, step by step
-# The active terminal (AT) knows its data and takes them out of its echoes; the passive one (PT) decides them first and senses with the
+# The active terminal (AT) knows its data and takes them out of its echoes; the passive one (PT)
+# decides them first and senses with the
 # same chirps. Both on one frame of the paper's swarm.
 
 # %%
@@ -20,7 +21,9 @@ from isac_rt.receive import cfar, spectrum
 from isac_rt.receive import maps as doppler
 from isac_rt.receive.symbols import powers as demodulate
 
-scenario = irt.load("../scenes/paper_swarm_consistent.yaml", ["propagation.leakage.enabled=false"], frames=200)
+scenario = irt.load(
+    "../scenes/paper_swarm_consistent.yaml", ["propagation.leakage.enabled=false"], frames=200
+)
 setup = irt.prepare(scenario)
 w, frame = setup.waveform, 160
 poses, paths = setup.trace(frame)
@@ -36,12 +39,18 @@ sent["AT"].payload.delay_symbols.shape, setup.timetable.modulated(frame)
 cube = setup.receive_samples(frame, ("AT", "AT"), sent, paths, poses)
 raw = np.abs(np.fft.fft(cube.samples[0, 0] * np.hanning(w.num_samples), axis=-1)).T
 figure, ax = plt.subplots(figsize=(8, 3.2))
-ax.imshow(20 * np.log10(raw), aspect="auto", origin="lower", cmap="magma", vmin=20 * np.log10(raw.max()) - 40)
-ax.set(xlabel="chirp", ylabel="cell", title="group 0, antenna 0, with data");
-
+ax.imshow(
+    20 * np.log10(raw),
+    aspect="auto",
+    origin="lower",
+    cmap="magma",
+    vmin=20 * np.log10(raw.max()) - 40,
+)
+ax.set(xlabel="chirp", ylabel="cell", title="group 0, antenna 0, with data")
 # %% [markdown]
 # ## AT: data out, range-Doppler map, CFAR
-# `clean_spectrum` removes the delay and all four of its phases, and the DPSK; the groups are united to one uniform slow time.
+# `clean_spectrum` removes the delay and all four of its phases, and the DPSK; the groups are united
+# to one uniform slow time.
 
 # %%
 spectra = spectrum.clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
@@ -51,13 +60,19 @@ above, level = cfar.detect(power, looks, r.false_alarm_rate, r.guard_cells, r.tr
 velocity = doppler.doppler_bins(w) * w.velocity_cell(2)
 figure, ax = plt.subplots(figsize=(8, 3.6))
 far = 120
-shown = ax.imshow(10 * np.log10(power[:far] / np.median(power)), aspect="auto", origin="lower", cmap="magma", vmin=-3, vmax=30,
-                  extent=(velocity[0], velocity[-1], 0, far * w.range_cell(2)))
+shown = ax.imshow(
+    10 * np.log10(power[:far] / np.median(power)),
+    aspect="auto",
+    origin="lower",
+    cmap="magma",
+    vmin=-3,
+    vmax=30,
+    extent=(velocity[0], velocity[-1], 0, far * w.range_cell(2)),
+)
 rows, columns = np.nonzero(above[:far])
 ax.plot(velocity[columns], rows * w.range_cell(2), "wo", mfc="none")
 figure.colorbar(shown, label="over the median [dB]")
-ax.set(xlabel="radial velocity [m/s]", ylabel="range [m]");
-
+ax.set(xlabel="radial velocity [m/s]", ylabel="range [m]")
 # %% [markdown]
 # Peaks are refined off the grid; directions come from the L-shaped virtual array:
 
@@ -66,7 +81,8 @@ irt.receive_active(cube, payload, setup.antennas, r).detections
 
 # %% [markdown]
 # ## PT: decide the data, then sense
-# It derotates every chirp by the beat that it predicts for its line of sight, and picks the strongest of N/2 cells.
+# It derotates every chirp by the beat that it predicts for its line of sight, and picks the
+# strongest of N/2 cells.
 
 # %%
 heard = setup.receive_samples(frame, ("AT", "PT1"), sent, paths, poses)
@@ -81,13 +97,22 @@ known = irt.Prediction(
     weight=np.ones(1),
 )
 symbols = demodulate.demodulate(heard, known, scenario.modulation.dpsk_order, None)
-print("wrong delay symbols:", int((symbols.delay != payload.delay_symbols).sum()), "of", symbols.delay.size)
-print("wrong transitions:  ", int((symbols.transitions != payload.transitions).sum()), "of", symbols.transitions.size)
+print(
+    "wrong delay symbols:",
+    int((symbols.delay != payload.delay_symbols).sum()),
+    "of",
+    symbols.delay.size,
+)
+print(
+    "wrong transitions:  ",
+    int((symbols.transitions != payload.transitions).sum()),
+    "of",
+    symbols.transitions.size,
+)
 
 # %%
 figure, ax = plt.subplots(figsize=(8, 2.6))
 ax.plot(10 * np.log10(symbols.delay_confidence[0]), ".")
-ax.set(xlabel="chirp", ylabel="confidence [dB]", title="peak over the mean of the other cells");
-
+ax.set(xlabel="chirp", ylabel="confidence [dB]", title="peak over the mean of the other cells")
 # %%
 irt.receive_passive(heard, setup.antennas, r, scenario.modulation.dpsk_order, known, True)

@@ -8,7 +8,8 @@
 
 # %% [markdown]
 # # Geometric against Rayleigh clutter
-# The paper puts 40 to 50 range cells of Rayleigh clutter at zero Doppler. A mesh gives something else: scatterers pinned to walls and
+# The paper puts 40 to 50 range cells of Rayleigh clutter at zero Doppler. A mesh gives something
+# else: scatterers pinned to walls and
 # ground, at the velocity that the terminal's own flight gives them, fading with distance.
 
 # %%
@@ -19,12 +20,18 @@ import isac_rt as irt
 
 frames = {}
 for model in ("rayleigh", "field"):
-    scenario = irt.load("../scenes/street_canyon.yaml", [f"clutter.model={model}", "modulation.acquisition_frames=1"], frames=2)
+    scenario = irt.load(
+        "../scenes/street_canyon.yaml",
+        [f"clutter.model={model}", "modulation.acquisition_frames=1"],
+        frames=2,
+    )
     setup = irt.prepare(scenario)
     poses, paths = setup.trace(1)
     sent = {"AT": setup.transmission("AT", 1, poses["AT"])}
     cube = setup.receive_samples(1, ("AT", "AT"), sent, paths, poses)
-    got = irt.receive_active(cube, sent["AT"].payload, setup.antennas, scenario.receivers, maps=True)
+    got = irt.receive_active(
+        cube, sent["AT"].payload, setup.antennas, scenario.receivers, maps=True
+    )
     frames[model] = paths["AT", "AT"], got
     print(model, paths["AT", "AT"])
 
@@ -36,30 +43,56 @@ figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
 for ax, (model, (_, got)) in zip(axes, frames.items(), strict=True):
     m = got.maps
     level = 10 * np.log10(m.range_doppler / np.median(m.range_doppler))
-    ax.imshow(level, aspect="auto", origin="lower", cmap="magma", vmin=-3, vmax=45,
-              extent=(m.velocity_axis[0], m.velocity_axis[-1], m.range_axis[0], m.range_axis[-1]))
+    ax.imshow(
+        level,
+        aspect="auto",
+        origin="lower",
+        cmap="magma",
+        vmin=-3,
+        vmax=45,
+        extent=(m.velocity_axis[0], m.velocity_axis[-1], m.range_axis[0], m.range_axis[-1]),
+    )
     ax.set(title=model, xlabel="radial velocity [m/s]", ylim=(0, 90))
-axes[0].set_ylabel("range [m]");
+axes[0].set_ylabel("range [m]")
 
 # %% [markdown]
 # ## Pinned to the world
-# From one frame to the next the same scatterers return, each moved by its own rate. The range profile of the city's clutter keeps its
+# From one frame to the next the same scatterers return, each moved by its own rate. The range
+# profile of the city's clutter keeps its
 # shape; a model that is drawn anew does not.
+
 
 # %%
 def profile(paths, waveform):
-    """Complex range profile of the diffuse paths, one value per range cell of a pass there and back."""
+    """Complex range profile of the diffuse paths, one value per range cell of a pass there and
+    back."""
     p = paths.select(paths.kind == irt.PathKind.DIFFUSE)
     cell = np.round(p.delay / waveform.delay_step).astype(int)
     turned = p.gain * np.exp(-2j * np.pi * waveform.carrier_frequency * p.delay)
-    return np.bincount(cell, turned.real, waveform.num_samples) + 1j * np.bincount(cell, turned.imag, waveform.num_samples)
+    return np.bincount(cell, turned.real, waveform.num_samples) + 1j * np.bincount(
+        cell, turned.imag, waveform.num_samples
+    )
+
 
 for model in ("diffuse", "field"):
-    scenario = irt.load("../scenes/street_canyon.yaml", [f"clutter.model={model}", "frame_interval_s=0.008"], frames=4)
+    scenario = irt.load(
+        "../scenes/street_canyon.yaml",
+        [f"clutter.model={model}", "frame_interval_s=0.008"],
+        frames=4,
+    )
     setup = irt.prepare(scenario)
     a, b = (setup.trace(k)[1]["AT", "AT"] for k in (0, 1))
     # the same instant seen from both frames: the second one's scatterers taken back by their rates
     dt = a.epoch - b.epoch
-    back = irt.PathSet(**{**vars(b), "delay": b.delay + b.delay_rate * dt + b.delay_accel * dt**2 / 2, "epoch": a.epoch})
+    back = irt.PathSet(
+        **{
+            **vars(b),
+            "delay": b.delay + b.delay_rate * dt + b.delay_accel * dt**2 / 2,
+            "epoch": a.epoch,
+        }
+    )
     x, y = profile(a, setup.waveform), profile(back, setup.waveform)
-    print(f"{model:8s} correlation from frame to frame {abs(np.vdot(x, y)) / np.linalg.norm(x) / np.linalg.norm(y):.3f}")
+    print(
+        f"{model:8s} correlation from frame to frame "
+        f"{abs(np.vdot(x, y)) / np.linalg.norm(x) / np.linalg.norm(y):.3f}"
+    )

@@ -8,7 +8,8 @@
 
 # %% [markdown]
 # # A receiver of one's own
-# A terminal is a class with a method `receive`: samples and public knowledge in, a `Reception` out. Replace it, and the rest of the run
+# A terminal is a class with a method `receive`: samples and public knowledge in, a `Reception` out.
+# Replace it, and the rest of the run
 # (tracking, scoring, figures) stays.
 
 # %% [markdown]
@@ -28,7 +29,12 @@ class Cautious(irt.ActiveTerminal):
     def receive(self, cube, payload, clutter, maps):
         found = super().receive(cube, payload, clutter, maps)
         strong = found.detections.snr > 25
-        return replace(found, detections=Detections(**{name: value[strong] for name, value in vars(found.detections).items()}))
+        return replace(
+            found,
+            detections=Detections(
+                **{name: value[strong] for name, value in vars(found.detections).items()}
+            ),
+        )
 
 
 def terminal(setup, link):
@@ -39,10 +45,17 @@ def terminal(setup, link):
     return Cautious(setup.waveform, setup.antennas, s.receivers, s.tracking)
 
 
-scenario = irt.load("../scenes/street_canyon.yaml", ["clutter.model=none", "modulation.acquisition_frames=1"], frames=4)
+scenario = irt.load(
+    "../scenes/street_canyon.yaml",
+    ["clutter.model=none", "modulation.acquisition_frames=1"],
+    frames=4,
+)
 for name, receiver in (("standard", irt.standard_terminal), ("cautious", terminal)):
     own = irt.run(scenario, terminal=receiver).summary["terminals"]["AT"]
-    print(f"{name}: hit rate {own['hit_rate']:.2f}, false detections per frame {own['false_per_frame']:.1f}")
+    print(
+        f"{name}: hit rate {own['hit_rate']:.2f}, false detections per frame "
+        f"{own['false_per_frame']:.1f}"
+    )
 
 # %% [markdown]
 # The samples can go elsewhere too: to a file, to SigMF, to another program.

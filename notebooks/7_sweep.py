@@ -8,7 +8,8 @@
 
 # %% [markdown]
 # # A sweep and its figures
-# A sweep is a scenario, axes and repetitions. It runs on all cores, keeps every finished point, and goes on where it stopped.
+# A sweep is a scenario, axes and repetitions. It runs on all cores, keeps every finished point, and
+# goes on where it stopped.
 
 # %% [markdown]
 # Four noise levels and two orders of the phase modulation, five frames each:
@@ -48,4 +49,4 @@ dataset.ser_dpsk_pooled.sel(link="AT->PT1").to_pandas()
 
 # %%
 figure, ax = plt.subplots(figsize=(7, 4))
-figures.sweep_curves(ax, dataset.sel(link=["AT->PT1"]), "ser_dpsk", "snr_db", "order");
+figures.sweep_curves(ax, dataset.sel(link=["AT->PT1"]), "ser_dpsk", "snr_db", "order")

@@ -1,4 +1,5 @@
-"""Shared by all tests: those that trace rays are skipped, with the reason, on a machine that cannot."""
+"""Shared by all tests: those that trace rays are skipped, with the reason, on a machine that
+cannot."""
 
 from __future__ import annotations
 
@@ -21,7 +22,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _backend(request: pytest.FixtureRequest) -> None:
     """Dr.Jit is told its back end before the first test that traces."""
-    if any(item.get_closest_marker("sionna") and not item.get_closest_marker("skip") for item in request.session.items):
+    if any(
+        item.get_closest_marker("sionna") and not item.get_closest_marker("skip")
+        for item in request.session.items
+    ):
         from isac_rt.runtime import activate
 
         activate()

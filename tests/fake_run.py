@@ -1,4 +1,5 @@
-"""A small made-up run, driven through the recorder: for the tests of results, figures, report and command line."""
+"""A small made-up run, driven through the recorder: for the tests of results, figures, report and
+command line."""
 
 from __future__ import annotations
 
@@ -18,7 +19,14 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.world.swarm import Swarm
 
 STATES = ("acquiring", "tracking", "lost")
-TIMING = {"setup": 1.25, "trace": 2.5, "synthesis": 3.75, "receive": 4.5, "track": 0.125, "total": 12.125}
+TIMING = {
+    "setup": 1.25,
+    "trace": 2.5,
+    "synthesis": 3.75,
+    "receive": 4.5,
+    "track": 0.125,
+    "total": 12.125,
+}
 
 
 def fake_scenario(frames: int = 7) -> Scenario:
@@ -40,22 +48,44 @@ def _values(own, poses, error: float = 0.0, keep=None) -> UavValues:
             continue
         e = own.to_body(offset / distance)
         rate = (offset / distance) @ (pose.velocity - own.velocity)
-        row = np.array([distance + error, rate - 2 * error, np.arctan2(e[0], e[1]) + error / 10, np.arcsin(e[2])])
+        row = np.array(
+            [
+                distance + error,
+                rate - 2 * error,
+                np.arctan2(e[0], e[1]) + error / 10,
+                np.arcsin(e[2]),
+            ]
+        )
         columns.append(row if keep is None or keep[k] else row * np.nan)
     r, v, a, e = np.array(columns).T
     return UavValues(range=r, velocity=v, azimuth=a, elevation=e)
 
 
 def _paths(own, poses, tx, rx, rng, count=23):
-    kind = np.concatenate([[PathKind.LEAKAGE if tx == rx else PathKind.LINE_OF_SIGHT, PathKind.TARGET], rng.integers(2, 5, count - 2)])
+    kind = np.concatenate(
+        [
+            [PathKind.LEAKAGE if tx == rx else PathKind.LINE_OF_SIGHT, PathKind.TARGET],
+            rng.integers(2, 5, count - 2),
+        ]
+    )
     u = rng.normal(size=(count, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     return make_paths(
         gain=10 ** (-4 - 2 * rng.random(count)) * np.exp(2j * np.pi * rng.random(count)),
-        delay=rng.uniform(3e-8, 6e-7, count), delay_rate=rng.normal(0, 3e-8, count), departure=u, arrival=-u, kind=kind,
-        epoch=0.1, tx=tx, rx=rx, target=np.where(kind == PathKind.TARGET, 2, -1), bounces=np.where(kind == PathKind.SPECULAR, 1, 0),
-        target_names=tuple(poses), points=rng.normal(0, 9, (count, 2, 3)), faces=rng.integers(0, 40, (count, 2)),
-    )  # fmt: skip
+        delay=rng.uniform(3e-8, 6e-7, count),
+        delay_rate=rng.normal(0, 3e-8, count),
+        departure=u,
+        arrival=-u,
+        kind=kind,
+        epoch=0.1,
+        tx=tx,
+        rx=rx,
+        target=np.where(kind == PathKind.TARGET, 2, -1),
+        bounces=np.where(kind == PathKind.SPECULAR, 1, 0),
+        target_names=tuple(poses),
+        points=rng.normal(0, 9, (count, 2, 3)),
+        faces=rng.integers(0, 40, (count, 2)),
+    )
 
 
 def _maps(w, rng, passes):
@@ -63,24 +93,43 @@ def _maps(w, rng, passes):
     power = rng.exponential(1e-12, (rows, doppler))
     power[17, 60] = 3e-9
     speed = (np.arange(doppler) - doppler // 2) * w.velocity_cell(passes)
-    return Maps(range_doppler=power, range_axis=np.arange(rows) * w.range_cell(passes), velocity_axis=speed,
-                equivalent_range=rng.rayleigh(1e-6, (64, doppler)), equivalent_detections=rng.random((64, doppler)) < 0.01)  # fmt: skip
+    return Maps(
+        range_doppler=power,
+        range_axis=np.arange(rows) * w.range_cell(passes),
+        velocity_axis=speed,
+        equivalent_range=rng.rayleigh(1e-6, (64, doppler)),
+        equivalent_detections=rng.random((64, doppler)) < 0.01,
+    )
 
 
 def _reception(w, rng, truth, maps, decoded, detections):
     found = Detections(
-        range=truth.range[2] + rng.normal(0, 0.05, detections), velocity=truth.velocity[2] + rng.normal(0, 0.1, detections),
-        direction=rng.uniform(-0.5, 0.5, (detections, 2)), snr=rng.uniform(20, 400, detections),
-        std=np.full((detections, 4), 0.07), is_reference=np.zeros(detections, bool),
-    )  # fmt: skip
+        range=truth.range[2] + rng.normal(0, 0.05, detections),
+        velocity=truth.velocity[2] + rng.normal(0, 0.1, detections),
+        direction=rng.uniform(-0.5, 0.5, (detections, 2)),
+        snr=rng.uniform(20, 400, detections),
+        std=np.full((detections, 4), 0.07),
+        is_reference=np.zeros(detections, bool),
+    )
     none = np.full((1, 1), -1)
-    return Reception(detections=found, decoded=decoded, delay_symbols=none, transitions=none, bits=np.zeros(0, np.uint8),
-                     delay_confidence=none, transition_confidence=none, raw_delay_symbols=none, line_of_sight=decoded,
-                     reference_power=3.3e-13, maps=maps)  # fmt: skip
+    return Reception(
+        detections=found,
+        decoded=decoded,
+        delay_symbols=none,
+        transitions=none,
+        bits=np.zeros(0, np.uint8),
+        delay_confidence=none,
+        transition_confidence=none,
+        raw_delay_symbols=none,
+        line_of_sight=decoded,
+        reference_power=3.3e-13,
+        maps=maps,
+    )
 
 
 def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord]:
-    """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3, and U1 is hidden in frame 4."""
+    """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3,
+    and U1 is hidden in frame 4."""
     w, swarm, out = waveform_of(scenario), Swarm.from_scenario(scenario), []
     for f in range(scenario.frames):
         rng = np.random.default_rng([5, f])
@@ -95,45 +144,103 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
             sent = data and name == "PT1"
             observers[name] = ObserverRecord(
                 transmitter="AT",
-                reception=_reception(w, rng, truth, _maps(w, rng, 2 if name == "AT" else 1) if snapshot else None, sent, detections),
+                reception=_reception(
+                    w,
+                    rng,
+                    truth,
+                    _maps(w, rng, 2 if name == "AT" else 1) if snapshot else None,
+                    sent,
+                    detections,
+                ),
                 paths=_paths(own, poses, "AT", name, rng),
                 truth=truth,
                 detected=_values(own, poses, 0.0637, see),
                 tracked=_values(own, poses, 0.0213, see),
                 in_view=np.array([name == "PT1", False, True]),
                 shadowed=hidden,
-                tracks=TrackTable(id=np.array([4]), range=truth.range[2:], velocity=truth.velocity[2:], u_x=np.array([0.1]),
-                                  u_z=np.array([0.02]), confirmed=np.array([True]), uav=np.array([2])),
+                tracks=TrackTable(
+                    id=np.array([4]),
+                    range=truth.range[2:],
+                    velocity=truth.velocity[2:],
+                    u_x=np.array([0.1]),
+                    u_z=np.array([0.02]),
+                    confirmed=np.array([True]),
+                    uav=np.array([2]),
+                ),
                 state=int(f > 0),
-                detection_kind=np.array([1, 3, -1, 4][:detections]) if detections else np.zeros(0, int),
-                detection_target=np.array([2, -1, -1, -1][:detections]) if detections else np.zeros(0, int),
-                detection_order=np.array([0, 1, -1, 1][:detections]) if detections else np.zeros(0, int),
-                detection_face=np.array([-1, 70123, -1, 5][:detections]) if detections else np.zeros(0, int),
-                symbols=SymbolCount(360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1) if sent else SymbolCount(),
+                detection_kind=np.array([1, 3, -1, 4][:detections])
+                if detections
+                else np.zeros(0, int),
+                detection_target=np.array([2, -1, -1, -1][:detections])
+                if detections
+                else np.zeros(0, int),
+                detection_order=np.array([0, 1, -1, 1][:detections])
+                if detections
+                else np.zeros(0, int),
+                detection_face=np.array([-1, 70123, -1, 5][:detections])
+                if detections
+                else np.zeros(0, int),
+                symbols=SymbolCount(
+                    360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1
+                )
+                if sent
+                else SymbolCount(),
                 num_false=1,
                 reference_snr=7.7,
-            )  # fmt: skip
-        out.append(FrameRecord(frame=f, time=f * 0.043 + 0.004, modulated=data, poses=poses, observers=observers, snapshot=snapshot))
+            )
+        out.append(
+            FrameRecord(
+                frame=f,
+                time=f * 0.043 + 0.004,
+                modulated=data,
+                poses=poses,
+                observers=observers,
+                snapshot=snapshot,
+            )
+        )
     return out
 
 
 def fake_recorder(scenario: Scenario) -> Recorder:
     w = waveform_of(scenario)
-    return Recorder(scenario, w, Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)), STATES)
+    return Recorder(
+        scenario,
+        w,
+        Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)),
+        STATES,
+    )
 
 
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
     w = waveform_of(scenario)
     recorder = fake_recorder(scenario)
-    scores = {("AT", name): SensingScore(resolutions(w, antennas_of(scenario, w), passes)) for name, passes in (("AT", 2), ("PT1", 1))}
+    scores = {
+        ("AT", name): SensingScore(resolutions(w, antennas_of(scenario, w), passes))
+        for name, passes in (("AT", 2), ("PT1", 1))
+    }
     for record in fake_records(scenario, detections=detections):
         recorder.add(record)
         for name, o in record.observers.items():
             t = o.truth
             truth = (
-                Truth(t.range[2], t.velocity[2], *o.reception.detections.direction[0], t.azimuth[2], t.elevation[2]) if detections else None
+                Truth(
+                    t.range[2],
+                    t.velocity[2],
+                    *o.reception.detections.direction[0],
+                    t.azimuth[2],
+                    t.elevation[2],
+                )
+                if detections
+                else None
             )
-            scores["AT", name].add([truth] if truth else [], o.reception.detections, kinds=o.detection_kind)
+            scores["AT", name].add(
+                [truth] if truth else [], o.reception.detections, kinds=o.detection_kind
+            )
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
-    return recorder.finish(scores=scores, timing=TIMING, fidelity={"model": "free_space", "if_model": "exact"}, link_budget=budget)
+    return recorder.finish(
+        scores=scores,
+        timing=TIMING,
+        fidelity={"model": "free_space", "if_model": "exact"},
+        link_budget=budget,
+    )

@@ -1,13 +1,14 @@
 """Mutation testing: does anything notice when the program is wrong?
 
-    python tests/mutation.py --planted [WORDS]        plant each case's bug of `isac-rt validate`; the case must fail
-                                                      (WORDS: parts of "group: name", with commas)
-    python tests/mutation.py --hard [WORDS]           plant the bugs of planted.py; the hard cases' tests must fail
-    python tests/mutation.py --sample 60 --seed 1     plant sampled sign, factor, index and unit errors; the tests must fail
+    python tests/mutation.py --planted [WORDS]     the bug of each case of `isac-rt validate`
+                                                   (WORDS: parts of "group: name", with commas)
+    python tests/mutation.py --hard [WORDS]        the bugs of planted.py, against their tests
+    python tests/mutation.py --sample 60 --seed 1  sampled sign, factor, index and unit errors
 
-Both work on a copy in a temporary folder. --planted takes about ten minutes. --sample first runs the tests once to see which of them call
-which function (--record FILE keeps that for the next time), then tries each mutant on those that call its function, the quick ones first.
-The exit status is 1 if a planted bug goes unnoticed, or if less than 90 % of the sample is caught.
+Both work on a copy in a temporary folder. --planted takes about ten minutes. --sample first runs
+the tests once to see which of them call which function (--record FILE keeps that for the next
+time), then tries each mutant on those that call its function, the quick ones first. The exit status
+is 1 if a planted bug goes unnoticed, or if less than 90 % of the sample is caught.
 """
 
 from __future__ import annotations
@@ -100,27 +101,51 @@ COMPILED_FROM = {
     "propagation/clutter/field.py": ("propagation/clutter/two_bounces.py",),
     "propagation/clutter/mirrors.py": ("propagation/clutter/two_bounces.py",),
 }
-"""The modules in whose compiled code a module's own is held; their cache does not know that it changed."""
+"""The modules in whose compiled code a module's own is held; their cache does not know that it
+changed."""
 LIMIT = 400
-"""Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by then has been noticed."""
+"""Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by
+then has been noticed."""
 BUDGET = 60.0
-"""Seconds of tests, as they were recorded, that are tried on one mutant: what only a slower one would notice counts as missed."""
+"""Seconds of tests, as they were recorded, that are tried on one mutant: what only a slower one
+would notice counts as missed."""
 EXCUSED = [
-    ("propagation/clutter/cells.py", "np.repeat(code[large], 2) * np.uint64(4)", "names of cells, for the hash: different all the same"),
-    ("propagation/clutter/rayleigh.py", "- (inside if clutter.place", "a draw from -0.5 to 0.5: the same law"),
+    (
+        "propagation/clutter/cells.py",
+        "np.repeat(code[large], 2) * np.uint64(4)",
+        "names of cells, for the hash: different all the same",
+    ),
+    (
+        "propagation/clutter/rayleigh.py",
+        "- (inside if clutter.place",
+        "a draw from -0.5 to 0.5: the same law",
+    ),
     ("receive/estimate.py", "step / np.sign([gx, gy])", "a product with a sign is the quotient"),
-    ("propagation/legs/bodies.py", "reach / np.sqrt(wavelength * (before[i]", "a wider first look at a body; the exact one follows"),
+    (
+        "propagation/legs/bodies.py",
+        "reach / np.sqrt(wavelength * (before[i]",
+        "a wider first look at a body; the exact one follows",
+    ),
     ("propagation/legs/bodies.py", "+ radius) * 2)", "wider as well"),
-    ("propagation/legs/direct.py", "(which.size, 2, 3)) for name in pair]", "a part of no length, which nothing shades"),
+    (
+        "propagation/legs/direct.py",
+        "(which.size, 2, 3)) for name in pair]",
+        "a part of no length, which nothing shades",
+    ),
     ("signal/gridded.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
     ("signal/gridded.py", "lag[:, 1]", "and of one offset"),
     ("signal/separable.py", "* fast) % 2)", "whole turns, one or two"),
     ("propagation/clutter/penumbra.py", "lift / side", "a quotient by a sign"),
     ("propagation/legs/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
     ("receive/maps.py", "support] = -2", "less than any modulus, as -1 is"),
-    ("signal/profiles.py", "*plan(2), np.zeros((0", "the transform of no band, which is never made"),
+    (
+        "signal/profiles.py",
+        "*plan(2), np.zeros((0",
+        "the transform of no band, which is never made",
+    ),
 ]
-"""Mutants (file, what the changed line holds and the line did not, why) that are not sampled: what follows is as right."""
+"""Mutants (file, what the changed line holds and the line did not, why) that are not sampled: what
+follows is as right."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +175,9 @@ class _Finder(ast.NodeVisitor):
         self._index = False
 
     def _at(self, line: int, column: int) -> int:
-        return self._lines[line - 1] + len(self.source.splitlines()[line - 1].encode()[:column].decode())
+        return self._lines[line - 1] + len(
+            self.source.splitlines()[line - 1].encode()[:column].decode()
+        )
 
     def _add(self, node: ast.AST, kind: str, start: int, old: str, new: str) -> None:
         self.found.append(Mutant(self.file, node.lineno, kind, start, old, new))  # type: ignore[attr-defined]
@@ -174,7 +201,12 @@ class _Finder(ast.NodeVisitor):
             self.visit(statement)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
-        signs = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
+        signs = {
+            ast.Add: ("+", "-"),
+            ast.Sub: ("-", "+"),
+            ast.Mult: ("*", "/"),
+            ast.Div: ("/", "*"),
+        }
         if type(node.op) in signs and not isinstance(node.left, ast.List | ast.Tuple):
             old, new = signs[type(node.op)]
             begin = self._at(node.left.end_lineno or 0, node.left.end_col_offset or 0)
@@ -200,7 +232,18 @@ class _Finder(ast.NodeVisitor):
         for argument in node.args:
             self.visit(argument)
         for keyword in node.keywords:
-            if keyword.arg not in ("axis", "axes", "workers", "cache", "nogil", "maxsize", "rcond", "indexing", "kind", "stacklevel"):
+            if keyword.arg not in (
+                "axis",
+                "axes",
+                "workers",
+                "cache",
+                "nogil",
+                "maxsize",
+                "rcond",
+                "indexing",
+                "kind",
+                "stacklevel",
+            ):
                 self.visit(keyword.value)
 
     def visit_Subscript(self, node: ast.Subscript) -> None:
@@ -210,7 +253,11 @@ class _Finder(ast.NodeVisitor):
         self._index = outer
 
     def visit_Constant(self, node: ast.Constant) -> None:
-        if isinstance(node.value, bool) or not isinstance(node.value, int | float) or node.end_lineno != node.lineno:
+        if (
+            isinstance(node.value, bool)
+            or not isinstance(node.value, int | float)
+            or node.end_lineno != node.lineno
+        ):
             return
         start = self._at(node.lineno, node.col_offset)
         old = self.source[start : self._at(node.lineno, node.end_col_offset or 0)]
@@ -224,7 +271,8 @@ class _Finder(ast.NodeVisitor):
 
 
 def mutants_of(file: str, source: str) -> list[Mutant]:
-    """Every mutant of a module of the package, but for its constants' own definitions (limits and thresholds are choices)."""
+    """Every mutant of a module of the package, but for its constants' own definitions (limits and
+    thresholds are choices)."""
     finder = _Finder(file, source)
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -243,8 +291,11 @@ class Copy:
             shutil.copytree(ROOT / name, self.folder / name)
         shutil.copy2(ROOT / "pyproject.toml", self.folder)
         self.environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join([str(self.folder), str(self.folder / "tests"), os.environ.get("PYTHONPATH", "")]),
-            "PYTHONDONTWRITEBYTECODE": "1",  # two changes of one length within a second would look alike
+            "PYTHONPATH": os.pathsep.join(
+                [str(self.folder), str(self.folder / "tests"), os.environ.get("PYTHONPATH", "")]
+            ),
+            # two changes of one length within a second would look alike
+            "PYTHONDONTWRITEBYTECODE": "1",
         }
 
     def source(self, file: str) -> str:
@@ -271,18 +322,23 @@ class Copy:
             shutil.copy2(self._whole / file, target)
             self._forget(files)
             for one in files:
-                for compiled in (self._whole / one.parent / "__pycache__").glob(f"{one.stem}.*.nb?"):
+                for compiled in (self._whole / one.parent / "__pycache__").glob(
+                    f"{one.stem}.*.nb?"
+                ):
                     shutil.copy2(compiled, self.folder / "isac_rt" / one.parent / "__pycache__")
 
     def _forget(self, files: list[Path]) -> None:
         for one in files:
-            for compiled in (self.folder / "isac_rt" / one.parent / "__pycache__").glob(f"{one.stem}.*.nb?"):
+            for compiled in (self.folder / "isac_rt" / one.parent / "__pycache__").glob(
+                f"{one.stem}.*.nb?"
+            ):
                 compiled.unlink()
 
 
 @dataclass(frozen=True)
 class Record:
-    """Which tests call which function, from `mutation_record`: `called` by "file:name", `seconds` of each test."""
+    """Which tests call which function, from `mutation_record`: `called` by "file:name", `seconds`
+    of each test."""
 
     called: dict[str, list[str]]
     seconds: dict[str, float]
@@ -293,23 +349,62 @@ class Record:
         out = kept or copy.folder / "record.json"
         if not out.exists():
             names = sorted({name for names in TESTS_OF.values() for name in names.split()})
-            command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "mutation_record"]
+            command = [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-q",
+                "--no-header",
+                "-p",
+                "no:cacheprovider",
+                "-p",
+                "mutation_record",
+            ]
             environment = copy.environment | {"RECORD": str(out.absolute())}
-            subprocess.run([*command, *(f"tests/{n}.py" for n in names)], cwd=copy.folder, env=environment, check=True)
+            subprocess.run(
+                [*command, *(f"tests/{n}.py" for n in names)],
+                cwd=copy.folder,
+                env=environment,
+                check=True,
+            )
         copy.keep_compiled()
         found = Record(**json.loads(out.read_text()))
         files = sorted({t.partition("::")[0] for t in found.seconds})
-        command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider", *files]
-        there = subprocess.run(command, cwd=copy.folder, env=copy.environment, capture_output=True, text=True, check=True)
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "--collect-only",
+            "-p",
+            "no:cacheprovider",
+            *files,
+        ]
+        there = subprocess.run(
+            command,
+            cwd=copy.folder,
+            env=copy.environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         ids = set(there.stdout.splitlines())
-        return Record(found.called, {t: seconds for t, seconds in found.seconds.items() if t in ids})
+        return Record(
+            found.called, {t: seconds for t, seconds in found.seconds.items() if t in ids}
+        )
 
     def tests(self, mutant: Mutant, source: str) -> list[str]:
-        """Those that call a mutant's function, or all of its module if none does: what is compiled is called unseen. Quick ones first."""
-        name = next((name for name, first, last in _functions(source) if first <= mutant.line <= last), "")
+        """Those that call a mutant's function, or all of its module if none does: what is compiled
+        is called unseen. Quick ones first."""
+        name = next(
+            (name for name, first, last in _functions(source) if first <= mutant.line <= last), ""
+        )
         callers = set(self.called.get(f"{mutant.file}:{name}", ())) & set(self.seconds)
         files = tuple(f"tests/{name}.py::" for name in TESTS_OF[mutant.file].split())
-        order = sorted(callers or {t for t in self.seconds if t.startswith(files)}, key=self.seconds.__getitem__)
+        order = sorted(
+            callers or {t for t in self.seconds if t.startswith(files)},
+            key=self.seconds.__getitem__,
+        )
         before = np.cumsum([0.0, *(self.seconds[t] for t in order[:-1])])
         return [test for test, spent in zip(order, before.tolist(), strict=True) if spent < BUDGET]
 
@@ -327,9 +422,13 @@ def _functions(source: str) -> list[tuple[str, int, int]]:
 
 
 def sampled(count: int, seed: int, copy: Copy) -> list[Mutant]:
-    """So many mutants, the modules in turn, so that small ones are not forgotten, in an order that leaves any first part a sample too."""
+    """So many mutants, the modules in turn, so that small ones are not forgotten, in an order that
+    leaves any first part a sample too."""
     rng = random.Random(seed)
-    pools = {file: [m for m in mutants_of(file, copy.source(file)) if not excused(m, copy.source(file))] for file in TESTS_OF}
+    pools = {
+        file: [m for m in mutants_of(file, copy.source(file)) if not excused(m, copy.source(file))]
+        for file in TESTS_OF
+    }
     for pool in pools.values():
         rng.shuffle(pool)
     out: list[Mutant] = []
@@ -342,8 +441,17 @@ def sampled(count: int, seed: int, copy: Copy) -> list[Mutant]:
 
 def excused(mutant: Mutant, source: str) -> str | None:
     """Why a mutant is not to be caught."""
-    before, after = (text.splitlines()[mutant.line - 1] for text in (source, mutant.applied(source)))
-    return next((why for file, new, why in EXCUSED if file == mutant.file and new in after and new not in before), None)
+    before, after = (
+        text.splitlines()[mutant.line - 1] for text in (source, mutant.applied(source))
+    )
+    return next(
+        (
+            why
+            for file, new, why in EXCUSED
+            if file == mutant.file and new in after and new not in before
+        ),
+        None,
+    )
 
 
 class Server:
@@ -353,15 +461,26 @@ class Server:
         self._log = copy.folder / "pytest.log"
         command = [sys.executable, str(copy.folder / "tests" / "mutation_server.py")]
         self._process = subprocess.Popen(
-            command, cwd=copy.folder, env=copy.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            command,
+            cwd=copy.folder,
+            env=copy.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
 
     def outcome(self, tests: list[str], limit: float) -> tuple[str, str]:
-        """"passed", "failed" or "too long", and the first test that failed."""
+        """ "passed", "failed" or "too long", and the first test that failed."""
         arguments = ["-q", "-x", "--no-header", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
         status = self._ended({"arguments": arguments}, limit)
-        said = [line for line in self._log.read_text(errors="replace").splitlines() if line.startswith(("FAILED", "ERROR"))]
-        return {0: "passed", -1: "too long"}.get(status, "failed"), said[0].split(" - ")[0].partition(" ")[2] if said else ""
+        said = [
+            line
+            for line in self._log.read_text(errors="replace").splitlines()
+            if line.startswith(("FAILED", "ERROR"))
+        ]
+        return {0: "passed", -1: "too long"}.get(status, "failed"), said[0].split(" - ")[
+            0
+        ].partition(" ")[2] if said else ""
 
     def said(self, program: str, limit: float) -> str:
         """The last line that a program printed, or its error's; "too long"."""
@@ -371,7 +490,9 @@ class Server:
 
     def _ended(self, order: dict, limit: float) -> int:
         assert self._process.stdin and self._process.stdout
-        self._process.stdin.write(json.dumps(order | {"limit": limit, "log": str(self._log)}) + "\n")
+        self._process.stdin.write(
+            json.dumps(order | {"limit": limit, "log": str(self._log)}) + "\n"
+        )
         self._process.stdin.flush()
         return int(self._process.stdout.readline())
 
@@ -391,19 +512,42 @@ def check_sample(mutants: list[Mutant], copy: Copy, record: Record, report: Path
         tests = record.tests(mutant, source)
         with copy.changed(mutant.file, mutant.applied(source)):
             outcome, by = server.outcome(tests, LIMIT + 4 * sum(record.seconds[t] for t in tests))
-        if by not in sound and outcome == "failed":  # what failed has to pass where nothing is changed
+        if (
+            by not in sound and outcome == "failed"
+        ):  # what failed has to pass where nothing is changed
             if server.outcome([by] if by else tests, 10 * LIMIT)[0] == "passed":
                 sound.add(by)
             else:
                 outcome = "passed"
-        if outcome == "too long" and server.outcome(tests, LIMIT + 4 * sum(record.seconds[t] for t in tests))[0] != "passed":
+        if (
+            outcome == "too long"
+            and server.outcome(tests, LIMIT + 4 * sum(record.seconds[t] for t in tests))[0]
+            != "passed"
+        ):
             outcome = "passed"
         caught += outcome != "passed"
         line = source.splitlines()[mutant.line - 1].strip()
-        rows.append({"file": mutant.file, "line": mutant.line, "kind": mutant.kind, "old": mutant.old, "new": mutant.new, "code": line,
-                     "outcome": outcome, "by": by})  # fmt: skip
-        word, change = {"passed": "SURVIVED", "failed": "caught  "}.get(outcome, outcome), f"{mutant.kind} {mutant.old} -> {mutant.new}"
-        print(f"{word} {mutant.file}:{mutant.line} {change}  in  {line}  ({time.monotonic() - begin:.0f} s) {by}", flush=True)
+        rows.append(
+            {
+                "file": mutant.file,
+                "line": mutant.line,
+                "kind": mutant.kind,
+                "old": mutant.old,
+                "new": mutant.new,
+                "code": line,
+                "outcome": outcome,
+                "by": by,
+            }
+        )
+        word, change = (
+            {"passed": "SURVIVED", "failed": "caught  "}.get(outcome, outcome),
+            f"{mutant.kind} {mutant.old} -> {mutant.new}",
+        )
+        print(
+            f"{word} {mutant.file}:{mutant.line} {change}  in  {line}  "
+            f"({time.monotonic() - begin:.0f} s) {by}",
+            flush=True,
+        )
         if report:
             report.write_text(json.dumps(rows, indent=1) + "\n")
     server.end()
@@ -428,16 +572,24 @@ def check_planted(words: str) -> int:
             source = copy.source(p.file)
             if source.count(p.old) != 1:
                 wrong += 1
-                print(f"STALE    {one.name}: {p.file} holds {p.old!r} {source.count(p.old)} times", flush=True)
+                print(
+                    f"STALE    {one.name}: {p.file} holds {p.old!r} {source.count(p.old)} times",
+                    flush=True,
+                )
                 continue
             program = (
                 "from isac_rt.studies.validation import all_cases, run_case; "
-                f"v = run_case(next(c for c in all_cases() if c.name == {one.name!r})); print(v.passed, v.error, v.note)"
+                f"v = run_case(next(c for c in all_cases() if c.name == {one.name!r})); "
+                "print(v.passed, v.error, v.note)"
             )
             with copy.changed(p.file, source.replace(p.old, p.new)):
                 said = server.said(program, LIMIT)
-            state = {"False": "fails   ", "None ": "LEFT OUT"}.get(said[:5], "UNNOTICED" if said.startswith("True") else "fails   ")
-            if re.match(r"False inf \w+: ", said):  # the bug is no wrong number but a program that does not run
+            state = {"False": "fails   ", "None ": "LEFT OUT"}.get(
+                said[:5], "UNNOTICED" if said.startswith("True") else "fails   "
+            )
+            if re.match(
+                r"False inf \w+: ", said
+            ):  # the bug is no wrong number but a program that does not run
                 state = "CRASHES "
             wrong += state in ("UNNOTICED", "CRASHES ")
             print(f"{state} {one.name}: {said[:150]}", flush=True)
@@ -447,7 +599,8 @@ def check_planted(words: str) -> int:
 
 
 def check_hard(words: str) -> int:
-    """Plant the bugs that the hard cases are written against; print those that their tests do not see."""
+    """Plant the bugs that the hard cases are written against; print those that their tests do not
+    see."""
     from planted import BUGS
 
     wrong, count = 0, 0
@@ -470,13 +623,22 @@ def check_hard(words: str) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--planted", nargs="?", const="", metavar="WORDS")
     parser.add_argument("--hard", nargs="?", const="", metavar="WORDS")
     parser.add_argument("--sample", type=int, default=0, metavar="COUNT")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", metavar="WORDS", help="of the sample, the files with these words in their name")
-    parser.add_argument("--record", type=Path, help="which tests call which function; made if it is not there")
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="WORDS",
+        help="of the sample, the files with these words in their name",
+    )
+    parser.add_argument(
+        "--record", type=Path, help="which tests call which function; made if it is not there"
+    )
     parser.add_argument("--report", type=Path, help="JSON of the sample")
     arguments = parser.parse_args()
     if arguments.planted is not None:
@@ -489,7 +651,9 @@ def main() -> int:
             mutants = sampled(arguments.sample, arguments.seed, copy)
             if arguments.only:
                 mutants = [m for m in mutants if arguments.only in m.file]
-            return check_sample(mutants, copy, Record.made(copy, arguments.record), arguments.report)
+            return check_sample(
+                mutants, copy, Record.made(copy, arguments.record), arguments.report
+            )
     parser.print_help()
     return 2
 

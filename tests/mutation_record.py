@@ -1,4 +1,5 @@
-"""A pytest plugin for `mutation.py`: which tests call which function of the package, and how long each test takes.
+"""A pytest plugin for `mutation.py`: which tests call which function of the package, and how long
+each test takes.
 
     RECORD=file.json pytest -p mutation_record tests/test_x.py
 
@@ -52,5 +53,8 @@ def pytest_sessionfinish() -> None:
     before = json.loads(file.read_text()) if file.exists() else {"called": {}, "seconds": {}}
     for place, tests in before["called"].items():
         _called.setdefault(place, {}).update(dict.fromkeys(t for t in tests if t not in _seconds))
-    text = {"called": {place: list(tests) for place, tests in _called.items()}, "seconds": before["seconds"] | _seconds}
+    text = {
+        "called": {place: list(tests) for place, tests in _called.items()},
+        "seconds": before["seconds"] | _seconds,
+    }
     file.write_text(json.dumps(text, indent=0) + "\n")

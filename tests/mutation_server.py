@@ -1,7 +1,9 @@
-"""Runs pytest or a program again and again for `mutation.py`, each time in a child of one process that has the libraries loaded.
+"""Runs pytest or a program again and again for `mutation.py`, each time in a child of one process
+that has the libraries loaded.
 
-Reads lines of JSON {"arguments": [...] of pytest or "program": text, "limit": seconds, "log": file} and answers each with a line: the exit
-status, or -1 when the time was up. What is tested is loaded by the child, never here.
+Reads lines of JSON {"arguments": [...] of pytest or "program": text, "limit": seconds, "log": file}
+and answers each with a line: the exit status, or -1 when the time was up. What is tested is loaded
+by the child, never here.
 """
 
 from __future__ import annotations
@@ -16,7 +18,10 @@ from importlib import import_module
 
 import pytest
 
-LIBRARIES = "numpy scipy.fft scipy.stats scipy.optimize scipy.ndimage scipy.interpolate scipy.spatial numba xarray pydantic yaml hypothesis"
+LIBRARIES = (
+    "numpy scipy.fft scipy.stats scipy.optimize scipy.ndimage scipy.interpolate "
+    "scipy.spatial numba xarray pydantic yaml hypothesis"
+)
 
 
 def in_child(order: dict, log: str) -> None:

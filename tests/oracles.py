@@ -1,4 +1,5 @@
-"""Slow reference implementations, written from the equations and sharing no code with the package."""
+"""Slow reference implementations, written from the equations and sharing no code with the
+package."""
 
 from __future__ import annotations
 
@@ -8,11 +9,13 @@ LIGHT = np.longdouble(299_792_458)
 
 
 def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0):
-    """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long double).
+    """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long
+    double).
 
-    `start_time` is that of the first reference chirp, which is sent in resource block `block` of its slot. Times are counted
-    from the start of the slot, so that no phase is formed from f_c times an absolute time. Elements are placed as points: a path
-    with a radius comes from (goes to) a point at this distance; a line of sight joins two elements.
+    `start_time` is that of the first reference chirp, which is sent in resource block `block` of
+    its slot. Times are counted from the start of the slot, so that no phase is formed from f_c
+    times an absolute time. Elements are placed as points: a path with a radius comes from (goes to)
+    a point at this distance; a line of sight joins two elements.
     """
     ld = np.longdouble
     period = ld(1) / ld(w.sampling_rate)
@@ -34,12 +37,18 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0
         later = ld(start_time) + frame / 2 - ld(paths.epoch)
         for m, source, p, k in np.ndindex(w.num_groups, w.num_groups, w.num_chirps, len(paths)):
             a = sender.schedule[source, p]
-            begun = 2 * (source + sender.first_block) * longest + ld(sender.payload.delay_symbols[source, p]) / (slope * window)
+            begun = 2 * (source + sender.first_block) * longest + ld(
+                sender.payload.delay_symbols[source, p]
+            ) / (slope * window)
             reference = 2 * (m + block) * longest
             slot_time = reference + fast
             t = 2 * m * longest + fast + p * slot - frame / 2
             aged = t + later
-            tau = ld(paths.delay[k]) + ld(paths.delay_rate[k]) * aged + ld(paths.delay_accel[k]) * aged * aged / 2
+            tau = (
+                ld(paths.delay[k])
+                + ld(paths.delay_rate[k]) * aged
+                + ld(paths.delay_accel[k]) * aged * aged / 2
+            )
             tau = tau + ld(sender.clock_offset) + ld(sender.clock_drift) * t
             middle = begun + tau[w.num_samples // 2] - reference
             beat = float(slope * middle)
@@ -83,7 +92,8 @@ def _norm(v):
 
 
 def splitmix64(state: int, word: int) -> int:
-    """The state moved on by the golden ratio's multiple and mixed, in whole numbers of Python; the published generator with word 0."""
+    """The state moved on by the golden ratio's multiple and mixed, in whole numbers of Python; the
+    published generator with word 0."""
     mask = 2**64 - 1
     z = state + (word + 1) * 0x9E3779B97F4A7C15 & mask
     z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9 & mask

@@ -1,4 +1,5 @@
-"""Test cubes straight from the equation of the IF signal, float64, sharing nothing with the program's synthesis."""
+"""Test cubes straight from the equation of the IF signal, float64, sharing nothing with the
+program's synthesis."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * C / 77e9, p
 
 @dataclass
 class Path:
-    """length and rate of the whole path [m, m/s] at mid-frame, complex amplitude, body-frame (u_x, u_z) at both ends."""
+    """length and rate of the whole path [m, m/s] at mid-frame, complex amplitude, body-frame (u_x,
+    u_z) at both ends."""
 
     length: float
     rate: float
@@ -34,21 +36,44 @@ def frame(order: int = 8, seed: int = 3, waveform: Waveform | None = None):
     return w, schedule, random_payload(w, schedule, order, rng)
 
 
-def cube(w: Waveform, schedule, payload: Payload, paths: list[Path], antennas: Antennas = ANTENNAS, noise=0.0, seed=0):
-    """cycles = f_c tau + alpha tau (u - tau/2), tau = tau_D + tau_k(t) - r.u/c, t the sample time since mid-frame."""
+def cube(
+    w: Waveform,
+    schedule,
+    payload: Payload,
+    paths: list[Path],
+    antennas: Antennas = ANTENNAS,
+    noise=0.0,
+    seed=0,
+):
+    """cycles = f_c tau + alpha tau (u - tau/2), tau = tau_D + tau_k(t) - r.u/c, t the sample time
+    since mid-frame."""
     out = np.zeros((w.num_groups, antennas.num_rx, w.num_chirps, w.num_samples), np.complex64)
     u = np.arange(w.num_samples) / w.sampling_rate + w.chirp_duration - w.sampled_duration
     for m in range(w.num_groups):
-        t = u + (np.arange(w.num_chirps) * w.slot_duration + 2 * m * w.max_delay - w.frame_duration / 2)[:, None]
+        t = (
+            u
+            + (
+                np.arange(w.num_chirps) * w.slot_duration
+                + 2 * m * w.max_delay
+                - w.frame_duration / 2
+            )[:, None]
+        )
         symbol = payload.delay_symbols[m] / (w.slope * w.sampled_duration)
         for path in paths:
-            sent = antennas.tx_positions[schedule[m]] @ np.array([path.departure[0], 0, path.departure[1]])
+            sent = antennas.tx_positions[schedule[m]] @ np.array(
+                [path.departure[0], 0, path.departure[1]]
+            )
             for rx in range(antennas.num_rx):
                 heard = antennas.rx_positions[rx] @ np.array([path.arrival[0], 0, path.arrival[1]])
                 tau = (path.length + path.rate * t - (sent[:, None] + heard)) / C + symbol[:, None]
                 cycles = (w.carrier_frequency * tau) % 1 + w.slope * tau * (u - tau / 2)
-                out[m, rx] += path.amplitude * payload.phases[m][:, None] * np.exp(2j * np.pi * (cycles % 1))
+                out[m, rx] += (
+                    path.amplitude * payload.phases[m][:, None] * np.exp(2j * np.pi * (cycles % 1))
+                )
     if noise:
         rng = np.random.default_rng(seed)
-        out += np.sqrt(noise / 2) * rng.standard_normal((*out.shape, 2), np.float32).view(np.complex64)[..., 0]
+        out += (
+            np.sqrt(noise / 2)
+            * rng.standard_normal((*out.shape, 2), np.float32).view(np.complex64)[..., 0]
+        )
     return IFCube(samples=out, waveform=w, schedule=schedule, start_time=0.0)

@@ -1,4 +1,5 @@
-"""Feedback: whole-cell slips planted at a passive terminal and repaired by what the active one knows."""
+"""Feedback: whole-cell slips planted at a passive terminal and repaired by what the active one
+knows."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ SIGMAS = 4.5  # statistical: fails by chance once in 10^5
 
 
 def decoded(frame, error_cells):
-    """A data frame at 0 dB per sample from 21.317 m, read with a range that is wrong by so many cells."""
+    """A data frame at 0 dB per sample from 21.317 m, read with a range that is wrong by so many
+    cells."""
     rng = np.random.default_rng([31, frame])
     schedule = pseudo_random_schedule(W.num_groups, W.num_chirps, W.num_tx, rng)
     sent = random_payload(W, schedule, 8, rng)
@@ -42,8 +44,9 @@ def decoded(frame, error_cells):
 
 @pytest.mark.parametrize("slip", [-3, -1, 1, 3])
 def test_planted_slips_are_repaired_by_the_next_feedback(slip):
-    """A slip from frame 2 on, feedback after every 4th frame, one frame of travel: frames 2, 3 and 4 are wrong (delay SER over 0.9) and
-    none before or after. The echo is good to 0.09 m, a fifth of a cell.
+    """A slip from frame 2 on, feedback after every 4th frame, one frame of travel: frames 2, 3 and
+    4 are wrong (delay SER over 0.9) and none before or after. The echo is good to 0.09 m, a fifth
+    of a cell.
 
     Planted bug: the sign of the correction."""
     period, error, pending = 4, 0, None
@@ -70,8 +73,9 @@ def test_planted_slips_are_repaired_by_the_next_feedback(slip):
 
 @pytest.mark.parametrize("share", [0.21, 0.33])
 def test_without_symbols_the_echo_decides_as_the_normal_law_says(share):
-    """The likeliest slip is wrong with 2 Q(1/2 cell / sigma), and is sure only when its posterior is 0.999; then it is wrong at most
-    once in 1000. Planted bug: the echo's spread left out of sigma."""
+    """The likeliest slip is wrong with 2 Q(1/2 cell / sigma), and is sure only when its posterior
+    is 0.999; then it is wrong at most once in 1000. Planted bug: the echo's spread left out of
+    sigma."""
     rng, trials = np.random.default_rng(12), 4000
     hits = sure = sure_wrong = 0
     expected = 0.0
@@ -88,13 +92,16 @@ def test_without_symbols_the_echo_decides_as_the_normal_law_says(share):
     assert abs(hits - trials * right) < SIGMAS * np.sqrt(trials * right * (1 - right))
     # the mean posterior of the likeliest is its rate of being right
     assert abs(expected - trials * right) < SIGMAS * np.sqrt(trials * right * (1 - right))
-    assert (sure > 0) == (share < 0.25)  # 2 exp(-1/2 share^2) is 2 % at 0.33 even in the middle of a cell
+    assert (sure > 0) == (
+        share < 0.25
+    )  # 2 exp(-1/2 share^2) is 2 % at 0.33 even in the middle of a cell
     assert sure_wrong <= 0.001 * sure + SIGMAS * np.sqrt(0.001 * sure) + 1
 
 
 def test_the_alphabet_bounds_the_slip():
-    """Symbols read -2 .. 124 of 128 allow slips of 2 and 3 only; a poor echo (1 cell) then chooses between two and is not sure, one that
-    says 2.1 cells with 0.15 is; an echo of something else is none. Planted bug: bounds of the other sign."""
+    """Symbols read -2 .. 124 of 128 allow slips of 2 and 3 only; a poor echo (1 cell) then chooses
+    between two and is not sure, one that says 2.1 cells with 0.15 is; an echo of something else is
+    none. Planted bug: bounds of the other sign."""
     told = Feedback(40.0, 0.001, -2, 124, 300)
     poor = correct(told, 40.0 - 2.1 * CELL, 1.0 * CELL, 0.0, W)
     assert not poor.sure
@@ -110,5 +117,6 @@ def test_the_alphabet_bounds_the_slip():
 
 @pytest.mark.parametrize(("first", "frames"), [(0, 26), (24, 2), (25, 26), (13, 13)])
 def test_the_frames_to_repair_are_those_that_go_by(first, frames):
-    """Counted by hand for a period of 25 and one frame of travel. Planted bug: the travel left out."""
+    """Counted by hand for a period of 25 and one frame of travel. Planted bug: the travel left
+    out."""
     assert frames_to_repair(first, 25) == frames

@@ -1,4 +1,5 @@
-"""On-off keyed messages and the identification of blocks, against the laws of noncoherent detection."""
+"""On-off keyed messages and the identification of blocks, against the laws of noncoherent
+detection."""
 
 from __future__ import annotations
 
@@ -6,7 +7,14 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from isac_rt.access.identify import HOT_RATE, choose_run, consensus, hot_chirps, hot_threshold, needed_chirps
+from isac_rt.access.identify import (
+    HOT_RATE,
+    choose_run,
+    consensus,
+    hot_chirps,
+    hot_threshold,
+    needed_chirps,
+)
 from isac_rt.access.ook import Codebook, Message, keyed, read, repeats, threshold
 from isac_rt.frame.waveform import Waveform
 
@@ -14,7 +22,9 @@ SIGMAS = 4.5  # statistical: fails by chance once in 10^5
 
 
 def noise(rng, *shape):
-    return (rng.standard_normal((*shape, 2), np.float32) * np.float32(np.sqrt(0.5))).view(np.complex64)[..., 0]
+    return (rng.standard_normal((*shape, 2), np.float32) * np.float32(np.sqrt(0.5))).view(
+        np.complex64
+    )[..., 0]
 
 
 def tone(cell, num_samples):
@@ -25,17 +35,22 @@ def marcum(order, a, b):
     """Q_M(a, b) by quadrature of its integral."""
 
     def density(x):
-        return x * (x / a) ** (order - 1) * np.exp(-((x - a) ** 2) / 2) * special.ive(order - 1, a * x)
+        return (
+            x * (x / a) ** (order - 1) * np.exp(-((x - a) ** 2) / 2) * special.ive(order - 1, a * x)
+        )
 
     return integrate.quad(density, b, b + a + 40, limit=400, epsabs=1e-12)[0]
 
 
 def within(count, trials, probability):
-    return abs(count - trials * probability) <= SIGMAS * np.sqrt(trials * probability * (1 - probability))
+    return abs(count - trials * probability) <= SIGMAS * np.sqrt(
+        trials * probability * (1 - probability)
+    )
 
 
 def test_every_message_comes_back_and_single_errors_are_caught():
-    """All senders and blocks, and every bit turned. Planted bug: parity over the sender's bits only."""
+    """All senders and blocks, and every bit turned. Planted bug: parity over the sender's bits
+    only."""
     book = Codebook(num_senders=5, num_blocks=19)
     assert book.num_bits == 3 + 5 + 1
     for sender in range(5):
@@ -60,11 +75,13 @@ def test_the_mask_says_on_off_and_then_the_bits():
 
 @pytest.mark.parametrize("snr_db", [-2.7, -0.6])
 def test_bit_errors_follow_the_closed_form(snr_db):
-    """Wrong ones and zeros of messages with a false rate of 5 %: 1 - Q_L(sqrt(2 L g), sqrt(2 L t)) and the chi-square's tail,
-    L = 3 antennas x 4 repeats looks, t the threshold, g = 10^(snr_db/10) the SNR of a cell and look.
+    """Wrong ones and zeros of messages with a false rate of 5 %: 1 - Q_L(sqrt(2 L g), sqrt(2 L t))
+    and the chi-square's tail, L = 3 antennas x 4 repeats looks, t the threshold, g = 10^(snr_db/10)
+    the SNR of a cell and look.
 
-    The preamble is made strong, so that the cell is known as the closed form has it. The noise of 128 cells x 12 looks is known to 2.5 %,
-    which the F law has and the closed form here has not: 1 % of the rates at most. Planted bug: repeats not counted in the looks.
+    The preamble is made strong, so that the cell is known as the closed form has it. The noise of
+    128 cells x 12 looks is known to 2.5 %, which the F law has and the closed form here has not: 1
+    % of the rates at most. Planted bug: repeats not counted in the looks.
     """
     g, rate, rng = 10 ** (snr_db / 10), 0.05, np.random.default_rng(3)
     num_samples, bits, rx, each = 128, 40, 3, 4
@@ -76,7 +93,9 @@ def test_bit_errors_follow_the_closed_form(snr_db):
         level = np.sqrt(g / num_samples) * np.repeat(word, each)
         amplitude = np.concatenate([np.full(each, 1.0), np.zeros(each), level]).astype(np.complex64)
         phases = np.exp(2j * np.pi * rng.random((1, rx, amplitude.size, 1)))
-        samples = noise(rng, 1, rx, amplitude.size, num_samples) + phases * amplitude[:, None] * tone(37, num_samples)
+        samples = noise(rng, 1, rx, amplitude.size, num_samples) + phases * amplitude[
+            :, None
+        ] * tone(37, num_samples)
         got = read(samples, bits, on_rate=rate)
         assert got.found
         assert got.cell == 37
@@ -91,21 +110,27 @@ def test_bit_errors_follow_the_closed_form(snr_db):
 
 
 def test_noise_is_rarely_taken_for_a_sender_and_a_sender_between_cells_is_found():
-    """At a find rate of 20 % noise is found in at most so many frames (a union bound over correlated fractions: at least a quarter of it),
-    and a sender 0.37 cells off at 16 looks and 6 dB always. Planted bug: the preamble's rate not shared among the cells."""
+    """At a find rate of 20 % noise is found in at most so many frames (a union bound over
+    correlated fractions: at least a quarter of it), and a sender 0.37 cells off at 16 looks and 6
+    dB always. Planted bug: the preamble's rate not shared among the cells."""
     rng, trials = np.random.default_rng(4), 400
     found = sum(read(noise(rng, 1, 2, 24, 64), 4, find_rate=0.2).found for _ in range(trials))
     assert trials * 0.05 < found < trials * 0.2 + SIGMAS * np.sqrt(trials * 0.2 * 0.8)
     mask = np.repeat([1, 0, 1, 1, 0, 1], 4).astype(np.complex64)
     for _ in range(20):
-        got = read(noise(rng, 1, 4, 24, 64) + np.sqrt(4 / 64) * mask[:, None] * tone(11.37, 64), 4, on_rate=1e-3)
+        got = read(
+            noise(rng, 1, 4, 24, 64) + np.sqrt(4 / 64) * mask[:, None] * tone(11.37, 64),
+            4,
+            on_rate=1e-3,
+        )
         assert got.found
         assert got.cell in (11.25, 11.5)
         assert got.bits.tolist() == [1, 1, 0, 1]
 
 
 def test_hot_chirps_follow_the_closed_form():
-    """Shares of hot chirps in noise and with a sender whose cell data move at random, against 1 - F_on F_off^(N-1).
+    """Shares of hot chirps in noise and with a sender whose cell data move at random, against 1 -
+    F_on F_off^(N-1).
 
     Planted bug: the threshold for a single cell."""
     rng, num_cells, rx, chirps = np.random.default_rng(5), 128, 3, 3000
@@ -116,9 +141,12 @@ def test_hot_chirps_follow_the_closed_form():
     samples[1] += (np.sqrt(g / num_cells) * sent).astype(np.complex64)
     hot = hot_chirps(samples)
     t = hot_threshold(rx, num_cells)
-    # the sender's cell is compared with the mean of the others, known to 1/sqrt(381) = 5 %: averaged over it
+    # the sender's cell is compared with the mean of the others, known to 1/sqrt(381) = 5 %:
+    # averaged over it
     u = stats.f(2 * rx, 2 * rx * (num_cells - 1))
-    detected = 1 - stats.ncf(2 * rx, 2 * rx * (num_cells - 1), 2 * rx * g).cdf(t) * u.cdf(t) ** (num_cells - 1)
+    detected = 1 - stats.ncf(2 * rx, 2 * rx * (num_cells - 1), 2 * rx * g).cdf(t) * u.cdf(t) ** (
+        num_cells - 1
+    )
     print(hot / chirps, detected)
     assert within(hot[0], chirps, HOT_RATE)
     assert within(hot[1], chirps, detected)
@@ -128,7 +156,10 @@ def test_enough_hot_chirps_and_no_more():
     """The smallest count whose binomial tail is within the rate. Planted bug: one chirp less."""
     for chirps, rate in ((12, 1e-3), (57, 1e-4), (120, 1e-6)):
         count = needed_chirps(chirps, rate)
-        law = [special.comb(chirps, k) * HOT_RATE**k * (1 - HOT_RATE) ** (chirps - k) for k in range(chirps + 1)]
+        law = [
+            special.comb(chirps, k) * HOT_RATE**k * (1 - HOT_RATE) ** (chirps - k)
+            for k in range(chirps + 1)
+        ]
         tails = [sum(law[c:]) for c in (count - 1, count)]
         assert tails[1] <= rate < tails[0]
 
@@ -154,13 +185,17 @@ def test_the_majority_of_blocks_is_believed():
 
 
 def test_taken_blocks_are_missed_and_free_ones_suspected_as_the_binomial_says():
-    """Share of blocks of 12 chirps called free with a sender in them, and taken without one, at a false rate of 2 % and a cell SNR of 2.
+    """Share of blocks of 12 chirps called free with a sender in them, and taken without one, at a
+    false rate of 2 % and a cell SNR of 2.
 
     Planted bug: the threshold for a single cell."""
     rng, num_cells, rx, chirps, trials = np.random.default_rng(6), 64, 2, 12, 1500
     needed, g = needed_chirps(chirps, 0.02), 2.0
     t = hot_threshold(rx, num_cells)
-    off, on = stats.f(2 * rx, 2 * rx * (num_cells - 1)), stats.ncf(2 * rx, 2 * rx * (num_cells - 1), 2 * rx * g)
+    off, on = (
+        stats.f(2 * rx, 2 * rx * (num_cells - 1)),
+        stats.ncf(2 * rx, 2 * rx * (num_cells - 1), 2 * rx * g),
+    )
     one = 1 - on.cdf(t) * off.cdf(t) ** (num_cells - 1)
     samples = noise(rng, 2, rx, chirps * trials, num_cells)
     cells = rng.integers(0, num_cells, chirps * trials)
@@ -168,7 +203,10 @@ def test_taken_blocks_are_missed_and_free_ones_suspected_as_the_binomial_says():
     samples[1] += (np.sqrt(g / num_cells) * sent).astype(np.complex64)
     blocks = [hot_chirps(samples[:, :, i * chirps : (i + 1) * chirps]) for i in range(trials)]
     taken = (np.array(blocks) >= needed).sum(axis=0)
-    missed, false = stats.binom.cdf(needed - 1, chirps, one), stats.binom.sf(needed - 1, chirps, HOT_RATE)
+    missed, false = (
+        stats.binom.cdf(needed - 1, chirps, one),
+        stats.binom.sf(needed - 1, chirps, HOT_RATE),
+    )
     print("missed", 1 - taken[1] / trials, missed, "false", taken[0] / trials, false)
     assert 0.05 < missed < 0.95
     assert within(trials - taken[1], trials, missed)

@@ -1,4 +1,5 @@
-"""The stages before the data, end to end on the IF signal: who finds whom, and what goes wrong when they cannot hear each other."""
+"""The stages before the data, end to end on the IF signal: who finds whom, and what goes wrong when
+they cannot hear each other."""
 
 from __future__ import annotations
 
@@ -29,11 +30,13 @@ PLACES = {
 
 
 def scene_of(deaf=()):
-    """Lines of sight of unit gain between all, but for the (transmitter, receiver) pairs in `deaf`."""
+    """Lines of sight of unit gain between all, but for the (transmitter, receiver) pairs in
+    `deaf`."""
 
     def scene(time, links):
         poses = {
-            name: Pose(np.array(x) + time * np.array(v), np.array(v), np.zeros(3), np.eye(3)) for name, (x, v) in PLACES.items()
+            name: Pose(np.array(x) + time * np.array(v), np.array(v), np.zeros(3), np.eye(3))
+            for name, (x, v) in PLACES.items()
         }
         paths = {}
         for tx, rx in links:
@@ -82,10 +85,11 @@ def test_a_scan_hears_every_block():
 
 
 def test_everybody_finds_everybody():
-    """Two active terminals whose wishes overlap and three passive ones at -4.8 dB per sample. The second avoids the first's blocks 4 to 6
-    (the nearest free run to 5 starts at 7); P's clock is two blocks and 31 ns off, Q's is ahead of its path's delay. Clocks within 4
-    sigma of the truth, offsets known to 1 ns (a third of a metre). 17 frames each: 7 to listen, 7 to announce, 2 rounds,
-    1 acknowledgment.
+    """Two active terminals whose wishes overlap and three passive ones at -4.8 dB per sample. The
+    second avoids the first's blocks 4 to 6 (the nearest free run to 5 starts at 7); P's clock is
+    two blocks and 31 ns off, Q's is ahead of its path's delay. Clocks within 4 sigma of the truth,
+    offsets known to 1 ns (a third of a metre). 17 frames each: 7 to listen, 7 to announce, 2
+    rounds, 1 acknowledgment.
 
     Planted bug: the hold left out (Q is not heard by A)."""
     clocks = {
@@ -107,17 +111,30 @@ def test_everybody_finds_everybody():
         estimate = link.clock
         one, other = clocks.get(at, Clock()), clocks.get(pt, Clock())
         offset = one.late(estimate.time) - other.late(estimate.time)
-        print(at, pt, estimate.offset - offset, estimate.offset_std, estimate.drift - (one.drift - other.drift), estimate.drift_std)
+        print(
+            at,
+            pt,
+            estimate.offset - offset,
+            estimate.offset_std,
+            estimate.drift - (one.drift - other.drift),
+            estimate.drift_std,
+        )
         assert abs(estimate.offset - offset) < 4 * estimate.offset_std
         assert abs(estimate.drift - (one.drift - other.drift)) < 4 * estimate.drift_std
         assert estimate.offset_std < 1e-9
-    wrong = got.missed_announcements, got.wrong_announcements, got.missed_acknowledgments, got.false_acknowledgments
+    wrong = (
+        got.missed_announcements,
+        got.wrong_announcements,
+        got.missed_acknowledgments,
+        got.false_acknowledgments,
+    )
     assert wrong == (0, 0, 0, 0)
     assert got.missed_blocks == got.false_blocks == {"A": 0, "B": 0}
 
 
 def test_who_is_not_heard_is_collided_with():
-    """B cannot hear A: it misses three taken blocks, takes its wish and collides with A's blocks 5 and 6.
+    """B cannot hear A: it misses three taken blocks, takes its wish and collides with A's blocks 5
+    and 6.
 
     Planted bug: listening on the truth."""
     got = establish(network(scene=scene_of({("A", "B")}), listeners={"A": (), "B": ()}))
@@ -126,8 +143,11 @@ def test_who_is_not_heard_is_collided_with():
 
 
 def test_a_link_needs_both_directions():
-    """Q does not hear A: no announcement. A does not hear P: P acknowledges in vain. Planted bug: acknowledged by the sender's word."""
-    n = network(scene=scene_of({("A", "Q"), ("P", "A")}), wishes={"A": None}, listeners={"A": ("P", "Q")})
+    """Q does not hear A: no announcement. A does not hear P: P acknowledges in vain. Planted bug:
+    acknowledged by the sender's word."""
+    n = network(
+        scene=scene_of({("A", "Q"), ("P", "A")}), wishes={"A": None}, listeners={"A": ("P", "Q")}
+    )
     got = establish(n)
     p, q = got.links["A", "P"], got.links["A", "Q"]
     assert p.identified
@@ -136,11 +156,16 @@ def test_a_link_needs_both_directions():
     assert p.clock is None
     assert q.message is None
     assert not q.sent_acknowledgment
-    assert (got.missed_announcements, got.missed_acknowledgments, got.false_acknowledgments) == (1, 1, 0)
+    assert (got.missed_announcements, got.missed_acknowledgments, got.false_acknowledgments) == (
+        1,
+        1,
+        0,
+    )
 
 
 def test_an_external_clock_leaves_stage_two_out():
-    """Two frames less, and links acknowledged without an estimate. Planted bug: the rounds run all the same."""
+    """Two frames less, and links acknowledged without an estimate. Planted bug: the rounds run all
+    the same."""
     got = establish(network(external_clock=True, wishes={"B": 17}, listeners={"B": ("R",)}))
     assert got.blocks == {"B": 16}
     assert got.links["B", "R"].clock is EXTERNAL
@@ -149,16 +174,22 @@ def test_an_external_clock_leaves_stage_two_out():
 
 
 def test_noise_alone_makes_no_link():
-    """At -40 dB per sample nobody hears anybody, and no block seems taken. Planted bug: one hot chirp is enough."""
-    got = establish(network(noise_power=dict.fromkeys("ABPQR", 1e4), wishes={"A": 4}, listeners={"A": ("P",)}))
+    """At -40 dB per sample nobody hears anybody, and no block seems taken. Planted bug: one hot
+    chirp is enough."""
+    got = establish(
+        network(noise_power=dict.fromkeys("ABPQR", 1e4), wishes={"A": 4}, listeners={"A": ("P",)})
+    )
     assert got.missed_announcements == 1
     assert not got.links["A", "P"].acknowledged
     assert got.false_blocks == {"A": 0}
 
 
 def test_the_outcome_is_repeatable():
-    """The same seed gives the same estimate to the last bit, another one another. Planted bug: noise seeded with an object's identity."""
+    """The same seed gives the same estimate to the last bit, another one another. Planted bug:
+    noise seeded with an object's identity."""
     n = network(wishes={"A": 4}, listeners={"A": ("P",)})
-    first, same, other = (establish(replace(n, seed=seed)).links["A", "P"].clock.offset for seed in (5, 5, 6))
+    first, same, other = (
+        establish(replace(n, seed=seed)).links["A", "P"].clock.offset for seed in (5, 5, 6)
+    )
     assert first == same
     assert first != other

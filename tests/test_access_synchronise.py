@@ -1,4 +1,5 @@
-"""Two-round synchronisation: closed form, consistency of its covariance, and real receptions of unmodulated frames."""
+"""Two-round synchronisation: closed form, consistency of its covariance, and real receptions of
+unmodulated frames."""
 
 from __future__ import annotations
 
@@ -29,12 +30,28 @@ def rounds(length, speed, accel, gap, stds=((0.011, 0.17), (0.013, 0.19)), rng=N
         s = 1 if forward else -1
         noise = rng.normal(size=2) if rng else np.zeros(2)
         apparent = length + speed * t + accel * t**2 / 2 + s * C * (OFFSET + DRIFT * t)
-        out.append(Round(epoch + t, forward, apparent + a * noise[0], speed + accel * t + s * C * DRIFT + b * noise[1], a, b))
+        out.append(
+            Round(
+                epoch + t,
+                forward,
+                apparent + a * noise[0],
+                speed + accel * t + s * C * DRIFT + b * noise[1],
+                a,
+                b,
+            )
+        )
     return out
 
 
 def error(estimate: ClockEstimate, length, speed) -> np.ndarray:
-    return np.array([estimate.offset - OFFSET, estimate.drift - DRIFT, estimate.range - length, estimate.velocity - speed])
+    return np.array(
+        [
+            estimate.offset - OFFSET,
+            estimate.drift - DRIFT,
+            estimate.range - length,
+            estimate.velocity - speed,
+        ]
+    )
 
 
 @pytest.mark.parametrize("gap", [0.00778, 0.213])
@@ -49,14 +66,18 @@ def test_clock_and_path_come_back_exactly_without_noise(gap):
 
 
 def test_the_solution_of_two_rounds_is_the_one_on_paper():
-    """drift = (v1 - v2)/2c and offset = (r1 - r2 + v2 dt)/2c with the variances of these sums, the acceleration's share included.
+    """drift = (v1 - v2)/2c and offset = (r1 - r2 + v2 dt)/2c with the variances of these sums, the
+    acceleration's share included.
 
-    a enters v2 by a dt, r2 by a dt^2/2: drift by -a dt/2c, offset by a dt^2/4c. Planted bug: the acceleration's spread left out."""
+    a enters v2 by a dt, r2 by a dt^2/2: drift by -a dt/2c, offset by a dt^2/4c. Planted bug: the
+    acceleration's spread left out."""
     gap, spread = 0.31, 6.3
     one, two = rounds(47.31, -8.37, 2.9, gap, rng=np.random.default_rng(8))
     found = estimate_clock([two, one], acceleration_std=spread)
     assert found.drift == pytest.approx((one.velocity - two.velocity) / (2 * C), rel=1e-9, abs=0)
-    assert found.offset == pytest.approx((one.range - two.range + two.velocity * gap) / (2 * C), rel=1e-9, abs=0)
+    assert found.offset == pytest.approx(
+        (one.range - two.range + two.velocity * gap) / (2 * C), rel=1e-9, abs=0
+    )
     variance = (0.17**2 + 0.19**2 + (spread * gap) ** 2) / (4 * C**2)
     assert found.drift_std == pytest.approx(np.sqrt(variance), rel=1e-9, abs=0)
     variance = (0.011**2 + 0.013**2 + (0.19 * gap) ** 2 + (spread * gap**2 / 2) ** 2) / (4 * C**2)
@@ -65,7 +86,8 @@ def test_the_solution_of_two_rounds_is_the_one_on_paper():
 
 
 def test_the_errors_are_those_that_the_covariance_states():
-    """Mean NEES of 2000 links is 4 (chi-square with 4 degrees of freedom) within 4.5 sigma, 4.5 sqrt(8/2000).
+    """Mean NEES of 2000 links is 4 (chi-square with 4 degrees of freedom) within 4.5 sigma, 4.5
+    sqrt(8/2000).
 
     Planted bug: standard deviations of one round used for both."""
     rng, trials = np.random.default_rng(9), 2000
@@ -86,8 +108,8 @@ def test_one_direction_is_not_enough():
 
 
 def received(w, antennas, forward, time, offset, held, seed, snr):
-    """The passive (forward) or active terminal's reception of an unmodulated frame of the other end; the path is 47.31 m at t = 0,
-    -8.37 m/s, 1.9 m/s^2."""
+    """The passive (forward) or active terminal's reception of an unmodulated frame of the other
+    end; the path is 47.31 m at t = 0, -8.37 m/s, 1.9 m/s^2."""
     rng = np.random.default_rng(2)
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     along = np.array([[0.13, 0.9, -0.21]]) / np.linalg.norm([0.13, 0.9, -0.21])
@@ -121,10 +143,12 @@ def received(w, antennas, forward, time, offset, held, seed, snr):
 
 
 def test_two_real_receptions_give_the_clock():
-    """Frames of both ends 11 ms apart through the IF signal at -12 dB per sample and `receive_passive`; the clock of -61 m makes the
-    path's delay negative in round 1 without the agreed hold. Truth within 4 sigma in offset and drift, whose sigmas are under 10 ps
-    (3 mm) and 0.2 ppb, in each of 6 trials, and a mean NEES of clock and drift of at most 3.9 (chi-square with 12 degrees of freedom
-    over 6 exceeds that once in 40; the stated deviations have floors, so that a small value is no error).
+    """Frames of both ends 11 ms apart through the IF signal at -12 dB per sample and
+    `receive_passive`; the clock of -61 m makes the path's delay negative in round 1 without the
+    agreed hold. Truth within 4 sigma in offset and drift, whose sigmas are under 10 ps (3 mm) and
+    0.2 ppb, in each of 6 trials, and a mean NEES of clock and drift of at most 3.9 (chi-square with
+    12 degrees of freedom over 6 exceeds that once in 40; the stated deviations have floors, so that
+    a small value is no error).
 
     Planted bug: the hold not taken out."""
     w = Waveform(num_chirps=60)
@@ -133,7 +157,13 @@ def test_two_real_receptions_give_the_clock():
     nees = []
     for seed in range(6):
         both = [
-            round_of(received(w, antennas, forward, t, offset, held, seed, 0.063).detections, t, forward, cell=w.range_cell(1), held=held)
+            round_of(
+                received(w, antennas, forward, t, offset, held, seed, 0.063).detections,
+                t,
+                forward,
+                cell=w.range_cell(1),
+                held=held,
+            )
             for t, forward in ((0.0, True), (gap, False))
         ]
         found = estimate_clock([r for r in both if r is not None])
@@ -144,6 +174,9 @@ def test_two_real_receptions_give_the_clock():
         assert abs(found.range - 47.31) < 4 * np.sqrt(found.covariance[2, 2])
         assert found.offset_std < 10e-12
         assert found.drift_std < 0.2e-9
-        nees.append((e / scale) @ np.linalg.solve(found.covariance[:2, :2] / np.outer(scale, scale), e / scale))
+        nees.append(
+            (e / scale)
+            @ np.linalg.solve(found.covariance[:2, :2] / np.outer(scale, scale), e / scale)
+        )
     print("nees", np.mean(nees))
     assert np.mean(nees) < 3.9

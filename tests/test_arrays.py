@@ -26,8 +26,8 @@ def test_counts_and_centroids():
 
 
 def test_virtual_arms_are_uniform_and_gapless():
-    """Sums of transmit and receive positions along X make 16 places one spacing apart; planted bug: transmit elements one
-    spacing apart."""
+    """Sums of transmit and receive positions along X make 16 places one spacing apart; planted bug:
+    transmit elements one spacing apart."""
     tx, rx = PAPER.tx_positions, PAPER.rx_positions
     arm_tx, arm_rx = tx[:2], rx[:8]
     sums = np.sort((arm_tx[:, None, 0] + arm_rx[None, :, 0]).ravel())
@@ -56,16 +56,28 @@ def test_cosine_pattern_radiates_its_own_power(gain):
 
 
 def test_sector_pattern_ends_at_the_field_of_view():
-    a = Antennas(tx_x=1, tx_z=1, rx_x=2, rx_z=2, spacing=1e-3, gain=2.5, pattern="sector", half_view=np.deg2rad(60))
+    a = Antennas(
+        tx_x=1,
+        tx_z=1,
+        rx_x=2,
+        rx_z=2,
+        spacing=1e-3,
+        gain=2.5,
+        pattern="sector",
+        half_view=np.deg2rad(60),
+    )
     for azimuth, inside in ((59.9, True), (-59.9, True), (60.1, False), (180.0, False)):
         t = np.deg2rad(azimuth)
         assert a.element_gain(np.array([np.sin(t), np.cos(t), 0.0])) == (2.5 if inside else 0.0)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(num_tx=st.integers(1, 8), cycles=st.integers(1, 12), seed=st.integers(0, 2**32), data=st.data())
+@given(
+    num_tx=st.integers(1, 8), cycles=st.integers(1, 12), seed=st.integers(0, 2**32), data=st.data()
+)
 def test_pseudo_random_schedules(num_tx, cycles, seed, data):
-    """Each cycle of each group is a permutation, no slot uses an antenna twice, and the seed decides."""
+    """Each cycle of each group is a permutation, no slot uses an antenna twice, and the seed
+    decides."""
     groups = data.draw(st.integers(1, num_tx))
     schedule = pseudo_random_schedule(groups, cycles * num_tx, num_tx, np.random.default_rng(seed))
     for row in schedule.reshape(groups, cycles, num_tx).reshape(-1, num_tx):
@@ -78,8 +90,8 @@ def test_pseudo_random_schedules(num_tx, cycles, seed, data):
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(num_tx=st.integers(1, 8), cycles=st.integers(1, 12), data=st.data())
 def test_conventional_schedules(num_tx, cycles, data):
-    """Schemes (a) and (c) for any L_tx and M: each antenna of each group every L_tx slots, never twice in a slot. Planted bug: all groups
-    at the same antenna."""
+    """Schemes (a) and (c) for any L_tx and M: each antenna of each group every L_tx slots, never
+    twice in a slot. Planted bug: all groups at the same antenna."""
     groups = data.draw(st.integers(1, num_tx))
     schedule = conventional_schedule(groups, cycles * num_tx, num_tx)
     assert is_latin(schedule, num_tx)
@@ -93,19 +105,33 @@ def test_conventional_schedules(num_tx, cycles, data):
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(num_tx=st.integers(1, 8), cycles=st.integers(1, 12), seed=st.integers(0, 2**32))
 def test_as_many_groups_as_antennas_sample_everything(num_tx, cycles, seed):
-    """With M = L_tx every antenna sends in every slot, in (c) and (d): the reason why the union needs no compressed sensing."""
+    """With M = L_tx every antenna sends in every slot, in (c) and (d): the reason why the union
+    needs no compressed sensing."""
     chirps, rng = cycles * num_tx, np.random.default_rng(seed)
-    for schedule in (conventional_schedule(num_tx, chirps, num_tx), pseudo_random_schedule(num_tx, chirps, num_tx, rng)):
+    for schedule in (
+        conventional_schedule(num_tx, chirps, num_tx),
+        pseudo_random_schedule(num_tx, chirps, num_tx, rng),
+    ):
         assert (np.sort(schedule, axis=0) == np.arange(num_tx)[:, None]).all()
 
 
-@pytest.mark.parametrize(("groups", "order"), [(1, "conventional"), (1, "pseudo_random"), (3, "conventional"), (3, "pseudo_random")])
+@pytest.mark.parametrize(
+    ("groups", "order"),
+    [(1, "conventional"), (1, "pseudo_random"), (3, "conventional"), (3, "pseudo_random")],
+)
 def test_the_four_schemes_come_from_the_scenario_and_its_seed(groups, order):
-    """Fig. 5(a) to (d) by two keys; the same seed gives the same schedule whatever else was drawn, another seed another random one.
+    """Fig. 5(a) to (d) by two keys; the same seed gives the same schedule whatever else was drawn,
+    another seed another random one.
 
     Planted bug: a seed of its own."""
     one, again, other = (
-        load(SCENES / "paper_swarm.yaml", (f"radio.groups={groups}", f"array.schedule={order}"), None, seed) for seed in (8, 8, 9)
+        load(
+            SCENES / "paper_swarm.yaml",
+            (f"radio.groups={groups}", f"array.schedule={order}"),
+            None,
+            seed,
+        )
+        for seed in (8, 8, 9)
     )
     first, second, third = (prepare(s).schedule for s in (one, again, other))
     assert first.shape == (groups, 120)
@@ -117,7 +143,9 @@ def test_the_four_schemes_come_from_the_scenario_and_its_seed(groups, order):
 def test_pseudo_random_order_is_not_periodic():
     schedule = pseudo_random_schedule(3, 120, 3, np.random.default_rng(5))
     cycles = schedule[0].reshape(40, 3)
-    assert len({tuple(c) for c in cycles}) == 6  # all orders occur in 40 draws (missing one: 6 (5/6)^40 = 0.4 %, fixed seed)
+    assert (
+        len({tuple(c) for c in cycles}) == 6
+    )  # all orders occur in 40 draws (missing one: 6 (5/6)^40 = 0.4 %, fixed seed)
 
 
 def test_conventional_schedule():

@@ -14,7 +14,8 @@ from isac_rt.studies.bench import REQUIRED, report
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.scenes import town
 
-LINEAR = 1.3  # measured exponents scatter by 0.1 to 0.2 on a busy machine; n log n is 1.1 here, n^2 would be 2
+# measured exponents scatter by 0.1 to 0.2 on a busy machine; n log n is 1.1 here, n^2 would be 2
+LINEAR = 1.3
 
 
 def test_an_exponent_is_found_from_its_own_curve():
@@ -24,18 +25,38 @@ def test_an_exponent_is_found_from_its_own_curve():
 
 
 def test_the_report_holds_every_row(tmp_path):
-    """Tables, figures and JSON of rows that are made up. Planted bug: rows of the first kind only."""
+    """Tables, figures and JSON of rows that are made up. Planted bug: rows of the first kind
+    only."""
     rows = [
-        {"kind": kind, "method": method, "size": size, "unit": "paths", "error": error, "cost": size * cost, "floor_s": 0.04,
-         "seconds": size * cost * 0.04, "oracle": error == 0}
+        {
+            "kind": kind,
+            "method": method,
+            "size": size,
+            "unit": "paths",
+            "error": error,
+            "cost": size * cost,
+            "floor_s": 0.04,
+            "seconds": size * cost * 0.04,
+            "oracle": error == 0,
+        }
         for kind in ("synthesis", "tracing")
         for method, cost, error in (("slow", 0.1, 0.0), ("quick", 0.01, 3e-4))
         for size in (10, 100)
-    ]  # fmt: skip
+    ]
     assert all(set(REQUIRED) <= set(row) for row in rows)
-    found = {"machine": report.machine(), "quick": True, "rows": rows, "growth": report.growth(rows)}
+    found = {
+        "machine": report.machine(),
+        "quick": True,
+        "rows": rows,
+        "growth": report.growth(rows),
+    }
     files = report.write(found, tmp_path)
-    assert {file.name for file in files} == {"bench.json", "bench.md", "synthesis.png", "tracing.png"}
+    assert {file.name for file in files} == {
+        "bench.json",
+        "bench.md",
+        "synthesis.png",
+        "tracing.png",
+    }
     assert all(file.stat().st_size > 0 for file in files)
     assert json.loads((tmp_path / "bench.json").read_text())["rows"] == rows
     text = (tmp_path / "bench.md").read_text()
@@ -61,10 +82,34 @@ def test_leaving_out_the_faintest_grows_no_faster_than_sorting():
 
 
 def test_the_command_measures_the_stages_that_are_asked_for(tmp_path, monkeypatch, capsys):
-    """With measurements that take no time. Planted bug: all stages measured whatever was asked for."""
-    rows = [{"kind": "tracing", "method": "traced", "size": k, "error": 0.0, "cost": 1.5 * k, "floor_s": 0.04} for k in (2, 4)]
+    """With measurements that take no time. Planted bug: all stages measured whatever was asked
+    for."""
+    rows = [
+        {
+            "kind": "tracing",
+            "method": "traced",
+            "size": k,
+            "error": 0.0,
+            "cost": 1.5 * k,
+            "floor_s": 0.04,
+        }
+        for k in (2, 4)
+    ]
     monkeypatch.setattr("isac_rt.studies.bench.tracing.rows", lambda quick: rows)
-    assert main(["bench", "trace", "--quick", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "rows.json")]) == 0
+    assert (
+        main(
+            [
+                "bench",
+                "trace",
+                "--quick",
+                "--out",
+                str(tmp_path / "out"),
+                "--json",
+                str(tmp_path / "rows.json"),
+            ]
+        )
+        == 0
+    )
     assert json.loads((tmp_path / "rows.json").read_text())["rows"] == rows
     assert "tracing: traced" in capsys.readouterr().out
     assert main(["bench", "nonsense", "--out", str(tmp_path / "out")]) == 2
@@ -72,11 +117,26 @@ def test_the_command_measures_the_stages_that_are_asked_for(tmp_path, monkeypatc
 
 
 def test_traced_frames_are_as_many_as_the_way_needs():
-    """With frames: twice the frames over the same way are traced as often, so the cost per frame falls. Planted bug: a fixed stride."""
+    """With frames: twice the frames over the same way are traced as often, so the cost per frame
+    falls. Planted bug: a fixed stride."""
     counts = []
     for frames in (60, 120, 240):
-        s = town(3, frames=frames, frame_interval_s=3.0 / frames, accuracy={"max_untraced_m": 1.0}, propagation={"model": "free_space"})
+        s = town(
+            3,
+            frames=frames,
+            frame_interval_s=3.0 / frames,
+            accuracy={"max_untraced_m": 1.0},
+            propagation={"model": "free_space"},
+        )
         plan = prepare(s).plan
-        ray_traced = s.model_copy(update={"propagation": s.propagation.model_copy(update={"model": "ray_traced"})})
-        counts.append(len(type(plan)(ray_traced, plan.waveform, plan.antennas, plan.timetable, plan.swarm).traced_frames))
+        ray_traced = s.model_copy(
+            update={"propagation": s.propagation.model_copy(update={"model": "ray_traced"})}
+        )
+        counts.append(
+            len(
+                type(plan)(
+                    ray_traced, plan.waveform, plan.antennas, plan.timetable, plan.swarm
+                ).traced_frames
+            )
+        )
     assert max(counts) - min(counts) <= 0.3 * counts[0]

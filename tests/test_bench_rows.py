@@ -1,4 +1,5 @@
-"""The rows of the synthesis and reception benches: what they must hold, and errors within the stated bounds. Times are not tested."""
+"""The rows of the synthesis and reception benches: what they must hold, and errors within the
+stated bounds. Times are not tested."""
 
 from __future__ import annotations
 
@@ -15,7 +16,11 @@ from isac_rt.studies.bench import REQUIRED, hermes, reception, synthesis
 
 def test_errors_of_the_synthesis_are_as_stated():
     found = synthesis.errors()
-    assert set(found) == {"direct", synthesis.BOTH, *(name for name, _ in synthesis.GRIDS + synthesis.DIRECTLY)}
+    assert set(found) == {
+        "direct",
+        synthesis.BOTH,
+        *(name for name, _ in synthesis.GRIDS + synthesis.DIRECTLY),
+    }
     assert found["direct"] < 1e-6
     assert max(found.values()) < 3e-4
     assert found["gridded wideband, 1.5 N, width 6"] < GRIDDED_ERROR
@@ -25,7 +30,8 @@ def test_errors_of_the_synthesis_are_as_stated():
 
 @pytest.mark.slow
 def test_rows_of_the_reception():
-    """Both receivers find all four paths to a hundredth of a cell, and need less than three cubes of memory."""
+    """Both receivers find all four paths to a hundredth of a cell, and need less than three cubes
+    of memory."""
     rows = reception.rows(quick=True)
     assert len(rows) == 2
     for row in rows:
@@ -36,7 +42,8 @@ def test_rows_of_the_reception():
 
 
 def test_hermespy_is_left_out_where_it_is_not_installed(tmp_path, monkeypatch, capsys):
-    """One message with the remedy, and the command is done. Planted bug: `missing` that looks at the variable alone."""
+    """One message with the remedy, and the command is done. Planted bug: `missing` that looks at
+    the variable alone."""
     monkeypatch.delenv(hermes.INTERPRETER, raising=False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert "HermesPy is not installed; set ISAC_RT_HERMESPY to" in (hermes.missing() or "")
@@ -58,30 +65,55 @@ def _pretender(folder, lines: str):
 
 
 def test_rows_beside_hermespy(tmp_path, monkeypatch):
-    """Arithmetic of the rows, with an answer that is made up: 3.5 CPU s for 20 paths of 120 x 1024 x 15 samples. Our error on the job is
-    as stated. Planted bug: samples counted at one antenna."""
-    answer = {"seconds": {"20": 3.5, "60": 10.1}, "error": 0.8, "versions": {"hermespy": "0", "python": "3", "numpy": "2"}}
-    monkeypatch.setenv(hermes.INTERPRETER, _pretender(tmp_path, f"echo noise; echo '{json.dumps(answer)}'"))
+    """Arithmetic of the rows, with an answer that is made up: 3.5 CPU s for 20 paths of 120 x 1024
+    x 15 samples. Our error on the job is as stated. Planted bug: samples counted at one antenna."""
+    answer = {
+        "seconds": {"20": 3.5, "60": 10.1},
+        "error": 0.8,
+        "versions": {"hermespy": "0", "python": "3", "numpy": "2"},
+    }
+    monkeypatch.setenv(
+        hermes.INTERPRETER, _pretender(tmp_path, f"echo noise; echo '{json.dumps(answer)}'")
+    )
     rows = hermes.rows(quick=True)
-    theirs, ours = [r for r in rows if "HermesPy" in r["method"]], [r for r in rows if r["method"] in hermes.OURS]
+    theirs, ours = (
+        [r for r in rows if "HermesPy" in r["method"]],
+        [r for r in rows if r["method"] in hermes.OURS],
+    )
     assert [r["size"] for r in theirs] == [20, 60]
-    assert theirs[0]["per_path_and_sample_s"] == pytest.approx(3.5 / (20 * 120 * 1024 * 15), rel=1e-12, abs=0)
+    assert theirs[0]["per_path_and_sample_s"] == pytest.approx(
+        3.5 / (20 * 120 * 1024 * 15), rel=1e-12, abs=0
+    )
     assert len(ours) == 2 * len(hermes.OURS)
     assert all(set(REQUIRED) <= set(row) for row in rows)
     assert all(row["error"] < 3e-4 < theirs[0]["error"] for row in ours)
-    monkeypatch.setenv(hermes.INTERPRETER, _pretender(tmp_path, "echo ModuleNotFoundError >&2; exit 3"))
+    monkeypatch.setenv(
+        hermes.INTERPRETER, _pretender(tmp_path, "echo ModuleNotFoundError >&2; exit 3")
+    )
     with pytest.raises(RuntimeError, match="ended with 3 and said: ModuleNotFoundError"):
         hermes.measured({})
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.environ.get(hermes.INTERPRETER) is None, reason=f"needs HermesPy: {hermes.INTERPRETER} names no Python")
+@pytest.mark.skipif(
+    os.environ.get(hermes.INTERPRETER) is None,
+    reason=f"needs HermesPy: {hermes.INTERPRETER} names no Python",
+)
 def test_hermespy_floors_its_delays():
-    """A shift by a fraction f of a sample turns a sample at the part t of the sweep by pi f (1 - 2 t): RMS^2 = 2 - 2 Re mean exp(j ...)
-    over f from 0 to 1 and t from 0.2 to 1, 0.805^2; for 40 paths within a tenth. Cost is linear in the paths (a quarter for the machine).
-    Planted bug: the truth with delays in whole samples (error 0)."""
-    job = {"bandwidth_hz": 1e9, "carrier_hz": 77e9, "num_samples": 1024, "num_chirps": 30, "num_rx": 15, "sizes": [20, 80],
-           "error_paths": 40, "seed": 3}  # fmt: skip
+    """A shift by a fraction f of a sample turns a sample at the part t of the sweep by pi f (1 - 2
+    t): RMS^2 = 2 - 2 Re mean exp(j ...) over f from 0 to 1 and t from 0.2 to 1, 0.805^2; for 40
+    paths within a tenth. Cost is linear in the paths (a quarter for the machine). Planted bug: the
+    truth with delays in whole samples (error 0)."""
+    job = {
+        "bandwidth_hz": 1e9,
+        "carrier_hz": 77e9,
+        "num_samples": 1024,
+        "num_chirps": 30,
+        "num_rx": 15,
+        "sizes": [20, 80],
+        "error_paths": 40,
+        "seed": 3,
+    }
     found = hermes.measured(job)
     assert found["error"] == pytest.approx(0.805, rel=0.1)
     assert found["seconds"]["80"] == pytest.approx(4 * found["seconds"]["20"], rel=0.25)

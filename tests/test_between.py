@@ -1,4 +1,5 @@
-"""Legs between traced instants: against tracing every frame, and against the geometry of a wall that ends."""
+"""Legs between traced instants: against tracing every frame, and against the geometry of a wall
+that ends."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ pytestmark = pytest.mark.sionna
 F_C = 77e9
 TIMES = np.linspace(0.013, 0.913, 13)
 AMPLITUDE = 2e-4  # Sionna's float32 through Fresnel's square roots
-ASIDE = 1e-2  # of corners, to which the tracer measures 0.1 m beside the terminal, 14 m and more away
+ASIDE = (
+    1e-2  # of corners, to which the tracer measures 0.1 m beside the terminal, 14 m and more away
+)
 LINKS = [("A", "A"), ("A", "P")]
 
 
@@ -25,7 +28,12 @@ def swarm_over(a, p, u, **changes) -> scenario.Scenario:
     rcs = {"model": "constant", "value_dbsm": -11.7}
     roles = {"A": "active", "P": "passive", "U": "target"}
     uavs = {
-        name: {"role": roles[name], "position_m": list(start), "velocity_mps": list(velocity), "rcs": rcs}
+        name: {
+            "role": roles[name],
+            "position_m": list(start),
+            "velocity_mps": list(velocity),
+            "rcs": rcs,
+        }
         for name, (start, velocity) in {"A": a, "P": p, "U": u}.items()
     }
     tree = {
@@ -45,12 +53,20 @@ def tracer(s: scenario.Scenario, city: City, instants=()):
 
 
 def test_sets_of_chains_are_padded_with_minus_one():
-    """What `PathSet` promises of faces where there is none, and NaN for their points. Planted bug: padded with another number."""
+    """What `PathSet` promises of faces where there is none, and NaN for their points. Planted bug:
+    padded with another number."""
     from isac_rt.propagation.legs.between import leg_set
     from isac_rt.propagation.legs.geometry import Legs
 
     def some(count: int, depth: int) -> tuple:
-        legs = Legs(np.ones(count), np.ones(count), np.ones(count), np.ones((count, 3)), np.ones((count, 3)), np.ones((count, depth, 3)))
+        legs = Legs(
+            np.ones(count),
+            np.ones(count),
+            np.ones(count),
+            np.ones((count, 3)),
+            np.ones((count, 3)),
+            np.ones((count, depth, 3)),
+        )
         chain = 7 + np.arange(count * depth).reshape(count, depth)
         return np.ones(count, complex), legs, chain, 2 * chain
 
@@ -71,18 +87,31 @@ def keyed(paths: PathSet) -> dict[tuple, int]:
 def streets():
     """Every frame traced, and only every sixth, past a crossing where paths come and go."""
     s = swarm_over(
-        ((-3.1, -20.3, 9.2), (0.4, 6.3, 0.1)), ((4.2, 13.7, 11.4), (-0.3, -3.1, 0.2)), ((-1.3, -4.9, 10.1), (0.5, 9.7, 0.3)),
-        city={"source": "blocks", "street_width_m": 19, "block_size_m": 16, "building_height_m": 14, "blocks_x": 2, "blocks_y": 3},
-    )  # fmt: skip
+        ((-3.1, -20.3, 9.2), (0.4, 6.3, 0.1)),
+        ((4.2, 13.7, 11.4), (-0.3, -3.1, 0.2)),
+        ((-1.3, -4.9, 10.1), (0.5, 9.7, 0.3)),
+        city={
+            "source": "blocks",
+            "street_width_m": 19,
+            "block_size_m": 16,
+            "building_height_m": 14,
+            "blocks_x": 2,
+            "blocks_y": 3,
+        },
+    )
     city = load_city(s.city, ".", F_C, (0.0, 0.0, 9.0))
     swarm = Swarm.from_scenario(s)
     full, between = tracer(s, city), tracer(s, city, TIMES[::6])
-    frames = [(t, full.paths(swarm.poses(t), t, LINKS), between.paths(swarm.poses(t), t, LINKS)) for t in TIMES]
+    frames = [
+        (t, full.paths(swarm.poses(t), t, LINKS), between.paths(swarm.poses(t), t, LINKS))
+        for t in TIMES
+    ]
     return frames, between, full
 
 
 def test_between_traces_the_paths_are_those_of_a_trace(streets):
-    """The same chains, delays to 1 um (the key), gains to Sionna's rounding. Planted bug: TE and TM coefficients swapped."""
+    """The same chains, delays to 1 um (the key), gains to Sionna's rounding. Planted bug: TE and TM
+    coefficients swapped."""
     for t, full, got in streets[0]:
         for link in LINKS:
             a, b = keyed(full[link]), keyed(got[link])
@@ -97,14 +126,19 @@ def test_births_and_deaths_happened_and_were_counted(streets):
     """Or the test above would not have tested them. Planted bug: the two counts swapped."""
     _, between, full = streets
     traced = [full._legs_on_the_way(t) for t in TIMES[::6]]
-    chains = [{(pair, *row) for pair, legs in at.items() for row in legs.planes.tolist()} for at in traced]
+    chains = [
+        {(pair, *row) for pair, legs in at.items() for row in legs.planes.tolist()} for at in traced
+    ]
     assert between.between.num_traced == 3
-    assert between.between.changes == {i: (len(chains[i + 1] - chains[i]), len(chains[i] - chains[i + 1])) for i in (0, 1)}
+    assert between.between.changes == {
+        i: (len(chains[i + 1] - chains[i]), len(chains[i] - chains[i + 1])) for i in (0, 1)
+    }
     assert min(min(pair) for pair in between.between.changes.values()) > 0
 
 
 def test_at_a_traced_instant_nothing_changes(streets):
-    """Bit for bit what the tracer gives. Planted bug: the instants' poses taken without the city's origin."""
+    """Bit for bit what the tracer gives. Planted bug: the instants' poses taken without the city's
+    origin."""
     for t, full, got in streets[0]:
         if t in TIMES[::6]:
             for link in LINKS:
@@ -113,12 +147,22 @@ def test_at_a_traced_instant_nothing_changes(streets):
 
 
 def test_a_path_dies_where_its_wall_ends():
-    """A wall x = 7, y from -40 to 3: the mirror point of a path from A to P lies, by similar triangles, at the mean of their y when both
-    are as far from the wall, so the path dies when that passes 3 m. Planted bug: the test behind the wall left out (it lives on)."""
+    """A wall x = 7, y from -40 to 3: the mirror point of a path from A to P lies, by similar
+    triangles, at the mean of their y when both are as far from the wall, so the path dies when that
+    passes 3 m. Planted bug: the test behind the wall left out (it lives on)."""
     corners = np.array([[7.0, -40, -20], [7, 3, -20], [7, 3, 40], [7, -40, 40]])
     material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
-    city = City("wall", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (material,), np.zeros(3))
-    s = swarm_over(((0, -11.3, 8.7), (0, 10.3, 0)), ((0, 7.9, 10.1), (0, 9.1, 0)), ((-30, 1, 4), (0, 1, 0)))
+    city = City(
+        "wall",
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.zeros(2, np.int16),
+        (material,),
+        np.zeros(3),
+    )
+    s = swarm_over(
+        ((0, -11.3, 8.7), (0, 10.3, 0)), ((0, 7.9, 10.1), (0, 9.1, 0)), ((-30, 1, 4), (0, 1, 0))
+    )
     swarm = Swarm.from_scenario(s)
     between = tracer(s, city, [TIMES[0], TIMES[-1]])
     for t in TIMES:
@@ -132,12 +176,24 @@ def test_a_path_dies_where_its_wall_ends():
 
 
 def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
-    """The line of sight of A to P crosses the plane y = 0 at x_A + (x_P - x_A) |y_A|/(|y_A| + y_P); a screen there from x = 2 on hides it
-    (then it bends round the screen's edge, or is gone). Planted bug: no ray tested at all."""
+    """The line of sight of A to P crosses the plane y = 0 at x_A + (x_P - x_A) |y_A|/(|y_A| + y_P);
+    a screen there from x = 2 on hides it (then it bends round the screen's edge, or is gone).
+    Planted bug: no ray tested at all."""
     corners = np.array([[2.0, 0, -20], [60, 0, -20], [60, 0, 40], [2, 0, 40]])
     material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
-    city = City("screen", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (material,), np.zeros(3))
-    s = swarm_over(((-4.3, -13.1, 8.7), (9.7, 0, 0)), ((-1.2, 21.3, 10.1), (8.3, 0, 0)), ((-30, 1, 4), (0, 1, 0)))
+    city = City(
+        "screen",
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.zeros(2, np.int16),
+        (material,),
+        np.zeros(3),
+    )
+    s = swarm_over(
+        ((-4.3, -13.1, 8.7), (9.7, 0, 0)),
+        ((-1.2, 21.3, 10.1), (8.3, 0, 0)),
+        ((-30, 1, 4), (0, 1, 0)),
+    )
     swarm = Swarm.from_scenario(s)
     between = tracer(s, city, [TIMES[0], TIMES[-1]])
     seen = []

@@ -1,4 +1,5 @@
-"""The plan against what a run says it used, and estimates against the measured truth on scenes of which the bounds know nothing."""
+"""The plan against what a run says it used, and estimates against the measured truth on scenes of
+which the bounds know nothing."""
 
 from __future__ import annotations
 
@@ -22,8 +23,13 @@ SCENES = Path(__file__).parents[1] / "scenes"
 
 
 def test_the_plan_is_what_the_summary_says_was_done():
-    """Decisions of `isac-rt plan` before, `fidelity` of the summary after. Planted bug: `decisions` of the default budget in the run."""
-    s = load(SCENES / "paper_swarm.yaml", ["accuracy.max_phase_error_rad=0.031", "propagation.weakest_path_db=33"], frames=4)
+    """Decisions of `isac-rt plan` before, `fidelity` of the summary after. Planted bug: `decisions`
+    of the default budget in the run."""
+    s = load(
+        SCENES / "paper_swarm.yaml",
+        ["accuracy.max_phase_error_rad=0.031", "propagation.weakest_path_db=33"],
+        frames=4,
+    )
     planned = make_plan(prepare(s))
     done = simulate.summarise(s)["fidelity"]
     for key in decisions(prepare(s).plan):
@@ -39,13 +45,16 @@ def test_the_plan_is_what_the_summary_says_was_done():
 
 
 def test_the_truth_of_a_flight_in_free_space_stays_within_the_bounds():
-    """The bounds of the frames checked against exact positions and point sources. Planted bug: delays at the ends of half a frame."""
+    """The bounds of the frames checked against exact positions and point sources. Planted bug:
+    delays at the ends of half a frame."""
     s = load(SCENES / "paper_swarm.yaml", ["accuracy.max_phase_error_rad=0.4"], frames=12)
     setup = prepare(s)
     for row in check(setup)["links"].values():
         assert row["left_out_db"] is None
         assert row["plane_rad"] <= row["plane_bound_rad"]
-        assert row["flight_rad"] <= row["straight_bound_rad"] * 1.01 + 1e-4  # the jerk, which is in no bound
+        assert (
+            row["flight_rad"] <= row["straight_bound_rad"] * 1.01 + 1e-4
+        )  # the jerk, which is in no bound
         assert row["synthesis"] <= 1e-4
         assert row["missed_chains"] == 0
 
@@ -77,27 +86,54 @@ def town(seed: int) -> Scenario:
 
     width = float(rng.uniform(14, 24))
     tree = {
-        "name": f"town{seed}", "seed": seed, "frames": 24, "frame_interval_s": 0.031,
-        "city": {"source": "blocks", "street_width_m": width, "block_size_m": float(rng.uniform(12, 30)), "blocks_x": 2, "blocks_y": 3,
-                 "building_height_m": 12, "height_spread_m": 4, "wall_material": str(rng.choice(["concrete", "glass", "brick"]))},
-        "swarm": {"A": uav("active", 0, -24), "P": uav("passive", 1.7, 21), "U": uav("target", -2.1, -3), "V": uav("target", 2.9, 8)},
-        "propagation": {"model": "ray_traced", "max_bounces": 2, "rays": 20000, "weakest_path_db": 20},
+        "name": f"town{seed}",
+        "seed": seed,
+        "frames": 24,
+        "frame_interval_s": 0.031,
+        "city": {
+            "source": "blocks",
+            "street_width_m": width,
+            "block_size_m": float(rng.uniform(12, 30)),
+            "blocks_x": 2,
+            "blocks_y": 3,
+            "building_height_m": 12,
+            "height_spread_m": 4,
+            "wall_material": str(rng.choice(["concrete", "glass", "brick"])),
+        },
+        "swarm": {
+            "A": uav("active", 0, -24),
+            "P": uav("passive", 1.7, 21),
+            "U": uav("target", -2.1, -3),
+            "V": uav("target", 2.9, 8),
+        },
+        "propagation": {
+            "model": "ray_traced",
+            "max_bounces": 2,
+            "rays": 20000,
+            "weakest_path_db": 20,
+        },
         "clutter": {"model": "field", "cell_area_per_metre_m": 0.4},
-    }  # fmt: skip
+    }
     return Scenario.model_validate(tree)
 
 
 @pytest.mark.sionna
 @pytest.mark.slow
 def test_estimates_bound_the_truth_and_exceed_it_by_ten_at_most_in_nine_of_ten():
-    """Two towns, every link, powers as amplitudes. Births of chains between traces are in the truth, not in the bounds: they count as
-    left out where a link's strongest missed path is above the weakest that matters. Planted bug: POWER_MARGIN of 0.1."""
+    """Two towns, every link, powers as amplitudes. Births of chains between traces are in the
+    truth, not in the bounds: they count as left out where a link's strongest missed path is above
+    the weakest that matters. Planted bug: POWER_MARGIN of 0.1."""
     within, cases = 0, 0
     for seed in (101, 102):
         setup = prepare(town(seed))
-        items = {(item["what"], item["link"]): item["estimate"] for item in make_plan(setup)["items"]}
+        items = {
+            (item["what"], item["link"]): item["estimate"] for item in make_plan(setup)["items"]
+        }
         for link, row in check(setup)["links"].items():
-            pairs = [(items["wavefronts", link], row["plane_rad"]), (items["flight in a frame", link], row["flight_rad"])]
+            pairs = [
+                (items["wavefronts", link], row["plane_rad"]),
+                (items["flight in a frame", link], row["flight_rad"]),
+            ]
             if row["left_out_db"] is not None and not row["missed_chains"]:
                 pairs.append((10 ** (items["paths", link] / 20), 10 ** (row["left_out_db"] / 20)))
             for estimate, truth in pairs:
@@ -109,8 +145,8 @@ def test_estimates_bound_the_truth_and_exceed_it_by_ten_at_most_in_nine_of_ten()
 
 @pytest.mark.sionna
 def test_delays_of_a_frame_are_found_again_from_its_chains():
-    """`delays` at the frame's own epoch gives the tracer's: line of sight, mirrors, echoes, ghosts, scatterers. Planted bug: the chain back
-    from a UAV taken in the order of the way there."""
+    """`delays` at the frame's own epoch gives the tracer's: line of sight, mirrors, echoes, ghosts,
+    scatterers. Planted bug: the chain back from a UAV taken in the order of the way there."""
     s = town(7).model_copy(update={"frames": 1})
     setup = prepare(s)
     poses, found = setup.find(0)
@@ -129,5 +165,7 @@ def test_a_path_is_present_where_its_like_is():
     s = load(SCENES / "paper_swarm.yaml", frames=4)
     paths = next(iter(prepare(s).find(0)[1].values()))
     assert present(paths, paths).all()
-    assert not present(paths, replace(paths, kind=np.full(len(paths), PathKind.SPECULAR, np.int8))).any()
+    assert not present(
+        paths, replace(paths, kind=np.full(len(paths), PathKind.SPECULAR, np.int8))
+    ).any()
     assert not present(paths, replace(paths, delay=paths.delay + 2e-14)).any()

@@ -30,13 +30,17 @@ def trace(handle, tx, rx, depth=2, **flags):
     scene.add(rt.Transmitter("tx", mi.Point3f(*map(float, tx))))
     scene.add(rt.Receiver("rx", mi.Point3f(*map(float, rx))))
     try:
-        paths = rt.PathSolver()(scene, max_depth=depth, samples_per_src=20_000, refraction=False, seed=3, **flags)
+        paths = rt.PathSolver()(
+            scene, max_depth=depth, samples_per_src=20_000, refraction=False, seed=3, **flags
+        )
     finally:
         scene.remove(["tx", "rx"])
     kept = np.asarray(paths.valid).reshape(-1)
     hits = np.asarray(paths.interactions)
     shape = (len(hits), kept.size)
-    objects, primitives = (np.asarray(x).reshape(shape)[:, kept] for x in (paths.objects, paths.primitives))
+    objects, primitives = (
+        np.asarray(x).reshape(shape)[:, kept] for x in (paths.objects, paths.primitives)
+    )
     points = np.asarray(paths.vertices).reshape(*shape, 3)[:, kept]
     gain = np.asarray(paths.a[0]).reshape(-1)[kept] + 1j * np.asarray(paths.a[1]).reshape(-1)[kept]
     return handle.face_index(objects, primitives), points, hits.reshape(shape)[:, kept], gain
@@ -46,13 +50,18 @@ def assert_points_lie_in_their_faces(city: City, faces: np.ndarray, points: np.n
     a, b, c = np.moveaxis(city.corners[faces], -2, 0)
     off = np.einsum("...i,...i->...", city.normals[faces], points - a)
     assert np.abs(off).max() < FLOAT32
-    parts = [np.linalg.norm(np.cross(p - points, q - points), axis=-1) / 2 for p, q in ((a, b), (b, c), (c, a))]
-    assert (sum(parts) <= city.areas[faces] + FLOAT32 * np.linalg.norm(b - a, axis=-1) + FLOAT32 * 200).all()
+    parts = [
+        np.linalg.norm(np.cross(p - points, q - points), axis=-1) / 2
+        for p, q in ((a, b), (b, c), (c, a))
+    ]
+    assert (
+        sum(parts) <= city.areas[faces] + FLOAT32 * np.linalg.norm(b - a, axis=-1) + FLOAT32 * 200
+    ).all()
 
 
 def test_known_wall_of_floor_wall():
-    """The mirror point on each of the two planes, by the image construction. Seen failing with the primitives reversed in
-    `faces_of_object`."""
+    """The mirror point on each of the two planes, by the image construction. Seen failing with the
+    primitives reversed in `faces_of_object`."""
     from isac_rt.world.city.scene import build_scene
 
     centre = np.array([0.31, -0.17, 0.9])
@@ -70,7 +79,10 @@ def test_known_wall_of_floor_wall():
         assert np.abs(image + at * (rx - image) - point).max() < FLOAT32
 
 
-@pytest.mark.parametrize("name", ["simple_reflector", "double_reflector", "triple_reflector", "box", "simple_street_canyon"])
+@pytest.mark.parametrize(
+    "name",
+    ["simple_reflector", "double_reflector", "triple_reflector", "box", "simple_street_canyon"],
+)
 def test_every_hit_lies_in_its_face(name):
     """Seen failing with the primitives reversed in `faces_of_object`."""
     from isac_rt.world.city.scene import build_scene
@@ -78,7 +90,9 @@ def test_every_hit_lies_in_its_face(name):
     centre = np.array([0.4, 0.3, 1.2])
     city = load_city(scenario.City(source="builtin", name=name), ".", F_C, centre)
     handle = build_scene(city, F_C)
-    faces, points, hits, _ = trace(handle, (-0.11, 0.23, 2.07), (0.17, -0.19, 1.61), diffuse_reflection=True)
+    faces, points, hits, _ = trace(
+        handle, (-0.11, 0.23, 2.07), (0.17, -0.19, 1.61), diffuse_reflection=True
+    )
     hit = hits > 0
     assert hit.sum() > 0
     assert (faces[~hit] == -1).all()
@@ -87,14 +101,22 @@ def test_every_hit_lies_in_its_face(name):
 
 
 def test_reflection_from_the_ground_has_the_slabs_fresnel_coefficient():
-    """Vertical incidence is avoided; horizontal links over a thick, lossy ground: |r| of the half-space, TM.
+    """Vertical incidence is avoided; horizontal links over a thick, lossy ground: |r| of the
+    half-space, TM.
 
     Seen failing with the conductivity left at zero.
     """
     from isac_rt.world.city.scene import build_scene
 
     keys = {"street_width_m": 200.0, "building_height_m": 5.0, "ground_material": "concrete"}
-    city = load_city(scenario.City(source="canyon", **keys, materials={"concrete": {"conductivity_s_per_m": 11.7}}), ".", F_C, (0, 0, 3.0))
+    city = load_city(
+        scenario.City(
+            source="canyon", **keys, materials={"concrete": {"conductivity_s_per_m": 11.7}}
+        ),
+        ".",
+        F_C,
+        (0, 0, 3.0),
+    )
     handle = build_scene(city, F_C)
     tx, rx = np.array([-6.3, 0.4, 2.9]), np.array([7.7, 0.4, 1.7])
     faces, _, hits, gain = trace(handle, tx, rx, depth=1)
@@ -119,16 +141,31 @@ def test_scattering_patterns_reach_sionna():
     from isac_rt.world.city.scene import build_scene
 
     changes = {
-        "concrete": {"scattering_pattern": "directive", "pattern_exponent": 7, "scattering_coefficient": 0.23},
-        "asphalt": {"scattering_pattern": "backscattering", "pattern_exponent": 3, "thickness_m": 0.41},
+        "concrete": {
+            "scattering_pattern": "directive",
+            "pattern_exponent": 7,
+            "scattering_coefficient": 0.23,
+        },
+        "asphalt": {
+            "scattering_pattern": "backscattering",
+            "pattern_exponent": 3,
+            "thickness_m": 0.41,
+        },
     }
-    city = load_city(scenario.City.model_validate({"source": "blocks", "materials": changes}), ".", F_C, (0, 0, 10))
+    city = load_city(
+        scenario.City.model_validate({"source": "blocks", "materials": changes}),
+        ".",
+        F_C,
+        (0, 0, 10),
+    )
     materials = [o.radio_material for o in build_scene(city, F_C).scene.objects.values()]
     assert len(materials) == 2
     for radio, ours in zip(materials, city.materials, strict=True):
         assert radio.relative_permittivity[0] == pytest.approx(ours.relative_permittivity, rel=1e-6)
         assert radio.conductivity[0] == pytest.approx(ours.conductivity, rel=1e-6)
-        assert radio.scattering_coefficient[0] == pytest.approx(ours.scattering_coefficient, rel=1e-6)
+        assert radio.scattering_coefficient[0] == pytest.approx(
+            ours.scattering_coefficient, rel=1e-6
+        )
         assert radio.thickness[0] == pytest.approx(ours.thickness, rel=1e-6)
         assert radio.scattering_pattern.alpha_r == ours.pattern_exponent
     patterns = {type(m.scattering_pattern) for m in materials}
@@ -142,4 +179,6 @@ def test_free_space_has_the_line_of_sight_alone():
     faces, _, _, gain = trace(handle, (0.0, 0.0, 0.0), (3.1, 11.7, -2.3), depth=1)
     assert (faces == -1).all()
     distance = np.linalg.norm([3.1, 11.7, -2.3])
-    assert abs(gain).tolist() == pytest.approx([299792458 / F_C / (4 * np.pi * distance)], rel=1e-5)  # float32
+    assert abs(gain).tolist() == pytest.approx(
+        [299792458 / F_C / (4 * np.pi * distance)], rel=1e-5
+    )  # float32

@@ -41,8 +41,11 @@ def simulation(monkeypatch):
     def prepare(scenario):
         from isac_rt.world.city.mesh import empty_city
 
-        return types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(scenario),
-                                     timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))  # fmt: skip
+        return types.SimpleNamespace(
+            city=empty_city("none", np.zeros(3)),
+            swarm=Swarm.from_scenario(scenario),
+            timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
+        )
 
     def run(scenario, *, setup, progress, snapshots, unfinished):
         for k in range(scenario.frames):
@@ -50,16 +53,40 @@ def simulation(monkeypatch):
         return fake_run(scenario)
 
     fake.prepare, fake.run = prepare, run
-    fake.link_budgets = lambda setup: [LinkBudget("AT->PT1", "line of sight", 34.4, -71.2, -88.9, 17.7, 47.1, 64.8)]
-    fake.trace = lambda s, frame, setup=None: {("AT", n): o.paths for n, o in fake_records(s)[frame].observers.items()}
+    fake.link_budgets = lambda setup: [
+        LinkBudget("AT->PT1", "line of sight", 34.4, -71.2, -88.9, 17.7, 47.1, 64.8)
+    ]
+    fake.trace = lambda s, frame, setup=None: {
+        ("AT", n): o.paths for n, o in fake_records(s)[frame].observers.items()
+    }
     monkeypatch.setitem(sys.modules, "isac_rt.run.simulate", fake)
     monkeypatch.setattr(isac_rt, "simulate", fake, raising=False)
     return fake
 
 
 def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
-    assert main(["run", str(scenario_file), "--out", str(tmp_path / "out"), "--frames", "5", "--seed", "42"]) == 0
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"results.nc", "summary.json", "scenario.yaml", "report.html", "figures"}
+    assert (
+        main(
+            [
+                "run",
+                str(scenario_file),
+                "--out",
+                str(tmp_path / "out"),
+                "--frames",
+                "5",
+                "--seed",
+                "42",
+            ]
+        )
+        == 0
+    )
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "results.nc",
+        "summary.json",
+        "scenario.yaml",
+        "report.html",
+        "figures",
+    }
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["frames"], summary["seed"]) == (5, 42)
     said = capsys.readouterr()
@@ -69,7 +96,19 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
 
 def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypatch):
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
-    assert main(["run", str(scenario_file), "--out", str(tmp_path / "o"), "--set", "modulation.dpsk_order=4"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(scenario_file),
+                "--out",
+                str(tmp_path / "o"),
+                "--set",
+                "modulation.dpsk_order=4",
+            ]
+        )
+        == 0
+    )
     assert "dpsk_order: 4" in (tmp_path / "o" / "scenario.yaml").read_text()
 
 
@@ -86,7 +125,9 @@ def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypat
         (["fly"], "fly"),
     ],
 )
-def test_wrong_input_ends_with_2_and_one_message(arguments, words, scenario_file, simulation, capsys, monkeypatch, tmp_path):
+def test_wrong_input_ends_with_2_and_one_message(
+    arguments, words, scenario_file, simulation, capsys, monkeypatch, tmp_path
+):
     """Seen to fail with ResultsError left out of the list."""
     monkeypatch.chdir(tmp_path)
     assert main([a.format(s=scenario_file) for a in arguments]) == 2
@@ -94,7 +135,9 @@ def test_wrong_input_ends_with_2_and_one_message(arguments, words, scenario_file
     assert words in said and "Traceback" not in said and len(said.strip().splitlines()) == 1
 
 
-def test_anything_else_ends_with_1_and_says_how_to_look(scenario_file, simulation, capsys, monkeypatch, tmp_path):
+def test_anything_else_ends_with_1_and_says_how_to_look(
+    scenario_file, simulation, capsys, monkeypatch, tmp_path
+):
     def broken(scenario, **_):
         raise ZeroDivisionError("division by zero")
 
@@ -139,7 +182,9 @@ def test_schema_is_json_schema(capsys):
 def test_doctor_says_what_to_do_and_fails_with_2(capsys, monkeypatch):
     from isac_rt import runtime
 
-    monkeypatch.setattr(runtime, "doctor", lambda: [runtime.Check("LLVM", False, "none", "apt install libllvm19")])
+    monkeypatch.setattr(
+        runtime, "doctor", lambda: [runtime.Check("LLVM", False, "none", "apt install libllvm19")]
+    )
     assert main(["doctor"]) == 2 and "libllvm19" in capsys.readouterr().out
     monkeypatch.setattr(runtime, "doctor", lambda: [runtime.Check("LLVM", True, "19.1", "")])
     assert main(["doctor"]) == 0
@@ -148,14 +193,20 @@ def test_doctor_says_what_to_do_and_fails_with_2(capsys, monkeypatch):
 def test_help_loads_nothing_heavy():
     """Seen to fail with `import numpy` at the top of cli.py."""
     heavy = ("numpy", "xarray", "matplotlib", "pydantic", "mitsuba")
-    code = f"import sys; from isac_rt.cli.cli import main; main(['--help']); print([m for m in {heavy} if m in sys.modules], file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    code = (
+        "import sys; from isac_rt.cli.cli import main; main(['--help']); print([m for m in "
+        f"{heavy} if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stderr.strip() == "[]" and "doctor" in done.stdout
 
 
 @pytest.mark.parametrize("stuck", ["time.sleep(60)", "native()"])
 def test_interrupt_ends_within_two_seconds(stuck, scenario_file, tmp_path):
-    """Also inside a native call that Python cannot interrupt, with an unfinished file on disk. Seen to fail without the thread."""
+    """Also inside a native call that Python cannot interrupt, with an unfinished file on disk. Seen
+    to fail without the thread."""
     program = f"""
 import ctypes, sys, time, types, os, pathlib
 import isac_rt.results.files
@@ -168,16 +219,24 @@ def native():
         try: libc.sleep(60)
         except KeyboardInterrupt: pass
 def prepare(scenario):
-    pathlib.Path({str(tmp_path / 'o')!r}, f".results.nc.{{os.getpid()}}.tmp").write_text("half")
+    pathlib.Path({str(tmp_path / "o")!r}, f".results.nc.{{os.getpid()}}.tmp").write_text("half")
     print("ready", flush=True)
     {stuck}
 fake.prepare = prepare
 import isac_rt
 sys.modules["isac_rt.run.simulate"] = isac_rt.run.simulate = fake
-sys.exit(main(["run", {str(scenario_file)!r}, "--out", {str(tmp_path / 'o')!r}]))
+sys.exit(main(["run", {str(scenario_file)!r}, "--out", {str(tmp_path / "o")!r}]))
 """
-    for _ in range(5):  # others may keep the machine busy: one try in time shows that the program can
-        child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    for _ in range(
+        5
+    ):  # others may keep the machine busy: one try in time shows that the program can
+        child = subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
         assert child.stdout.readline().strip() == "ready"
         time.sleep(0.2)
         began = time.monotonic()

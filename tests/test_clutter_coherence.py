@@ -1,4 +1,5 @@
-"""The clutter field in flight: coherent with a separate sum over its list of scatterers, without jumps, and faster than a re-trace."""
+"""The clutter field in flight: coherent with a separate sum over its list of scatterers, without
+jumps, and faster than a re-trace."""
 
 from __future__ import annotations
 
@@ -22,10 +23,17 @@ C, F_C = 299_792_458.0, 77e9
 LAMBDA = C / F_C
 CELL = 0.25
 CROSSING = scenario.City(
-    source="blocks", street_width_m=18.3, building_height_m=16.7, block_size_m=31.0, blocks_x=2, blocks_y=2,
-    wall_material="metal", roof_material="metal", ground_material="metal",
+    source="blocks",
+    street_width_m=18.3,
+    building_height_m=16.7,
+    block_size_m=31.0,
+    blocks_x=2,
+    blocks_y=2,
+    wall_material="metal",
+    roof_material="metal",
+    ground_material="metal",
     materials={"metal": scenario.MaterialOverride(scattering_coefficient=0.4)},
-)  # fmt: skip
+)
 SHARE = 0.4
 
 
@@ -35,7 +43,8 @@ def crossing() -> City:
 
 
 def flown(waypoints, model="field", **clutter):
-    """A tracer for one terminal in flight through the crossing (isotropic elements, 0 dBi), contiguous frames, and its trajectory."""
+    """A tracer for one terminal in flight through the crossing (isotropic elements, 0 dBi),
+    contiguous frames, and its trajectory."""
     w0 = [{"time_s": float(t), "position_m": list(map(float, x))} for t, x in waypoints]
     tree = {
         "frames": round(waypoints[-1][0] / 7.7824e-3),
@@ -62,11 +71,16 @@ def correlation(p: np.ndarray, q: np.ndarray) -> float:
 
 
 class Separate:
-    """Profiles from a list of scatterers in code of its own: Lambert on metal, shadows by trimesh's ray caster."""
+    """Profiles from a list of scatterers in code of its own: Lambert on metal, shadows by trimesh's
+    ray caster."""
 
-    def __init__(self, city: City, points: np.ndarray, strength: np.ndarray, normals: np.ndarray) -> None:
+    def __init__(
+        self, city: City, points: np.ndarray, strength: np.ndarray, normals: np.ndarray
+    ) -> None:
         self.points, self.strength, self.normals = points, strength, normals
-        self.caster = trimesh.ray.ray_triangle.RayMeshIntersector(trimesh.Trimesh(city.vertices, city.faces, process=False))
+        self.caster = trimesh.ray.ray_triangle.RayMeshIntersector(
+            trimesh.Trimesh(city.vertices, city.faces, process=False)
+        )
 
     def at(self, place: np.ndarray) -> np.ndarray:
         span = place - self.points
@@ -74,14 +88,17 @@ class Separate:
         cosine = np.abs((span * self.normals).sum(1)) / r
         lifted = self.points + 3e-3 * np.sign((span * self.normals).sum(1))[:, None] * self.normals
         way = lifted - place
-        where, ray, _ = self.caster.intersects_location(np.broadcast_to(place, way.shape), way, multiple_hits=True)
+        where, ray, _ = self.caster.intersects_location(
+            np.broadcast_to(place, way.shape), way, multiple_hits=True
+        )
         before = np.linalg.norm(where - place, axis=1) < np.linalg.norm(way[ray], axis=1) - 1e-6
         free = np.bincount(ray[before], minlength=r.size) == 0
         gain = self.strength * free * LAMBDA / (4 * np.pi) * SHARE * cosine / np.sqrt(np.pi) / r**2
         return profile(2 * r, gain)
 
 
-STREETS = {  # along a street past a corner, across it towards a wall, climbing beside a wall over a roof's edge
+# along a street past a corner, across it towards a wall, climbing beside a wall over a roof's edge
+STREETS = {
     "along": [(0.0, (-2.1, -26.0, 7.3)), (1.0, (-1.7, -14.1, 7.6)), (2.0, (-1.3, -2.2, 7.9))],
     "towards a wall": [(0.0, (-5.9, 3.1, 9.2)), (1.0, (0.1, 4.7, 9.0)), (2.0, (6.2, 6.3, 8.8))],
     "climbing": [(0.0, (4.3, -15.2, 9.9)), (1.0, (4.6, -15.9, 15.1)), (2.0, (4.9, -16.6, 20.3))],
@@ -91,11 +108,12 @@ STEPS = (1e-4, 1e-3, 1e-2, 1e-1)
 
 @pytest.mark.parametrize("name", STREETS)
 def test_field_is_coherent_with_a_separate_sum(name):
-    """Correlation of the range profile >= 0.99 after steps of 0.1 to 100 mm from seven places of each flight, against a list of scatterers
-    exported once; and each scatterer's phase within 1e-6 rad of the closed form (in long doubles).
+    """Correlation of the range profile >= 0.99 after steps of 0.1 to 100 mm from seven places of
+    each flight, against a list of scatterers exported once; and each scatterer's phase within 1e-6
+    rad of the closed form (in long doubles).
 
-    The separate sum switches scatterers at shadow edges, the field takes them across by the knife edge's factor: that is what 0.99 leaves
-    room for. Planted bug: delays in float32.
+    The separate sum switches scatterers at shadow edges, the field takes them across by the knife
+    edge's factor: that is what 0.99 leaves room for. Planted bug: delays in float32.
     """
     model, swarm = flown(STREETS[name], cell_area_per_metre_m=4.0, smallest_cell_m2=0.8)
     cells, city = model.field.cells, crossing()
@@ -111,7 +129,15 @@ def test_field_is_coherent_with_a_separate_sum(name):
             seen = model.field.seen("A", "A", local, local, when)
             p = profile(seen.length, cells.amplitude[seen.index] * seen.magnitude)
             worst = min(worst, correlation(p, separate.at(local.position)))
-            exact = np.sqrt(((cells.points[seen.index].astype(np.longdouble) - local.position.astype(np.longdouble)) ** 2).sum(1))
+            exact = np.sqrt(
+                (
+                    (
+                        cells.points[seen.index].astype(np.longdouble)
+                        - local.position.astype(np.longdouble)
+                    )
+                    ** 2
+                ).sum(1)
+            )
             assert np.abs(2 * np.pi / LAMBDA * (seen.length - 2 * exact)).max() < 1e-6
             share = model.field.sight.share("A", local, when)
             edges += int(((share > 0) & (share < 1)).sum())
@@ -120,8 +146,8 @@ def test_field_is_coherent_with_a_separate_sum(name):
 
 
 def test_retraced_clutter_is_not_coherent():
-    """The same test on Sionna's diffuse paths traced anew: the points of the first trace, summed in float64 at the next place, against
-    the next trace. It fails at every step."""
+    """The same test on Sionna's diffuse paths traced anew: the points of the first trace, summed in
+    float64 at the next place, against the next trace. It fails at every step."""
     model, swarm = flown(STREETS["along"], model="diffuse", rays=5_000)
     flight, best = swarm.trajectories["A"], 0.0
     for time in (0.13, 1.29):
@@ -131,7 +157,10 @@ def test_retraced_clutter_is_not_coherent():
             second = traced(model, flight, time + step / speed)
             place = flight.pose(time + step / speed).position
             length = 2 * np.linalg.norm(first.points[:, 0] - place, axis=1)
-            best = max(best, correlation(profile(length, first.gain), profile(C * second.delay, second.gain)))
+            best = max(
+                best,
+                correlation(profile(length, first.gain), profile(C * second.delay, second.gain)),
+            )
     assert best < 0.9
 
 
@@ -141,14 +170,19 @@ def traced(model, flight, time: float):
 
 
 ROUND_A_CORNER = [  # up one street of the crossing and into the other, 50 m at 10 m/s
-    (0.0, (-2.1, -31.0, 7.3)), (1.4, (-1.7, -17.3, 7.6)), (2.6, (-0.4, -5.8, 7.9)), (3.5, (5.9, 0.2, 8.1)), (5.0, (20.6, 1.7, 8.3)),
-]  # fmt: skip
+    (0.0, (-2.1, -31.0, 7.3)),
+    (1.4, (-1.7, -17.3, 7.6)),
+    (2.6, (-0.4, -5.8, 7.9)),
+    (3.5, (5.9, 0.2, 8.1)),
+    (5.0, (20.6, 1.7, 8.3)),
+]
 
 
 def test_sight_alone_changes_no_range_cell_at_once():
-    """Flying 50 m up a street and round its corner, the change that births and deaths make in a range cell from one frame to the next is at
-    most 0.15 of its local rms (mean power over 2 m and 15 frames; where that is 1e-4 of the whole and more). Planted bug: sight
-    switched at the knots."""
+    """Flying 50 m up a street and round its corner, the change that births and deaths make in a
+    range cell from one frame to the next is at most 0.15 of its local rms (mean power over 2 m and
+    15 frames; where that is 1e-4 of the whole and more). Planted bug: sight switched at the
+    knots."""
     model, swarm = flown(ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05)
     city, flight, cells = crossing(), swarm.trajectories["A"], model.field.cells
     times = (np.arange(round(5.0 / 7.7824e-3)) + 0.5) * 7.7824e-3
@@ -156,17 +190,26 @@ def test_sight_alone_changes_no_range_cell_at_once():
     for time in times:
         pose = flight.pose(time)
         local = replace(pose, position=pose.position - city.origin)
-        seen, share = model.field.seen("A", "A", local, local, time), model.field.sight.share("A", local, time)
+        seen, share = (
+            model.field.seen("A", "A", local, local, time),
+            model.field.sight.share("A", local, time),
+        )
         gain, mean = np.zeros(len(cells), complex), np.zeros(len(cells))
         mean[seen.index] = seen.magnitude**2
-        gain[seen.index] = cells.amplitude[seen.index] * seen.magnitude * np.exp(-2j * np.pi * np.mod(seen.length / LAMBDA, 1.0))
+        gain[seen.index] = (
+            cells.amplitude[seen.index]
+            * seen.magnitude
+            * np.exp(-2j * np.pi * np.mod(seen.length / LAMBDA, 1.0))
+        )
         cell = (np.linalg.norm(cells.points - local.position, axis=1) / CELL).astype(int)
         if before is not None:
             old_gain, old_share, old_cell = before
             with np.errstate(divide="ignore", invalid="ignore"):
                 change = np.where(old_share > 0, old_gain * (share / old_share - 1), gain)
             where = np.where(old_share > 0, old_cell, cell)
-            jumps.append(np.bincount(where, change.real, 800) + 1j * np.bincount(where, change.imag, 800))
+            jumps.append(
+                np.bincount(where, change.real, 800) + 1j * np.bincount(where, change.imag, 800)
+            )
         power.append(np.bincount(cell, mean, 800))
         before = gain, share, cell
     smooth = uniform_filter(np.array(power), (15, 8), mode="nearest")[1:]

@@ -1,5 +1,5 @@
-"""Detectors in clutter: covariance against cubes written from the signal's equation, thresholds against drawn noise, filters against
-the formulas of Robey and of Reed, Mallett and Brennan."""
+"""Detectors in clutter: covariance against cubes written from the signal's equation, thresholds
+against drawn noise, filters against the formulas of Robey and of Reed, Mallett and Brennan."""
 
 from __future__ import annotations
 
@@ -13,9 +13,24 @@ from scipy import stats
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
 from isac_rt.receive.cfar import detect
-from isac_rt.receive.clutter.adaptive import Matched, beams_of, expected_count, like_exponential, map_factor, sampled, scan_threshold
+from isac_rt.receive.clutter.adaptive import (
+    Matched,
+    beams_of,
+    expected_count,
+    like_exponential,
+    map_factor,
+    sampled,
+    scan_threshold,
+)
 from isac_rt.receive.clutter.detectors import cfar_ratio, judge, noise_level
-from isac_rt.receive.clutter.power import Taper, arm_channels, covariances, joint_channels, power_map, steering
+from isac_rt.receive.clutter.power import (
+    Taper,
+    arm_channels,
+    covariances,
+    joint_channels,
+    power_map,
+    steering,
+)
 from isac_rt.receive.clutter.sense import _beam, _direction
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -29,8 +44,11 @@ EXACT = Taper(range_cells=0.0, doppler_bins=0.0, cosine=0.0, fine=12)
 FALSE_FAILURE = 1e-6  # statistical
 
 
-def scatterers(count: int, seed: int, ranges: tuple[float, float], speed: float = 9.3) -> list[Path]:
-    """Points at rest around a terminal that flies at `speed` along u = (0.6, 0.3), each with its power's square root as amplitude."""
+def scatterers(
+    count: int, seed: int, ranges: tuple[float, float], speed: float = 9.3
+) -> list[Path]:
+    """Points at rest around a terminal that flies at `speed` along u = (0.6, 0.3), each with its
+    power's square root as amplitude."""
     rng = np.random.default_rng(seed)
     u = rng.uniform(-0.6, 0.6, (count, 2))
     lengths = 2 * rng.uniform(*ranges, count)
@@ -38,41 +56,79 @@ def scatterers(count: int, seed: int, ranges: tuple[float, float], speed: float 
     rates = [-2 * speed * forward @ np.array([a, np.sqrt(1 - a * a - b * b), b]) for a, b in u]
     powers = rng.uniform(0.2, 2.0, count)
     return [
-        Path(length, rate, np.sqrt(p), tuple(c), tuple(c)) for length, rate, p, c in zip(lengths, rates, powers, u.tolist(), strict=True)
+        Path(length, rate, np.sqrt(p), tuple(c), tuple(c))
+        for length, rate, p, c in zip(lengths, rates, powers, u.tolist(), strict=True)
     ]
 
 
 def expected(paths: list[Path]) -> ExpectedClutter:
-    u = np.array([[p.arrival[0], np.sqrt(1 - p.arrival[0] ** 2 - p.arrival[1] ** 2), p.arrival[1]] for p in paths])
-    delay, rate = np.array([p.length for p in paths]) / SPEED_OF_LIGHT, np.array([p.rate for p in paths]) / SPEED_OF_LIGHT
+    u = np.array(
+        [
+            [p.arrival[0], np.sqrt(1 - p.arrival[0] ** 2 - p.arrival[1] ** 2), p.arrival[1]]
+            for p in paths
+        ]
+    )
+    delay, rate = (
+        np.array([p.length for p in paths]) / SPEED_OF_LIGHT,
+        np.array([p.rate for p in paths]) / SPEED_OF_LIGHT,
+    )
     return ExpectedClutter(delay, rate, np.array([abs(p.amplitude) ** 2 for p in paths]), u, u)
 
 
-def maps_of(w: Waveform, schedule, payload, paths: list[Path], antennas, rows: int, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+def maps_of(
+    w: Waveform,
+    schedule,
+    payload,
+    paths: list[Path],
+    antennas,
+    rows: int,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> np.ndarray:
     one = cube(w, schedule, payload, paths, antennas, noise, seed)
-    return channel_maps(clean_spectrum(one, payload.delay_symbols, payload.phases, rows), w, schedule, payload.delay_symbols)
+    return channel_maps(
+        clean_spectrum(one, payload.delay_symbols, payload.phases, rows),
+        w,
+        schedule,
+        payload.delay_symbols,
+    )
 
 
 @pytest.mark.parametrize(("ranges", "bound"), [((8.0, 26.0), 0.06), ((36.0, 52.0), 0.1)])
 def test_covariance_is_the_sum_over_single_scatterers(ranges: tuple[float, float], bound: float):
-    """x x^H of one scatterer at a time, through the receiver's own chain, data included, summed; the second case lies past half of
-    the range (32 m), where the data gate the chirps. Discretisation: grid of 1/12 cell (3 %), curvature and migration left out.
-    Planted bugs: steering conjugated (1.3), sign of Doppler (1.0), all chirps taken as held (1.9 in the second case)."""
+    """x x^H of one scatterer at a time, through the receiver's own chain, data included, summed;
+    the second case lies past half of the range (32 m), where the data gate the chirps.
+    Discretisation: grid of 1/12 cell (3 %), curvature and migration left out. Planted bugs:
+    steering conjugated (1.3), sign of Doppler (1.0), all chirps taken as held (1.9 in the second
+    case)."""
     w, schedule, payload = frame(waveform=SHORT)
     paths, rows = scatterers(7, 5, ranges), 220
     channels = joint_channels(FEW)
     truth = np.zeros((rows, w.num_chirps, len(channels), len(channels)), complex)
     for path in paths:
         one = cube(w, schedule, payload, [path], FEW)
-        beat = w.slope * w.sampled_duration * (path.length / SPEED_OF_LIGHT) + path.rate / SPEED_OF_LIGHT * 77.3e9 * w.sampled_duration
-        one.samples[np.broadcast_to((beat + payload.delay_symbols >= w.num_samples)[:, None], one.samples.shape[:3])] = 0  # IF filter
+        beat = (
+            w.slope * w.sampled_duration * (path.length / SPEED_OF_LIGHT)
+            + path.rate / SPEED_OF_LIGHT * 77.3e9 * w.sampled_duration
+        )
+        one.samples[
+            np.broadcast_to(
+                (beat + payload.delay_symbols >= w.num_samples)[:, None], one.samples.shape[:3]
+            )
+        ] = 0  # IF filter
         spectra = clean_spectrum(one, payload.delay_symbols, payload.phases, rows)
-        x = np.moveaxis(channel_maps(spectra, w, schedule, payload.delay_symbols)[channels.tx, channels.rx], 0, -1)
+        x = np.moveaxis(
+            channel_maps(spectra, w, schedule, payload.delay_symbols)[channels.tx, channels.rx],
+            0,
+            -1,
+        )
         truth += x[..., :, None] * x[..., None, :].conj()
     power = np.einsum("rpii->rp", truth).real
     wanted = power > 1e-2 * power.max()
     found = np.zeros_like(truth)
-    for row, bins, R in covariances(expected(paths), w, channels, wanted, schedule, payload.delay_symbols, EXACT):
+    for row, bins, R in covariances(
+        expected(paths), w, channels, wanted, schedule, payload.delay_symbols, EXACT
+    ):
         found[row, bins] = R
     assert wanted.sum() > 40
     error = np.linalg.norm((found - truth)[wanted]) / np.linalg.norm(truth[wanted])
@@ -80,8 +136,9 @@ def test_covariance_is_the_sum_over_single_scatterers(ranges: tuple[float, float
 
 
 def test_power_map_is_the_mean_power_of_random_clutter():
-    """60 draws of 40 circular Gaussian scatterers, moving, through the receiver's chain; speckle of an average over the map is 3 %.
-    Planted bug: amplitude in place of power in the Doppler kernel."""
+    """60 draws of 40 circular Gaussian scatterers, moving, through the receiver's chain; speckle of
+    an average over the map is 3 %. Planted bug: amplitude in place of power in the Doppler
+    kernel."""
     w, schedule, payload = frame(waveform=SHORT)
     paths, rng = scatterers(40, 8, (10.0, 24.0)), np.random.default_rng(2)
     single = [maps_of(w, schedule, payload, [p], FEW, 110) for p in paths]
@@ -89,17 +146,22 @@ def test_power_map_is_the_mean_power_of_random_clutter():
     for _ in range(60):
         a = rng.standard_normal((40, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         power += accumulate(np.einsum("s,s...->...", a, single).astype(np.complex64)) / 60
-    predicted = power_map(expected(paths), w, 110, schedule, payload.delay_symbols, Taper(0.0, 0.0, 0.0, 8))
+    predicted = power_map(
+        expected(paths), w, 110, schedule, payload.delay_symbols, Taper(0.0, 0.0, 0.0, 8)
+    )
     some = predicted > 1e-3 * predicted.max()
     ratio = power[some] / predicted[some]
     assert power[some].sum() / predicted[some].sum() == pytest.approx(1, abs=4 / np.sqrt(60 * 20))
     assert np.median(ratio) == pytest.approx(1, abs=0.12)
 
 
-@pytest.mark.parametrize(("joint", "rate"), [(False, 0.02), (True, 0.02), (False, 1e-3), (True, 1e-3)])
+@pytest.mark.parametrize(
+    ("joint", "rate"), [(False, 0.02), (True, 0.02), (False, 1e-3), (True, 1e-3)]
+)
 def test_scan_threshold_holds_the_rate_in_white_noise(joint: bool, rate: float):
-    """Largest beam of white snapshots. Beams half a lobe apart miss a fifth to a half of the continuous scan's crossings, so the rate
-    is below the design's and above 0.4 of it, 0.2 with both axes. Planted bug: e^-t alone as the tail (43 times the rate)."""
+    """Largest beam of white snapshots. Beams half a lobe apart miss a fifth to a half of the
+    continuous scan's crossings, so the rate is below the design's and above 0.4 of it, 0.2 with
+    both axes. Planted bug: e^-t alone as the tail (43 times the rate)."""
     w, rng, draws = Waveform(), np.random.default_rng(6), 60000
     if joint:
         sets = [(joint_channels(ANTENNAS), (0, 2))]
@@ -111,15 +173,23 @@ def test_scan_threshold_holds_the_rate_in_white_noise(joint: bool, rate: float):
     for _ in range(10):
         total = np.zeros(draws // 10)
         for b in beams:
-            x = (rng.standard_normal((draws // 10, b.steer.shape[1], 2)) @ np.array([1, 1j]) / np.sqrt(2)).astype(np.complex64)
+            x = (
+                rng.standard_normal((draws // 10, b.steer.shape[1], 2))
+                @ np.array([1, 1j])
+                / np.sqrt(2)
+            ).astype(np.complex64)
             total += (np.abs(x @ b.steer.conj().T) ** 2).max(axis=1) / b.steer.shape[1]
         hits += int((total > limit).sum())
-    low, high = stats.binom.ppf(FALSE_FAILURE, draws, (0.2 if joint else 0.4) * rate), stats.binom.isf(FALSE_FAILURE, draws, rate)
+    low, high = (
+        stats.binom.ppf(FALSE_FAILURE, draws, (0.2 if joint else 0.4) * rate),
+        stats.binom.isf(FALSE_FAILURE, draws, rate),
+    )
     assert low <= hits <= high
 
 
 def test_expected_count_is_that_of_a_fine_scan():
-    """One arm scanned 16 times as finely: crossings of t = 7 against the Euler characteristic. Planted bug: sqrt(t/pi) without pi."""
+    """One arm scanned 16 times as finely: crossings of t = 7 against the Euler characteristic.
+    Planted bug: sqrt(t/pi) without pi."""
     w, rng, draws = Waveform(), np.random.default_rng(4), 40000
     channels = arm_channels(ANTENNAS, 0)
     beams = beams_of(channels, w, ANTENNAS, (0,))
@@ -127,7 +197,9 @@ def test_expected_count_is_that_of_a_fine_scan():
     u[:, 0] = np.linspace(-1, 1, 513) * np.sin(ANTENNAS.half_view)
     fine = steering(channels.places, u, w)
     x = rng.standard_normal((draws, 16, 2)) @ np.array([1, 1j]) / np.sqrt(2)
-    above = np.concatenate([(np.abs(part @ fine.conj().T) ** 2).max(axis=1) / 16 > 7 for part in np.array_split(x, 20)])
+    above = np.concatenate(
+        [(np.abs(part @ fine.conj().T) ** 2).max(axis=1) / 16 > 7 for part in np.array_split(x, 20)]
+    )
     p = float(expected_count(np.array(7.0), beams))
     assert above.mean() == pytest.approx(p, abs=5 * np.sqrt(p / draws) + 0.05 * p)
 
@@ -151,8 +223,9 @@ def one_beam(a: np.ndarray):
 
 
 def test_matched_filter_is_exponential_and_has_the_optimal_sinr():
-    """Clutter 40 dB over the noise with its own covariance: T is exponential (Kolmogorov-Smirnov), and a target of amplitude s gives
-    E T = 1 + s^2 a^H R^-1 a, Brennan and Reed's optimum. Planted bug: R transposed (mean of T without a target 4e3)."""
+    """Clutter 40 dB over the noise with its own covariance: T is exponential (Kolmogorov-Smirnov),
+    and a target of amplitude s gives E T = 1 + s^2 a^H R^-1 a, Brennan and Reed's optimum. Planted
+    bug: R transposed (mean of T without a target 4e3)."""
     from isac_rt.receive.clutter.adaptive import Scan
 
     rng, size, draws = np.random.default_rng(11), 12, 20000
@@ -162,7 +235,9 @@ def test_matched_filter_is_exponential_and_has_the_optimal_sinr():
     for s in (0.0, 1.7):
         scan = Scan(*(np.zeros((1, draws)) for _ in range(3)))
         x = draw(R, draws, rng) + s * a
-        whole = Matched(matched.inverse.repeat(draws, 0), matched.norm.repeat(draws, 0), matched.against)
+        whole = Matched(
+            matched.inverse.repeat(draws, 0), matched.norm.repeat(draws, 0), matched.against
+        )
         whole.fill(scan, 0, np.arange(draws), x)
         gain = float((a.conj() @ np.linalg.solve(R, a)).real)
         mean = 1 + s**2 * gain
@@ -174,8 +249,9 @@ def test_matched_filter_is_exponential_and_has_the_optimal_sinr():
 
 
 def test_sample_matrix_tail_and_loss_are_the_known_ones():
-    """36 independent snapshots for 12 channels. Robey's tail at p = 0.01, binomial; and Reed, Mallett and Brennan's mean loss
-    (N - L + 2)/(N + 1) of the SINR. Planted bug: rho ~ Beta(L - 1, N - L + 2)."""
+    """36 independent snapshots for 12 channels. Robey's tail at p = 0.01, binomial; and Reed,
+    Mallett and Brennan's mean loss (N - L + 2)/(N + 1) of the SINR. Planted bug: rho ~ Beta(L - 1,
+    N - L + 2)."""
     rng, size, count, draws = np.random.default_rng(5), 12, 36, 20000
     a = np.exp(1j * 1.3 * np.arange(size))
     x = (rng.standard_normal((draws, size, 2)) @ np.array([1, 1j])) / np.sqrt(2)
@@ -187,34 +263,51 @@ def test_sample_matrix_tail_and_loss_are_the_known_ones():
     grid = np.geomspace(0.1, 200, 400)
     limit = float(np.interp(-np.log(0.01), like_exponential(grid, count, size), grid))
     hits = int((statistic > limit).sum())
-    assert stats.binom.ppf(FALSE_FAILURE, draws, 0.01) <= hits <= stats.binom.isf(FALSE_FAILURE, draws, 0.01)
+    assert (
+        stats.binom.ppf(FALSE_FAILURE, draws, 0.01)
+        <= hits
+        <= stats.binom.isf(FALSE_FAILURE, draws, 0.01)
+    )
     loss = np.abs(w @ a.conj()) ** 2 / (np.abs(w) ** 2).sum(axis=1) / size
-    assert loss.mean() == pytest.approx((count - size + 2) / (count + 1), abs=5 * loss.std() / np.sqrt(draws))
+    assert loss.mean() == pytest.approx(
+        (count - size + 2) / (count + 1), abs=5 * loss.std() / np.sqrt(draws)
+    )
 
 
 @pytest.mark.parametrize("row", [40, 2])
 def test_sampled_scan_is_the_filter_of_the_cells_around(row: int):
-    """One cell by the definition: the mean of x x^H over L rows on each side outside the guard and a bin on each side (at the end of the
-    range axis those there are), loaded, inverted. Planted bugs: a row of the guard among them, one neighbouring bin twice."""
+    """One cell by the definition: the mean of x x^H over L rows on each side outside the guard and
+    a bin on each side (at the end of the range axis those there are), loaded, inverted. Planted
+    bugs: a row of the guard among them, one neighbouring bin twice."""
     w, rng, column, guard = Waveform(), np.random.default_rng(9), 0, 3
     antennas = replace(ANTENNAS, rx_x=3, rx_z=3)
-    maps = (rng.standard_normal((3, 5, 90, 120, 2)) @ np.array([1, 1j]) / np.sqrt(2)).astype(np.complex64)
+    maps = (rng.standard_normal((3, 5, 90, 120, 2)) @ np.array([1, 1j]) / np.sqrt(2)).astype(
+        np.complex64
+    )
     channels = arm_channels(antennas, 0)
     beams = beams_of(channels, w, antennas, (0,))
     scan = sampled(maps, channels, beams, 1.3, guard)
     x, size = maps[channels.tx, channels.rx].astype(complex), len(channels)
     rows = [r for r in range(90) if guard < abs(r - row) <= guard + size]
-    cells = np.concatenate([x[:, rows][:, :, c % 120] for c in (column - 1, column, column + 1)], axis=1)
+    cells = np.concatenate(
+        [x[:, rows][:, :, c % 120] for c in (column - 1, column, column + 1)], axis=1
+    )
     R = cells @ cells.conj().T / cells.shape[1] + 0.1 * 1.3 * np.eye(size)
     weights = np.linalg.inv(R)
     a = beams.steer.astype(complex)
-    peak = (np.abs(a.conj() @ weights @ x[:, row, column]) ** 2 / np.einsum("bi,ij,bj->b", a.conj(), weights, a).real).max()
-    assert scan.peak[row, column] == pytest.approx(float(like_exponential(np.array([peak]), 18, size)[0]), rel=2e-3, abs=0)
+    peak = (
+        np.abs(a.conj() @ weights @ x[:, row, column]) ** 2
+        / np.einsum("bi,ij,bj->b", a.conj(), weights, a).real
+    ).max()
+    assert scan.peak[row, column] == pytest.approx(
+        float(like_exponential(np.array([peak]), 18, size)[0]), rel=2e-3, abs=0
+    )
 
 
 def test_guard_of_the_sample_matrix_is_that_of_the_range():
-    """Its cells lie along the range: the guard of the Doppler axis plays no part, that of the range keeps a second echo three rows off
-    out of the covariance that would cancel the first. Planted bug: the other axis's guard."""
+    """Its cells lie along the range: the guard of the Doppler axis plays no part, that of the range
+    keeps a second echo three rows off out of the covariance that would cancel the first. Planted
+    bug: the other axis's guard."""
     w, schedule, payload = frame(waveform=SHORT)
     near = 20 * w.range_cell(2)
     echoes = [Path(2 * (near + k * w.range_cell(2)), 3.7, 2.0) for k in (0, 3)]
@@ -228,8 +321,9 @@ def test_guard_of_the_sample_matrix_is_that_of_the_range():
 
 
 def test_noise_level_from_the_quietest_cells():
-    """Means of few exponentials: their median is less than their mean, which Wilson and Hilferty's cube makes up for to 0.3 %; and half
-    of the map under clutter that the mesh foretells. Planted bugs: the cube left out; the loudest cells taken."""
+    """Means of few exponentials: their median is less than their mean, which Wilson and Hilferty's
+    cube makes up for to 0.3 %; and half of the map under clutter that the mesh foretells. Planted
+    bugs: the cube left out; the loudest cells taken."""
     rng = np.random.default_rng(14)
     for looks in (5, 21):
         power = 0.37 * rng.gamma(looks, 1 / looks, (400, 500))
@@ -241,8 +335,8 @@ def test_noise_level_from_the_quietest_cells():
 
 
 def test_background_is_noise_and_expected_clutter():
-    """White noise through the receiver's chain where the mesh foretells clutter: the level is its power over the foretold one's, alike in
-    all cells. Planted bug: the clutter taken off."""
+    """White noise through the receiver's chain where the mesh foretells clutter: the level is its
+    power over the foretold one's, alike in all cells. Planted bug: the clutter taken off."""
     w, schedule, payload = frame(waveform=SHORT)
     guess = expected(scatterers(7, 5, (8.0, 26.0)))
     maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
@@ -264,77 +358,122 @@ def test_ratio_of_the_cfar_is_its_decision():
 
 
 def test_size_of_the_scanned_directions():
-    """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances written out; beams half a lobe apart at
-    most. Planted bugs: the variance for the deviation; the area without the covariance of the two arms; no limit to the view."""
+    """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances
+    written out; beams half a lobe apart at most. Planted bugs: the variance for the deviation; the
+    area without the covariance of the two arms; no limit to the view."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
     channels = joint_channels(antennas)
-    x, z = channels.places[:, 0] - channels.places[:, 0].mean(), channels.places[:, 2] - channels.places[:, 2].mean()
+    x, z = (
+        channels.places[:, 0] - channels.places[:, 0].mean(),
+        channels.places[:, 2] - channels.places[:, 2].mean(),
+    )
     k, side = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT, 2 * np.sin(antennas.half_view)
     beams = beams_of(channels, w, antennas, (0, 2))
-    assert beams.lengths == pytest.approx((side * k * np.sqrt((x * x).mean()), side * k * np.sqrt((z * z).mean())), rel=1e-9, abs=0)
+    assert beams.lengths == pytest.approx(
+        (side * k * np.sqrt((x * x).mean()), side * k * np.sqrt((z * z).mean())), rel=1e-9, abs=0
+    )
     determinant = (x * x).mean() * (z * z).mean() - (x * z).mean() ** 2
     assert beams.area == pytest.approx(side**2 * k**2 * np.sqrt(determinant), rel=1e-9, abs=0)
-    assert np.abs(beams.cosines[:, 0]).max() == pytest.approx(np.sin(antennas.half_view)) and not beams.cosines[:, 1].any()
+    assert (
+        np.abs(beams.cosines[:, 0]).max() == pytest.approx(np.sin(antennas.half_view))
+        and not beams.cosines[:, 1].any()
+    )
     for axis in (0, 2):
         lobe = w.wavelength / (np.ptp(channels.places[:, axis]) + antennas.spacing)
         apart = np.diff(np.unique(np.round(beams.cosines[:, axis], 12)))
         assert apart.max() <= lobe / 2 and apart.min() > 0.8 * lobe / 2
-    wide, half = (beams_of(channels, w, replace(antennas, half_view=h), (0, 2)) for h in (2.1, np.pi / 2))  # an arm tells no more apart
-    assert wide.lengths == half.lengths and wide.lengths[0] == pytest.approx(beams.lengths[0] / np.sin(antennas.half_view))
+    wide, half = (
+        beams_of(channels, w, replace(antennas, half_view=h), (0, 2)) for h in (2.1, np.pi / 2)
+    )  # an arm tells no more apart
+    assert wide.lengths == half.lengths and wide.lengths[0] == pytest.approx(
+        beams.lengths[0] / np.sin(antennas.half_view)
+    )
 
 
 def test_direction_within_a_filters_beam():
-    """Power of the filter's beam from exact responses, and the place of the most of it, to the last step of the search. Planted bugs:
-    conjugated; the other arm's axis."""
+    """Power of the filter's beam from exact responses, and the place of the most of it, to the last
+    step of the search. Planted bugs: conjugated; the other arm's axis."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=6, rx_z=5)
     u, k = np.array([0.37, -0.21]), 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
-    wave = [np.exp(-1j * k * (places[:, [0, 2]] @ u)) for places in (antennas.tx_positions, antennas.rx_positions)]
-    found = _direction(Estimate(1e-7, 1e-8, 2.3j * np.outer(*wave)), antennas, w, u + np.array([0.043, -0.038]))
+    wave = [
+        np.exp(-1j * k * (places[:, [0, 2]] @ u))
+        for places in (antennas.tx_positions, antennas.rx_positions)
+    ]
+    found = _direction(
+        Estimate(1e-7, 1e-8, 2.3j * np.outer(*wave)), antennas, w, u + np.array([0.043, -0.038])
+    )
     assert np.abs(found - u).max() < 0.003
     weights = _beam(antennas, w, u)
     size = len(joint_channels(antennas))
     assert np.count_nonzero(weights) == size
-    assert abs((weights.conj() * np.outer(*wave)).sum()) == pytest.approx(size, rel=2e-3)  # the window's middle is 9 samples off
+    assert abs((weights.conj() * np.outer(*wave)).sum()) == pytest.approx(
+        size, rel=2e-3
+    )  # the window's middle is 9 samples off
 
 
 def test_map_factor_at_its_ends():
-    """Without clutter the noise's own law, with much of it an exponential: -ln(rate) of the clutter's mean."""
-    assert map_factor(np.array(0.0), 45, 1e-3) == pytest.approx(stats.gamma.isf(1e-3, 45, scale=1 / 45), rel=1e-9, abs=0)
-    assert map_factor(np.array(1e5), 45, 1e-3) / 1e5 == pytest.approx(-np.log(1e-3), rel=1e-3, abs=0)
+    """Without clutter the noise's own law, with much of it an exponential: -ln(rate) of the
+    clutter's mean."""
+    assert map_factor(np.array(0.0), 45, 1e-3) == pytest.approx(
+        stats.gamma.isf(1e-3, 45, scale=1 / 45), rel=1e-9, abs=0
+    )
+    assert map_factor(np.array(1e5), 45, 1e-3) / 1e5 == pytest.approx(
+        -np.log(1e-3), rel=1e-3, abs=0
+    )
 
 
 def test_receiver_finds_what_clutter_hides():
-    """60 strong scatterers around a flying terminal, known in power and place but not in phase, and in their midst a target 13 dB
-    weaker than them: CFAR is lost in false alarms, the filter has the target, its direction and at most two more. Planted bug: steering
-    conjugated."""
+    """60 strong scatterers around a flying terminal, known in power and place but not in phase, and
+    in their midst a target 13 dB weaker than them: CFAR is lost in false alarms, the filter has the
+    target, its direction and at most two more. Planted bug: steering conjugated."""
     w, schedule, payload = frame(waveform=SHORT)
     antennas, rng = replace(ANTENNAS, rx_x=6, rx_z=3), np.random.default_rng(3)
     truth = scatterers(60, 21, (14.0, 21.0))
     guess = expected(truth)
     guess = replace(guess, power=20 * guess.power)
     for path in truth:
-        path.amplitude = np.sqrt(20) * abs(path.amplitude) * (rng.standard_normal() + 1j * rng.standard_normal()) / np.sqrt(2)
+        path.amplitude = (
+            np.sqrt(20)
+            * abs(path.amplitude)
+            * (rng.standard_normal() + 1j * rng.standard_normal())
+            / np.sqrt(2)
+        )
     target = Path(2 * 17.3, -2 * 9.3 * 0.74, 1.1, (-0.5, -0.3), (-0.5, -0.3))
     received = cube(w, schedule, payload, [*truth, target], antennas, 20.0, 1)
     count = {}
     for detector in ("cfar", "angle_doppler"):
-        settings = Receivers(clutter_detector=detector, clutter_channels="joint", false_alarm_rate=1e-5, cluster_cells=(2, 2))
+        settings = Receivers(
+            clutter_detector=detector,
+            clutter_channels="joint",
+            false_alarm_rate=1e-5,
+            cluster_cells=(2, 2),
+        )
         d = receive_active(received, payload, antennas, settings, clutter=guess).detections
-        near = (np.abs(d.range - 17.3) < w.range_cell(2)) & (np.abs(d.velocity - target.rate / 2) < w.velocity_cell(2))
+        near = (np.abs(d.range - 17.3) < w.range_cell(2)) & (
+            np.abs(d.velocity - target.rate / 2) < w.velocity_cell(2)
+        )
         count[detector] = int(near.sum()), int((~near).sum())
     assert count["cfar"][1] > 4
     assert count["angle_doppler"][0] == 1
     assert count["angle_doppler"][1] <= 2
-    assert np.abs(d.direction[near][0] - target.arrival).max() < 0.08  # half a lobe of 12 elements, pulled by the clutter that is left
+    assert (
+        np.abs(d.direction[near][0] - target.arrival).max() < 0.08
+    )  # half a lobe of 12 elements, pulled by the clutter that is left
     # the paper's estimates here too: centres of cells. Planted bug: refined all the same
-    d = receive_active(received, payload, antennas, settings.model_copy(update={"refinement": "grid"}), clutter=guess).detections
+    d = receive_active(
+        received,
+        payload,
+        antennas,
+        settings.model_copy(update={"refinement": "grid"}),
+        clutter=guess,
+    ).detections
     bins = d.velocity / w.velocity_cell(2)
     assert len(d) and np.abs(bins - np.round(bins)).max() < 1e-9
 
 
 def test_snr_of_a_detection_in_clutter_is_power_over_background():
-    """A lone echo where the mesh foretells next to nothing: the highest cell of the mean map over the mean of noise that went the same way.
-    Planted bug: times the background."""
+    """A lone echo where the mesh foretells next to nothing: the highest cell of the mean map over
+    the mean of noise that went the same way. Planted bug: times the background."""
     w, schedule, payload = frame(waveform=SHORT)
     guess = expected(scatterers(7, 5, (8.0, 26.0)))
     guess = replace(guess, power=1e-9 * guess.power)
@@ -342,11 +481,23 @@ def test_snr_of_a_detection_in_clutter_is_power_over_background():
     received = cube(w, schedule, payload, echo, FEW, 20.0, 1)
     settings = Receivers(clutter_detector="map")
     d = receive_active(received, payload, FEW, settings, clutter=guess).detections
-    powers = [(np.abs(maps_of(w, schedule, payload, p, FEW, 110, noise=20.0, seed=1)) ** 2).mean(axis=(0, 1)) for p in (echo, [])]
-    assert d.snr.max() == pytest.approx(powers[0].max() / powers[1].mean(), rel=0.1)  # the level is a median of a third of the cells
+    powers = [
+        (np.abs(maps_of(w, schedule, payload, p, FEW, 110, noise=20.0, seed=1)) ** 2).mean(
+            axis=(0, 1)
+        )
+        for p in (echo, [])
+    ]
+    assert d.snr.max() == pytest.approx(
+        powers[0].max() / powers[1].mean(), rel=0.1
+    )  # the level is a median of a third of the cells
 
 
 def test_a_mesh_detector_without_a_mesh_says_so():
     w, schedule, payload = frame(waveform=SHORT)
     with pytest.raises(ValueError, match="clutter that the mesh predicts"):
-        receive_active(cube(w, schedule, payload, [], FEW, 1.0), payload, FEW, Receivers(clutter_detector="map"))
+        receive_active(
+            cube(w, schedule, payload, [], FEW, 1.0),
+            payload,
+            FEW,
+            Receivers(clutter_detector="map"),
+        )

@@ -28,21 +28,36 @@ def surroundings(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.n
     return towards, rng.uniform(3.0, 29.0, count), rng.uniform(0.01, 0.1, count)
 
 
-def power_of(amplitude: np.ndarray, ranges: np.ndarray, rates: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """(ROWS, P) mean power over the channels of tones in noise: two Hann windows and a transform written out; Doppler centred.
+def power_of(
+    amplitude: np.ndarray,
+    ranges: np.ndarray,
+    rates: np.ndarray,
+    noise: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """(ROWS, P) mean power over the channels of tones in noise: two Hann windows and a transform
+    written out; Doppler centred.
 
     amplitude (K, LOOKS); rates of the ranges [m/s].
     """
     n, p, size = np.arange(W.num_samples), np.arange(W.num_chirps), window_length(W)
     carrier = W.carrier_frequency + W.slope * (W.chirp_duration - W.sampled_duration / 2)
     doppler = 2 * rates / C * carrier * W.num_chirps * W.slot_duration
-    beat = W.slope * 2 * ranges / C * W.sampled_duration + 2 * rates / C * W.carrier_frequency * W.sampled_duration
-    fast = np.exp(2j * np.pi * np.outer(n, beat) / W.num_samples) * np.where(n < size, np.sin(np.pi * (n + 0.5) / size) ** 2, 0)[:, None]
+    beat = (
+        W.slope * 2 * ranges / C * W.sampled_duration
+        + 2 * rates / C * W.carrier_frequency * W.sampled_duration
+    )
+    fast = (
+        np.exp(2j * np.pi * np.outer(n, beat) / W.num_samples)
+        * np.where(n < size, np.sin(np.pi * (n + 0.5) / size) ** 2, 0)[:, None]
+    )
     slow = np.exp(2j * np.pi * np.outer(p, doppler) / W.num_chirps)
     window = np.sin(np.pi * (p + 0.5) / W.num_chirps) ** 2
     out = np.zeros((ROWS, W.num_chirps))
     for a in amplitude.T:
-        white = np.sqrt(noise / 2) * (rng.standard_normal((W.num_samples, W.num_chirps, 2)) @ np.array([1, 1j]))
+        white = np.sqrt(noise / 2) * (
+            rng.standard_normal((W.num_samples, W.num_chirps, 2)) @ np.array([1, 1j])
+        )
         white *= np.where(n < size, np.sin(np.pi * (n + 0.5) / size) ** 2, 0)[:, None]
         x = np.fft.fft(((fast * a) @ slow.T + white) * window, axis=0)[:ROWS]
         out += np.abs(np.fft.fft(x, axis=1)) ** 2 / LOOKS
@@ -51,45 +66,71 @@ def power_of(amplitude: np.ndarray, ranges: np.ndarray, rates: np.ndarray, noise
 
 @pytest.mark.parametrize("targets", [0, 10])
 def test_velocity_and_level_come_back_from_the_clutter(targets: int):
-    """3000 points, places and mean powers known, a velocity 0.2 m/s off and 3 dB too little. With ten
-    targets 25 dB over a point, a tenth of the cells, boresight's component comes back to 0.07 m/s, the others to 0.13 m/s and the level to
-    0.6 dB; without them to 0.03 m/s, 0.13 m/s and 0.4 dB: some three deviations of a dozen other draws. Planted bugs: the slope's sign;
-    one way only; the level as a factor on amplitudes; targets counted in full (0.2 m/s, 2 dB)."""
+    """3000 points, places and mean powers known, a velocity 0.2 m/s off and 3 dB too little. With
+    ten targets 25 dB over a point, a tenth of the cells, boresight's component comes back to 0.07
+    m/s, the others to 0.13 m/s and the level to 0.6 dB; without them to 0.03 m/s, 0.13 m/s and 0.4
+    dB: some three deviations of a dozen other draws. Planted bugs: the slope's sign; one way only;
+    the level as a factor on amplitudes; targets counted in full (0.2 m/s, 2 dB)."""
     rng = np.random.default_rng(4)
     towards, ranges, powers = surroundings(COUNT, rng)
     noise = 0.02
     at = rng.uniform(3, 29, targets), rng.uniform(-12, 12, targets)
     wrong = VELOCITY + MISTAKE
-    guess = ExpectedClutter(2 * ranges / C, -2 * (towards @ wrong) / C, powers / 2, towards, towards)
+    guess = ExpectedClutter(
+        2 * ranges / C, -2 * (towards @ wrong) / C, powers / 2, towards, towards
+    )
     _, schedule, payload = frame(waveform=W)
     floor = float(power_of(np.zeros((1, LOOKS)), np.zeros(1), np.zeros(1), noise, rng).mean())
     for _ in range(2):
         own = np.sqrt(powers / 2) * (rng.standard_normal((COUNT, 2)) @ np.array([1, 1j]))
-        phase = np.exp(40j * (towards @ rng.standard_normal((3, LOOKS))))  # channels differ by their places
+        phase = np.exp(
+            40j * (towards @ rng.standard_normal((3, LOOKS)))
+        )  # channels differ by their places
         amplitude = np.concatenate([own[:, None] * phase, np.full((targets, LOOKS), 4.0 + 0j)])
-        power = power_of(amplitude, np.append(ranges, at[0]), np.append(-(towards @ VELOCITY), at[1]), noise, rng)
+        power = power_of(
+            amplitude, np.append(ranges, at[0]), np.append(-(towards @ VELOCITY), at[1]), noise, rng
+        )
         found = fit(power, floor, guess, W, schedule, payload.delay_symbols)
         off = np.abs(found.velocity + MISTAKE)
         assert off[1] < (0.07 if targets else 0.03) and off.max() < 0.13
         mended = found.apply(guess)
-        assert 10 * np.log10(mended.power.sum() / powers.sum()) == pytest.approx(0, abs=0.6 if targets else 0.4)
-        np.testing.assert_allclose(mended.delay_rate, -2 * towards @ (wrong + found.velocity) / C, rtol=0, atol=1e-16)
+        assert 10 * np.log10(mended.power.sum() / powers.sum()) == pytest.approx(
+            0, abs=0.6 if targets else 0.4
+        )
+        np.testing.assert_allclose(
+            mended.delay_rate, -2 * towards @ (wrong + found.velocity) / C, rtol=0, atol=1e-16
+        )
 
 
 def test_detectors_judge_with_the_corrected_clutter():
-    """Circular Gaussian cells of the clutter's own mean; the terminal believes in a third of the power and 0.15 m/s too much. The level
-    that its threshold map rests on is the true one: 15 % at the median over cells with clutter, 5 % in all. Planted bugs: the map not made
-    anew; the correction left out."""
+    """Circular Gaussian cells of the clutter's own mean; the terminal believes in a third of the
+    power and 0.15 m/s too much. The level that its threshold map rests on is the true one: 15 % at
+    the median over cells with clutter, 5 % in all. Planted bugs: the map not made anew; the
+    correction left out."""
     towards, ranges, powers = surroundings(COUNT, np.random.default_rng(4))
     truth = ExpectedClutter(2 * ranges / C, -2 * (towards @ VELOCITY) / C, powers, towards, towards)
-    wrong = ExpectedClutter(truth.delay, truth.delay_rate - 2 * 0.15 * towards[:, 1] / C, powers / 3, towards, towards)
+    wrong = ExpectedClutter(
+        truth.delay, truth.delay_rate - 2 * 0.15 * towards[:, 1] / C, powers / 3, towards, towards
+    )
     _, schedule, payload = frame(waveform=W)
     noise = 0.02 * W.num_samples * W.num_chirps
     mean = power_map(truth, W, ROWS, schedule, payload.delay_symbols) + noise
     rng = np.random.default_rng(8)
-    white = rng.standard_normal((ANTENNAS.num_tx, ANTENNAS.num_rx, *mean.shape, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+    white = (
+        rng.standard_normal((ANTENNAS.num_tx, ANTENNAS.num_rx, *mean.shape, 2))
+        @ np.array([1, 1j])
+        / np.sqrt(2)
+    )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
-    judged = judge([maps], W, ANTENNAS, schedule, payload.delay_symbols, Receivers(clutter_detector="map"), wrong)[0]
+    judged = judge(
+        [maps],
+        W,
+        ANTENNAS,
+        schedule,
+        payload.delay_symbols,
+        Receivers(clutter_detector="map"),
+        wrong,
+    )[0]
     strong = mean > 3 * noise
     off = judged.level[strong] / mean[strong] - 1
     assert strong.sum() > 500 and np.median(np.abs(off)) < 0.15
@@ -97,7 +138,8 @@ def test_detectors_judge_with_the_corrected_clutter():
 
 
 def test_noise_alone_corrects_nothing():
-    """A mesh whose clutter is below the noise: no cell to fit to. Planted bug: the prior alone moves it."""
+    """A mesh whose clutter is below the noise: no cell to fit to. Planted bug: the prior alone
+    moves it."""
     towards, ranges, powers = surroundings(50, np.random.default_rng(4))
     guess = ExpectedClutter(2 * ranges / C, np.zeros(50), 1e-9 * powers, towards, towards)
     _, schedule, payload = frame(waveform=W)

@@ -1,4 +1,5 @@
-"""Speckle and Doppler of the clutter field: each filled cell's amplitude over many seeds, and its spectrum under four kinds of flight."""
+"""Speckle and Doppler of the clutter field: each filled cell's amplitude over many seeds, and its
+spectrum under four kinds of flight."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ DOPPLER_CELL = 1 / (PULSE * PULSES)
 
 
 def flown(flight: dict, seed: int = 3):
-    """A field of the crossing planned for one terminal (isotropic, 0 dBi) in flight for a fifth of a second, and the flight."""
+    """A field of the crossing planned for one terminal (isotropic, 0 dBi) in flight for a fifth of
+    a second, and the flight."""
     s = scenario.Scenario.model_validate(
         {
             "seed": seed,
@@ -35,15 +37,22 @@ def flown(flight: dict, seed: int = 3):
         }
     )
     w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), crossing()), Swarm.from_scenario(s).trajectories["A"]
+    return make_propagation(s, w, antennas_of(s, w), crossing()), Swarm.from_scenario(
+        s
+    ).trajectories["A"]
 
 
 def at(model, flight, time: float):
-    """What the terminal sees at a time, the coherent contribution of each scatterer, and the pose in local coordinates."""
+    """What the terminal sees at a time, the coherent contribution of each scatterer, and the pose
+    in local coordinates."""
     pose = flight.pose(time)
     local = replace(pose, position=pose.position - crossing().origin)
     seen = model.field.seen("A", "A", local, local, time)
-    wave = model.field.cells.amplitude[seen.index] * seen.magnitude * np.exp(-2j * np.pi * np.mod(seen.length / LAMBDA, 1.0))
+    wave = (
+        model.field.cells.amplitude[seen.index]
+        * seen.magnitude
+        * np.exp(-2j * np.pi * np.mod(seen.length / LAMBDA, 1.0))
+    )
     return seen, wave, local
 
 
@@ -51,14 +60,19 @@ CRUISE = {"position_m": [-2.1, -9.7, 7.3], "velocity_mps": [1.3, 9.1, 0.4]}
 
 
 def test_every_filled_cell_is_rayleigh():
-    """Cells of range and Doppler that hold 1e-4 of the power or more, 18 seeds: |sum|^2 over its mean is exponential (Kolmogorov-Smirnov,
-    level 1e-4) and so is its tail: beyond 5 and 8 times the mean within 4 sigma of the binomial. A test of the sampling: a cell of a
-    large surface has Gaussian speckle. Planted bug: amplitudes of fixed modulus."""
+    """Cells of range and Doppler that hold 1e-4 of the power or more, 18 seeds: |sum|^2 over its
+    mean is exponential (Kolmogorov-Smirnov, level 1e-4) and so is its tail: beyond 5 and 8 times
+    the mean within 4 sigma of the binomial. A test of the sampling: a cell of a large surface has
+    Gaussian speckle. Planted bug: amplitudes of fixed modulus."""
     level = []
     for seed in range(18):
         seen, wave, _ = at(*flown(CRUISE, seed), 0.09)
         doppler = -seen.rate / LAMBDA
-        cell = (seen.length / 2 / CELL).astype(int) * 4096 + np.rint(doppler / DOPPLER_CELL).astype(int) + 2048
+        cell = (
+            (seen.length / 2 / CELL).astype(int) * 4096
+            + np.rint(doppler / DOPPLER_CELL).astype(int)
+            + 2048
+        )
         _, inverse = np.unique(cell, return_inverse=True)
         mean = np.bincount(inverse, seen.magnitude.astype(float) ** 2)
         total = np.bincount(inverse, wave.real) + 1j * np.bincount(inverse, wave.imag)
@@ -88,19 +102,26 @@ FLIGHTS = {
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_doppler_of_each_range_cell_is_that_of_its_surfaces(name):
-    """Spectra of 64 pulses, each from the scatterers as seen at its own time: in every range cell that holds 1e-3 of the power, 98 % of
-    the energy lies where 2 v.u/lambda of the cell's scatterers (from their points and the flight alone) says, two Doppler cells (the half
-    width of Hann's main lobe) aside. Planted bug: points that fly along with the terminal."""
+    """Spectra of 64 pulses, each from the scatterers as seen at its own time: in every range cell
+    that holds 1e-3 of the power, 98 % of the energy lies where 2 v.u/lambda of the cell's
+    scatterers (from their points and the flight alone) says, two Doppler cells (the half width of
+    Hann's main lobe) aside. Planted bug: points that fly along with the terminal."""
     model, flight = flown(FLIGHTS[name])
     times = 0.09 + PULSE * (np.arange(PULSES) - PULSES / 2)
     profiles = []
     first, _, start = at(model, flight, 0.09)
     for time in times:
         seen, wave, _ = at(model, flight, time)
-        span = np.linalg.norm(model.field.cells.points[seen.index] - start.position, axis=1)  # a scatterer stays in its range cell
+        span = np.linalg.norm(
+            model.field.cells.points[seen.index] - start.position, axis=1
+        )  # a scatterer stays in its range cell
         cell = (span / CELL).astype(int)
-        profiles.append(np.bincount(cell, wave.real, 1200) + 1j * np.bincount(cell, wave.imag, 1200))
-    spectrum = np.abs(np.fft.fft(np.array(profiles) * np.hanning(PULSES + 1)[:PULSES, None], axis=0)) ** 2
+        profiles.append(
+            np.bincount(cell, wave.real, 1200) + 1j * np.bincount(cell, wave.imag, 1200)
+        )
+    spectrum = (
+        np.abs(np.fft.fft(np.array(profiles) * np.hanning(PULSES + 1)[:PULSES, None], axis=0)) ** 2
+    )
     towards = model.field.cells.points[first.index] - start.position
     span = np.linalg.norm(towards, axis=1)
     expected = 2 * F_C / C * (towards / span[:, None]) @ start.velocity

@@ -1,4 +1,5 @@
-"""Clutter of two bounces, a mirror before or after the scatterer: against Fermat, field vectors, integrals, Sionna, and a separate sum."""
+"""Clutter of two bounces, a mirror before or after the scatterer: against Fermat, field vectors,
+integrals, Sionna, and a separate sum."""
 
 from __future__ import annotations
 
@@ -12,7 +13,18 @@ from scipy.integrate import dblquad
 from scipy.optimize import minimize
 from test_clutter_against_sionna import STREET
 from test_clutter_coherence import STREETS, correlation, crossing, profile
-from test_clutter_field import EPS_0, F_C, LAMBDA, METAL, C, flown, hemisphere, lobe, rectangle, slab
+from test_clutter_field import (
+    EPS_0,
+    F_C,
+    LAMBDA,
+    METAL,
+    C,
+    flown,
+    hemisphere,
+    lobe,
+    rectangle,
+    slab,
+)
 
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
@@ -31,16 +43,29 @@ pytestmark = pytest.mark.sionna
 def joined(*parts: City) -> City:
     """Several meshes in one, each with its own material."""
     shift = np.cumsum([0] + [len(p.vertices) for p in parts])
-    faces = np.concatenate([p.faces + s for p, s in zip(parts, shift, strict=False)]).astype(np.int32)
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, shift, strict=False)]).astype(
+        np.int32
+    )
     material = np.repeat(np.arange(len(parts)), [p.num_faces for p in parts]).astype(np.int16)
-    return City("several", np.concatenate([p.vertices for p in parts]), faces, material, tuple(p.materials[0] for p in parts), np.zeros(3))
+    return City(
+        "several",
+        np.concatenate([p.vertices for p in parts]),
+        faces,
+        material,
+        tuple(p.materials[0] for p in parts),
+        np.zeros(3),
+    )
 
 
 def coefficients(material: Material, cos: float) -> tuple[complex, complex]:
-    """Amplitude reflection of a slab by adding up its inner echoes, TE and TM, less what it scatters; from Fresnel's equations."""
+    """Amplitude reflection of a slab by adding up its inner echoes, TE and TM, less what it
+    scatters; from Fresnel's equations."""
     eta = material.relative_permittivity - 1j * material.conductivity / (2 * np.pi * F_C * EPS_0)
     inside = np.sqrt(1 - (1 - cos**2) / eta)
-    n, turn = np.sqrt(eta), np.exp(-2j * np.pi * material.thickness / LAMBDA * np.sqrt(eta) * inside)
+    n, turn = (
+        np.sqrt(eta),
+        np.exp(-2j * np.pi * material.thickness / LAMBDA * np.sqrt(eta) * inside),
+    )
     out = []
     for first in ((cos - n * inside) / (cos + n * inside), (n * cos - inside) / (n * cos + inside)):
         total, echo = first, (1 - first**2) * -first * turn**2
@@ -50,8 +75,11 @@ def coefficients(material: Material, cos: float) -> tuple[complex, complex]:
     return out[0], out[1]
 
 
-def reflected(field: np.ndarray, along: np.ndarray, normal: np.ndarray, material: Material) -> tuple[np.ndarray, np.ndarray]:
-    """Field vector and direction of a wave after a mirror: TE across the plane of incidence, TM in it."""
+def reflected(
+    field: np.ndarray, along: np.ndarray, normal: np.ndarray, material: Material
+) -> tuple[np.ndarray, np.ndarray]:
+    """Field vector and direction of a wave after a mirror: TE across the plane of incidence, TM in
+    it."""
     n = -np.sign(along @ normal) * normal
     te, tm = coefficients(material, -along @ n)
     out = along + 2 * (-along @ n) * n
@@ -65,25 +93,44 @@ def upright(u: np.ndarray) -> np.ndarray:
     return t / np.linalg.norm(t)
 
 
-def scattered(field: np.ndarray, u: np.ndarray, w: np.ndarray, normal: np.ndarray, material: Material, area: float) -> complex:
-    """Upright amplitude along w, times distances, of a facet lit by a field along u; no lambda/(4 pi)."""
+def scattered(
+    field: np.ndarray,
+    u: np.ndarray,
+    w: np.ndarray,
+    normal: np.ndarray,
+    material: Material,
+    area: float,
+) -> complex:
+    """Upright amplitude along w, times distances, of a facet lit by a field along u; no lambda/(4
+    pi)."""
     n = -np.sign(u @ normal) * normal
     returned, _ = reflected(field, u, n, replace(material, scattering_coefficient=0.0))
     gamma = np.linalg.norm(returned) / np.linalg.norm(field)
     turned = np.array([np.sqrt(1 - (u @ n) ** 2), u @ n, 0.0])
     pattern = lobe(material, u, w, n) / hemisphere(material, turned)
-    return material.scattering_coefficient * gamma * complex(field @ upright(u)) * np.sqrt(pattern * (-u @ n) * area)
+    return (
+        material.scattering_coefficient
+        * gamma
+        * complex(field @ upright(u))
+        * np.sqrt(pattern * (-u @ n) * area)
+    )
 
 
 def bounce_point(a: np.ndarray, b: np.ndarray, corner, along, across) -> tuple[np.ndarray, float]:
-    """Where the shortest way from a to b by way of a rectangle's plane meets it, and its length; by minimisation (Fermat)."""
+    """Where the shortest way from a to b by way of a rectangle's plane meets it, and its length; by
+    minimisation (Fermat)."""
     p, e, f = (np.array(v, float) for v in (corner, along, across))
 
     def way(x):
         q = p + x[0] * e + x[1] * f
         return np.linalg.norm(a - q) + np.linalg.norm(b - q)
 
-    best = minimize(way, [0.5, 0.5], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 2000})
+    best = minimize(
+        way,
+        [0.5, 0.5],
+        method="Nelder-Mead",
+        options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 2000},
+    )
     return p + best.x[0] * e + best.x[1] * f, best.fun
 
 
@@ -93,18 +140,29 @@ GROUND = ((-30.0, -25.0, -5.1), (60.0, 1.3, 0.4), (-0.7, 60.0, 0.3))
 
 @pytest.mark.parametrize("pattern", ["lambertian", "directive"])
 def test_each_way_against_an_oracle(pattern):
-    """Ways over a slanting wall by way of a sloping ground (and the reverse), one at a time: length by Fermat's principle, gain (complex)
-    from vectors of the electric field, rate and acceleration from differences of the lengths over 1 ms, directions and points.
+    """Ways over a slanting wall by way of a sloping ground (and the reverse), one at a time: length
+    by Fermat's principle, gain (complex) from vectors of the electric field, rate and acceleration
+    from differences of the lengths over 1 ms, directions and points.
 
-    Planted bugs: the image's velocity not mirrored; TE and TM of the mirror exchanged; the ground's scattered share not taken off.
+    Planted bugs: the image's velocity not mirrored; TE and TM of the mirror exchanged; the ground's
+    scattered share not taken off.
     """
-    facet, soil = slab(scattering_pattern=pattern, pattern_exponent=5), slab(relative_permittivity=4.1, conductivity=2.3)
+    facet, soil = (
+        slab(scattering_pattern=pattern, pattern_exponent=5),
+        slab(relative_permittivity=4.1, conductivity=2.3),
+    )
     city = joined(rectangle(*WALL, facet), rectangle(*GROUND, soil))
-    model, swarm = flown(city, (0.3, -1.1, 0.9), (-7.7, 1.4, 2.2), cell_area_per_metre_m=0.5, mirrors=2)
+    model, swarm = flown(
+        city, (0.3, -1.1, 0.9), (-7.7, 1.4, 2.2), cell_area_per_metre_m=0.5, mirrors=2
+    )
     still = swarm.poses(0.0)
     bodies = {
-        "A": replace(still["A"], velocity=np.array([3.1, -7.3, 1.9]), acceleration=np.array([0.7, 1.1, -2.3])),
-        "P": replace(still["P"], velocity=np.array([-5.2, 2.4, 0.6]), acceleration=np.array([-1.7, 0.2, 0.9])),
+        "A": replace(
+            still["A"], velocity=np.array([3.1, -7.3, 1.9]), acceleration=np.array([0.7, 1.1, -2.3])
+        ),
+        "P": replace(
+            still["P"], velocity=np.array([-5.2, 2.4, 0.6]), acceleration=np.array([-1.7, 0.2, 0.9])
+        ),
     }
     level = np.cross(*(np.array(v) for v in GROUND[1:]))
     level /= np.linalg.norm(level)
@@ -133,7 +191,9 @@ def test_each_way_against_an_oracle(pattern):
                 r = np.linalg.norm(point - (end if part.before else start).position)
                 assert part.seen.length[i] == pytest.approx(way + r, rel=0, abs=1e-9)
                 chain = [at, point] if part.before else [point, at]
-                assert np.abs(paths.points[i] - chain).max() < 1e-3  # Fermat's minimum is flat: the root of its tolerance
+                assert (
+                    np.abs(paths.points[i] - chain).max() < 1e-3
+                )  # Fermat's minimum is flat: the root of its tolerance
                 stops = [start.position, *paths.points[i], end.position]
                 legs = [(b - a) / np.linalg.norm(b - a) for a, b in pairwise(stops)]
                 if part.before:
@@ -141,8 +201,12 @@ def test_each_way_against_an_oracle(pattern):
                     gain = scattered(field, legs[1], legs[2], upward, facet, area)
                 else:
                     passed, out = reflected(upright(legs[1]), legs[1], level, soil)
-                    gain = scattered(upright(legs[0]), legs[0], legs[1], upward, facet, area) * complex(passed @ upright(out))
-                gain *= LAMBDA / (4 * np.pi) / (way * r) * complex(model.field.cells.amplitude[cell])
+                    gain = scattered(
+                        upright(legs[0]), legs[0], legs[1], upward, facet, area
+                    ) * complex(passed @ upright(out))
+                gain *= (
+                    LAMBDA / (4 * np.pi) / (way * r) * complex(model.field.cells.amplitude[cell])
+                )
                 assert abs(paths.gain[i] / gain - 1) < 3e-4  # the slab's table, 4096 angles
                 assert part.seen.departure[i] == pytest.approx(legs[0], abs=1e-12)
                 assert part.seen.arrival[i] == pytest.approx(-legs[2], abs=1e-12)
@@ -152,8 +216,12 @@ def test_each_way_against_an_oracle(pattern):
                     a, b = (mirrored(a), b) if part.before else (a, mirrored(b))
                     lengths.append(np.linalg.norm(point - a) + np.linalg.norm(point - b))
                 assert abs(part.seen.length[i] - lengths[1]) * 2 * np.pi / LAMBDA < 1e-6
-                assert part.seen.rate[i] == pytest.approx((lengths[2] - lengths[0]) / 2e-3, abs=1e-4)
-                assert part.seen.accel[i] == pytest.approx((lengths[2] - 2 * lengths[1] + lengths[0]) / 1e-6, abs=1e-3)
+                assert part.seen.rate[i] == pytest.approx(
+                    (lengths[2] - lengths[0]) / 2e-3, abs=1e-4
+                )
+                assert part.seen.accel[i] == pytest.approx(
+                    (lengths[2] - 2 * lengths[1] + lengths[0]) / 1e-6, abs=1e-3
+                )
                 checked[part.before] += 1
     assert min(checked.values()) > 6
 
@@ -163,9 +231,10 @@ def power(part) -> float:
 
 
 def test_power_of_a_wall_by_way_of_the_ground_is_its_integral():
-    """A metal wall over metal ground: mean power of ground then wall, and wall then ground, within 0.03 dB of Lambert's integral over
-    the wall with one end at its image under the ground, times what the ground mirrors. Metal of 1e7 S/m mirrors a vertical wave
-    whole but under a degree of grazing. Planted bug: the direct distance in place of the image's."""
+    """A metal wall over metal ground: mean power of ground then wall, and wall then ground, within
+    0.03 dB of Lambert's integral over the wall with one end at its image under the ground, times
+    what the ground mirrors. Metal of 1e7 S/m mirrors a vertical wave whole but under a degree of
+    grazing. Planted bug: the direct distance in place of the image's."""
     share = METAL.scattering_coefficient
     wall = rectangle((-31.0, 38.0, 0.0), (62.0, 0, 0), (0, 0, 23.0), METAL)
     ground = rectangle((-90.0, -90.0, 0.0), (180.0, 0, 0), (0, 180.0, 0), METAL)
@@ -180,11 +249,19 @@ def test_power_of_a_wall_by_way_of_the_ground_is_its_integral():
             r1, r2 = np.linalg.norm(r - start), np.linalg.norm(r - end)
             return (38 - start[1]) / r1 * (38 - end[1]) / r2 / np.pi / (r1 * r2) ** 2
 
-        return share**2 * (LAMBDA / (4 * np.pi)) ** 2 * dblquad(density, -31, 31, 0, 23, epsrel=1e-8)[0]
+        return (
+            share**2
+            * (LAMBDA / (4 * np.pi)) ** 2
+            * dblquad(density, -31, 31, 0, 23, epsrel=1e-8)[0]
+        )
 
     below = np.array([1, 1, -1.0])
     for tx, rx, start, end in (("A", "A", a, a), ("A", "P", a, p)):
-        by_ground = [s for s in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.0) if (s.mirror.normal[2] ** 2 > 0.5)]
+        by_ground = [
+            s
+            for s in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.0)
+            if (s.mirror.normal[2] ** 2 > 0.5)
+        ]
         assert [s.before for s in by_ground] == [True, False]
         for part in by_ground:
             ends = (start * below, end) if part.before else (start, end * below)
@@ -193,12 +270,18 @@ def test_power_of_a_wall_by_way_of_the_ground_is_its_integral():
 
 
 def test_mirrors_are_those_that_send_on_the_most():
-    """Shares of three metal plates against the solid angle of a rectangle times (1 - S^2)/4 pi, within 5 % (cells of some degrees), and
-    the order by share; of coplanar faces of two materials each is a mirror. Planted bug: the cosine left out."""
+    """Shares of three metal plates against the solid angle of a rectangle times (1 - S^2)/4 pi,
+    within 5 % (cells of some degrees), and the order by share; of coplanar faces of two materials
+    each is a mirror. Planted bug: the cosine left out."""
     plates = [
         rectangle((-8.0, 11.0, -6.0), (16.0, 0, 0), (0, 0, 12.0), METAL),
         rectangle((-20.0, -20.0, -7.0), (40.0, 0, 0), (0, 31.0, 0), METAL),
-        rectangle((8.0, 11.0, -6.0), (5.0, 0, 0), (0, 0, 12.0), slab(conductivity=1e7, scattering_coefficient=0.2)),
+        rectangle(
+            (8.0, 11.0, -6.0),
+            (5.0, 0, 0),
+            (0, 0, 12.0),
+            slab(conductivity=1e7, scattering_coefficient=0.2),
+        ),
     ]
     model, _ = flown(joined(*plates), (0.0, 0.0, 0.0), mirrors=8)
 
@@ -215,53 +298,79 @@ def test_mirrors_are_those_that_send_on_the_most():
     ]
     mirrors = model.twice.mirrors["A"]
     assert [int(m.faces[0]) // 2 for m in mirrors] == [1, 0, 2]
-    assert [m.share for m in mirrors] == [pytest.approx(expected[k], rel=0.05, abs=0) for k in (1, 0, 2)]
+    assert [m.share for m in mirrors] == [
+        pytest.approx(expected[k], rel=0.05, abs=0) for k in (1, 0, 2)
+    ]
 
 
 def street(material: str):
-    """A street of walls and ground of one material, two terminals in flight along it, every mirror taken."""
+    """A street of walls and ground of one material, two terminals in flight along it, every mirror
+    taken."""
     s = scenario.Scenario.model_validate(
         {
             "frames": 40,
             "swarm": {
-                "A": {"role": "active", "position_m": [2.4, -22.7, 12.3], "velocity_mps": [-0.9, 7.7, 0.6]},
-                "P": {"role": "passive", "position_m": [-1.3, 17.9, 13.1], "velocity_mps": [0.7, -4.1, 0.3]},
+                "A": {
+                    "role": "active",
+                    "position_m": [2.4, -22.7, 12.3],
+                    "velocity_mps": [-0.9, 7.7, 0.6],
+                },
+                "P": {
+                    "role": "passive",
+                    "position_m": [-1.3, 17.9, 13.1],
+                    "velocity_mps": [0.7, -4.1, 0.3],
+                },
             },
-            "city": STREET | {f"{part}_material": material for part in ("wall", "roof", "ground")}
+            "city": STREET
+            | {f"{part}_material": material for part in ("wall", "roof", "ground")}
             | {"materials": {material: {"scattering_coefficient": 0.41}}},
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
             "clutter": {"model": "field", "cell_area_per_metre_m": 0.024, "mirrors": 12},
         }
-    )  # fmt: skip
+    )
     w = waveform_of(s)
     city = load_city(s.city, ".", F_C, (0.4, -1.3, 12.0))
     return city, make_propagation(s, w, antennas_of(s, w), city), Swarm.from_scenario(s)
 
 
-@pytest.mark.parametrize(("material", "rays"), [("concrete", 3_000_000), pytest.param("metal", 3_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("material", "rays"),
+    [("concrete", 3_000_000), pytest.param("metal", 3_000_000, marks=pytest.mark.slow)],
+)
 def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
-    """A street with all its mirrors, monostatic and bistatic, by 4 m of range: median and total within 0.05 dB, 90th percentile of the
-    cells that hold a thousandth of the power within 0.3 dB (of the rays, a tenth take such a way).
+    """A street with all its mirrors, monostatic and bistatic, by 4 m of range: median and total
+    within 0.05 dB, 90th percentile of the cells that hold a thousandth of the power within 0.3 dB
+    (of the rays, a tenth take such a way).
 
-    Sionna keeps one path per plane of those that scatter first (the hash of a specular suffix does not know the point before it), so that
-    order is compared with the reverse link's other order: on metal, where Gamma is 1 from every side.
-    Planted bug: the mirror's loss squared.
+    Sionna keeps one path per plane of those that scatter first (the hash of a specular suffix does
+    not know the point before it), so that order is compared with the reverse link's other order: on
+    metal, where Gamma is 1 from every side. Planted bug: the mirror's loss squared.
     """
     city, model, swarm = street(material)
     poses = {n: replace(p, position=p.position - city.origin) for n, p in swarm.poses(0.13).items()}
-    pairs = [("A", "A", True, "A", "A"), ("A", "P", True, "A", "P")] + [("A", "P", False, "P", "A")] * (material == "metal")
+    pairs = [("A", "A", True, "A", "A"), ("A", "P", True, "A", "P")] + [
+        ("A", "P", False, "P", "A")
+    ] * (material == "metal")
     for tx, rx, before, source, sink in pairs:
         edges = np.arange(0, 1500, 8 if tx == rx else 4)
-        theirs = sionna_power(city, poses[source].position, poses[sink].position, edges, rays, by_mirror=True)
+        theirs = sionna_power(
+            city, poses[source].position, poses[sink].position, edges, rays, by_mirror=True
+        )
         ours = np.zeros(edges.size - 1)
         for part in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.13):
             if part.before == before:
-                ours += np.histogram(part.seen.length, edges, weights=part.seen.magnitude.astype(float) ** 2)[0]
+                ours += np.histogram(
+                    part.seen.length, edges, weights=part.seen.magnitude.astype(float) ** 2
+                )[0]
         filled = theirs > 1e-3 * theirs.sum()
         off = 10 * np.log10(ours[filled] / theirs[filled])
-        print(f"{material} {tx}->{rx} before={before}: {filled.sum()} cells, median {np.median(off):.3f}, 90th percentile "
-              f"{np.quantile(np.abs(off), 0.9):.3f}, total {10 * np.log10(ours.sum() / theirs.sum()):.3f} dB")  # fmt: skip
+        print(
+            f"{material} {tx}->{rx} before={before}: {filled.sum()} cells, median "
+            f"{np.median(off):.3f}, 90th percentile "
+            f"{np.quantile(np.abs(off), 0.9):.3f}, total "
+            f"{10 * np.log10(ours.sum() / theirs.sum()):.3f} dB"
+        )
         assert filled.sum() > 8
         assert abs(np.median(off)) < 0.05
         assert np.quantile(np.abs(off), 0.9) < 0.3
@@ -269,19 +378,31 @@ def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
 
 
 class Separate:
-    """Two-bounce profiles of a terminal's own link from a list of scatterers, in code of its own: Lambert on metal, images of the
-    scatterers (not of the terminal) in the planes of faces, shadows and mirrors by trimesh's ray caster."""
+    """Two-bounce profiles of a terminal's own link from a list of scatterers, in code of its own:
+    Lambert on metal, images of the scatterers (not of the terminal) in the planes of faces, shadows
+    and mirrors by trimesh's ray caster."""
 
     def __init__(self, city: City, points, strength, normals, planes) -> None:
-        self.points, self.strength, self.normals, self.planes, self.city = points, strength, normals, planes, city
-        self.caster = trimesh.ray.ray_triangle.RayMeshIntersector(trimesh.Trimesh(city.vertices, city.faces, process=False))
+        self.points, self.strength, self.normals, self.planes, self.city = (
+            points,
+            strength,
+            normals,
+            planes,
+            city,
+        )
+        self.caster = trimesh.ray.ray_triangle.RayMeshIntersector(
+            trimesh.Trimesh(city.vertices, city.faces, process=False)
+        )
 
     def _first(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(K,) distance from `start` along the way to `end` of the first face, inf without one before the end."""
+        """(K,) distance from `start` along the way to `end` of the first face, inf without one
+        before the end."""
         where, ray, _ = self.caster.intersects_location(start, end - start, multiple_hits=True)
         away = np.linalg.norm(where - start[ray], axis=1)
         out = np.full(len(start), np.inf)
-        np.minimum.at(out, ray, np.where(away < np.linalg.norm(end - start, axis=1)[ray] - 1e-6, away, np.inf))
+        np.minimum.at(
+            out, ray, np.where(away < np.linalg.norm(end - start, axis=1)[ray] - 1e-6, away, np.inf)
+        )
         return out
 
     def at(self, place: np.ndarray) -> np.ndarray:
@@ -295,27 +416,45 @@ class Separate:
             around = trimesh.triangles.points_to_barycentric
             on_wall = np.zeros(here.size, bool)
             for f in faces:
-                on_wall |= (around(np.broadcast_to(self.city.corners[f], (here.size, 3, 3)), at) >= 0).all(axis=1)
+                on_wall |= (
+                    around(np.broadcast_to(self.city.corners[f], (here.size, 3, 3)), at) >= 0
+                ).all(axis=1)
             here, at, image = here[on_wall], at[on_wall], image[on_wall]
-            side = np.sign(((at - self.points[here]) * self.normals[here]).sum(1))[:, None] * self.normals[here]
+            side = (
+                np.sign(((at - self.points[here]) * self.normals[here]).sum(1))[:, None]
+                * self.normals[here]
+            )
             lifted, before = self.points[here] + 3e-3 * side, at + 3e-3 * np.sign(above) * n
-            free = np.isinf(self._first(lifted, before)) & np.isinf(self._first(before, np.broadcast_to(place, at.shape)))
-            r1, r2 = np.linalg.norm(image - place, axis=1), np.linalg.norm(self.points[here] - place, axis=1)
-            into = ((at - self.points[here]) * side).sum(1) / np.linalg.norm(at - self.points[here], axis=1)
+            free = np.isinf(self._first(lifted, before)) & np.isinf(
+                self._first(before, np.broadcast_to(place, at.shape))
+            )
+            r1, r2 = (
+                np.linalg.norm(image - place, axis=1),
+                np.linalg.norm(self.points[here] - place, axis=1),
+            )
+            into = ((at - self.points[here]) * side).sum(1) / np.linalg.norm(
+                at - self.points[here], axis=1
+            )
             back = ((place - self.points[here]) * side).sum(1) / r2
-            gain = self.strength[here] * (free & (back > 0)) * np.sqrt(np.maximum(into * back, 0)) / (r1 * r2)
+            gain = (
+                self.strength[here]
+                * (free & (back > 0))
+                * np.sqrt(np.maximum(into * back, 0))
+                / (r1 * r2)
+            )
             total += profile(r1 + r2, gain)
         return total
 
 
 @pytest.mark.parametrize("name", ["along", "climbing"])
 def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
-    """Correlation of the range profile of all two-bounce ways (mirror first) over the crossing's mirrors >= 0.99 after steps of 0.1 to
-    100 mm from three places of a flight, against a separate sum over the scatterers exported once; the field's strengths without the
-    mirrors' polarisation are what both use, so that delays and sight are what is compared.
+    """Correlation of the range profile of all two-bounce ways (mirror first) over the crossing's
+    mirrors >= 0.99 after steps of 0.1 to 100 mm from three places of a flight, against a separate
+    sum over the scatterers exported once; the field's strengths without the mirrors' polarisation
+    are what both use, so that delays and sight are what is compared.
 
-    The separate sum switches at the edges of mirrors too, of which there are more than shadow edges. Planted bug: the image at the
-    last knot in place of the pose.
+    The separate sum switches at the edges of mirrors too, of which there are more than shadow
+    edges. Planted bug: the image at the last knot in place of the pose.
     """
     w0 = [{"time_s": float(t), "position_m": list(map(float, x))} for t, x in STREETS[name]]
     s = scenario.Scenario.model_validate(
@@ -325,12 +464,20 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
             "city": {"source": "canyon"},
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
-            "clutter": {"model": "field", "cell_area_per_metre_m": 4.0, "smallest_cell_m2": 0.8, "mirrors": 4},
+            "clutter": {
+                "model": "field",
+                "cell_area_per_metre_m": 4.0,
+                "smallest_cell_m2": 0.8,
+                "mirrors": 4,
+            },
         }
     )
     w = waveform_of(s)
     city = crossing()
-    model, flight = make_propagation(s, w, antennas_of(s, w), city), Swarm.from_scenario(s).trajectories["A"]
+    model, flight = (
+        make_propagation(s, w, antennas_of(s, w), city),
+        Swarm.from_scenario(s).trajectories["A"],
+    )
     cells = model.field.cells
     amplitude = np.asarray(cells.amplitude, complex)
     strength, walls = amplitude * np.sqrt(cells.area), [m.faces for m in model.twice.mirrors["A"]]
@@ -344,7 +491,9 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
             local = replace(pose, position=pose.position - city.origin)
             total = np.zeros(1000, complex)
             shares = {id(m): np.zeros(len(cells), np.float32) for m in model.twice.mirrors["A"]}
-            for m, (index, share) in zip(model.twice.mirrors["A"], model.twice._share("A", local, when), strict=True):
+            for m, (index, share) in zip(
+                model.twice.mirrors["A"], model.twice._share("A", local, when), strict=True
+            ):
                 shares[id(m)][index] = share
             straight = model.field.sight.share("A", local, when)
             for part in model.twice.seen("A", "A", local, local, when):
@@ -352,9 +501,18 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
                     q, n = part.seen, city.normals[cells.face[part.seen.index]]
                     points, _ = model.twice._chain(part, local, local)
                     into = points[:, 0] - points[:, 1]
-                    cosines = np.abs((into * n).sum(1)) / np.linalg.norm(into, axis=1) * np.abs((q.arrival * n).sum(1))
+                    cosines = (
+                        np.abs((into * n).sum(1))
+                        / np.linalg.norm(into, axis=1)
+                        * np.abs((q.arrival * n).sum(1))
+                    )
                     sight = shares[id(part.mirror)][q.index] * straight[q.index]
-                    gain = amplitude[q.index] * np.sqrt(cells.area[q.index] * cosines) * sight / (q.tx_radius * q.rx_radius)
+                    gain = (
+                        amplitude[q.index]
+                        * np.sqrt(cells.area[q.index] * cosines)
+                        * sight
+                        / (q.tx_radius * q.rx_radius)
+                    )
                     total += profile(q.length, gain)
                     count += len(q.index)
             worst = min(worst, correlation(total, separate.at(local.position)))
@@ -363,9 +521,10 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
 
 
 def test_what_a_terminal_expects_of_mirrors():
-    """A terminal's copy of the mesh: the total power it expects by way of the mirrors within 0.2 dB of the field's (two draws of points of
-    5,000 cells), and what errors of the mesh do to its delays, mirror and facet moved along their normals (second order 1e-7 m).
-    Planted bug: the mirror's error left out."""
+    """A terminal's copy of the mesh: the total power it expects by way of the mirrors within 0.2 dB
+    of the field's (two draws of points of 5,000 cells), and what errors of the mesh do to its
+    delays, mirror and facet moved along their normals (second order 1e-7 m). Planted bug: the
+    mirror's error left out."""
     tree = {
         "frames": 40,
         "swarm": {"A": {"role": "active", "position_m": [0.3, -1.1, 0.9]}},
@@ -382,7 +541,9 @@ def test_what_a_terminal_expects_of_mirrors():
     pose = Swarm.from_scenario(s).poses(0.0)["A"]
     parts = copy._twice.seen("A", "A", pose, pose, 0.0)
     once = len(copy._field.seen("A", "A", pose, pose, 0.0).index)
-    right, wrong = (copy.clutter("A", pose, 0.0, 1.0, Mistakes(mesh_std=std, seed=5)) for std in (0.0, 1e-4))
+    right, wrong = (
+        copy.clutter("A", pose, 0.0, 1.0, Mistakes(mesh_std=std, seed=5)) for std in (0.0, 1e-4)
+    )
     ours = sum(power(part) for part in model.twice.seen("A", "A", pose, pose, 0.0))
     assert abs(10 * np.log10(right.power[once:].sum() / ours)) < 0.2
     error = 1e-4 * generator(5, "mesh error").standard_normal(city.num_faces)
@@ -392,7 +553,9 @@ def test_what_a_terminal_expects_of_mirrors():
         image = pose.position - 2 * (n @ pose.position - part.mirror.offset - e) * n
         face = copy._field.cells.face[part.seen.index]
         points = copy._field.cells.points[part.seen.index] + error[face, None] * city.normals[face]
-        length = np.linalg.norm(points - image, axis=1) + np.linalg.norm(points - pose.position, axis=1)
+        length = np.linalg.norm(points - image, axis=1) + np.linalg.norm(
+            points - pose.position, axis=1
+        )
         rows = slice(begin, begin + len(face))
         assert np.abs(C * wrong.delay[rows] - length).max() < 1e-7
         assert np.abs(C * (wrong.delay - right.delay)[rows]).max() > 1e-5

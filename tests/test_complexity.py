@@ -1,4 +1,5 @@
-"""How cost grows with what a scenario has more of: counted work where it can be counted, else ratios with wide margins."""
+"""How cost grows with what a scenario has more of: counted work where it can be counted, else
+ratios with wide margins."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from isac_rt.studies.bench.scenes import alone, town
 
 
 def test_synthesis_grows_no_faster_than_its_paths():
-    """Four times the paths cost at most eight times as much. Planted bug: `_blocks` that lists every path once per hundred paths."""
+    """Four times the paths cost at most eight times as much. Planted bug: `_blocks` that lists
+    every path once per hundred paths."""
     job = synthesis.Job(30)
     seconds = []
     for count in (1000, 4000):
@@ -23,15 +25,19 @@ def test_synthesis_grows_no_faster_than_its_paths():
 
 @pytest.mark.sionna
 def test_tracing_grows_slower_than_the_triangles():
-    """More than four times the triangles: less than four times the cost, since rays go through a hierarchy. All of what is not rays
-    (unfolding, edges) is in the cost."""
+    """More than four times the triangles: less than four times the cost, since rays go through a
+    hierarchy. All of what is not rays (unfolding, edges) is in the cost."""
     faces, seconds = [], []
     for blocks in (2, 6):
         setup = prepare(town(3, blocks, accuracy={"preset": "everything"}))
         poses, found = setup.find(1)
         when = setup.timetable.epoch(1)
         faces.append(setup.city.num_faces)
-        seconds.append(cpu_seconds(lambda s=setup, p=poses, t=when, of=list(found): s.propagation.paths(p, t, of), 3))
+        seconds.append(
+            cpu_seconds(
+                lambda s=setup, p=poses, t=when, of=list(found): s.propagation.paths(p, t, of), 3
+            )
+        )
     assert faces[1] >= 4 * faces[0]
     assert seconds[1] < 4 * seconds[0]
 
@@ -68,12 +74,18 @@ def test_frames_between_traced_ones_trace_nothing():
 
 @pytest.mark.sionna
 def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
-    """Frames that follow each other share their tests of sight: a test every half metre of flight, however many frames."""
+    """Frames that follow each other share their tests of sight: a test every half metre of flight,
+    however many frames."""
     tests = []
     for per_metre in (5, 20):
         speed = 5.315  # of the active terminal [m/s]
-        setup = prepare(alone(frames=3 * per_metre, frame_interval_s=1 / speed / per_metre,
-                              clutter={"model": "field", "cell_area_per_metre_m": 1.0}))  # fmt: skip
+        setup = prepare(
+            alone(
+                frames=3 * per_metre,
+                frame_interval_s=1 / speed / per_metre,
+                clutter={"model": "field", "cell_area_per_metre_m": 1.0},
+            )
+        )
         sight = tracer_of(setup).field.sight
         sees, calls = sight.shadows.sees, []
         sight.shadows.sees = lambda *args, sees=sees, calls=calls: (calls.append(1), sees(*args))[1]

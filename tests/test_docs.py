@@ -17,27 +17,46 @@ ROOT = Path(__file__).parent.parent
 def site(tmp_path_factory) -> Path:
     pytest.importorskip("sphinx")
     out = tmp_path_factory.mktemp("site")
-    done = subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(out)], cwd=ROOT,
-                          env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(out)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     return out
 
 
 def test_every_page_is_there(site):
-    pages = {p.relative_to(ROOT / "docs").with_suffix(".html") for p in (ROOT / "docs").rglob("*.md")}
+    pages = {
+        p.relative_to(ROOT / "docs").with_suffix(".html") for p in (ROOT / "docs").rglob("*.md")
+    }
     assert all((site / page).is_file() for page in pages)
 
 
 def test_the_reference_has_every_key(site):
-    """Keys deep in the tree, their defaults and their limits. Planted bug: nodes behind anyOf left out."""
-    page = re.sub(r"<[^>]+>", "", (site / "generated" / "scenario.html").read_text(encoding="utf-8"))
-    for key in ("filter_transition_hz", "weakest_path_db", "clock_drift_ppm", "cell_area_per_metre_m", "acceleration_std_mps2", "time_s"):
+    """Keys deep in the tree, their defaults and their limits. Planted bug: nodes behind anyOf left
+    out."""
+    page = re.sub(
+        r"<[^>]+>", "", (site / "generated" / "scenario.html").read_text(encoding="utf-8")
+    )
+    for key in (
+        "filter_transition_hz",
+        "weakest_path_db",
+        "clock_drift_ppm",
+        "cell_area_per_metre_m",
+        "acceleration_std_mps2",
+        "time_s",
+    ):
         assert key in page, key
     assert "77000000000.0" in page
 
 
 def test_links_between_pages_and_files_lead_somewhere():
-    """Markdown links to files of the repository, and files named in backquotes that begin with a folder of it."""
+    """Markdown links to files of the repository, and files named in backquotes that begin with a
+    folder of it."""
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         text = page.read_text(encoding="utf-8")
         for target in re.findall(r"\]\((?!https?:|#)([^)#]+)\)", text):
@@ -50,7 +69,9 @@ def test_tests_that_the_pages_name_are_there():
     """`test_file::test_name`. Planted bug: one of them renamed."""
     found = 0
     for page in (ROOT / "docs").glob("*.md"):
-        for file, name in re.findall(r"`(?:tests/)?(test_\w+)(?:\.py)?::(test_\w+)`", page.read_text(encoding="utf-8")):
+        for file, name in re.findall(
+            r"`(?:tests/)?(test_\w+)(?:\.py)?::(test_\w+)`", page.read_text(encoding="utf-8")
+        ):
             tests = (ROOT / "tests" / f"{file}.py").read_text(encoding="utf-8")
             assert re.search(rf"^def {name}\(", tests, re.MULTILINE), f"{page.name}: {name}"
             found += 1

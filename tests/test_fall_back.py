@@ -1,4 +1,5 @@
-"""The fall-back from the pseudo-random to the conventional schedule in whole runs, and what each receiver's advice does."""
+"""The fall-back from the pseudo-random to the conventional schedule in whole runs, and what each
+receiver's advice does."""
 
 from __future__ import annotations
 
@@ -22,23 +23,37 @@ COUNT = 9
 
 
 def swarm() -> dict[str, Uav]:
-    """Bodies at one distance and of different speeds: one range row that holds more velocities than 40 random chirps recover, and that
-    drifts apart within 0.1 s. A passive terminal behind them."""
-    out = {"A": Uav(role="active", position_m=(0, 0, 50)), "P": Uav(role="passive", position_m=(3.1, 27.4, 50), boresight=(0, -1, 0))}
+    """Bodies at one distance and of different speeds: one range row that holds more velocities than
+    40 random chirps recover, and that drifts apart within 0.1 s. A passive terminal behind them."""
+    out = {
+        "A": Uav(role="active", position_m=(0, 0, 50)),
+        "P": Uav(role="passive", position_m=(3.1, 27.4, 50), boresight=(0, -1, 0)),
+    }
     for i, azimuth in enumerate(np.deg2rad(np.linspace(-50, 50, COUNT))):
         u = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
         speed = -4.5 + 9 * (4 * i % COUNT) / (COUNT - 1)
         place = 20.3 * u + [0, 0, 50]
-        out[f"T{i}"] = Uav(role="target", position_m=tuple(place), velocity_mps=tuple(speed * u), rcs={"model": "constant"})
+        out[f"T{i}"] = Uav(
+            role="target",
+            position_m=tuple(place),
+            velocity_mps=tuple(speed * u),
+            rcs={"model": "constant"},
+        )
     return out
 
 
 def scenario(**changes) -> Scenario:
     base = {
-        "name": "dense", "seed": 4, "frames": 12, "frame_interval_s": 0.02, "radio": Radio(samples_per_chirp=256, groups=1),
-        "array": Array(rx_x=2, rx_z=2, element_pattern="isotropic", fall_back=True), "noise": Noise(model="snr", snr_db=-5.0),
-        "propagation": Propagation(leakage={"enabled": False}), "modulation": Modulation(acquisition_frames=2, pilot_every_frames=None),
-    }  # fmt: skip
+        "name": "dense",
+        "seed": 4,
+        "frames": 12,
+        "frame_interval_s": 0.02,
+        "radio": Radio(samples_per_chirp=256, groups=1),
+        "array": Array(rx_x=2, rx_z=2, element_pattern="isotropic", fall_back=True),
+        "noise": Noise(model="snr", snr_db=-5.0),
+        "propagation": Propagation(leakage={"enabled": False}),
+        "modulation": Modulation(acquisition_frames=2, pilot_every_frames=None),
+    }
     return Scenario(**base | changes, swarm=swarm())
 
 
@@ -48,8 +63,8 @@ def run():
 
 
 def test_the_transmitter_follows_the_advice_one_frame_later(run):
-    """Dense at the start, sparse once the bodies have drifted apart. Planted bugs: the advice acts on the frame that it came from; no
-    way back from the conventional schedule."""
+    """Dense at the start, sparse once the bodies have drifted apart. Planted bugs: the advice acts
+    on the frame that it came from; no way back from the conventional schedule."""
     d = run.dataset
     sparse, fell_back = d.sparse.sel(observer="A").values, d.fell_back.sel(observer="A").values
     assert sparse[0] == 0 and sparse[-1] == 1
@@ -59,7 +74,11 @@ def test_the_transmitter_follows_the_advice_one_frame_later(run):
     assert not fell_back[0] and fell_back[3:].tolist() == advised[2:-1].tolist()
     assert fell_back[1] and not fell_back[-1]
     row = run.summary["sparsity"]["A->A"]
-    assert row == {"judged": 12, "dense": int((sparse == 0).sum()), "fell_back": int(fell_back.sum())}
+    assert row == {
+        "judged": 12,
+        "dense": int((sparse == 0).sum()),
+        "fell_back": int(fell_back.sum()),
+    }
 
 
 def test_data_are_read_by_either_schedule(run):
@@ -69,8 +88,12 @@ def test_data_are_read_by_either_schedule(run):
 
 
 def test_without_the_key_the_advice_is_recorded_and_nothing_changes(run, tmp_path):
-    still = simulate.run(scenario(frames=3, array=Array(rx_x=2, rx_z=2, element_pattern="isotropic")), snapshots=0)
-    assert not still.dataset.fell_back.any() and still.dataset.sparse.sel(observer="A").values[0] == 0
+    still = simulate.run(
+        scenario(frames=3, array=Array(rx_x=2, rx_z=2, element_pattern="isotropic")), snapshots=0
+    )
+    assert (
+        not still.dataset.fell_back.any() and still.dataset.sparse.sel(observer="A").values[0] == 0
+    )
     row = still.summary["sparsity"]["A->A"]
     assert row["judged"] == 3 and row["dense"] >= 1 and row["fell_back"] == 0
     assert "dense" in write_report(run, tmp_path, []).read_text()
@@ -93,9 +116,17 @@ def test_one_dense_advice_is_enough_and_the_last_word_counts(run):
 def empty():
     none = np.zeros(0)
     return Reception(
-        detections=no_detections(), decoded=False, delay_symbols=none, transitions=none, bits=none, delay_confidence=none,
-        transition_confidence=none, raw_delay_symbols=none, line_of_sight=False, reference_power=float("nan"),
-    )  # fmt: skip
+        detections=no_detections(),
+        decoded=False,
+        delay_symbols=none,
+        transitions=none,
+        bits=none,
+        delay_confidence=none,
+        transition_confidence=none,
+        raw_delay_symbols=none,
+        line_of_sight=False,
+        reference_power=float("nan"),
+    )
 
 
 def test_a_fall_back_that_can_never_act_is_doubted():

@@ -1,4 +1,5 @@
-"""Decisions of the budget and their bounds: each bound against a truth that is computed without it."""
+"""Decisions of the budget and their bounds: each bound against a truth that is computed without
+it."""
 
 from __future__ import annotations
 
@@ -27,7 +28,13 @@ K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [r
 def plan_of(scene: str = "paper_swarm_consistent.yaml", *overrides: str) -> Plan:
     s = load(SCENES / scene, overrides)
     w = waveform_of(s)
-    return Plan(s, w, antennas_of(s, w), Timetable(s, w, schedule_of(s, w, generator(s.seed, "schedule"))), Swarm.from_scenario(s))
+    return Plan(
+        s,
+        w,
+        antennas_of(s, w),
+        Timetable(s, w, schedule_of(s, w, generator(s.seed, "schedule"))),
+        Swarm.from_scenario(s),
+    )
 
 
 def some_paths(count: int, seed: int, **changes) -> PathSet:
@@ -54,8 +61,9 @@ def some_paths(count: int, seed: int, **changes) -> PathSet:
 
 
 def test_a_plane_wavefront_errs_by_no_more_than_its_bound():
-    """Truth: distances of every pair of elements of the two arrays, one point source each, against the plane wave. The bound holds
-    everywhere and is within ten of the truth in nine paths of ten. Planted bug: r for r^2 in the bound, or the radius squared."""
+    """Truth: distances of every pair of elements of the two arrays, one point source each, against
+    the plane wave. The bound holds everywhere and is within ten of the truth in nine paths of ten.
+    Planted bug: r for r^2 in the bound, or the radius squared."""
     plan = plan_of()
     a = plan.antennas
     paths = some_paths(400, 7)
@@ -65,7 +73,10 @@ def test_a_plane_wavefront_errs_by_no_more_than_its_bound():
         (a.rx_positions, paths.arrival, paths.rx_radius),
     ):
         source = (direction * radius[:, None]).astype(np.longdouble)
-        exact = np.linalg.norm(source[:, None] - positions, axis=2).astype(np.longdouble) - radius[:, None]
+        exact = (
+            np.linalg.norm(source[:, None] - positions, axis=2).astype(np.longdouble)
+            - radius[:, None]
+        )
         truth += np.abs(exact + direction @ positions.T).max(axis=1).astype(float) * K_MIDDLE
     bound = plane_bound(paths, a, plan.waveform)
     assert (truth <= bound).all()
@@ -73,7 +84,8 @@ def test_a_plane_wavefront_errs_by_no_more_than_its_bound():
 
 
 def test_a_line_of_sight_seen_plane_errs_by_no_more_than_its_bound():
-    """Truth: the distance of every transmit element from every receive element. Planted bug: the joint term left out."""
+    """Truth: the distance of every transmit element from every receive element. Planted bug: the
+    joint term left out."""
     plan = plan_of()
     a = plan.antennas
     rng = np.random.default_rng(11)
@@ -93,8 +105,9 @@ def test_a_line_of_sight_seen_plane_errs_by_no_more_than_its_bound():
 
 
 def test_flight_taken_as_straight_errs_by_no_more_than_its_bound():
-    """Truth: distances to a body that flies a circle of 9 m radius at 8 m/s, over the chirps of a frame, against the tangent. Planted
-    bug: half a frame for the whole reach, which the groups prolong."""
+    """Truth: distances to a body that flies a circle of 9 m radius at 8 m/s, over the chirps of a
+    frame, against the tangent. Planted bug: half a frame for the whole reach, which the groups
+    prolong."""
     plan = plan_of()
     w = plan.waveform
     t = np.linspace(-1, 1, 41) * frame_reach(w)
@@ -109,7 +122,9 @@ def test_flight_taken_as_straight_errs_by_no_more_than_its_bound():
         rate = (distance(h) - distance(-h)) / (2 * h)
         accel = (distance(h) - 2 * distance(0.0) + distance(-h)) / h**2
         truth = 2 * np.abs(distance(t) - distance(0.0) - rate * t).max() * K_MIDDLE
-        one = some_paths(1, 3, delay_rate=2 * rate / SPEED_OF_LIGHT, delay_accel=2 * accel / SPEED_OF_LIGHT)
+        one = some_paths(
+            1, 3, delay_rate=2 * rate / SPEED_OF_LIGHT, delay_accel=2 * accel / SPEED_OF_LIGHT
+        )
         bound = float(straight_bound(one, w)[0])
         assert truth <= bound * 1.01 + 1e-4  # the jerk, which is not in the bound
         assert bound <= 10 * truth + 1e-3
@@ -138,8 +153,9 @@ def test_the_faintest_are_left_out_and_no_cell_loses_more_than_the_limit(limit):
 
 
 def test_what_is_out_of_reach_is_what_the_synthesis_cannot_hear():
-    """`longest_delay` against the filter as the kernels know it (`synthesis.sources`), with every data delay. Planted bug: the groups'
-    offsets left out, which put a mirror image 2 T_d late into the next group."""
+    """`longest_delay` against the filter as the kernels know it (`synthesis.sources`), with every
+    data delay. Planted bug: the groups' offsets left out, which put a mirror image 2 T_d late into
+    the next group."""
     plan = plan_of("paper_swarm_consistent.yaml", "accuracy.preset=budget")
     w = plan.waveform
     late = plan.longest_delay + np.linspace(-0.9, 0.9, 60) * w.max_delay
@@ -157,7 +173,8 @@ def test_what_is_out_of_reach_is_what_the_synthesis_cannot_hear():
 
 
 def test_what_a_cell_loses_stays_under_the_noise_by_the_budget():
-    """A hundred equal paths in one cell, each a tenth of the limit: ten go, not all. Planted bug: paths judged one by one."""
+    """A hundred equal paths in one cell, each a tenth of the limit: ten go, not all. Planted bug:
+    paths judged one by one."""
     plan = plan_of("munich_swarm.yaml", "propagation.weakest_path_db=20", "noise.tx_power_dbm=30")
     w = plan.waveform
     noise = 3.7e-13
@@ -187,7 +204,9 @@ def test_everything_leaves_nothing_out_and_fastest_does_what_it_can():
     """Planted bug: the preset everything with the budget's threshold for weak paths."""
     paths = some_paths(120, 6)
     for noise in (1e-30, 1e10):
-        kept, use = plan_of("paper_swarm_consistent.yaml", "accuracy.preset=everything").apply(paths, noise)
+        kept, use = plan_of("paper_swarm_consistent.yaml", "accuracy.preset=everything").apply(
+            paths, noise
+        )
         assert len(kept) == 120
         assert np.array_equal(kept.rx_radius, paths.rx_radius)
         assert np.array_equal(kept.delay_accel, paths.delay_accel)
@@ -198,15 +217,20 @@ def test_everything_leaves_nothing_out_and_fastest_does_what_it_can():
 
 
 def test_frames_are_traced_as_seldom_as_the_flight_allows():
-    """Between neighbours no UAV flies farther than the limit, and with any traced frame left out one would. Planted bug: distance from
-    the start instead of the way flown."""
+    """Between neighbours no UAV flies farther than the limit, and with any traced frame left out
+    one would. Planted bug: distance from the start instead of the way flown."""
     plan = plan_of("munich_swarm.yaml", "accuracy.max_untraced_m=1.7")
     frames = plan.traced_frames
     assert frames[0] == 0
     assert frames[-1] == plan.scenario.frames - 1
 
     def flown(a: int, b: int) -> float:
-        places = np.array([[p.position for p in plan.swarm.poses(plan.timetable.epoch(f)).values()] for f in range(a, b + 1)])
+        places = np.array(
+            [
+                [p.position for p in plan.swarm.poses(plan.timetable.epoch(f)).values()]
+                for f in range(a, b + 1)
+            ]
+        )
         return float(np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0).max())
 
     assert all(flown(a, b) <= 1.7 for a, b in pairwise(frames))
@@ -216,8 +240,8 @@ def test_frames_are_traced_as_seldom_as_the_flight_allows():
 
 
 def test_chains_that_live_shortly_are_missed_as_often_as_said():
-    """Truth: 4000 intervals of a birth-and-death process with exponential lives, seen at both ends and at random times in between.
-    Tolerance: 4 sigma of the count. Planted bug: 2 for 6."""
+    """Truth: 4000 intervals of a birth-and-death process with exponential lives, seen at both ends
+    and at random times in between. Tolerance: 4 sigma of the count. Planted bug: 2 for 6."""
     rng = np.random.default_rng(17)
     mean_life, rate, way, runs = 11.0, 3.0, 1.0, 4000
     found = born = died = missed = 0
@@ -226,6 +250,12 @@ def test_chains_that_live_shortly_are_missed_as_often_as_said():
         end = start + rng.exponential(mean_life, start.size)
         first, last = (start <= 0) & (end > 0), (start <= way) & (end > way)
         t = rng.uniform(0, way)
-        found, born, died = found + first.sum(), born + (last & ~first).sum(), died + (first & ~last).sum()
+        found, born, died = (
+            found + first.sum(),
+            born + (last & ~first).sum(),
+            died + (first & ~last).sum(),
+        )
         missed += int(((start <= t) & (end > t) & ~first & ~last).sum())
-    assert missed_chains(found / runs, born / runs, died / runs) == pytest.approx(missed / runs, abs=4 * np.sqrt(missed) / runs)
+    assert missed_chains(found / runs, born / runs, died / runs) == pytest.approx(
+        missed / runs, abs=4 * np.sqrt(missed) / runs
+    )

@@ -12,7 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from isac_rt.results.records import KINDS
-from isac_rt.views.figures import KIND_COLOURS, error_cdf, make_figures, over_time, range_doppler, scene_map
+from isac_rt.views.figures import (
+    KIND_COLOURS,
+    error_cdf,
+    make_figures,
+    over_time,
+    range_doppler,
+    scene_map,
+)
 
 INK_VARIANCE = 1e-3
 """Of pixel values in [0, 1]: an empty framed axis has about 1e-4, one line more than this."""
@@ -32,8 +39,17 @@ def written(run, tmp_path_factory):
 def test_all_figures_are_there_and_hold_ink(written):
     """Seen to fail with figures saved before anything was drawn on them."""
     folder, files = written
-    assert {f.stem for f in files} == {"scene", "range_doppler_0002", "equivalent_range_0002", "tracks_AT", "tracks_PT1", "errors", "paths",
-                                       "decoding", "link"}  # fmt: skip
+    assert {f.stem for f in files} == {
+        "scene",
+        "range_doppler_0002",
+        "equivalent_range_0002",
+        "tracks_AT",
+        "tracks_PT1",
+        "errors",
+        "paths",
+        "decoding",
+        "link",
+    }
     assert sorted(p.name for p in (folder / "figures").iterdir()) == sorted(f.name for f in files)
     for file in files:
         pixels = imread(file)[..., :3]
@@ -48,8 +64,8 @@ def test_a_run_without_detections_maps_or_paths_still_makes_figures(tmp_path):
 
 
 def test_range_doppler_marks_detections_and_truth_where_they_are(run):
-    """Circle of U1 at the AT at its true range and velocity; the detections by kind. Seen to fail with axes exchanged
-    and with an empty map."""
+    """Circle of U1 at the AT at its true range and velocity; the detections by kind. Seen to fail
+    with axes exchanged and with an empty map."""
     ax = range_doppler(Figure().subplots(), run.dataset, 0, 0)
     lines = {line.get_label(): line for line in ax.get_lines()}
     truth = lines["UAV in view (truth)"]
@@ -59,11 +75,16 @@ def test_range_doppler_marks_detections_and_truth_where_they_are(run):
     )
     assert {"target (1)", "specular (1)", "unexplained (1)"} <= set(lines)
     shown = np.asarray(ax.images[0].get_array())
-    assert np.unravel_index(shown.argmax(), shown.shape) == (17, 60) and shown.max() > 30 and abs(np.median(shown)) < 1e-4
+    assert (
+        np.unravel_index(shown.argmax(), shown.shape) == (17, 60)
+        and shown.max() > 30
+        and abs(np.median(shown)) < 1e-4
+    )
 
 
 def test_truth_beyond_the_unambiguous_velocity_is_drawn_where_it_folds_to(run):
-    """U1 made faster by 1.25 spans shows a quarter of a span farther on. Seen to fail without the folding."""
+    """U1 made faster by 1.25 spans shows a quarter of a span farther on. Seen to fail without the
+    folding."""
     fast = run.dataset.copy(deep=True)
     axis = fast.map_velocity.values[0]
     span = 120 * (axis[1] - axis[0])
@@ -78,21 +99,30 @@ def test_a_terminal_without_the_data_shows_no_map_and_says_so(run):
     blank = run.dataset.copy(deep=True)
     blank.map_power.values[0, 1] = 0.0
     ax = range_doppler(Figure().subplots(), blank, 0, 1)
-    assert "no map" in " ".join(text.get_text() for text in ax.texts) and ax.images[0].get_clim()[1] >= 5
+    assert (
+        "no map" in " ".join(text.get_text() for text in ax.texts)
+        and ax.images[0].get_clim()[1] >= 5
+    )
     assert not range_doppler(Figure().subplots(), run.dataset, 0, 1).texts
 
 
 def test_tracks_are_drawn_in_people_units_and_shadow_is_shaded(run):
     ax = over_time(Figure().subplots(), run.dataset, 1, "azimuth")
     line = next(line for line in ax.get_lines() if line.get_label() == "U1")
-    assert np.allclose(line.get_ydata(), np.rad2deg(run.dataset.truth_azimuth.values[:, 1, 2]), rtol=1e-12)
+    assert np.allclose(
+        line.get_ydata(), np.rad2deg(run.dataset.truth_azimuth.values[:, 1, 2]), rtol=1e-12
+    )
     assert len(ax.patches) == 1
 
 
 def test_error_cdf_ends_at_one_and_leaves_the_observer_itself_out(run):
     ax = error_cdf(Figure().subplots(), run.dataset, "range")
     raw = next(line for line in ax.get_lines() if line.get_label().startswith("PT1 raw"))
-    assert raw.get_ydata()[-1] == 1 and len(raw.get_ydata()) == 13 and np.allclose(raw.get_xdata(), 0.0637, rtol=1e-9)
+    assert (
+        raw.get_ydata()[-1] == 1
+        and len(raw.get_ydata()) == 13
+        and np.allclose(raw.get_xdata(), 0.0637, rtol=1e-9)
+    )
 
 
 def test_every_kind_has_its_own_colour():
@@ -105,7 +135,8 @@ def test_scene_shows_every_uav(run):
 
 
 def test_report_is_one_self_contained_page(run, written):
-    """No address of any kind is followed. Seen to fail with names in place of the pictures' data."""
+    """No address of any kind is followed. Seen to fail with names in place of the pictures'
+    data."""
     from isac_rt.views.report import write_report
 
     folder, files = written
@@ -113,9 +144,19 @@ def test_report_is_one_self_contained_page(run, written):
     for reference in re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?([^\"')>\s]+)", page):
         assert reference.startswith(("data:", "#")), reference[:60]
     assert "<link" not in page and "@import" not in page
-    embedded = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", page)]
+    embedded = [
+        base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", page)
+    ]
     assert embedded == [file.read_bytes() for file in files]
-    for text in ("AT to PT1", "passive", "25,758", "line of sight", "prefers-color-scheme", "viewport", "\u2013"):
+    for text in (
+        "AT to PT1",
+        "passive",
+        "25,758",
+        "line of sight",
+        "prefers-color-scheme",
+        "viewport",
+        "\u2013",
+    ):
         assert text in page
     text = re.sub(r"base64,[^\"]+", "", page)
     assert not re.search(r"\b(nan|None|inf)\b", re.sub(r"(?s)<pre>.*</pre>", "", text))

@@ -1,4 +1,5 @@
-"""The geometric ghost test: echoes over walls against shortest ways, places behind walls against trimesh, tracks by what explains them."""
+"""The geometric ghost test: echoes over walls against shortest ways, places behind walls against
+trimesh, tracks by what explains them."""
 
 from __future__ import annotations
 
@@ -27,8 +28,17 @@ BODY = np.array([4.6, 24.7, 6.9, -1.3, -2.2, 0.4])
 
 
 def wall() -> City:
-    corners = np.array([[WALL_X, 2.0, -6.0], [WALL_X, 40.0, -6.0], [WALL_X, 40.0, 13.0], [WALL_X, 2.0, 13.0]])
-    return City("wall", corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (), ORIGIN.copy())
+    corners = np.array(
+        [[WALL_X, 2.0, -6.0], [WALL_X, 40.0, -6.0], [WALL_X, 40.0, 13.0], [WALL_X, 2.0, 13.0]]
+    )
+    return City(
+        "wall",
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.zeros(2, np.int16),
+        (),
+        ORIGIN.copy(),
+    )
 
 
 def track(number: int, place: np.ndarray, velocity: np.ndarray) -> Track:
@@ -38,7 +48,8 @@ def track(number: int, place: np.ndarray, velocity: np.ndarray) -> Track:
 
 
 def length(start: np.ndarray, end: np.ndarray, over_wall: bool) -> float:
-    """Way between two points, local; over the wall by least time: the shortest of all ways that touch its plane, found numerically."""
+    """Way between two points, local; over the wall by least time: the shortest of all ways that
+    touch its plane, found numerically."""
     if not over_wall:
         return float(np.linalg.norm(end - start))
     from scipy.optimize import minimize
@@ -48,13 +59,18 @@ def length(start: np.ndarray, end: np.ndarray, over_wall: bool) -> float:
         return float(np.linalg.norm(touch - start) + np.linalg.norm(end - touch))
 
     return float(
-        minimize(way, (start[1:] + end[1:]) / 2, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 4000}).fun
+        minimize(
+            way,
+            (start[1:] + end[1:]) / 2,
+            method="Nelder-Mead",
+            options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 4000},
+        ).fun
     )
 
 
 def test_echoes_over_a_wall_are_the_shortest_ways_that_touch_it():
-    """Range and rate of orders 1 and 2 against ways found by minimising their length (1e-8 m: the minimiser's),
-    rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step).
+    """Range and rate of orders 1 and 2 against ways found by minimising their length (1e-8 m: the
+    minimiser's), rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step).
     Planted bugs: the image's velocity not mirrored; the origin left out of the plane."""
     state = BODY - np.concatenate([OWN.position - ORIGIN, OWN.velocity])
     found = echoes(state, OWN, Walls(wall()))
@@ -73,15 +89,16 @@ def test_echoes_over_a_wall_are_the_shortest_ways_that_touch_it():
 
 
 def test_no_echo_where_the_wall_ends_or_stands_between():
-    """The mirror point of a body at y = -20 lies at y < 2, off the wall; a body behind the wall has no echo over it.
-    Planted bug: the plane taken for endless."""
+    """The mirror point of a body at y = -20 lies at y < 2, off the wall; a body behind the wall has
+    no echo over it. Planted bug: the plane taken for endless."""
     own = np.concatenate([OWN.position - ORIGIN, OWN.velocity])
     assert echoes(np.array([4.6, -20.0, 6.9, 0, 0, 0]) - own, OWN, Walls(wall())) == []
     assert echoes(np.array([15.0, 24.7, 6.9, 0, 0, 0]) - own, OWN, Walls(wall())) == []
 
 
 def test_blocked_segments_are_those_of_trimesh():
-    """300 random segments against trimesh's ray caster. Planted bug: the segment taken for an endless ray."""
+    """300 random segments against trimesh's ray caster. Planted bug: the segment taken for an
+    endless ray."""
     city, rng = wall(), np.random.default_rng(7)
     mesh = trimesh.Trimesh(city.vertices, city.faces, process=False)
     starts, ends = rng.uniform([-5, -10, -10], [20, 50, 20], (2, 300, 3))
@@ -92,19 +109,28 @@ def test_blocked_segments_are_those_of_trimesh():
 
 
 def test_ghosts_are_suspected_and_bodies_are_not():
-    """A body, its image behind the wall, an echo over one way seen in the body's own direction (so before the wall), and another body
-    of the same range and rate as that echo but elsewhere. Planted bugs: directions not compared; only the image looked for."""
+    """A body, its image behind the wall, an echo over one way seen in the body's own direction (so
+    before the wall), and another body of the same range and rate as that echo but elsewhere.
+    Planted bugs: directions not compared; only the image looked for."""
     body, own = BODY[:3], OWN.position - ORIGIN
     image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     image_velocity = BODY[3:] * [-1, 1, 1]
     mean = (np.linalg.norm(body - own) + np.linalg.norm(image - own)) / 2
     ahead = (body - own) / np.linalg.norm(body - own)
     half = own + mean * ahead
-    rates = [float((p - own) / np.linalg.norm(p - own) @ (v - OWN.velocity)) for p, v in ((body, BODY[3:]), (image, image_velocity))]
+    rates = [
+        float((p - own) / np.linalg.norm(p - own) @ (v - OWN.velocity))
+        for p, v in ((body, BODY[3:]), (image, image_velocity))
+    ]
     half_velocity = OWN.velocity + ahead * np.mean(rates)
     aside = np.array([-0.6, 0.8, 0.0])
     beside, beside_velocity = own + mean * aside, OWN.velocity + aside * np.mean(rates)
-    tracks = [track(3, body, BODY[3:]), track(5, image, image_velocity), track(6, half, half_velocity), track(8, beside, beside_velocity)]
+    tracks = [
+        track(3, body, BODY[3:]),
+        track(5, image, image_velocity),
+        track(6, half, half_velocity),
+        track(8, beside, beside_velocity),
+    ]
     found = suspicion(track_set(tracks, OWN), OWN, Walls(wall()), RESOLUTION, PERIOD)
     assert found.suspect.tolist() == [False, True, True, False]
     assert found.order.tolist() == [0, 2, 1, 0] and found.source.tolist() == [-1, 3, 3, -1]
@@ -114,11 +140,14 @@ def test_ghosts_are_suspected_and_bodies_are_not():
 
 
 def test_a_place_just_behind_a_wall_is_in_doubt_as_far_as_it_is_unsure():
-    """0.4 m behind the wall with 2 cm of deviation: suspect; with 30 cm, not. Planted bug: the deviation left out."""
+    """0.4 m behind the wall with 2 cm of deviation: suspect; with 30 cm, not. Planted bug: the
+    deviation left out."""
     behind = track(1, np.array([WALL_X + 0.4, 24.0, 5.0]), np.zeros(3))
     unsure = replace(behind, state=Gaussian(behind.state.mean, np.diag([0.09] * 3 + [1e-2] * 3)))
     for one, expected in ((behind, True), (unsure, False)):
-        assert suspicion(track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD).suspect.tolist() == [expected]
+        assert suspicion(
+            track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD
+        ).suspect.tolist() == [expected]
 
 
 SENDER = np.array([3.9, 34.2, 2.6, 0.9, -5.7, 0.3])
@@ -126,19 +155,31 @@ SENDER = np.array([3.9, 34.2, 2.6, 0.9, -5.7, 0.3])
 
 
 def touch(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Where the shortest way over the wall touches it, by similar triangles: the heights over the plane divide the way."""
+    """Where the shortest way over the wall touches it, by similar triangles: the heights over the
+    plane divide the way."""
     a, b = WALL_X - start[0], WALL_X - end[0]
     return start + (end - start) * a / (a + b) + np.array([2 * a * b / (a + b), 0, 0])
 
 
 def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
-    """Path length and rate over the wall before the body, behind it and both, and of the sender itself, against lengths found by
-    minimising; the direction is that of the point where the last way touches the wall. Tolerances as for the echoes. Planted bugs:
-    arrival from the body where the last way is over the wall; the rate of one way only."""
+    """Path length and rate over the wall before the body, behind it and both, and of the sender
+    itself, against lengths found by minimising; the direction is that of the point where the last
+    way touches the wall. Tolerances as for the echoes. Planted bugs: arrival from the body where
+    the last way is over the wall; the rate of one way only."""
     here = np.concatenate([OWN.position - ORIGIN, OWN.velocity])
-    found = {order_of: echo for order_of, echo in zip(
-        ("back", "out", "both"), (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))), strict=True)}  # fmt: skip
-    assert [o for _, o, _ in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))] == [1, 1, 2]
+    found = {
+        order_of: echo
+        for order_of, echo in zip(
+            ("back", "out", "both"),
+            (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))),
+            strict=True,
+        )
+    }
+    assert [o for _, o, _ in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))] == [
+        1,
+        1,
+        2,
+    ]
     ((_, order, own_echo),) = reflections(SENDER - here, None, OWN, Walls(wall()))
     assert order == 1
     found["sender"] = own_echo
@@ -154,7 +195,12 @@ def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
         }
 
     now, before, after = lengths(0.0), lengths(-h), lengths(h)
-    ends = {"out": BODY[:3], "back": touch(BODY[:3], here[:3]), "both": touch(BODY[:3], here[:3]), "sender": touch(SENDER[:3], here[:3])}
+    ends = {
+        "out": BODY[:3],
+        "back": touch(BODY[:3], here[:3]),
+        "both": touch(BODY[:3], here[:3]),
+        "sender": touch(SENDER[:3], here[:3]),
+    }
     for name, echo in found.items():
         assert echo[0] == pytest.approx(now[name], abs=1e-7)
         assert echo[1] == pytest.approx((after[name] - before[name]) / (2 * h), abs=1e-3)
@@ -163,7 +209,8 @@ def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
 
 
 def heard(number: int, path: float, rate: float, towards: np.ndarray) -> Track:
-    """A track whose path from `SENDER` by way of a point towards a direction has this length and rate."""
+    """A track whose path from `SENDER` by way of a point towards a direction has this length and
+    rate."""
     from scipy.optimize import brentq
 
     own = OWN.position - ORIGIN
@@ -176,9 +223,9 @@ def heard(number: int, path: float, rate: float, towards: np.ndarray) -> Track:
 
 
 def test_a_passive_terminal_suspects_its_ghosts():
-    """Its reference; a body; an echo over the wall on the way to the body, one on the way from it, the reference over the wall; and a body
-    elsewhere with the first echo's length and rate. Planted bugs: the reference's own reflection not asked for; the active terminal's
-    ranges taken."""
+    """Its reference; a body; an echo over the wall on the way to the body, one on the way from it,
+    the reference over the wall; and a body elsewhere with the first echo's length and rate. Planted
+    bugs: the reference's own reflection not asked for; the active terminal's ranges taken."""
     own = OWN.position - ORIGIN
     here = np.concatenate([own, OWN.velocity])
     back, out, _ = (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall())))
@@ -188,32 +235,59 @@ def test_a_passive_terminal_suspects_its_ghosts():
         return np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
 
     aside = np.array([-0.6, 0.8, 0.0])
-    tracks = [track(3, BODY[:3], BODY[3:]), heard(5, *out[:2], ahead(out[2:])), heard(6, *back[:2], ahead(back[2:])),
-              heard(7, *mirrored[:2], ahead(mirrored[2:])), heard(8, *out[:2], aside)]  # fmt: skip
+    tracks = [
+        track(3, BODY[:3], BODY[3:]),
+        heard(5, *out[:2], ahead(out[2:])),
+        heard(6, *back[:2], ahead(back[2:])),
+        heard(7, *mirrored[:2], ahead(mirrored[2:])),
+        heard(8, *out[:2], aside),
+    ]
     everyone = track_set(tracks, OWN, track(1, SENDER[:3], SENDER[3:]))
     one_pass = RESOLUTION * [2, 2, 3, 3]
     found = suspicion(everyone, OWN, Walls(wall()), one_pass, 2 * PERIOD)
     assert found.suspect.tolist() == [False, False, True, True, True, False]
-    assert found.source.tolist() == [-1, -1, 3, 3, 1, -1] and found.order.tolist() == [0, 0, 1, 1, 1, 0]
+    assert found.source.tolist() == [-1, -1, 3, 3, 1, -1] and found.order.tolist() == [
+        0,
+        0,
+        1,
+        1,
+        1,
+        0,
+    ]
 
 
 def test_a_place_that_the_sender_cannot_see_is_suspect_at_a_passive_terminal():
-    """The sender behind the wall's plane, the place in sight of the own pose alone. Planted bug: only the own line of sight asked."""
+    """The sender behind the wall's plane, the place in sight of the own pose alone. Planted bug:
+    only the own line of sight asked."""
     hidden = SENDER + np.array([2 * (WALL_X - SENDER[0]), 0, 0, 0, 0, 0])
     found = suspicion(
-        track_set([track(3, BODY[:3], BODY[3:])], OWN, track(1, hidden[:3], hidden[3:])), OWN, Walls(wall()), RESOLUTION, PERIOD
+        track_set([track(3, BODY[:3], BODY[3:])], OWN, track(1, hidden[:3], hidden[3:])),
+        OWN,
+        Walls(wall()),
+        RESOLUTION,
+        PERIOD,
     )
     assert (found.behind >= 0).tolist() == [False, True]
 
 
 def test_tracks_are_counted_by_what_explains_them():
-    """A UAV's track, two ghosts of which the test sees one, and one of a wall: 2 of 4 without the test, 1 of 3 with it. Planted bug:
-    the rate with the test over all tracks."""
+    """A UAV's track, two ghosts of which the test sees one, and one of a wall: 2 of 4 without the
+    test, 1 of 3 with it. Planted bug: the rate with the test over all tracks."""
     rows = []
-    for number, (uav, kind, order, suspect) in enumerate([(2, 1, 0, False), (-1, 2, 1, True), (-1, 2, 2, False), (-1, 3, 1, False)]):
-        rows += [(f, "active", number, uav, kind, order, 7 + number, kind == 2, suspect) for f in range(4)]
+    for number, (uav, kind, order, suspect) in enumerate(
+        [(2, 1, 0, False), (-1, 2, 1, True), (-1, 2, 2, False), (-1, 3, 1, False)]
+    ):
+        rows += [
+            (f, "active", number, uav, kind, order, 7 + number, kind == 2, suspect)
+            for f in range(4)
+        ]
     rows.append((4, "active", 1, -1, -1, -1, -1, False, False))
-    tracks = whole_tracks(pd.DataFrame(rows, columns=["frame", "terminal", "id", "uav", "kind", "order", "face", "ghost", "suspect"]))
+    tracks = whole_tracks(
+        pd.DataFrame(
+            rows,
+            columns=["frame", "terminal", "id", "uav", "kind", "order", "face", "ghost", "suspect"],
+        )
+    )
     assert tracks.what.tolist() == ["uav", "ghost", "ghost", "other"]
     assert tracks.order.tolist() == [-1, 1, 2, -1] and tracks.face.tolist() == [-1, 8, 9, -1]
     said = verdicts(tracks)[1].finding
@@ -221,26 +295,35 @@ def test_tracks_are_counted_by_what_explains_them():
 
 
 def test_a_track_has_its_own_detections_explanation():
-    """The fake run's track lies on the first detection of PT1 and of the AT, a UAV's echo. Planted bug: detections of another observer."""
+    """The fake run's track lies on the first detection of PT1 and of the AT, a UAV's echo. Planted
+    bug: detections of another observer."""
     from fake_run import fake_run
 
     d = fake_run().dataset
-    parts = [explained_tracks(d, o, np.array([40.0, 40.0, 1, 1]), 1e6, o > 0) for o in range(d.observer.size)]
+    parts = [
+        explained_tracks(d, o, np.array([40.0, 40.0, 1, 1]), 1e6, o > 0)
+        for o in range(d.observer.size)
+    ]
     rows = pd.concat(parts).sort_values(["frame", "observer", "id"], ignore_index=True)
     assert len(rows) == d.track_id.size
     for row in rows.itertuples():
         mine = (d.det_frame.values == row.frame) & (d.det_observer.values == row.observer)
-        off = np.hypot(d.det_range.values[mine] - d.track_range.values[row.Index],
-                       d.det_velocity.values[mine] - d.track_velocity.values[row.Index])  # fmt: skip
+        off = np.hypot(
+            d.det_range.values[mine] - d.track_range.values[row.Index],
+            d.det_velocity.values[mine] - d.track_velocity.values[row.Index],
+        )
         assert row.kind == d.det_kind.values[mine][np.argmin(off)]
 
 
 @pytest.mark.slow
 def test_the_street_has_ghosts_and_the_test_finds_them():
-    """Three flights: every ghost track has a wall and an order, more than half of them are suspect at either
-    terminal, and no UAV's track is lost."""
+    """Three flights: every ghost track has a wall and an order, more than half of them are suspect
+    at either terminal, and no UAV's track is lost."""
     tracks = run(True, 20260, lambda _done, _all: None).tables["tracks"]
     ghosts = tracks[tracks.what == "ghost"]
     assert len(ghosts) and (ghosts.order > 0).all() and (ghosts.face >= 0).all()
-    assert (ghosts.groupby("terminal").suspect.mean() > 0.5).all() and set(ghosts.terminal) == {"active", "passive"}
+    assert (ghosts.groupby("terminal").suspect.mean() > 0.5).all() and set(ghosts.terminal) == {
+        "active",
+        "passive",
+    }
     assert not tracks[tracks.what == "uav"].suspect.any()

@@ -1,4 +1,5 @@
-"""The fast kernels of the gridded synthesis against plain numpy, and its stated errors against the exact model."""
+"""The fast kernels of the gridded synthesis against plain numpy, and its stated errors against the
+exact model."""
 
 from __future__ import annotations
 
@@ -17,12 +18,25 @@ from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.direct import add_direct, exact
-from isac_rt.signal.gridded import ACCURATE, ACCURATE_ERROR, DEFAULT, Setting, add_gridded, add_plain
+from isac_rt.signal.gridded import (
+    ACCURATE,
+    ACCURATE_ERROR,
+    DEFAULT,
+    Setting,
+    add_gridded,
+    add_plain,
+)
 from isac_rt.signal.if_signal import _tones
 from isac_rt.world.swarm import Pose, attitude
 
 SKIRT = 0.41e6
-SETTINGS = [DEFAULT, ACCURATE, Setting(1.25, 6, False), Setting(1.25, 10, True, True), Setting(2.0, 4, False)]
+SETTINGS = [
+    DEFAULT,
+    ACCURATE,
+    Setting(1.25, 6, False),
+    Setting(1.25, 10, True, True),
+    Setting(2.0, 4, False),
+]
 
 
 @pytest.mark.parametrize("size", [1280, 1536, 2048, 90, 4])
@@ -57,7 +71,9 @@ def test_cosine_and_sine():
 
     run(cycles, c, s)
     truth = np.exp(2j * np.pi * cycles.astype(float))
-    assert np.abs(c + 1j * s.astype(float) - truth).max() < 1.5e-6  # the double angle amplifies roundings of 6e-8
+    assert (
+        np.abs(c + 1j * s.astype(float) - truth).max() < 1.5e-6
+    )  # the double angle amplifies roundings of 6e-8
 
 
 def test_cosine_and_sine_for_the_direct_method():
@@ -92,42 +108,72 @@ def test_memory_is_lent_again_only_when_nothing_refers_to_it():
 
 
 def scene(count, rng, speed=15.0, view=60.0, **change):
-    """Paths in the field of view, |u| up to 0.87, of one sender with data; and the tones at a full L of 15 elements."""
+    """Paths in the field of view, |u| up to 0.87, of one sender with data; and the tones at a full
+    L of 15 elements."""
     w = replace(Waveform(), **({"num_chirps": 6} | change))
     array = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.1, 1.0, 0.05])))
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
-    sender = Transmission(name="A", pose=pose, antennas=array, schedule=schedule, payload=random_payload(w, schedule, 8, rng))
+    sender = Transmission(
+        name="A",
+        pose=pose,
+        antennas=array,
+        schedule=schedule,
+        payload=random_payload(w, schedule, 8, rng),
+    )
     azimuth, elevation = np.radians(rng.uniform(-view, view, (2, count)))
-    u = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1)
+    u = np.stack(
+        [
+            np.sin(azimuth) * np.cos(elevation),
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
+        axis=1,
+    )
     born = np.where(np.arange(count) % 11 == 3, w.slot_duration - w.frame_duration / 2, -np.inf)
     paths = make_paths(
-        epoch=w.frame_duration / 2, tx="A", rx="B", gain=rng.normal(size=count) + 1j * rng.normal(size=count),
-        delay=rng.uniform(0.003, 0.997, count) * w.max_delay, delay_rate=2 * rng.uniform(-speed, speed, count) / SPEED_OF_LIGHT,
-        delay_accel=rng.normal(size=count) * 20 / SPEED_OF_LIGHT, departure=u, arrival=u, tx_radius=np.inf, rx_radius=np.inf,
-        kind=PathKind.DIFFUSE, begin=born,
-    )  # fmt: skip
+        epoch=w.frame_duration / 2,
+        tx="A",
+        rx="B",
+        gain=rng.normal(size=count) + 1j * rng.normal(size=count),
+        delay=rng.uniform(0.003, 0.997, count) * w.max_delay,
+        delay_rate=2 * rng.uniform(-speed, speed, count) / SPEED_OF_LIGHT,
+        delay_accel=rng.normal(size=count) * 20 / SPEED_OF_LIGHT,
+        departure=u,
+        arrival=u,
+        tx_radius=np.inf,
+        rx_radius=np.inf,
+        kind=PathKind.DIFFUSE,
+        begin=born,
+    )
     return w, _tones(w, [(sender, paths)], pose, array, w.frame_duration / 2, 0)[0]
 
 
 def gridded(w, tones, setting):
-    samples = np.full((w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples), 7j, np.complex64)
+    samples = np.full(
+        (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples), 7j, np.complex64
+    )
     add_gridded(samples, w, tones, SKIRT, setting, fresh=True)
     return samples
 
 
 def narrowband(w, tones):
-    """The exact model with receive elements that only turn the phase, by its value at the middle of the window."""
+    """The exact model with receive elements that only turn the phase, by its value at the middle of
+    the window."""
     one = replace(tones, rx_delay=np.zeros((len(tones), 1)), cross=tones.cross[:, :, :1] * 0)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
     turn = np.exp(2j * np.pi * (middle * tones.rx_delay - w.slope * tones.rx_delay**2 / 2))
-    return sum(exact(w, one.select(np.array([k])), SKIRT) * turn[k][None, :, None, None] for k in range(len(tones)))
+    return sum(
+        exact(w, one.select(np.array([k])), SKIRT) * turn[k][None, :, None, None]
+        for k in range(len(tones))
+    )
 
 
 @pytest.mark.parametrize(("speed", "samples"), [(15.0, 1024), (60.0, 1024), (15.0, 90)])
 def test_error_of_the_direct_method(speed, samples):
-    """Against float64: roundings of float32 products, 4e-8 each, and the square of what turns within sixteen samples (1e-7 at 60 m/s).
-    Planted bug: `cross` counted from the first of the sixteen samples."""
+    """Against float64: roundings of float32 products, 4e-8 each, and the square of what turns
+    within sixteen samples (1e-7 at 60 m/s). Planted bug: `cross` counted from the first of the
+    sixteen samples."""
     w, tones = scene(5, np.random.default_rng(9), speed=speed, num_chirps=3, num_samples=samples)
     found = np.full((w.num_groups, 15, w.num_chirps, w.num_samples), 7j, np.complex64)
     add_direct(found, w, tones, SKIRT, fresh=True)
@@ -159,18 +205,26 @@ def test_many_paths_go_several_chirps_at_a_time():
 
 @pytest.mark.parametrize(
     ("setting", "bound"),
-    [(Setting(1.25, 6, False), 3e-4), (replace(DEFAULT, wideband=False), 1e-4), (replace(ACCURATE, wideband=False), 5e-6)],
+    [
+        (Setting(1.25, 6, False), 3e-4),
+        (replace(DEFAULT, wideband=False), 1e-4),
+        (replace(ACCURATE, wideband=False), 5e-6),
+    ],
 )
 def test_error_of_the_narrowband_model(setting, bound):
-    """The bounds stated in docs/performance_synthesis.md, two to five times below which the errors lie."""
+    """The bounds stated in docs/performance_synthesis.md, two to five times below which the errors
+    lie."""
     w, tones = scene(40, np.random.default_rng(21), num_chirps=3)
     assert relative(gridded(w, tones, setting), narrowband(w, tones)) < bound
 
 
-@pytest.mark.parametrize(("setting", "bound"), [(Setting(1.25, 6, True), 3e-4), (DEFAULT, 1e-4), (ACCURATE, ACCURATE_ERROR)])
+@pytest.mark.parametrize(
+    ("setting", "bound"),
+    [(Setting(1.25, 6, True), 3e-4), (DEFAULT, 1e-4), (ACCURATE, ACCURATE_ERROR)],
+)
 def test_error_of_the_full_model(setting, bound):
-    """Up to |u| = 0.87. Without the wideband term the error is above 1 %. Planted bug: the fourth set's strength without jq, which only
-    the bound of ACCURATE sees."""
+    """Up to |u| = 0.87. Without the wideband term the error is above 1 %. Planted bug: the fourth
+    set's strength without jq, which only the bound of ACCURATE sees."""
     w, tones = scene(40, np.random.default_rng(22), num_chirps=3)
     truth = exact(w, tones, SKIRT)
     assert relative(gridded(w, tones, setting), truth) < bound

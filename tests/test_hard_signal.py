@@ -29,50 +29,84 @@ def paths(w: Waveform, delay, gain=1.0, rate=0.0, radius=np.inf) -> PathSet:
     delay = np.atleast_1d(np.asarray(delay, float))
     along = np.tile([0.0, 1.0, 0.0], (delay.size, 1))
     gain = np.broadcast_to(gain, delay.shape)
-    return make_paths(gain=gain, delay=delay, delay_rate=rate, departure=along, arrival=along, rx_radius=radius, tx_radius=radius,
-                      kind=PathKind.TARGET, epoch=w.frame_duration / 2, tx="A", rx="P")  # fmt: skip
+    return make_paths(
+        gain=gain,
+        delay=delay,
+        delay_rate=rate,
+        departure=along,
+        arrival=along,
+        rx_radius=radius,
+        tx_radius=radius,
+        kind=PathKind.TARGET,
+        epoch=w.frame_duration / 2,
+        tx="A",
+        rx="P",
+    )
 
 
-def samples(w: Waveform, of: PathSet, method: str, data: bool = False, antennas: Antennas | None = None) -> np.ndarray:
+def samples(
+    w: Waveform, of: PathSet, method: str, data: bool = False, antennas: Antennas | None = None
+) -> np.ndarray:
     antennas = antennas or stage.arrays(w)
-    sender = stage.sender(w, np.random.default_rng(5), data, pose=stage.pose((0, 0, 0), boresight=(0, 1, 0)))
-    return stage.synthesise(w, [(sender, of)], stage.pose((0, 0, 0), boresight=(0, 1, 0)), method, 0.0, antennas)
+    sender = stage.sender(
+        w, np.random.default_rng(5), data, pose=stage.pose((0, 0, 0), boresight=(0, 1, 0))
+    )
+    return stage.synthesise(
+        w, [(sender, of)], stage.pose((0, 0, 0), boresight=(0, 1, 0)), method, 0.0, antennas
+    )
 
 
 def prediction(length: float, rate: float) -> Prediction:
     one = np.ones(1)
-    return Prediction(range=length * one, velocity=rate * one, direction=np.zeros((1, 2)), range_std=one, velocity_std=one, weight=one)
+    return Prediction(
+        range=length * one,
+        velocity=rate * one,
+        direction=np.zeros((1, 2)),
+        range_std=one,
+        velocity_std=one,
+        weight=one,
+    )
 
 
 @pytest.mark.parametrize("cell", [20.0, 20.25, 20.5, 21.0])
 def test_whole_and_half_cells(cell):
-    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Written against: the peak's neighbour on
-    the wrong side at a tie."""
+    """Range and velocity on, beside and exactly between the cells of both axes, noise-free. Written
+    against: the peak's neighbour on the wrong side at a tie."""
     _, schedule, payload = stage.frame(w=W)
     length, rate = cell * W.range_cell(1), (cell - 13) * W.velocity_cell(1)
     cube = stage.cube_of(W, schedule, payload, [(length, rate, 1.0)])
     found = receive_passive(cube, FEW, SETTINGS, 8, prediction(length, rate), True)
     assert np.array_equal(found.bits, payload.bits)
-    assert abs(found.detections.range[0] - length) < 1e-3 * W.range_cell(1)  # element delays of opposite sign do not cancel in power
+    assert abs(found.detections.range[0] - length) < 1e-3 * W.range_cell(
+        1
+    )  # element delays of opposite sign do not cancel in power
     assert abs(found.detections.velocity[0] - rate) < 1e-3 * W.velocity_cell(1)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_delay_at_all(method):
-    """A path of delay 0 is a constant: its gain in every sample. Written against: the phase of the window's start left in."""
+    """A path of delay 0 is a constant: its gain in every sample. Written against: the phase of the
+    window's start left in."""
     one = Antennas(tx_x=2, tx_z=4, rx_x=2, rx_z=2, spacing=1e-12)
     w = SMALL
-    sender = stage.sender(w, np.random.default_rng(5), False, pose=stage.pose((0, 0, 0)), antennas=one)
-    found = stage.synthesise(w, [(sender, paths(w, 0.0, 0.3 - 0.7j))], stage.pose((0, 0, 0)), method, 0.0, one)
+    sender = stage.sender(
+        w, np.random.default_rng(5), False, pose=stage.pose((0, 0, 0)), antennas=one
+    )
+    found = stage.synthesise(
+        w, [(sender, paths(w, 0.0, 0.3 - 0.7j))], stage.pose((0, 0, 0)), method, 0.0, one
+    )
     error = GRIDDED_ERROR if method == "gridded" else COMPLEX64
-    assert np.abs(found - (0.3 + 0.7j)).max() < 30 * error  # RMS bound; a single sample may be off by more
+    assert (
+        np.abs(found - (0.3 + 0.7j)).max() < 30 * error
+    )  # RMS bound; a single sample may be off by more
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("delay", [-1.01, 1.01, 1.9, 3.7])
 def test_beyond_the_filter_there_is_nothing(method, delay):
-    """Delays a skirt below 0 and a skirt beyond the passband, and far beyond. In another group's block such a path may be heard: here
-    there is one group. Written against: the skirt of twice the width."""
+    """Delays a skirt below 0 and a skirt beyond the passband, and far beyond. In another group's
+    block such a path may be heard: here there is one group. Written against: the skirt of twice the
+    width."""
     w = Waveform(num_samples=64, num_chirps=6, num_groups=1)
     skirt = 1.01 * stage.SKIRT / w.slope
     tau = -skirt if delay < 0 else delay * w.max_delay if delay > 1.5 else w.max_delay + skirt
@@ -81,8 +115,8 @@ def test_beyond_the_filter_there_is_nothing(method, delay):
 
 @pytest.mark.parametrize("speed", [16.0, -21.3, 44.9])
 def test_velocities_beyond_the_limit_are_aliases_of_a_known_span(speed):
-    """An echo beyond the unambiguous velocity is reported one span off (30 m/s at the AT), at the right range but for the coupling of what
-    was aliased. Written against: bins from 0 to P."""
+    """An echo beyond the unambiguous velocity is reported one span off (30 m/s at the AT), at the
+    right range but for the coupling of what was aliased. Written against: bins from 0 to P."""
     _, schedule, payload = stage.frame(w=W)
     cube = stage.cube_of(W, schedule, payload, [(2 * 14.3, 2 * speed, 1.0)])
     found = receive_active(cube, payload, FEW, SETTINGS).detections
@@ -90,38 +124,53 @@ def test_velocities_beyond_the_limit_are_aliases_of_a_known_span(speed):
     alias = speed - span * np.round(speed / span)
     best = int(np.argmax(found.snr))
     assert abs(found.velocity[best] - alias) < 0.1 * W.velocity_cell(2)
-    coupling = (speed - alias) / W.velocity_cell(2) * W.sampled_duration / W.frame_duration * W.range_cell(2)
+    coupling = (
+        (speed - alias)
+        / W.velocity_cell(2)
+        * W.sampled_duration
+        / W.frame_duration
+        * W.range_cell(2)
+    )
     assert abs(found.range[best] - 14.3 - coupling) < 0.1 * W.range_cell(2)
 
 
 @pytest.mark.parametrize("method", ["direct", "gridded", "auto"])
 def test_a_target_at_half_a_metre(method):
-    """Spherical waves over the whole array, against the exact model. Written against: plane waves."""
-    found, truth = (samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8, 0.5), m, True) for m in (method, "exact"))
+    """Spherical waves over the whole array, against the exact model. Written against: plane
+    waves."""
+    found, truth = (
+        samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8, 0.5), m, True) for m in (method, "exact")
+    )
     plane = samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8), "exact", True)
     assert stage.relative(found, truth) < (GRIDDED_ERROR if method == "gridded" else COMPLEX64)
     assert stage.relative(plane, truth) > 0.05
 
 
 def test_one_path_80_db_above_another():
-    """With the default method the weak path is right to a hundredth beside the strong one, among twelve (so that most are gridded).
-    Written against: the strongest gridded as well."""
+    """With the default method the weak path is right to a hundredth beside the strong one, among
+    twelve (so that most are gridded). Written against: the strongest gridded as well."""
     rng = np.random.default_rng(3)
     every = stage.random_paths(SMALL, rng, 14, SMALL.frame_duration / 2)
     gain = every.gain.copy()
     gain[0] = 1e4 * abs(gain).max()
     strong = replace(every, gain=gain)
     without = strong.select(np.arange(14) > 0)
-    rest = samples(SMALL, strong, "auto") - samples(SMALL, strong.select(np.arange(14) == 0), "exact")
+    rest = samples(SMALL, strong, "auto") - samples(
+        SMALL, strong.select(np.arange(14) == 0), "exact"
+    )
     truth = samples(SMALL, without, "exact")
-    assert stage.relative(rest, truth) < 1e-2  # complex64 of the strong one: 1e4 * 6e-8 * a few roundings
+    assert (
+        stage.relative(rest, truth) < 1e-2
+    )  # complex64 of the strong one: 1e4 * 6e-8 * a few roundings
 
 
 @pytest.mark.parametrize("times", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_million_paths(times):
-    """A thousand paths over and over, with a part of the gain each, are the thousand paths. Written against: an index of 16 bits.
+    """A thousand paths over and over, with a part of the gain each, are the thousand paths. Written
+    against: an index of 16 bits.
 
-    Rounding: sqrt(1e6) * 6e-8 of the largest partial sums, a few times the total, beside the method's own 1e-4 on both sides.
+    Rounding: sqrt(1e6) * 6e-8 of the largest partial sums, a few times the total, beside the
+    method's own 1e-4 on both sides.
     """
     w = Waveform(num_samples=64, num_chirps=3, num_groups=1)
     few = stage.random_paths(w, np.random.default_rng(8), 1000, w.frame_duration / 2)
@@ -133,14 +182,19 @@ def test_a_million_paths(times):
 
 
 def test_ten_thousand_paths_at_one_delay():
-    """Their sum is one path with the sum of the gains. Written against: equal frequencies counted once."""
+    """Their sum is one path with the sum of the gains. Written against: equal frequencies counted
+    once."""
     rng = np.random.default_rng(2)
     gain = rng.normal(size=10_000) + 1j * rng.normal(size=10_000) + 0.3
     w = Waveform(num_samples=64, num_chirps=3, num_groups=1)
     antennas = stage.arrays(w, tx_z=2, rx_x=2)
-    found = samples(w, paths(w, np.full(10_000, 0.37 * w.max_delay), gain), "gridded", antennas=antennas)
+    found = samples(
+        w, paths(w, np.full(10_000, 0.37 * w.max_delay), gain), "gridded", antennas=antennas
+    )
     truth = samples(w, paths(w, 0.37 * w.max_delay, gain.sum()), "exact", antennas=antennas)
-    assert stage.relative(found, truth) < GRIDDED_ERROR * 10  # |sum| is a fortieth of the sum of the moduli
+    assert (
+        stage.relative(found, truth) < GRIDDED_ERROR * 10
+    )  # |sum| is a fortieth of the sum of the moduli
 
 
 @pytest.mark.parametrize("method", [*METHODS, "auto"])
@@ -150,14 +204,19 @@ def test_denormal_and_zero_gains(method):
     with np.errstate(all="ignore"):
         alone = samples(SMALL, tiny, method)
     assert np.isfinite(alone).all() and np.abs(alone).max() < 1e-37
-    both = paths(SMALL, [0.1 * SMALL.max_delay, 0.3 * SMALL.max_delay, 0.6 * SMALL.max_delay], np.array([0.0, 5e-324, 1.0]))
+    both = paths(
+        SMALL,
+        [0.1 * SMALL.max_delay, 0.3 * SMALL.max_delay, 0.6 * SMALL.max_delay],
+        np.array([0.0, 5e-324, 1.0]),
+    )
     one = paths(SMALL, 0.6 * SMALL.max_delay)
     assert stage.relative(samples(SMALL, both, method), samples(SMALL, one, method)) < COMPLEX64
 
 
 @pytest.mark.parametrize(("size", "chirps", "tx"), [(90, 10, 5), (100, 21, 3), (250, 28, 4)])
 def test_sizes_that_are_no_powers_of_two(size, chirps, tx):
-    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is decoded."""
+    """N = 90, 100, 250 and P = 10, 21, 28: the fast methods hold their bounds, and a frame is
+    decoded."""
     w = Waveform(num_samples=size, num_chirps=chirps, num_tx=tx, num_groups=min(tx, 3))
     every = stage.random_paths(w, np.random.default_rng(size), 30, w.frame_duration / 2)
     truth = samples(w, every, "exact", True)
@@ -167,7 +226,10 @@ def test_sizes_that_are_no_powers_of_two(size, chirps, tx):
     antennas = Antennas(tx_x=2, tx_z=tx - 1, rx_x=2, rx_z=2, spacing=2e-3)
     length = 0.31 * size * w.range_cell(1)
     cube = stage.cube_of(w, schedule, payload, [(length, 2.3, 1.0)], antennas)
-    assert np.array_equal(receive_passive(cube, antennas, SETTINGS, 4, prediction(length, 2.3), True).bits, payload.bits)
+    assert np.array_equal(
+        receive_passive(cube, antennas, SETTINGS, 4, prediction(length, 2.3), True).bits,
+        payload.bits,
+    )
 
 
 def test_chirps_that_do_not_divide_among_the_antennas_are_refused():
@@ -180,7 +242,8 @@ def test_chirps_that_do_not_divide_among_the_antennas_are_refused():
 
 @pytest.mark.parametrize("modulated", [True, False])
 def test_one_group_and_one_antenna(modulated):
-    """M = 1, L_tx = 1: data come through without an error, range and velocity are found, at both kinds of terminal."""
+    """M = 1, L_tx = 1: data come through without an error, range and velocity are found, at both
+    kinds of terminal."""
     w = Waveform(num_samples=256, num_chirps=60, num_groups=1, num_tx=1)
     schedule = np.zeros((1, 60), np.int64)
     _, _, payload = stage.frame(8, 3, w)
@@ -190,6 +253,11 @@ def test_one_group_and_one_antenna(modulated):
     cube = stage.cube_of(w, schedule, payload, [(length, rate, 1.0)], single)
     found = receive_passive(cube, single, SETTINGS, 8, prediction(length, rate), modulated)
     assert found.line_of_sight and np.array_equal(found.bits, payload.bits)
-    echo = receive_active(stage.cube_of(w, schedule, payload, [(2 * 12.3, 2 * 4.1, 1.0)], single), payload, single, SETTINGS).detections
+    echo = receive_active(
+        stage.cube_of(w, schedule, payload, [(2 * 12.3, 2 * 4.1, 1.0)], single),
+        payload,
+        single,
+        SETTINGS,
+    ).detections
     for d, (r, v) in ((found.detections, (length, rate)), (echo, (12.3, 4.1))):
         assert abs(d.range[0] - r) < 2e-3 and abs(d.velocity[0] - v) < 2e-3

@@ -1,4 +1,5 @@
-"""The IF signal: the exact model against mixed chirps in long double, the fast methods against the exact one, signs."""
+"""The IF signal: the exact model against mixed chirps in long double, the fast methods against the
+exact one, signs."""
 
 from __future__ import annotations
 
@@ -23,12 +24,19 @@ C = SPEED_OF_LIGHT
 START = 3.217
 SKIRT = 0.43e6
 COMPLEX64 = 2e-7  # rounding: two float32 roundings of the result
-FLOAT64 = 1e-10  # rounding: a delay of 5e-6 s is summed of 8 terms, 8 half ulps of 4e-22 s at 77 GHz are 2e-10 cycles at worst, 3e-11 RMS
-SMALL = Waveform(bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3)
+# rounding: a delay of 5e-6 s is summed of 8 terms, 8 half ulps of 4e-22 s at 77 GHz are 2e-10
+# cycles at worst, 3e-11 RMS
+FLOAT64 = 1e-10
+SMALL = Waveform(
+    bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3
+)
 
 
 def antennas(w, **change):
-    return Antennas(**{"tx_x": 2, "tx_z": w.num_tx - 1, "rx_x": 3, "rx_z": 2, "spacing": 0.5774 * w.wavelength} | change)
+    return Antennas(
+        **{"tx_x": 2, "tx_z": w.num_tx - 1, "rx_x": 3, "rx_z": 2, "spacing": 0.5774 * w.wavelength}
+        | change
+    )
 
 
 def pose(x, y, z):
@@ -38,7 +46,12 @@ def pose(x, y, z):
 def sender(w, rng, *, data=True, **change):
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, 8, rng) if data else unmodulated(w)
-    fields = {"pose": pose(0.31, 1.2, -0.17), "antennas": antennas(w), "schedule": schedule, "payload": payload}
+    fields = {
+        "pose": pose(0.31, 1.2, -0.17),
+        "antennas": antennas(w),
+        "schedule": schedule,
+        "payload": payload,
+    }
     return Transmission(name="A", **(fields | change))
 
 
@@ -65,7 +78,14 @@ def paths(w, rng, count, *, reach=0.9, speed=30.0, **change):
 def synthesise(w, links, method, *, turned=(0.2, 1.0, 0.3), array=None, **options):
     array = antennas(w) if array is None else array
     return if_signal(
-        w, links, pose(*turned), array, start_time=START, filter_transition=SKIRT, method=method, **options
+        w,
+        links,
+        pose(*turned),
+        array,
+        start_time=START,
+        filter_transition=SKIRT,
+        method=method,
+        **options,
     ).samples
 
 
@@ -75,13 +95,25 @@ def relative(found, truth):
 
 
 def hard_links(w, rng):
-    """Two senders: clocks, on-off keying, data, neighbour groups, births and deaths, a near line of sight."""
+    """Two senders: clocks, on-off keying, data, neighbour groups, births and deaths, a near line of
+    sight."""
     first = paths(w, rng, 7, reach=2.8)
     born = np.where(np.arange(5) == 2, 0.13 * w.frame_duration, -np.inf)
     dies = np.where(np.arange(5) == 3, -0.21 * w.frame_duration, np.inf)
     u = directions(rng, 5)
     kinds = np.array([PathKind.LINE_OF_SIGHT, 4, 4, 4, 1])
-    second = paths(w, rng, 5, begin=born, end=dies, kind=kinds, departure=u, arrival=-u, tx_radius=0.61, rx_radius=0.61)
+    second = paths(
+        w,
+        rng,
+        5,
+        begin=born,
+        end=dies,
+        kind=kinds,
+        departure=u,
+        arrival=-u,
+        tx_radius=0.61,
+        rx_radius=0.61,
+    )
     active = rng.uniform(size=(w.num_groups, w.num_chirps)) < 0.7
     return [
         (sender(w, rng, amplitude=0.37, clock_offset=-3.1e-8, clock_drift=2.3e-7), first),
@@ -90,25 +122,35 @@ def hard_links(w, rng):
 
 
 def test_exact_model_is_what_mixing_gives():
-    """Planted bugs: + alpha tau^2/2; conj(beta); 2 (m - m') T_d with the other sign; rotation transposed."""
+    """Planted bugs: + alpha tau^2/2; conj(beta); 2 (m - m') T_d with the other sign; rotation
+    transposed."""
     links = hard_links(SMALL, np.random.default_rng(11))
     truth = mixed_chirps(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START, SKIRT)
-    tones, _, _ = _tones(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START + SMALL.frame_duration / 2, 0)
+    tones, _, _ = _tones(
+        SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START + SMALL.frame_duration / 2, 0
+    )
     assert relative(exact(SMALL, tones, SKIRT), truth) < FLOAT64
     assert relative(synthesise(SMALL, links, "exact"), truth) < COMPLEX64
 
 
 @pytest.mark.parametrize("block", [0, 2, 4])
 def test_resource_blocks_are_what_mixing_gives(block):
-    """Two senders in the blocks 2..4 and 3..5, received in blocks from `block` on, the paths given for the middle of the slots:
-    partly the right blocks, partly neighbours that pass the filter. Planted bugs: first_block with the other sign; the paths not
-    moved to the cube's own middle."""
+    """Two senders in the blocks 2..4 and 3..5, received in blocks from `block` on, the paths given
+    for the middle of the slots: partly the right blocks, partly neighbours that pass the filter.
+    Planted bugs: first_block with the other sign; the paths not moved to the cube's own middle."""
     w, links = SMALL, hard_links(SMALL, np.random.default_rng(17))
     links = [(replace(links[i][0], first_block=2 + i), links[i][1]) for i in (0, 1)]
     start = START + block * w.group_spacing
     truth = mixed_chirps(w, links, pose(0.2, 1.0, 0.3), antennas(w), start, SKIRT, block)
     found = if_signal(
-        w, links, pose(0.2, 1.0, 0.3), antennas(w), start_time=start, filter_transition=SKIRT, first_block=block, method="exact"
+        w,
+        links,
+        pose(0.2, 1.0, 0.3),
+        antennas(w),
+        start_time=start,
+        filter_transition=SKIRT,
+        first_block=block,
+        method="exact",
     )
     assert np.abs(truth).max() > 0.1
     assert relative(found.samples, truth) < COMPLEX64
@@ -123,13 +165,19 @@ def test_direct_is_exact(shape, data):
     rng = np.random.default_rng(n)
     array = antennas(w, tx_x=1, tx_z=num_tx)
     links = [(sender(w, rng, data=data, antennas=array), paths(w, rng, 6, reach=2.5))]
-    assert relative(synthesise(w, links, "direct", array=array), synthesise(w, links, "exact", array=array)) < COMPLEX64
+    assert (
+        relative(
+            synthesise(w, links, "direct", array=array), synthesise(w, links, "exact", array=array)
+        )
+        < COMPLEX64
+    )
 
 
 @pytest.mark.parametrize("speed", [0.0, 3.3, 30.0])
 @pytest.mark.parametrize(("samples", "count"), [(1024, 9), (1000, 40), (255, 130)])
 def test_gridded_against_exact(samples, count, speed):
-    """At 30 m/s and for the full L. Planted bugs: no second order of motion; no `lag`; modes not taken modulo the grid."""
+    """At 30 m/s and for the full L. Planted bugs: no second order of motion; no `lag`; modes not
+    taken modulo the grid."""
     w = replace(Waveform(), num_samples=samples, num_chirps=6)
     rng = np.random.default_rng(samples + count)
     array = antennas(w, rx_x=8, rx_z=8)
@@ -142,7 +190,12 @@ def test_paths_at_the_ends_of_the_passband():
     """Frequencies 0 and 1 wrap around the grid; planted bug: margins not wrapped."""
     w = replace(Waveform(), num_chirps=3)
     ends = np.array([-0.011, 0.0, 1e-7, 0.9999999, 1.0, 1.013]) * w.max_delay
-    links = [(sender(w, np.random.default_rng(3), data=False), paths(w, np.random.default_rng(4), 6, delay=ends))]
+    links = [
+        (
+            sender(w, np.random.default_rng(3), data=False),
+            paths(w, np.random.default_rng(4), 6, delay=ends),
+        )
+    ]
     assert relative(synthesise(w, links, "gridded"), synthesise(w, links, "exact")) < GRIDDED_ERROR
 
 
@@ -151,7 +204,14 @@ def test_births_and_deaths_of_fast_methods_are_whole_chirps():
     w = SMALL
     rng = np.random.default_rng(5)
     changes = np.array([3, 7]) * w.slot_duration - w.frame_duration / 2
-    one = paths(w, rng, 2, begin=np.array([changes[0], -np.inf]), end=np.array([np.inf, changes[1]]), reach=0.4)
+    one = paths(
+        w,
+        rng,
+        2,
+        begin=np.array([changes[0], -np.inf]),
+        end=np.array([np.inf, changes[1]]),
+        reach=0.4,
+    )
     links = [(sender(w, rng), one)]
     truth = synthesise(w, links, "exact")
     assert relative(synthesise(w, links, "direct"), truth) < COMPLEX64
@@ -161,17 +221,25 @@ def test_births_and_deaths_of_fast_methods_are_whole_chirps():
 def tone(w, *, delay=0.3, method="exact", **change):
     """One unmodulated path of gain 1 through one sender without array offset."""
     rng = np.random.default_rng(2)
-    fields = {"gain": np.ones(1), "delay": np.array([delay * w.max_delay]), "delay_rate": 0.0, "delay_accel": 0.0}
+    fields = {
+        "gain": np.ones(1),
+        "delay": np.array([delay * w.max_delay]),
+        "delay_rate": 0.0,
+        "delay_accel": 0.0,
+    }
     fields |= {"tx_radius": np.inf, "rx_radius": np.inf}
     single = antennas(w, tx_x=1, tx_z=1)
     schedule = np.zeros((w.num_groups, w.num_chirps), np.int64)
     one = paths(w, rng, 1, **(fields | change))
-    return synthesise(w, [(sender(w, rng, data=False, antennas=single, schedule=schedule), one)], method)
+    return synthesise(
+        w, [(sender(w, rng, data=False, antennas=single, schedule=schedule), one)], method
+    )
 
 
 @pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
 def test_signs(method):
-    """Farther: higher positive beat. Receding: positive slow-time frequency, f_v = +f_eff * rate."""
+    """Farther: higher positive beat. Receding: positive slow-time frequency, f_v = +f_eff *
+    rate."""
     w = Waveform(num_chirps=60, num_groups=1)
     near, far = (tone(w, delay=d, method=method)[0, 0, 0] for d in (0.2137, 0.6213))
     assert np.argmax(np.abs(np.fft.fft(near))) == round(0.2137 * w.num_samples)
@@ -185,7 +253,8 @@ def test_signs(method):
 
 @pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
 def test_arrival_from_the_right_along_the_array(method):
-    """A wave from +X: element phase exp(-j 2 pi f_eff x/c) at mid-window, less what was sent tau earlier."""
+    """A wave from +X: element phase exp(-j 2 pi f_eff x/c) at mid-window, less what was sent tau
+    earlier."""
     w = Waveform(num_chirps=3, num_groups=1)
     turned = pose(0.2, 1.0, 0.3).rotation
     samples = tone(w, arrival=turned[:, 0][None], method=method)[0, :, 1, w.num_samples // 2]
@@ -193,36 +262,49 @@ def test_arrival_from_the_right_along_the_array(method):
     assert np.ptp(x) > 0
     sent = w.effective_carrier - 0.3 * w.sampling_rate
     expected = np.exp(-2j * np.pi * sent * (x - x[0]) / C)
-    np.testing.assert_allclose(samples / samples[0], expected, atol=3 * GRIDDED_ERROR)  # method error
+    np.testing.assert_allclose(
+        samples / samples[0], expected, atol=3 * GRIDDED_ERROR
+    )  # method error
 
 
 @pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
 def test_filter(method):
-    """Passband, half a skirt (amplitude 1/2), stop band, and the neighbour group whose beat is 2 f_s lower."""
+    """Passband, half a skirt (amplitude 1/2), stop band, and the neighbour group whose beat is 2
+    f_s lower."""
     w = replace(Waveform(), num_chirps=3)
     half = SKIRT / w.sampling_rate / 2
-    level = [np.sqrt((np.abs(tone(w, delay=d, method=method)) ** 2).mean(axis=(1, 2, 3))) for d in (0.7, 1 + half, -half, 1.5, 2.4)]
+    level = [
+        np.sqrt((np.abs(tone(w, delay=d, method=method)) ** 2).mean(axis=(1, 2, 3)))
+        for d in (0.7, 1 + half, -half, 1.5, 2.4)
+    ]
     tolerance = 3 * GRIDDED_ERROR  # method error
     np.testing.assert_allclose(level[0], [1, 1, 1], atol=tolerance)
     np.testing.assert_allclose(level[1], [0.5] * 3, atol=tolerance)
     np.testing.assert_allclose(level[2], [0.5] * 3, atol=tolerance)
     np.testing.assert_array_equal(level[3], 0)
-    np.testing.assert_allclose(level[4], [0, 1, 1], atol=tolerance)  # group m - 1, two maximal delays late
+    np.testing.assert_allclose(
+        level[4], [0, 1, 1], atol=tolerance
+    )  # group m - 1, two maximal delays late
 
 
 @pytest.mark.parametrize("method", ["direct", "exact"])
 def test_target_at_half_a_metre_is_seen_spherically(method):
-    """Phase differences of the elements follow the distances to the point. Planted bug: plane waves."""
+    """Phase differences of the elements follow the distances to the point. Planted bug: plane
+    waves."""
     w = Waveform(num_chirps=3, num_groups=1)
     u = np.array([[0.48, 0.8, 0.36]])
-    samples = tone(w, delay=0.004, arrival=u, rx_radius=0.5, method=method)[0, :, 0, w.num_samples // 2]
+    samples = tone(w, delay=0.004, arrival=u, rx_radius=0.5, method=method)[
+        0, :, 0, w.num_samples // 2
+    ]
     elements = antennas(w).rx_positions @ pose(0.2, 1.0, 0.3).rotation.T
     distance = np.linalg.norm(0.5 * u - elements, axis=1)
     frequency = w.effective_carrier - 0.004 * w.sampling_rate
     expected = np.exp(2j * np.pi * frequency / C * (distance - distance[0]))
     plane = np.exp(-2j * np.pi * frequency / C * ((elements - elements[0]) @ u[0]))
     assert np.abs(plane - expected).max() > 1e-3  # the case is not trivial
-    np.testing.assert_allclose(samples / samples[0], expected, atol=1e-5)  # e^2 slope pi and rounding
+    np.testing.assert_allclose(
+        samples / samples[0], expected, atol=1e-5
+    )  # e^2 slope pi and rounding
 
 
 def test_linear_in_paths_and_gains():
@@ -249,20 +331,23 @@ def test_nothing_gives_nothing(method):
 
 
 def test_auto_is_more_accurate_where_a_path_is_strong():
-    """The strongest path and the line of sight go direct, so what is left of the error is the weak paths'."""
+    """The strongest path and the line of sight go direct, so what is left of the error is the weak
+    paths'."""
     w, rng = SMALL, np.random.default_rng(10)
     gain = np.where(np.arange(40) == 17, 1.0, 1e-3) * np.exp(2j * np.pi * rng.uniform(size=40))
     kind = np.where(np.arange(40) == 5, int(PathKind.LINE_OF_SIGHT), int(PathKind.DIFFUSE))
     links = [(sender(w, rng), paths(w, rng, 40, gain=gain, kind=kind))]
     truth = synthesise(w, links, "exact")
-    assert relative(synthesise(w, links, "auto", noise_power=1e-6), truth) < 1e-2 * GRIDDED_ERROR * np.sqrt(40)
+    assert relative(
+        synthesise(w, links, "auto", noise_power=1e-6), truth
+    ) < 1e-2 * GRIDDED_ERROR * np.sqrt(40)
     assert relative(synthesise(w, links, "gridded"), truth) > 1e-2 * GRIDDED_ERROR * np.sqrt(40)
 
 
 @pytest.mark.parametrize("method", ["exact", "gridded"])
 def test_the_epoch_is_only_where_the_polynomial_is_written(method):
-    """Paths said for another instant, delays expanded about it by hand, and births counted from it, give the same samples. Accelerations of
-    1e6 m/s^2 so that their square shows: 0.3 mm.
+    """Paths said for another instant, delays expanded about it by hand, and births counted from it,
+    give the same samples. Accelerations of 1e6 m/s^2 so that their square shows: 0.3 mm.
     Planted bugs: the acceleration's half left out or subtracted; the rate not moved; births not."""
     w, rng = SMALL, np.random.default_rng(14)
     accel = rng.normal(size=9) * 1e6 / C
@@ -281,7 +366,10 @@ def test_the_epoch_is_only_where_the_polynomial_is_written(method):
     )
     change = np.abs(s.delay_accel).max() * shift**2 / 2 * w.carrier_frequency
     assert change > 1e-2  # cycles
-    assert relative(synthesise(w, [(links[0][0], other)], method), synthesise(w, links, method)) < 2 * COMPLEX64
+    assert (
+        relative(synthesise(w, [(links[0][0], other)], method), synthesise(w, links, method))
+        < 2 * COMPLEX64
+    )
 
 
 def test_a_wrong_epoch_is_refused():

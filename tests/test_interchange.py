@@ -1,4 +1,5 @@
-"""What others read: the same samples back, the same paths as Sionna's, the same geometry as Stone Soup's models."""
+"""What others read: the same samples back, the same paths as Sionna's, the same geometry as Stone
+Soup's models."""
 
 from __future__ import annotations
 
@@ -17,7 +18,15 @@ from isac_rt.scenario.environment import Propagation
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
-from isac_rt.views.interchange import cube_dataset, from_sionna, load_cube, read_sigmf, save_cube, stonesoup_detections, write_sigmf
+from isac_rt.views.interchange import (
+    cube_dataset,
+    from_sionna,
+    load_cube,
+    read_sigmf,
+    save_cube,
+    stonesoup_detections,
+    write_sigmf,
+)
 
 W = Waveform(num_samples=64, num_chirps=12)
 
@@ -25,8 +34,15 @@ W = Waveform(num_samples=64, num_chirps=12)
 @pytest.fixture
 def cube() -> IFCube:
     rng = np.random.default_rng(3)
-    samples = rng.normal(size=(W.num_groups, 5, 12, 64, 2)).astype(np.float32).view(np.complex64)[..., 0]
-    return IFCube(samples=samples, waveform=W, schedule=rng.permuted(np.arange(36).reshape(3, 12) % 4, axis=1), start_time=0.7 / 3)
+    samples = (
+        rng.normal(size=(W.num_groups, 5, 12, 64, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    )
+    return IFCube(
+        samples=samples,
+        waveform=W,
+        schedule=rng.permuted(np.arange(36).reshape(3, 12) % 4, axis=1),
+        start_time=0.7 / 3,
+    )
 
 
 def same(a: IFCube, b: IFCube) -> None:
@@ -44,7 +60,8 @@ def test_a_cube_comes_back_from_netcdf(cube, tmp_path):
 
 
 def test_a_cube_comes_back_from_sigmf_and_another_reader_finds_a_sample(cube, tmp_path):
-    """The library `sigmf` reads sample n of chirp p of antenna l in group m at row p N + n, channel m L + l.
+    """The library `sigmf` reads sample n of chirp p of antenna l in group m at row p N + n, channel
+    m L + l.
 
     Planted bug: channels and samples exchanged."""
     sigmf = pytest.importorskip("sigmf")
@@ -73,8 +90,9 @@ def test_what_is_no_cube_is_said_so(tmp_path):
 
 @pytest.mark.sionna
 def test_paths_of_sionna_are_those_of_geometry():
-    """Line of sight and floor bounce between two moving terminals over a floor, against mirror geometry in float64: delays to 1e-5 m
-    (theirs are float32), Doppler from unit vectors, directions, kinds. Planted bug: the sign of the Doppler shift."""
+    """Line of sight and floor bounce between two moving terminals over a floor, against mirror
+    geometry in float64: delays to 1e-5 m (theirs are float32), Doppler from unit vectors,
+    directions, kinds. Planted bug: the sign of the Doppler shift."""
     from isac_rt.runtime import activate
 
     activate()
@@ -85,9 +103,18 @@ def test_paths_of_sionna_are_those_of_geometry():
     from isac_rt.world.city import load_city
     from isac_rt.world.city.scene import build_scene
 
-    scene = build_scene(load_city(City(source="builtin", name="floor_wall"), ".", 77e9, (0.0, 0.0, 0.0)), 77e9).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    a, b, va, vb = np.array([-1.3, 0.4, 2.7]), np.array([1.1, -0.7, 3.9]), np.array([3.1, -1.7, 0.4]), np.array([-0.9, 2.2, 1.3])
+    scene = build_scene(
+        load_city(City(source="builtin", name="floor_wall"), ".", 77e9, (0.0, 0.0, 0.0)), 77e9
+    ).scene
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
+    a, b, va, vb = (
+        np.array([-1.3, 0.4, 2.7]),
+        np.array([1.1, -0.7, 3.9]),
+        np.array([3.1, -1.7, 0.4]),
+        np.array([-0.9, 2.2, 1.3]),
+    )
     scene.add(rt.Transmitter("tx", mi.Point3f(*a.tolist()), velocity=mi.Vector3f(*va.tolist())))
     scene.add(rt.Receiver("rx", mi.Point3f(*b.tolist()), velocity=mi.Vector3f(*vb.tolist())))
     found = from_sionna(rt.PathSolver()(scene, max_depth=1, refraction=False), 77e9, epoch=0.25)
@@ -99,14 +126,18 @@ def test_paths_of_sionna_are_those_of_geometry():
     assert direct.delay_rate[0] * c == pytest.approx(along @ (vb - va), rel=1e-5, abs=0)
     assert direct.departure[0] == pytest.approx(along, abs=1e-6)
     assert direct.arrival[0] == pytest.approx(-along, abs=1e-6)
-    assert abs(direct.gain[0]) == pytest.approx(c / 77e9 / (4 * np.pi * np.linalg.norm(b - a)), rel=1e-4, abs=0)
+    assert abs(direct.gain[0]) == pytest.approx(
+        c / 77e9 / (4 * np.pi * np.linalg.norm(b - a)), rel=1e-4, abs=0
+    )
     image = b * [1, 1, -1]  # the floor is z = 0
     length = np.linalg.norm(image - a)
     bounced = found.select(found.kind == PathKind.SPECULAR)
     k = int(np.abs(bounced.delay * c - length).argmin())
     assert bounced.delay[k] * c == pytest.approx(length, abs=1e-5)
     assert bounced.bounces[k] == 1
-    assert bounced.delay_rate[k] * c == pytest.approx((image - a) / length @ (vb * [1, 1, -1] - va), rel=1e-5, abs=0)
+    assert bounced.delay_rate[k] * c == pytest.approx(
+        (image - a) / length @ (vb * [1, 1, -1] - va), rel=1e-5, abs=0
+    )
     assert found.epoch == 0.25
 
 
@@ -114,20 +145,38 @@ def flight():
     body = {"rcs": {"model": "constant", "value_dbsm": 5.0}}
     return simulate.run(
         Scenario(
-            name="s", seed=4, frames=4, radio=Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60),
-            array=Array(element_pattern="isotropic", element_gain_dbi=0), propagation=Propagation(leakage={"enabled": False}),
-            noise=Noise(model="snr", snr_db=0.0), modulation=Modulation(acquisition_frames=2, pilot_every_frames=None),
+            name="s",
+            seed=4,
+            frames=4,
+            radio=Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60),
+            array=Array(element_pattern="isotropic", element_gain_dbi=0),
+            propagation=Propagation(leakage={"enabled": False}),
+            noise=Noise(model="snr", snr_db=0.0),
+            modulation=Modulation(acquisition_frames=2, pilot_every_frames=None),
             swarm={
-                "A": Uav(role="active", position_m=(3.1, -2.2, 50), velocity_mps=(1.3, 2.9, 0.4), boresight=(0.3, 1, 0.2), **body),
-                "P": Uav(role="passive", position_m=(7.9, 15.1, 53.3), velocity_mps=(-2.1, 1.7, 0.3), boresight=(-0.2, -1, 0), **body),
+                "A": Uav(
+                    role="active",
+                    position_m=(3.1, -2.2, 50),
+                    velocity_mps=(1.3, 2.9, 0.4),
+                    boresight=(0.3, 1, 0.2),
+                    **body,
+                ),
+                "P": Uav(
+                    role="passive",
+                    position_m=(7.9, 15.1, 53.3),
+                    velocity_mps=(-2.1, 1.7, 0.3),
+                    boresight=(-0.2, -1, 0),
+                    **body,
+                ),
             },
         )
-    )  # fmt: skip
+    )
 
 
 def test_stone_soup_would_have_measured_what_was_detected():
-    """Its measurement model applied to the true state gives each detection within five of its deviations (floor: 1e-3 of a cell, for
-    what the grid leaves). Planted bugs: bearing from north; the observer's own velocity left out."""
+    """Its measurement model applied to the true state gives each detection within five of its
+    deviations (floor: 1e-3 of a cell, for what the grid leaves). Planted bugs: bearing from north;
+    the observer's own velocity left out."""
     pytest.importorskip("stonesoup")
     from stonesoup.types.state import State
 
@@ -138,10 +187,19 @@ def test_stone_soup_would_have_measured_what_was_detected():
         assert [len(s) for s in sets] == [1, 1, 1, 1]
         for frame, detections in enumerate(sets):
             (one,) = detections
-            truth = np.ravel(np.column_stack([d.uav_position.values[frame, other], d.uav_velocity.values[frame, other]]))
+            truth = np.ravel(
+                np.column_stack(
+                    [d.uav_position.values[frame, other], d.uav_velocity.values[frame, other]]
+                )
+            )
             expected = one.measurement_model.function(State(truth.reshape(-1, 1)), noise=False)
             off = np.array([float(v) for v in (one.state_vector - expected)])
             std = np.sqrt(np.diag(one.measurement_model.noise_covar.astype(float)))
-            assert (np.abs(off) < 5 * std + [1e-4, 1e-4, 5e-4, 5e-3]).all(), (observer, frame, off, std)
+            assert (np.abs(off) < 5 * std + [1e-4, 1e-4, 5e-4, 5e-3]).all(), (
+                observer,
+                frame,
+                off,
+                std,
+            )
             assert one.timestamp == start + datetime.timedelta(seconds=float(d.time[frame]))
             assert np.linalg.eigvalsh(one.measurement_model.noise_covar.astype(float)).min() > 0

@@ -1,4 +1,5 @@
-"""Runs that are ended from outside, disks that are full, folders that cannot be written; and runs that must not differ by a bit."""
+"""Runs that are ended from outside, disks that are full, folders that cannot be written; and runs
+that must not differ by a bit."""
 
 from __future__ import annotations
 
@@ -28,7 +29,18 @@ from isac_rt.scenario.tree import Scenario
 
 ROOT = Path(__file__).parent.parent
 WHOLE = {"results.nc", "summary.json", "scenario.yaml"}
-WITHOUT_A_NUMBER = {"dask", "distributed", "jinja2", "matplotlib", "pandas", "pyyaml", "rich", "rtree", "threadpoolctl", "typer"}
+WITHOUT_A_NUMBER = {
+    "dask",
+    "distributed",
+    "jinja2",
+    "matplotlib",
+    "pandas",
+    "pyyaml",
+    "rich",
+    "rtree",
+    "threadpoolctl",
+    "typer",
+}
 """Dependencies that start, show or look up what others compute."""
 
 PROGRAM = """
@@ -41,8 +53,11 @@ import numpy as np
 from isac_rt.city.mesh import empty_city
 from isac_rt.swarm import Swarm
 fake = types.ModuleType("isac_rt.run.simulate")
-fake.prepare = lambda s: types.SimpleNamespace(city=empty_city("none", np.zeros(3)), swarm=Swarm.from_scenario(s),
-                                               timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f))
+fake.prepare = lambda s: types.SimpleNamespace(
+    city=empty_city("none", np.zeros(3)),
+    swarm=Swarm.from_scenario(s),
+    timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
+)
 fake.link_budgets = lambda setup: []
 fake.run = lambda s, **_: fake_run(s)
 import isac_rt
@@ -71,12 +86,20 @@ sys.exit(main(["run", {scenario!r}, "--out", {out!r}]))
     ],
 )
 def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
-    """Each file is whole or absent; asked to end (SIGTERM, Ctrl-C) the run takes its unfinished file along, which Python's own answer to
-    SIGTERM would leave."""
+    """Each file is whole or absent; asked to end (SIGTERM, Ctrl-C) the run takes its unfinished
+    file along, which Python's own answer to SIGTERM would leave."""
     scenario, out = tmp_path / "s.yaml", tmp_path / "o"
     scenario.write_text(to_yaml(fake_scenario()))
-    program = PROGRAM.format(tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), when=when)
-    child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    program = PROGRAM.format(
+        tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), when=when
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     assert child.stdout is not None
     while (line := child.stdout.readline()) and line.strip() != when:
         pass
@@ -86,7 +109,9 @@ def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
     _, said = child.communicate(timeout=60)
     left = {p.name for p in out.iterdir()}
     assert child.returncode == (-9 if how == signal.SIGKILL else 128 + how), said
-    assert left - {n for n in left if n.endswith(".tmp")} == (set() if when == "results.nc" else {"results.nc", "scenario.yaml"})
+    assert left - {n for n in left if n.endswith(".tmp")} == (
+        set() if when == "results.nc" else {"results.nc", "scenario.yaml"}
+    )
     if how != signal.SIGKILL:
         assert not [n for n in left if n.endswith(".tmp")], left
         assert "interrupted" in said and "Traceback" not in said
@@ -118,7 +143,10 @@ def test_a_full_device_is_one_message():
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full here")
     with pytest.raises(ResultsError, match="No space left"):
-        results.write_bytes(Path("/dev/shm") / f"isac_rt-{os.getpid()}", lambda temporary: Path("/dev/full").write_text("x" * 100_000))
+        results.write_bytes(
+            Path("/dev/shm") / f"isac_rt-{os.getpid()}",
+            lambda temporary: Path("/dev/full").write_text("x" * 100_000),
+        )
 
 
 def test_an_unwritable_folder_is_refused_before_the_run(tmp_path, capsys):
@@ -141,7 +169,12 @@ def small() -> Scenario:
             "swarm": {
                 "A": {"role": "active", "position_m": [0, 0, 9]},
                 "P": {"role": "passive", "position_m": [1.3, 8.1, 9.3], "boresight": [0, -1, 0]},
-                "Q": {"role": "passive", "position_m": [-2.3, 6.1, 9.3], "velocity_mps": [1, 2, 0], "boresight": [0, -1, 0]},
+                "Q": {
+                    "role": "passive",
+                    "position_m": [-2.3, 6.1, 9.3],
+                    "velocity_mps": [1, 2, 0],
+                    "boresight": [0, -1, 0],
+                },
                 "U": {"role": "target", "position_m": [0.4, 4.1, 9.3], "velocity_mps": [0, 1, 0]},
             },
         }
@@ -153,20 +186,30 @@ def digest(run) -> str:
     out = hashlib.sha256()
     for name in sorted(run.dataset.variables):
         values = run.dataset[name].values
-        out.update(name.encode() + (repr(values.tolist()).encode() if values.dtype == object else np.ascontiguousarray(values).tobytes()))
-    return out.hexdigest() + json.dumps({k: v for k, v in run.summary.items() if k != "timing_s"}, sort_keys=True)
+        out.update(
+            name.encode()
+            + (
+                repr(values.tolist()).encode()
+                if values.dtype == object
+                else np.ascontiguousarray(values).tobytes()
+            )
+        )
+    return out.hexdigest() + json.dumps(
+        {k: v for k, v in run.summary.items() if k != "timing_s"}, sort_keys=True
+    )
 
 
 def test_reruns_are_equal_bit_by_bit_whatever_the_threads():
-    """One, two and five receivers at work at once, and again. Written against: a generator shared by the receivers."""
+    """One, two and five receivers at work at once, and again. Written against: a generator shared
+    by the receivers."""
     found = {digest(simulate.run(small(), threads=threads)) for threads in (1, 2, 5, 1)}
     assert len(found) == 1
     assert digest(simulate.run(small().model_copy(update={"seed": 2}))) not in found
 
 
 def test_versions_stand_in_the_results(tmp_path):
-    """Another version of a package is seen in the file and in the summary. Written against: versions taken when the module is written,
-    and a new dependency that nobody entered."""
+    """Another version of a package is seen in the file and in the summary. Written against:
+    versions taken when the module is written, and a new dependency that nobody entered."""
     import importlib.metadata
 
     run = fake_run()

@@ -14,7 +14,8 @@ PACKAGE = Path(__file__).parent.parent / "isac_rt"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
-    "runtime randomness scenario kernels world frame propagation signal receive terminal access results run sweep views studies cli"
+    "runtime randomness scenario kernels world frame propagation signal receive terminal access "
+    "results run sweep views studies cli"
 ).split()
 GROUND = {"runtime", "randomness"}
 NEVER = {("receive", "signal"), ("receive", "propagation"), ("world", "frame")}
@@ -35,7 +36,11 @@ def imported_rooms(source: str) -> set[str]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the order"
-            names = [f"{node.module}.{alias.name}" for alias in node.names] if node.module == "isac_rt" else [node.module or ""]
+            names = (
+                [f"{node.module}.{alias.name}" for alias in node.names]
+                if node.module == "isac_rt"
+                else [node.module or ""]
+            )
         else:
             continue
         rooms |= {name.split(".")[1] for name in names if name.startswith("isac_rt.")}
@@ -46,24 +51,33 @@ def ids(path: Path) -> str:
     return str(path.relative_to(PACKAGE))
 
 
-@pytest.mark.parametrize("path", [m for m in MODULES if m.parent != PACKAGE or m.name != "__init__.py"], ids=ids)
+@pytest.mark.parametrize(
+    "path", [m for m in MODULES if m.parent != PACKAGE or m.name != "__init__.py"], ids=ids
+)
 def test_imports_run_one_way_through_the_rooms(path: Path):
-    """Planted bug: `from isac_rt.cli.cli import main` in frame/waveform.py; `from isac_rt.signal.noise import add_white_noise` in
-    receive/cfar.py."""
+    """Planted bug: `from isac_rt.cli.cli import main` in frame/waveform.py; `from
+    isac_rt.signal.noise import add_white_noise` in receive/cfar.py."""
     room = room_of(path)
     assert room in ORDER, f"{ids(path)} stands in no room"
     below = set() if room in GROUND else set(ORDER[: ORDER.index(room)])
-    assert imported_rooms(path.read_text()) <= {room} | {other for other in below if (room, other) not in NEVER}
+    assert imported_rooms(path.read_text()) <= {room} | {
+        other for other in below if (room, other) not in NEVER
+    }
 
 
-@pytest.mark.parametrize("path", [m for m in MODULES if room_of(m) not in ("cli", "studies")], ids=ids)
+@pytest.mark.parametrize(
+    "path", [m for m in MODULES if room_of(m) not in ("cli", "studies")], ids=ids
+)
 def test_studies_are_imported_by_the_command_line_only(path: Path):
     """Planted bug: `from isac_rt.studies.paper import names` in views/report.py."""
     assert "studies" not in imported_rooms(path.read_text())
 
 
 def test_import_finder_sees_every_form():
-    source = "import isac_rt.cli\nfrom isac_rt import report, figures as f\ndef g():\n    from isac_rt.sweep.grid import x\nimport numpy"
+    source = (
+        "import isac_rt.cli\nfrom isac_rt import report, figures as f\ndef g():\n    from "
+        "isac_rt.sweep.grid import x\nimport numpy"
+    )
     assert imported_rooms(source) == {"cli", "report", "figures", "sweep"}
 
 
@@ -75,7 +89,11 @@ def imported_files(path: Path) -> set[Path]:
             for dotted in (f"{node.module}.{alias.name}" for alias in node.names):
                 for name in (dotted, node.module or ""):
                     at = PACKAGE.parent / name.replace(".", "/")
-                    file = at.with_suffix(".py") if at.with_suffix(".py").is_file() else at / "__init__.py"
+                    file = (
+                        at.with_suffix(".py")
+                        if at.with_suffix(".py").is_file()
+                        else at / "__init__.py"
+                    )
                     if file.is_file():
                         found.add(file)
                         break
@@ -90,21 +108,42 @@ def test_no_file_imports_itself_by_way_of_others():
 
 def test_importing_the_package_starts_no_ray_tracer():
     """Planted bug: `import drjit` in isac_rt/__init__.py."""
-    program = "import sys, isac_rt; print([m for m in ('sionna', 'mitsuba', 'drjit') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    program = (
+        "import sys, isac_rt; print([m for m in ('sionna', 'mitsuba', 'drjit') if m in "
+        "sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        cwd=PACKAGE.parent,
+        check=True,
+    )
     assert done.stdout.strip() == "[]"
 
 
 def test_style():
     """Planted bug: an unused import."""
-    done = subprocess.run([sys.executable, "-m", "ruff", "check", "."], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "."],
+        capture_output=True,
+        text=True,
+        cwd=PACKAGE.parent,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.slow
 def test_types():
     """Planted bug: an argument too many."""
-    done = subprocess.run([sys.executable, "-m", "mypy"], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy"],
+        capture_output=True,
+        text=True,
+        cwd=PACKAGE.parent,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -15,15 +15,20 @@ PUBLISHED = 0.005  # decibel figures given to two decimals
 
 
 def test_thermal_noise():
-    """-174 dBm/Hz (-173.98 at 290 K) + 73.01 dB Hz + 11.3 dB. Seen failing with half of the bandwidth."""
+    """-174 dBm/Hz (-173.98 at 290 K) + 73.01 dB Hz + 11.3 dB. Seen failing with half of the
+    bandwidth."""
     level = thermal_noise_power(Noise(noise_figure_db=11.3), WAVEFORM)
     assert 10 * np.log10(level / 1e-3) == pytest.approx(-173.975 + 73.010 + 11.3, abs=PUBLISHED)
-    assert thermal_noise_power(Noise(noise_figure_db=11.3, temperature_k=145.0), WAVEFORM) == pytest.approx(level / 2, rel=1e-12, abs=0)
+    assert thermal_noise_power(
+        Noise(noise_figure_db=11.3, temperature_k=145.0), WAVEFORM
+    ) == pytest.approx(level / 2, rel=1e-12, abs=0)
 
 
 def test_transmit_amplitude():
     """12.7 dBm are 18.62 mW; with an SNR the scale is 1."""
-    assert transmit_amplitude(Noise(tx_power_dbm=12.7)) ** 2 == pytest.approx(18.62e-3, rel=1e-4, abs=0)
+    assert transmit_amplitude(Noise(tx_power_dbm=12.7)) ** 2 == pytest.approx(
+        18.62e-3, rel=1e-4, abs=0
+    )
     assert transmit_amplitude(Noise(model="snr")) == 1.0
 
 
@@ -35,7 +40,8 @@ def test_noise_of_an_snr():
 
 
 def test_budget_of_the_papers_link():
-    """Section 0, 14 of the notes: 10 dBm, isotropic, noise figure 10 dB, 11.31 m: about +10 dB per sample at a PT."""
+    """Section 0, 14 of the notes: 10 dBm, isotropic, noise figure 10 dB, 11.31 m: about +10 dB per
+    sample at a PT."""
     noise = Noise(tx_power_dbm=10.0, noise_figure_db=10.0)
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=1e-3)
     amplitude = WAVEFORM.wavelength / (4 * np.pi * 11.31)

@@ -38,7 +38,12 @@ RESOLUTION = np.array([0.25, 0.25, 0.108, 0.108])
 
 
 def pose(position, velocity, boresight=(0.0, 1.0, 0.0)) -> Pose:
-    return Pose(np.array(position, float), np.array(velocity, float), np.zeros(3), attitude(np.array(boresight)))
+    return Pose(
+        np.array(position, float),
+        np.array(velocity, float),
+        np.zeros(3),
+        attitude(np.array(boresight)),
+    )
 
 
 def detections(rows) -> Detections:
@@ -55,7 +60,9 @@ def detections(rows) -> Detections:
 
 
 def truth(r=20.3, v=1.7, u_x=0.31, u_z=-0.12) -> Truth:
-    return Truth(r, v, u_x, u_z, float(np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), float(np.arcsin(u_z)))
+    return Truth(
+        r, v, u_x, u_z, float(np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), float(np.arcsin(u_z))
+    )
 
 
 def test_truth_one_way_and_bistatic():
@@ -73,20 +80,34 @@ def test_truth_one_way_and_bistatic():
 
 def test_truth_rate_is_the_derivative_of_the_length():
     h = 1e-4
-    poses = [([1.3, 2.1, 3.7], [3.1, -2.7, 0.9]), ([15.1, 25.3, 8.8], [-4.1, 7.3, 1.1]), ([-21.7, 9.3, 33.1], [6.1, 2.9, -0.3])]
-    ahead, behind = ([pose(np.array(p) + s * h * np.array(v), v) for p, v in poses] for s in (1, -1))
+    poses = [
+        ([1.3, 2.1, 3.7], [3.1, -2.7, 0.9]),
+        ([15.1, 25.3, 8.8], [-4.1, 7.3, 1.1]),
+        ([-21.7, 9.3, 33.1], [6.1, 2.9, -0.3]),
+    ]
+    ahead, behind = (
+        [pose(np.array(p) + s * h * np.array(v), v) for p, v in poses] for s in (1, -1)
+    )
     rate = (truth_of(*ahead).range - truth_of(*behind).range) / (2 * h)
-    assert truth_of(*(pose(p, v) for p, v in poses)).velocity == pytest.approx(rate, abs=1e-7)  # h^2 and 80 m eps / h
+    assert truth_of(*(pose(p, v) for p, v in poses)).velocity == pytest.approx(
+        rate, abs=1e-7
+    )  # h^2 and 80 m eps / h
 
 
 def test_resolutions_of_table_one():
-    """Published (notes, section 1): cells of range and velocity, and 16 or 8 elements at 0.5774 wavelengths."""
-    assert resolutions(WAVEFORM, ANTENNAS, 2) == pytest.approx([0.24983, 0.249, 0.10824, 0.10824], rel=2e-3)
-    assert resolutions(WAVEFORM, ANTENNAS, 1) == pytest.approx([0.49965, 0.498, 0.21649, 0.21649], rel=2e-3)
+    """Published (notes, section 1): cells of range and velocity, and 16 or 8 elements at 0.5774
+    wavelengths."""
+    assert resolutions(WAVEFORM, ANTENNAS, 2) == pytest.approx(
+        [0.24983, 0.249, 0.10824, 0.10824], rel=2e-3
+    )
+    assert resolutions(WAVEFORM, ANTENNAS, 1) == pytest.approx(
+        [0.49965, 0.498, 0.21649, 0.21649], rel=2e-3
+    )
 
 
 def test_association_is_one_to_one_and_gated():
-    """The nearest estimate of the first truth is the only one of the second; planted bug: greedy choice."""
+    """The nearest estimate of the first truth is the only one of the second; planted bug: greedy
+    choice."""
     truths = [truth(20.0), truth(20.5)]
     rows = [[20.3, 1.7, 0.31, -0.12], [19.6, 1.7, np.nan, np.nan], [40.0, 1.7, 0.31, -0.12]]
     assert sorted(associate(truths, np.array(rows), RESOLUTION)) == [(0, 1), (1, 0)]
@@ -95,8 +116,9 @@ def test_association_is_one_to_one_and_gated():
 
 
 def test_explain_takes_the_strongest_near_path():
-    """Strongest within a cell, velocity modulo the unambiguous span, -1 where none is near; planted bug: the nearest path.
-    The face is the first that the path meets, whether a UAV's point comes before it or not; planted bug: the first column of the faces."""
+    """Strongest within a cell, velocity modulo the unambiguous span, -1 where none is near; planted
+    bug: the nearest path. The face is the first that the path meets, whether a UAV's point comes
+    before it or not; planted bug: the first column of the faces."""
     passes, span = 2, 2 * WAVEFORM.max_velocity(2)
     delays = np.array([20.0, 20.2, 33.0, 47.0]) * passes / SPEED_OF_LIGHT
     rates = np.array([1.0, 1.1, span + 3.0, 0.0]) * passes / SPEED_OF_LIGHT
@@ -116,7 +138,9 @@ def test_explain_takes_the_strongest_near_path():
         rx="AT",
         target_names=("a", "b", "c"),
     )
-    found = detections([[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]])
+    found = detections(
+        [[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]]
+    )
     kind, target, order, face = explain(found, paths, WAVEFORM, passes)
     assert kind.tolist() == [PathKind.SPECULAR, PathKind.GHOST, -1, PathKind.TARGET]
     assert target.tolist() == [-1, 2, -1, 0]
@@ -139,8 +163,9 @@ def reception(payload, delay, transitions, bits, decoded=True) -> Reception:
 
 
 def test_symbol_counts():
-    """Two wrong delay symbols of which one is erased, three wrong transitions, four wrong bits; an undecoded frame is all
-    errors; a pilot counts nothing. Planted bug: erased symbols left out of the errors."""
+    """Two wrong delay symbols of which one is erased, three wrong transitions, four wrong bits; an
+    undecoded frame is all errors; a pilot counts nothing. Planted bug: erased symbols left out of
+    the errors."""
     schedule = conventional_schedule(2, 12, 3)
     p = random_payload(SMALL, schedule, 8, np.random.default_rng(2))
     delay, transitions, bits = p.delay_symbols.copy(), p.transitions.copy(), p.bits.copy()
@@ -150,15 +175,24 @@ def test_symbol_counts():
     one = count_symbols(p, reception(p, delay, transitions, bits))
     assert one == SymbolCount(24, 2, 1, 18, 3, 0, p.bits.size, 4, p.bits.size, 1)
     blank = np.zeros(0, np.uint8)
-    lost = count_symbols(p, reception(p, np.full((2, 12), -1), np.full((2, 3, 3), -1), blank, decoded=False))
+    lost = count_symbols(
+        p, reception(p, np.full((2, 12), -1), np.full((2, 3, 3), -1), blank, decoded=False)
+    )
     assert lost == SymbolCount(24, 24, 24, 18, 18, 18, p.bits.size, p.bits.size, 0, 1)
     pilot = unmodulated(SMALL)
-    assert count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False)) == SymbolCount()
+    assert (
+        count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False))
+        == SymbolCount()
+    )
     block = summary_block("passive", SensingScore(RESOLUTION), one + lost, duration=0.1)
-    assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(21 / 36)
+    assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(
+        21 / 36
+    )
     assert block["ber"] == pytest.approx((4 + p.bits.size) / (2 * p.bits.size))
     assert block["erased"] == pytest.approx((1 + 24 + 18) / 84)
-    assert block["bits"] == p.bits.size and block["bit_rate_bps"] == pytest.approx(p.bits.size / 0.1)
+    assert block["bits"] == p.bits.size and block["bit_rate_bps"] == pytest.approx(
+        p.bits.size / 0.1
+    )
     assert block["hit_rate"] is None and block["rmse"] == dict.fromkeys(ERROR_KEYS)
 
 
@@ -179,11 +213,22 @@ def tracks(rows, confirmed) -> TrackSet:
 
 
 def test_sensing_score():
-    """Frame 1: a hit, one match beyond a resolution, one stray that a path explains and one that none does; frame 2:
-    a match without direction. RMS by hand; planted bug: RMS over all target-frames."""
+    """Frame 1: a hit, one match beyond a resolution, one stray that a path explains and one that
+    none does; frame 2: a match without direction. RMS by hand; planted bug: RMS over all
+    target-frames."""
     score, first, second = SensingScore(RESOLUTION), truth(20.0, 1.7), truth(50.0, -3.1)
-    rows = [[20.1, 1.6, 0.31, -0.12], [50.5, -3.1, 0.31, -0.12], [70.0, 0.0, 0.0, 0.0], [90.0, 0.0, 0.0, 0.0]]
-    score.add([first, second], detections(rows), tracks(rows[:2], [True, False]), np.array([1, 1, 4, -1], np.int8))
+    rows = [
+        [20.1, 1.6, 0.31, -0.12],
+        [50.5, -3.1, 0.31, -0.12],
+        [70.0, 0.0, 0.0, 0.0],
+        [90.0, 0.0, 0.0, 0.0],
+    ]
+    score.add(
+        [first, second],
+        detections(rows),
+        tracks(rows[:2], [True, False]),
+        np.array([1, 1, 4, -1], np.int8),
+    )
     score.add([first], detections([[20.2, 1.7, np.nan, np.nan]]))
     assert (score.frames, score.target_frames, score.hits, score.matched) == (2, 3, 1, 3)
     assert (score.false, score.clutter, score.matched_tracks) == (1, 1, 1)
@@ -191,12 +236,19 @@ def test_sensing_score():
     assert block["rmse"]["range_m"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2 + 0.2**2) / 3))
     assert block["rmse"]["azimuth_deg"] == pytest.approx(0.0, abs=1e-9)
     assert block["rmse_tracked"]["range_m"] == pytest.approx(0.1)
-    assert block["hit_rate"] == pytest.approx(1 / 3) and block["matched"] == 1.0 and block["bits"] is None
+    assert (
+        block["hit_rate"] == pytest.approx(1 / 3)
+        and block["matched"] == 1.0
+        and block["bits"] is None
+    )
     assert block["false_per_frame"] == 0.5 and block["ser_dpsk"] is None
     pooled = SensingScore(RESOLUTION)
     pooled.merge(score)
     pooled.merge(score)
-    assert pooled.target_frames == 6 and pooled.detection_errors.rmse() == score.detection_errors.rmse()
+    assert (
+        pooled.target_frames == 6
+        and pooled.detection_errors.rmse() == score.detection_errors.rmse()
+    )
 
 
 def test_angle_errors_are_in_degrees_of_azimuth_and_elevation():
@@ -205,12 +257,14 @@ def test_angle_errors_are_in_degrees_of_azimuth_and_elevation():
     a, e = azimuth + np.deg2rad(0.4), elevation - np.deg2rad(0.9)
     score.add([t], detections([[20.0, 1.0, np.sin(a) * np.cos(e), np.sin(e)]]))
     rmse = score.detection_errors.rmse()
-    assert rmse["azimuth_deg"] == pytest.approx(0.4, abs=1e-9) and rmse["elevation_deg"] == pytest.approx(0.9, abs=1e-9)
+    assert rmse["azimuth_deg"] == pytest.approx(0.4, abs=1e-9) and rmse[
+        "elevation_deg"
+    ] == pytest.approx(0.9, abs=1e-9)
 
 
 def test_gospa_closed_forms():
-    """Equal sets, one pair, a pair beyond the cut-off, cardinality alone; then all assignments tried one by one.
-    Planted bug: c^2 instead of c^2/2 for a missed target."""
+    """Equal sets, one pair, a pair beyond the cut-off, cardinality alone; then all assignments
+    tried one by one. Planted bug: c^2 instead of c^2/2 for a missed target."""
     c, x = 5.0, np.array([[1.3, 2.7, 0.4], [11.1, 3.3, 7.9]])
     assert gospa(x, x[::-1], c).distance == 0.0
     assert gospa(x[:1], x[:1] + np.array([3.0, 0.0, 4.0 - 1e-9]), c).distance == pytest.approx(5.0)
@@ -220,7 +274,8 @@ def test_gospa_closed_forms():
     rng = np.random.default_rng(7)
     x, y = rng.normal(0, 4, (3, 3)), rng.normal(0, 4, (4, 3))
     best = min(
-        sum(min(np.sum((x[i] - y[j]) ** 2), c**2) for i, j in enumerate(order)) + c**2 / 2 for order in permutations(range(4), 3)
+        sum(min(np.sum((x[i] - y[j]) ** 2), c**2) for i, j in enumerate(order)) + c**2 / 2
+        for order in permutations(range(4), 3)
     )
     assert gospa(x, y, c).distance == pytest.approx(np.sqrt(best))
 
@@ -230,4 +285,6 @@ def test_binomial_interval():
     assert binomial_interval(0, 37) == pytest.approx((0.0, 1 - 0.025 ** (1 / 37)))
     assert binomial_interval(37, 37) == pytest.approx((0.025 ** (1 / 37), 1.0))
     low, high = binomial_interval(11, 53, 0.9)
-    assert binom.sf(10, 53, low) == pytest.approx(0.05) and binom.cdf(11, 53, high) == pytest.approx(0.05)
+    assert binom.sf(10, 53, low) == pytest.approx(0.05) and binom.cdf(
+        11, 53, high
+    ) == pytest.approx(0.05)

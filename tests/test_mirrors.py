@@ -1,4 +1,5 @@
-"""Mirror reflections in float64: slabs against the sum of their inner echoes, chains of walls against vectors written out."""
+"""Mirror reflections in float64: slabs against the sum of their inner echoes, chains of walls
+against vectors written out."""
 
 from __future__ import annotations
 
@@ -20,14 +21,17 @@ ROUNDING = 1e-10
 
 
 def echoes(material: Material, cosine: float) -> tuple[complex, complex]:
-    """TE and TM coefficients by adding up a slab's inner echoes, from Fresnel's equations and Snell's law; the field normal to the
-    plane of incidence for TE, the magnetic field for TM."""
+    """TE and TM coefficients by adding up a slab's inner echoes, from Fresnel's equations and
+    Snell's law; the field normal to the plane of incidence for TE, the magnetic field for TM."""
     eta = material.relative_permittivity - 1j * material.conductivity / (2 * np.pi * F_C * EPS_0)
     inside = np.sqrt(1 - (1 - cosine**2) / eta)  # cosine of the refracted angle
     n = np.sqrt(eta)
     turn = np.exp(-2j * np.pi * material.thickness / LAMBDA * n * inside)
     out = []
-    for first in ((cosine - n * inside) / (cosine + n * inside), (n * cosine - inside) / (n * cosine + inside)):
+    for first in (
+        (cosine - n * inside) / (cosine + n * inside),
+        (n * cosine - inside) / (n * cosine + inside),
+    ):
         total, echo = first, (1 - first**2) * -first * turn**2
         for _ in range(400):
             total, echo = total + echo, echo * first**2 * turn**2
@@ -36,12 +40,15 @@ def echoes(material: Material, cosine: float) -> tuple[complex, complex]:
 
 
 def test_slab_is_the_sum_of_its_echoes():
-    """Complex, so that the phase is in it. Planted bugs: the scattered share divided; the phase of one way through the slab; the loss's
-    sign; TE and TM exchanged."""
+    """Complex, so that the phase is in it. Planted bugs: the scattered share divided; the phase of
+    one way through the slab; the loss's sign; TE and TM exchanged."""
     for thickness in (0.012, 0.0011):
         pane = replace(PANE, thickness=thickness)
         for cosine in (0.05, 0.317, 0.7, 1.0):
-            found = [float(c.real) + 1j * float(c.imag) for c in (a[0] for a in slab_coefficients(pane, np.array([cosine]), LAMBDA))]
+            found = [
+                float(c.real) + 1j * float(c.imag)
+                for c in (a[0] for a in slab_coefficients(pane, np.array([cosine]), LAMBDA))
+            ]
             assert np.abs(np.array(found) - echoes(pane, cosine)).max() < ROUNDING
             assert np.abs(found).max() > 0.1
 
@@ -54,30 +61,46 @@ def facets(normals, offsets, materials) -> City:
         a /= np.linalg.norm(a)
         corners.append(d * n + 100 * np.array([a, np.cross(n, a), -a - np.cross(n, a)]))
     faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-    return City("facets", np.concatenate(corners), faces, np.arange(len(corners), dtype=np.int16), tuple(materials), np.zeros(3))
+    return City(
+        "facets",
+        np.concatenate(corners),
+        faces,
+        np.arange(len(corners), dtype=np.int16),
+        tuple(materials),
+        np.zeros(3),
+    )
 
 
 def still(*position: float) -> Pose:
     return Pose(np.array(position), np.zeros(3), np.zeros(3), np.eye(3))
 
 
-def amplitude(normals, offsets, materials, start: Pose, end: Pose) -> tuple[complex, np.ndarray, float]:
+def amplitude(
+    normals, offsets, materials, start: Pose, end: Pose
+) -> tuple[complex, np.ndarray, float]:
     """Amplitude of the chain over the planes in turn, its corners, and its length."""
     n, d = np.array(normals, float)[None], np.array(offsets, float)[None]
     legs = unfold(n, d, start, end)
     city = facets(normals, offsets, materials)
     value = mirror_amplitude(city, n, np.arange(len(materials))[None], legs, LAMBDA)[0]
-    return complex(value), np.vstack([start.position, legs.points[0], end.position]), float(legs.length[0])
+    return (
+        complex(value),
+        np.vstack([start.position, legs.points[0], end.position]),
+        float(legs.length[0]),
+    )
 
 
 def theta(direction: np.ndarray) -> np.ndarray:
     """Derivative of the unit vector by the angle from the zenith."""
     zenith, azimuth = np.arccos(direction[2]), np.arctan2(direction[1], direction[0])
-    return np.array([np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)])
+    return np.array(
+        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)]
+    )
 
 
 def test_the_vertical_field():
-    """Against the derivative by the angle from the zenith. Planted bugs: up for down; azimuth mirrored."""
+    """Against the derivative by the angle from the zenith. Planted bugs: up for down; azimuth
+    mirrored."""
     rng = np.random.default_rng(4)
     directions = rng.standard_normal((20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -87,15 +110,23 @@ def test_the_vertical_field():
 
 
 def test_conductors_turn_the_field_about_their_normals():
-    """Over a conductor the reflected field is 2 (n.E) n - E whatever the polarisation: chains of one to three walls in any attitude, and
-    back along the normal. Planted bugs: the incident field's frame for the reflected wave; TM with the other sign; length left out."""
+    """Over a conductor the reflected field is 2 (n.E) n - E whatever the polarisation: chains of
+    one to three walls in any attitude, and back along the normal. Planted bugs: the incident
+    field's frame for the reflected wave; TM with the other sign; length left out."""
     rng, walls = np.random.default_rng(7), []
     for _ in range(3):
         n = rng.standard_normal(3)
         walls.append(n / np.linalg.norm(n))
     a, b = still(1.3, -7.1, 4.7), still(-2.9, 5.3, 8.1)
     cases = [(walls[:k], [-21.3, 34.1, -57.7][:k], a, b) for k in (1, 2, 3)]
-    cases.append(([np.array([0.6, 0.64, 0.48])], [31.7], a, still(*(a.position + 1.9 * np.array([0.6, 0.64, 0.48])))))
+    cases.append(
+        (
+            [np.array([0.6, 0.64, 0.48])],
+            [31.7],
+            a,
+            still(*(a.position + 1.9 * np.array([0.6, 0.64, 0.48]))),
+        )
+    )
     for normals, offsets, start, end in cases:
         value, corners, length = amplitude(normals, offsets, [METAL] * len(normals), start, end)
         segments = np.diff(corners, axis=0)
@@ -105,15 +136,22 @@ def test_conductors_turn_the_field_about_their_normals():
             field = 2 * (n @ field) * n - field
         truth = field @ theta(-ways[-1]) * LAMBDA / (4 * np.pi * length)
         assert abs(truth) * 4 * np.pi * length / LAMBDA > 0.05
-        assert abs(value - truth) < 1e-4 * LAMBDA / (4 * np.pi * length)  # surface impedance of the conductor: 2e-6 over the cosine
+        assert abs(value - truth) < 1e-4 * LAMBDA / (
+            4 * np.pi * length
+        )  # surface impedance of the conductor: 2e-6 over the cosine
 
 
 def test_panes_reflect_each_polarisation_with_its_own_coefficient():
-    """TM off the ground, TE off a wall at the terminals' height, and at a slant the projections on both, s = k x n / |k x n|. Planted bugs:
-    TE and TM exchanged; the angle to the surface for that to the normal."""
+    """TM off the ground, TE off a wall at the terminals' height, and at a slant the projections on
+    both, s = k x n / |k x n|. Planted bugs: TE and TM exchanged; the angle to the surface for that
+    to the normal."""
     a, b = still(0.7, -6.1, 5.3), still(2.9, 8.7, 5.3)
     other = still(2.9, 8.7, 9.9)
-    for normal, offset, end in (((0, 0, 1.0), -1.7, b), ((1.0, 0, 0), -4.1, b), ((0.8, 0, 0.6), -3.3, other)):
+    for normal, offset, end in (
+        ((0, 0, 1.0), -1.7, b),
+        ((1.0, 0, 0), -4.1, b),
+        ((0.8, 0, 0.6), -3.3, other),
+    ):
         n = np.array(normal)
         value, corners, length = amplitude([n], [offset], [PANE], a, end)
         ways = np.diff(corners, axis=0)
@@ -121,7 +159,8 @@ def test_panes_reflect_each_polarisation_with_its_own_coefficient():
         te, tm = echoes(PANE, abs(into @ n))
         s = np.cross(into, n) / np.linalg.norm(np.cross(into, n))
         field = theta(into)
-        # the magnetic field k x E of the TM part lies along s and is multiplied by the coefficient; then E = -(k x H)
+        # the magnetic field k x E of the TM part lies along s and is multiplied by the coefficient;
+        # then E = -(k x H)
         reflected = te * (field @ s) * s - tm * (np.cross(into, field) @ s) * np.cross(out, s)
         truth = reflected @ theta(-out) * LAMBDA / (4 * np.pi * length)
         assert abs(value - truth) < ROUNDING * LAMBDA / (4 * np.pi * length)

@@ -1,4 +1,5 @@
-"""Noise: known answers of the generator, distribution, independence. False-failure rates are stated; seeds are fixed."""
+"""Noise: known answers of the generator, distribution, independence. False-failure rates are
+stated; seeds are fixed."""
 
 from __future__ import annotations
 
@@ -24,28 +25,39 @@ def draw(*purpose, count=COUNT, power=1.0):
 
 
 def test_known_answers_of_threefry():
-    """Published with the Random123 library for Threefry-2x32, 20 rounds. Planted bug: rotation 16 for 15."""
+    """Published with the Random123 library for Threefry-2x32, 20 rounds. Planted bug: rotation 16
+    for 15."""
     ones = 0xFFFFFFFF
     counters = np.array([[0, 0], [ones, ones], [0x243F6A88, 0x85A308D3]], np.uint32)
     keys = np.array([[0, 0], [ones, ones], [0x13198A2E, 0x03707344]], np.uint32)
     answers = [[0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]]
-    np.testing.assert_array_equal(_words(counters, keys), np.array(answers, np.uint32))  # published, exact
+    np.testing.assert_array_equal(
+        _words(counters, keys), np.array(answers, np.uint32)
+    )  # published, exact
 
 
 def test_each_sample_is_box_and_mullers():
-    """sqrt(-P ln u) exp(j 2 pi v) in float64 from the words themselves, many of them: the polynomials are good to float32.
-    Planted bugs: the sign of the last term of the cosine, 7e-6; the logarithm's third term without its half."""
+    """sqrt(-P ln u) exp(j 2 pi v) in float64 from the words themselves, many of them: the
+    polynomials are good to float32. Planted bugs: the sign of the last term of the cosine, 7e-6;
+    the logarithm's third term without its half."""
     key, power, count = np.array([0x13198A2E, 0x03707344], np.uint32), 1.0, 300_000
     z = np.zeros(count, np.complex64)
     add_white_noise(z, power, key)
     counters = np.stack([np.arange(count, dtype=np.uint32), np.zeros(count, np.uint32)], axis=1)
     words = _words(counters, np.tile(key, (count, 1))).astype(float)
-    square, turn = -power * np.log((words[:, 0] + 0.5) / 2**32), np.exp(2j * np.pi * words[:, 1] / 2**32)
+    square, turn = (
+        -power * np.log((words[:, 0] + 0.5) / 2**32),
+        np.exp(2j * np.pi * words[:, 1] / 2**32),
+    )
     off = np.abs(np.abs(z.astype(complex)) ** 2 - square)
-    assert off[square < np.log(2) / 2].max() < 2.4e-7  # four half ulps of 1; the series' last terms are 1e-7 and 3e-7 at the end
+    assert (
+        off[square < np.log(2) / 2].max() < 2.4e-7
+    )  # four half ulps of 1; the series' last terms are 1e-7 and 3e-7 at the end
     assert (off < 5e-7 * np.maximum(square, 1)).all()
     some = square > 0.1
-    assert np.abs(z[some] / np.abs(z[some].astype(complex)) - turn[some]).max() < 3e-7  # the last terms are 3e-7 and 4e-6
+    assert (
+        np.abs(z[some] / np.abs(z[some].astype(complex)) - turn[some]).max() < 3e-7
+    )  # the last terms are 3e-7 and 4e-6
 
 
 def test_moments():
@@ -53,13 +65,20 @@ def test_moments():
     power = 3.7e-11
     z = draw("moments", power=power) / np.sqrt(power / 2)
     for part in (z.real.astype(float), z.imag.astype(float)):
-        for order, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10170)):
+        for order, moment, variance in (
+            (1, 0, 1),
+            (2, 1, 2),
+            (3, 0, 15),
+            (4, 3, 96),
+            (6, 15, 10170),
+        ):
             assert abs((part**order).mean() - moment) < SIGMAS * np.sqrt(variance / COUNT)
     assert abs((z.real * z.imag).mean()) < SIGMAS / np.sqrt(COUNT)
 
 
 def test_distribution_and_tails():
-    """Kolmogorov-Smirnov at 1e-6; counts beyond 3, 4, 4.5 and 5 sigma by the Poisson law at 1e-6 each."""
+    """Kolmogorov-Smirnov at 1e-6; counts beyond 3, 4, 4.5 and 5 sigma by the Poisson law at 1e-6
+    each."""
     z = draw("tails", count=8 * COUNT, power=2.0)
     parts = np.concatenate([z.real, z.imag])
     assert stats.kstest(z.real[:COUNT].astype(float), "norm").pvalue > 1e-6
@@ -130,7 +149,9 @@ def test_counters_beyond_32_bits():
 def test_noise_is_added_to_the_samples_of_a_cube():
     w = Waveform(num_samples=64, num_chirps=6)
     samples = np.full((3, 2, 6, 64), 2 - 1j, np.complex64)
-    cube = IFCube(samples=samples, waveform=w, schedule=conventional_schedule(3, 6, 3), start_time=0.0)
+    cube = IFCube(
+        samples=samples, waveform=w, schedule=conventional_schedule(3, 6, 3), start_time=0.0
+    )
     words = seed_sequence(3, "noise", "PT2", 0).generate_state(2)
     noise = np.zeros(samples.size, np.complex64)
     add_white_noise(noise, 0.04, words)

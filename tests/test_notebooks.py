@@ -39,5 +39,8 @@ def test_a_notebook_runs_in_a_kernel(source):
     """The same in Jupyter's own kernel."""
     jupytext, nbclient = pytest.importorskip("jupytext"), pytest.importorskip("nbclient")
     nbclient.NotebookClient(
-        jupytext.read(source), timeout=600, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}
+        jupytext.read(source),
+        timeout=600,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(FOLDER)}},
     ).execute()

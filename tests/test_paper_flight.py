@@ -22,8 +22,8 @@ def rms(dataset, observer: str, uav: str, quantity: str, group: str = "tracked")
 
 @pytest.mark.slow
 def test_the_papers_flight():
-    """The bounds of the prototype that started from the truth, met by terminals that acquire; PT2's reflected path is 20 dB
-    under the reference."""
+    """The bounds of the prototype that started from the truth, met by terminals that acquire; PT2's
+    reflected path is 20 dB under the reference."""
     r = simulate.run(load(SCENES / "paper_swarm_consistent.yaml"))
     d = r.dataset
     assert r.summary["terminals"]["PT1"]["ser_delay"] == 0
@@ -34,11 +34,18 @@ def test_the_papers_flight():
     assert rms(d, "AT", "PT1", "range") <= 0.03
     assert rms(d, "AT", "PT1", "velocity") <= 0.06
     assert np.rad2deg(rms(d, "AT", "PT1", "azimuth")) <= 0.03
-    seen = np.flatnonzero(d.in_view.sel(observer="AT", uav="PT2").values & d.processed.sel(observer="AT").values)
+    seen = np.flatnonzero(
+        d.in_view.sel(observer="AT", uav="PT2").values & d.processed.sel(observer="AT").values
+    )
     assert seen.min() == 140  # in view from frame 132 on, and the AT processes every 20th
     both = np.flatnonzero(d.in_view.sel(observer="PT1", uav="PT2").values)
-    assert (both.min(), both.max()) == (132, 232)  # published: 133 to 233, counted at the start of a frame; here at its middle
+    assert (both.min(), both.max()) == (
+        132,
+        232,
+    )  # published: 133 to 233, counted at the start of a frame; here at its middle
     pt2 = d.sel(observer="PT2")
-    assert np.flatnonzero(pt2.decoded.values).min() == 151  # the first data frame after the first pilot with the AT in view, 150
+    assert (
+        np.flatnonzero(pt2.decoded.values).min() == 151
+    )  # the first data frame after the first pilot with the AT in view, 150
     wrong = pt2.symbol_errors.values[151:, :2].sum()
     assert wrong == 0

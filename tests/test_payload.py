@@ -43,18 +43,29 @@ def test_bits_survive(order, num_tx, cycles, samples, seed, data):
     data=st.data(),
 )
 def test_bits_and_rate_are_exact(order, num_tx, cycles, half, ratio, rate, data):
-    """N_bit and the slot for any L_tx, M <= L_tx, P, N, D and T: bits counted symbol by symbol in integers, the slot in units of T as
-    1 + (2 + 2 L_tx) f_s/(B - 2 f_s), from T~ = T + 2 T_d, T_GI = 2 L_tx T_d and T_d = f_s T~/B.
+    """N_bit and the slot for any L_tx, M <= L_tx, P, N, D and T: bits counted symbol by symbol in
+    integers, the slot in units of T as 1 + (2 + 2 L_tx) f_s/(B - 2 f_s), from T~ = T + 2 T_d, T_GI
+    = 2 L_tx T_d and T_d = f_s T~/B.
 
     Planted bug: floor(log2(N)) in place of floor(log2(N/2))."""
     groups = data.draw(st.integers(1, num_tx))
     w = Waveform(
-        sampling_rate=rate, bandwidth=ratio * rate, num_samples=2 * half, num_chirps=cycles * num_tx, num_groups=groups, num_tx=num_tx
+        sampling_rate=rate,
+        bandwidth=ratio * rate,
+        num_samples=2 * half,
+        num_chirps=cycles * num_tx,
+        num_groups=groups,
+        num_tx=num_tx,
     )
     per_delay, per_phase = 0, {2: 1, 4: 2, 8: 3, 16: 4}[order]
     while 2 ** (per_delay + 1) <= half:
         per_delay += 1
-    count = sum(per_delay + (per_phase if cycle else 0) for _ in range(groups) for cycle in range(cycles) for _ in range(num_tx))
+    count = sum(
+        per_delay + (per_phase if cycle else 0)
+        for _ in range(groups)
+        for cycle in range(cycles)
+        for _ in range(num_tx)
+    )
     assert w.bits_per_frame(order) == count
     rng = np.random.default_rng(half)
     p = random_payload(w, pseudo_random_schedule(groups, w.num_chirps, num_tx, rng), order, rng)
@@ -74,19 +85,28 @@ def test_bits_and_rate_are_exact(order, num_tx, cycles, half, ratio, rate, data)
     seed=st.integers(0, 999),
 )
 def test_every_single_bit_reaches_its_symbol(order, samples, groups, seed):
-    """Turning one bit changes one symbol and, through the running product, no phase before it. Planted bug: the groups' bits in the
-    order of time."""
-    w, rng = Waveform(num_samples=samples, num_chirps=12, num_groups=groups), np.random.default_rng(seed)
+    """Turning one bit changes one symbol and, through the running product, no phase before it.
+    Planted bug: the groups' bits in the order of time."""
+    w, rng = (
+        Waveform(num_samples=samples, num_chirps=12, num_groups=groups),
+        np.random.default_rng(seed),
+    )
     schedule = pseudo_random_schedule(groups, 12, 3, rng)
     one = random_payload(w, schedule, order, rng)
     bits = one.bits.copy()
     k = int(rng.integers(bits.size))
     bits[k] ^= 1
     other = modulate(bits, w, schedule, order)
-    changed = [(one.delay_symbols != other.delay_symbols).sum(), (one.transitions != other.transitions).sum()]
+    changed = [
+        (one.delay_symbols != other.delay_symbols).sum(),
+        (one.transitions != other.transitions).sum(),
+    ]
     assert changed == ([1, 0] if k < one.num_delay_bits else [0, 1])
-    group = (k // (12 * w.bits_per_delay_symbol) if k < one.num_delay_bits
-             else (k - one.num_delay_bits) // (9 * (order.bit_length() - 1)))  # fmt: skip
+    group = (
+        k // (12 * w.bits_per_delay_symbol)
+        if k < one.num_delay_bits
+        else (k - one.num_delay_bits) // (9 * (order.bit_length() - 1))
+    )
     kept = [m for m in range(groups) if m != group]
     assert (one.bits_of([group]) != other.bits_of([group])).sum() == 1
     assert not kept or (one.bits_of(kept) == other.bits_of(kept)).all()
@@ -94,7 +114,8 @@ def test_every_single_bit_reaches_its_symbol(order, samples, groups, seed):
 
 
 def test_phases_are_the_running_product():
-    """beta starts at 1 for every antenna and its steps are the transitions; planted bug: cumsum without the leading 0."""
+    """beta starts at 1 for every antenna and its steps are the transitions; planted bug: cumsum
+    without the leading 0."""
     w, rng = Waveform(num_chirps=24), np.random.default_rng(3)
     schedule = pseudo_random_schedule(3, 24, 3, rng)
     p = random_payload(w, schedule, 8, rng)

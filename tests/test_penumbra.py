@@ -1,4 +1,5 @@
-"""Clutter across shadow edges: the knife edge's factor along a flight, against Fresnel's integral over the true detour."""
+"""Clutter across shadow edges: the knife edge's factor along a flight, against Fresnel's integral
+over the true detour."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ SCREEN = ((-80.0, 31.0, -90.0), (160.0, 0, 0), (0, 0, 90.0))
 
 
 def exact(place: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) nu and modulus of Fresnel's integral over the upper edge of the screen, from one place to points (K, 3); nu from the detour."""
+    """(K,) nu and modulus of Fresnel's integral over the upper edge of the screen, from one place
+    to points (K, 3); nu from the detour."""
     d = np.linalg.norm(point - place, axis=1)
     a, b = place[[1, 2]] - [31.0, 0.0], point[:, [1, 2]] - [31.0, 0.0]
     pa, pb = np.linalg.norm(a), np.linalg.norm(b, axis=1)
@@ -33,15 +35,21 @@ def exact(place: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def test_sight_over_an_edge_is_fresnels_integral():
-    """A terminal climbs behind a screen and sees a wall 31 + 47 m off rise over its edge: the sight of each small scatterer, lit, dark
-    and in between, is |F(nu)| of the true detour, within 0.02 where |nu| < 2 (the tables' taper begins there) and 0.09 outside (the
-    tapered tail and ripple). Planted bugs: the terminal's and the scatterer's distances exchanged; lit and dark exchanged."""
+    """A terminal climbs behind a screen and sees a wall 31 + 47 m off rise over its edge: the sight
+    of each small scatterer, lit, dark and in between, is |F(nu)| of the true detour, within 0.02
+    where |nu| < 2 (the tables' taper begins there) and 0.09 outside (the tapered tail and ripple).
+    Planted bugs: the terminal's and the scatterer's distances exchanged; lit and dark exchanged."""
     wall = rectangle((-2.0, 78.0, -1.9), (4.0, 0, 0), (0, 0, 3.9), METAL)
     quiet = rectangle(*SCREEN, slab(scattering_coefficient=0.0))
     model, swarm = flown(
-        joined(wall, quiet), (0.4, 0.0, -0.3), (0.0, 5.0, 60.0), speed_a=(0.3, 0.1, 2.6), frames=110,
-        cell_area_per_metre_m=1e-9, smallest_cell_m2=2e-3,
-    )  # fmt: skip
+        joined(wall, quiet),
+        (0.4, 0.0, -0.3),
+        (0.0, 5.0, 60.0),
+        speed_a=(0.3, 0.1, 2.6),
+        frames=110,
+        cell_area_per_metre_m=1e-9,
+        smallest_cell_m2=2e-3,
+    )
     flight, cells = swarm.trajectories["A"], model.field.cells
     assert len(cells) > 4000
     near, far, between = [], [], 0
@@ -65,8 +73,8 @@ def test_sight_over_an_edge_is_fresnels_integral():
 
 
 def test_sight_does_not_know_the_frames_before():
-    """A frame alone, in another order, and at the ends of the run, is the same to the bit. Planted bug: crossings of the knots behind
-    forgotten and not found again."""
+    """A frame alone, in another order, and at the ends of the run, is the same to the bit. Planted
+    bug: crossings of the knots behind forgotten and not found again."""
     wall = rectangle((-9.0, 78.0, -9.9), (18.0, 0, 0), (0, 0, 19.9), METAL)
     scene = joined(wall, rectangle(*SCREEN, METAL))
     flight = dict(a=(0.4, 0.0, -4.3), p=(0.0, 5.0, 60.0), speed_a=(0.3, 0.1, 9.6), frames=128)
@@ -75,19 +83,25 @@ def test_sight_does_not_know_the_frames_before():
     times = [0.0, 0.11, 0.48, 0.52, 0.9, 0.993]
     poses = [swarm.trajectories["A"].pose(t) for t in times]
     first = [one.field.sight.share("A", p, t) for p, t in zip(poses, times, strict=True)]
-    second = [two.field.sight.share("A", p, t) for p, t in zip(poses[::-1], times[::-1], strict=True)][::-1]
+    second = [
+        two.field.sight.share("A", p, t) for p, t in zip(poses[::-1], times[::-1], strict=True)
+    ][::-1]
     for a, b in zip(first, second, strict=True):
         assert np.array_equal(a, b)
     middle = first[2]
     assert ((middle > 0.05) & (middle < 0.95)).sum() > 50
     beside = replace(poses[2], position=poses[2].position + np.array([0.0, 0.0, 0.3]))
-    assert set(np.unique(one.field.sight.share("A", beside, times[2]))) == {0.0, 1.0}  # off the flight rays alone decide
+    assert set(np.unique(one.field.sight.share("A", beside, times[2]))) == {
+        0.0,
+        1.0,
+    }  # off the flight rays alone decide
 
 
 def powers(model, flight, city, times, lift: float = 0.02):
-    """Power per 4 m of range (one set after the other) of a terminal's own link by four kinds of sight: the exact knife edge at the
-    pose (by the edge of the shortest detour), rays alone, the field's, and a blend of rays over two metres; and the squares
-    of the last three's errors of amplitude in the penumbra."""
+    """Power per 4 m of range (one set after the other) of a terminal's own link by four kinds of
+    sight: the exact knife edge at the pose (by the edge of the shortest detour), rays alone, the
+    field's, and a blend of rays over two metres; and the squares of the last three's errors of
+    amplitude in the penumbra."""
     field, sight = model.field, model.field.sight
     edges, out, apart = ShadowEdges(city, sight.shadows, LAMBDA), [], []
     for time in times:
@@ -120,11 +134,14 @@ def powers(model, flight, city, times, lift: float = 0.02):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["crossing", "munich"])
 def test_power_of_range_cells_with_the_exact_knife_edge(name):
-    """What sight's approximations do to the power per 4 m of range that holds a thousandth of the whole, against the exact knife edge at
-    the pose, among the same scatterers (those that are seen from somewhere), and to amplitudes in the penumbra: printed. The field's 90th
-    percentile is at most 0.1 dB, and its amplitudes are nearer than the others'."""
+    """What sight's approximations do to the power per 4 m of range that holds a thousandth of the
+    whole, against the exact knife edge at the pose, among the same scatterers (those that are seen
+    from somewhere), and to amplitudes in the penumbra: printed. The field's 90th percentile is at
+    most 0.1 dB, and its amplitudes are nearer than the others'."""
     if name == "crossing":
-        model, swarm = flown_round(ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05)
+        model, swarm = flown_round(
+            ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05
+        )
         city, times = crossing(), np.linspace(0.6, 4.4, 7)
     else:
         city, model, swarm = street_of("munich", 0.2)
@@ -132,12 +149,19 @@ def test_power_of_range_cells_with_the_exact_knife_edge(name):
     (truth, *others), apart = powers(model, swarm.trajectories["A"], city, times)
     filled = truth > 1e-3 * truth.sum() / len(times)
     found, amplitude = {}, {}
-    for kind, power, square in zip(("rays alone", "field", "blend over 2 m"), others, apart, strict=True):
+    for kind, power, square in zip(
+        ("rays alone", "field", "blend over 2 m"), others, apart, strict=True
+    ):
         off = 10 * np.log10(power[filled] / truth[filled])
         found[kind] = np.quantile(np.abs(off), 0.9)
-        print(f"{name}, {kind}: {filled.sum()} cells, median {np.median(off):.3f}, 90th percentile {found[kind]:.3f}, "
-              f"worst {np.abs(off).max():.2f}, total {10 * np.log10(power.sum() / truth.sum()):.3f} dB; "
-              f"amplitude of {square.size} sights whose exact factor is 0.1 to 0.9: {np.sqrt(square.mean()):.3f} rms")  # fmt: skip
+        print(
+            f"{name}, {kind}: {filled.sum()} cells, median {np.median(off):.3f}, 90th percentile "
+            f"{found[kind]:.3f}, "
+            f"worst {np.abs(off).max():.2f}, total {10 * np.log10(power.sum() / truth.sum()):.3f} "
+            "dB; "
+            f"amplitude of {square.size} sights whose exact factor is 0.1 to 0.9: "
+            f"{np.sqrt(square.mean()):.3f} rms"
+        )
         amplitude[kind] = square.mean()
     assert found["field"] < 0.1
     assert amplitude["field"] < min(amplitude["rays alone"], amplitude["blend over 2 m"])

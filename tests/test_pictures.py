@@ -29,8 +29,9 @@ def results() -> Results:
 
 
 def test_tracks_lie_where_the_uavs_are(results):
-    """The active terminal's track of P and P's reference, placed in the world, within 0.2 m of the truth (0.4 mrad of the cosines at
-    20 m, a tenth of a range cell). Planted bug: the attitude not applied."""
+    """The active terminal's track of P and P's reference, placed in the world, within 0.2 m of the
+    truth (0.4 mrad of the cosines at 20 m, a tenth of a range cell). Planted bug: the attitude not
+    applied."""
     d = results.dataset
     for observer, other in ((0, 1), (1, 0)):
         found = tracked_positions(d, 3, observer)
@@ -61,14 +62,20 @@ def test_what_cannot_move_is_refused(results, tmp_path, capsys):
 
 
 def test_a_scene_to_turn_about_is_one_page():
-    """Every kind of path and every UAV is a trace; corners of a path lie on its points; the page asks for nothing from a network."""
+    """Every kind of path and every UAV is a trace; corners of a path lie on its points; the page
+    asks for nothing from a network."""
     pytest.importorskip("plotly")
     from isac_rt.views.interactive import scene_3d
 
-    scenario = load(ROOT / "scenes" / "access_swarm.yaml", ["access.establish=false", "access.synchronisation=external"])
+    scenario = load(
+        ROOT / "scenes" / "access_swarm.yaml",
+        ["access.establish=false", "access.synchronisation=external"],
+    )
     setup = prepare(scenario)
     paths = trace(scenario, 0, setup=setup)
-    figure = scene_3d(setup.city, setup.swarm, np.linspace(0, 1, 5), setup.timetable.epoch(0), paths)
+    figure = scene_3d(
+        setup.city, setup.swarm, np.linspace(0, 1, 5), setup.timetable.epoch(0), paths
+    )
     names = [trace.name for trace in figure.data]
     for kind in ("line_of_sight", "target"):
         count = sum(p.counts()[kind] for p in paths.values())
@@ -79,13 +86,16 @@ def test_a_scene_to_turn_about_is_one_page():
     poses = setup.swarm.poses(setup.timetable.epoch(0))
     corners = np.column_stack([sight.x, sight.y, sight.z])[:2]
     ends = {name: pose.position for name, pose in poses.items()}
-    assert any(np.allclose(corners, [ends[a], ends[b]], atol=1e-9) for a in ends for b in ends if a != b)
+    assert any(
+        np.allclose(corners, [ends[a], ends[b]], atol=1e-9) for a in ends for b in ends if a != b
+    )
     page = figure.to_html(include_plotlyjs=True)
     assert "<script src=" not in page
 
 
 def test_new_writes_a_scenario_that_is_right(tmp_path, capsys):
-    """It loads, names the schema beside it, has every marker filled in, and does not replace what is there."""
+    """It loads, names the schema beside it, has every marker filled in, and does not replace what
+    is there."""
     file = tmp_path / "mine.yaml"
     assert main(["new", str(file)]) == 0
     scenario = load(file)
@@ -101,7 +111,10 @@ def test_new_writes_a_scenario_that_is_right(tmp_path, capsys):
 def test_new_over_ones_own_buildings(tmp_path):
     """The swarm starts ten metres over the highest roof of the file's buildings."""
     file = tmp_path / "quarter.yaml"
-    assert main(["new", str(file), "--footprints", str(ROOT / "scenes" / "data" / "quarter.geojson")]) == 0
+    assert (
+        main(["new", str(file), "--footprints", str(ROOT / "scenes" / "data" / "quarter.geojson")])
+        == 0
+    )
     scenario = load(file)
     city = city_of(scenario)
     top = (city.corners + city.origin)[..., 2].max()
@@ -110,9 +123,13 @@ def test_new_over_ones_own_buildings(tmp_path):
 
 
 def test_every_scene_names_the_schema_and_the_schema_is_today_s():
-    assert (ROOT / "scenes" / "scenario.schema.json").read_text() == schema_text(), "isac-rt schema > scenes/scenario.schema.json"
+    assert (ROOT / "scenes" / "scenario.schema.json").read_text() == schema_text(), (
+        "isac-rt schema > scenes/scenario.schema.json"
+    )
     for file in (ROOT / "scenes").glob("*.yaml"):
-        assert file.read_text().startswith("# yaml-language-server: $schema=scenario.schema.json\n"), file.name
+        assert file.read_text().startswith(
+            "# yaml-language-server: $schema=scenario.schema.json\n"
+        ), file.name
 
 
 def test_objects_print_themselves_in_short(results):
@@ -122,5 +139,14 @@ def test_objects_print_themselves_in_short(results):
     assert "hit rate" in repr(results)
     assert repr(setup.city) == "<City free space: 0 faces, 0 x 0 x 0 m, 0 materials>"
     w = Waveform(num_samples=16, num_chirps=6)
-    cube = IFCube(samples=np.full((3, 2, 6, 16), 3 + 4j, np.complex64), waveform=w, schedule=np.zeros((3, 6), int), start_time=0.5)
-    assert repr(cube) == "<IFCube 3 groups x 2 antennas x 6 chirps x 16 samples at 0.5000 s, RMS 5.00e+00 sqrt(W)>"
+    cube = IFCube(
+        samples=np.full((3, 2, 6, 16), 3 + 4j, np.complex64),
+        waveform=w,
+        schedule=np.zeros((3, 6), int),
+        start_time=0.5,
+    )
+    assert (
+        repr(cube)
+        == "<IFCube 3 groups x 2 antennas x 6 chirps x 16 samples at 0.5000 s, RMS 5.00e+00 "
+        "sqrt(W)>"
+    )

@@ -7,7 +7,13 @@ import pytest
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.legs.geometry import (
+    edges_in_any_order,
+    one_of_each_chain,
+    plane_of_each_face,
+    straight,
+    unfold,
+)
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario.swarm import Rcs, Uav
@@ -20,12 +26,16 @@ ROUNDING = 1e-13  # some tens of operations in float64, relative to metres over 
 
 
 def near(value, rel: float):
-    """Equal to a relative error alone: pytest's default adds 1e-12, which is more than most gains."""
+    """Equal to a relative error alone: pytest's default adds 1e-12, which is more than most
+    gains."""
     return pytest.approx(value, rel=rel, abs=0)
 
 
 def pose(position, velocity=(0, 0, 0), acceleration=(0, 0, 0), boresight=(0.3, 1.0, 0.1)) -> Pose:
-    return Pose(*(np.array(v, float) for v in (position, velocity, acceleration)), attitude(np.array(boresight, float)))
+    return Pose(
+        *(np.array(v, float) for v in (position, velocity, acceleration)),
+        attitude(np.array(boresight, float)),
+    )
 
 
 TX = pose((1.37, -2.21, 11.3), (4.3, -7.1, 1.9), (0.7, 1.1, -2.3))
@@ -34,7 +44,11 @@ BODY = pose((9.7, 31.1, 14.9), (3.7, 8.3, -2.2), (2.1, -0.6, 1.7), (0.2, -1.0, 0
 
 
 def at(p: Pose, t: float, dtype=float) -> np.ndarray:
-    return p.position.astype(dtype) + p.velocity.astype(dtype) * t + p.acceleration.astype(dtype) * t * t / 2
+    return (
+        p.position.astype(dtype)
+        + p.velocity.astype(dtype) * t
+        + p.acceleration.astype(dtype) * t * t / 2
+    )
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -43,13 +57,17 @@ def rotation(seed: int) -> np.ndarray:
 
 
 def moved(p: Pose, turn: np.ndarray, shift: np.ndarray) -> Pose:
-    return Pose(turn @ p.position + shift, turn @ p.velocity, turn @ p.acceleration, turn @ p.rotation)
+    return Pose(
+        turn @ p.position + shift, turn @ p.velocity, turn @ p.acceleration, turn @ p.rotation
+    )
 
 
 def mirrors(*planes) -> tuple[np.ndarray, np.ndarray]:
     """One chain of planes given as (normal, point), as `unfold` wants it."""
     normals = np.array([np.array(n, float) / np.linalg.norm(n) for n, _ in planes])
-    return normals[None], np.array([[n @ np.array(p, float) for n, (_, p) in zip(normals, planes, strict=True)]])
+    return normals[None], np.array(
+        [[n @ np.array(p, float) for n, (_, p) in zip(normals, planes, strict=True)]]
+    )
 
 
 FRONT, SIDE, FLOOR = (
@@ -62,18 +80,22 @@ CHAINS = {0: (), 1: (FRONT,), 2: (FRONT, SIDE), 3: (FRONT, FLOOR, SIDE)}
 
 
 def chain_length(planes, start: np.ndarray, end: np.ndarray) -> np.longdouble:
-    """Length over mirrors by Householder matrices in long double, without any of the package's code."""
+    """Length over mirrors by Householder matrices in long double, without any of the package's
+    code."""
     image = start
     for normal, point in planes:
         n = np.array(normal, np.longdouble)
         n = n / np.sqrt((n * n).sum())
         householder = np.eye(3, dtype=np.longdouble) - 2 * np.outer(n, n)
-        image = householder @ (image - np.array(point, np.longdouble)) + np.array(point, np.longdouble)
+        image = householder @ (image - np.array(point, np.longdouble)) + np.array(
+            point, np.longdouble
+        )
     return np.sqrt(((end - image) ** 2).sum())
 
 
 def derivatives(length) -> tuple[float, float]:
-    """First and second derivative of length(t) at 0 by central differences of fourth order in long double."""
+    """First and second derivative of length(t) at 0 by central differences of fourth order in long
+    double."""
     h = np.longdouble("1e-3")
     f = {k: length(k * h) for k in (-2, -1, 0, 1, 2)}
     first = (8 * (f[1] - f[-1]) - (f[2] - f[-2])) / (12 * h)
@@ -81,14 +103,15 @@ def derivatives(length) -> tuple[float, float]:
     return float(first), float(second)
 
 
-# discretisation: h^4/30 of the fifth derivative (v^4/L^3 ~ 1 m/s^5 and less), long double rounding 1e-18*50/h^2 = 5e-11
+# discretisation: h^4/30 of the fifth derivative (v^4/L^3 ~ 1 m/s^5 and less), long double rounding
+# 1e-18*50/h^2 = 5e-11
 DIFFERENCE = 1e-9
 
 
 @pytest.mark.parametrize("bounces", [0, 1, 2, 3])
 def test_unfolded_chain_against_long_double(bounces):
-    """Length, rate and acceleration with both ends in curved flight. Seen failing with the image's velocity not reflected, and
-    with the ends' accelerations left out."""
+    """Length, rate and acceleration with both ends in curved flight. Seen failing with the image's
+    velocity not reflected, and with the ends' accelerations left out."""
     planes = CHAINS[bounces]
     normals, offsets = mirrors(*planes) if planes else (np.zeros((1, 0, 3)), np.zeros((1, 0)))
     legs = unfold(normals, offsets, TX, RX)
@@ -101,12 +124,15 @@ def test_unfolded_chain_against_long_double(bounces):
     assert legs.rate[0] == pytest.approx(rate, abs=DIFFERENCE)
     assert legs.accel[0] == pytest.approx(accel, abs=DIFFERENCE)
     # a second way to the rate: only the ends move, so it is -(departure.v_tx + arrival.v_rx)
-    assert legs.rate[0] == near(-float(legs.departure[0] @ TX.velocity + legs.arrival[0] @ RX.velocity), 1e-12)
+    assert legs.rate[0] == near(
+        -float(legs.departure[0] @ TX.velocity + legs.arrival[0] @ RX.velocity), 1e-12
+    )
 
 
 @pytest.mark.parametrize("bounces", [1, 2, 3])
 def test_points_are_mirror_points(bounces):
-    """On their planes, equal angles, and the polyline has the unfolded length. Seen failing with the points in reverse order."""
+    """On their planes, equal angles, and the polyline has the unfolded length. Seen failing with
+    the points in reverse order."""
     normals, offsets = mirrors(*CHAINS[bounces])
     legs = unfold(normals, offsets, TX, RX)
     points = legs.points[0]
@@ -130,20 +156,28 @@ def test_image_under_the_ground():
 
 @pytest.mark.parametrize("walls", [2, 3])
 def test_a_corner_of_right_angles_returns_a_wave_to_its_source(walls):
-    """Two walls: twice the distance to the edge; three: to the corner; the wave goes back the way it came in every axis."""
+    """Two walls: twice the distance to the edge; three: to the corner; the wave goes back the way
+    it came in every axis."""
     turn, corner = rotation(5), np.array([14.1, -6.3, 2.2])
     normals = turn.T[None, :walls]
     legs = unfold(normals, normals @ corner, TX, TX)
     away = turn.T[:walls] @ (TX.position - corner)
     assert legs.length[0] == near(2 * np.linalg.norm(away), ROUNDING)
-    assert legs.departure[0] == pytest.approx(-away @ turn.T[:walls] / np.linalg.norm(away), abs=1e-12)
+    assert legs.departure[0] == pytest.approx(
+        -away @ turn.T[:walls] / np.linalg.norm(away), abs=1e-12
+    )
     assert legs.arrival[0] == pytest.approx(legs.departure[0], abs=1e-12)
 
 
 @pytest.mark.parametrize("bounces", [0, 1, 2, 3])
 def test_the_way_back_is_as_long(bounces):
-    normals, offsets = mirrors(*CHAINS[bounces]) if bounces else (np.zeros((1, 0, 3)), np.zeros((1, 0)))
-    there, back = unfold(normals, offsets, TX, RX), unfold(normals[:, ::-1], offsets[:, ::-1], RX, TX)
+    normals, offsets = (
+        mirrors(*CHAINS[bounces]) if bounces else (np.zeros((1, 0, 3)), np.zeros((1, 0)))
+    )
+    there, back = (
+        unfold(normals, offsets, TX, RX),
+        unfold(normals[:, ::-1], offsets[:, ::-1], RX, TX),
+    )
     for name in ("length", "rate", "accel"):
         assert getattr(there, name)[0] == near(getattr(back, name)[0], 1e-11)
     assert there.departure[0] == pytest.approx(back.arrival[0], abs=1e-12)
@@ -154,7 +188,12 @@ def test_a_rigid_motion_changes_no_length_and_turns_the_directions():
     turn, shift = rotation(8), np.array([310.0, -170.0, 41.0])
     normals, offsets = mirrors(*CHAINS[3])
     there = unfold(normals, offsets, TX, RX)
-    other = unfold(normals @ turn.T, offsets + normals @ turn.T @ shift, moved(TX, turn, shift), moved(RX, turn, shift))
+    other = unfold(
+        normals @ turn.T,
+        offsets + normals @ turn.T @ shift,
+        moved(TX, turn, shift),
+        moved(RX, turn, shift),
+    )
     far = 1e-12 * 400  # coordinates of 400 m lose three digits to the shift
     for name in ("length", "rate", "accel"):
         assert getattr(there, name)[0] == pytest.approx(getattr(other, name)[0], abs=far)
@@ -176,9 +215,11 @@ def test_straight_leg_to_a_moving_point():
 
 
 def test_all_triangles_of_a_wall_are_one_mirror():
-    """A corner lifted by half of the tolerance: both triangles take the plane of the larger one, to the last bit. Seen failing
-    with each face's own plane."""
-    vertices = np.array([(0, 0, 0), (9.1, 0, 0), (9.1, 5.3, 0), (0, 7.7, 5e-7), (0, 0, 3.0), (9.1, 0, 3.0)], float)
+    """A corner lifted by half of the tolerance: both triangles take the plane of the larger one, to
+    the last bit. Seen failing with each face's own plane."""
+    vertices = np.array(
+        [(0, 0, 0), (9.1, 0, 0), (9.1, 5.3, 0), (0, 7.7, 5e-7), (0, 0, 3.0), (9.1, 0, 3.0)], float
+    )
     faces = np.array([(0, 1, 2), (0, 2, 3), (0, 1, 5), (0, 5, 4)], np.int32)
     city = City("tilted", vertices, faces, np.zeros(4, np.int16), (), np.zeros(3))
     assert city.areas[1] > city.areas[0]
@@ -187,13 +228,15 @@ def test_all_triangles_of_a_wall_are_one_mirror():
     assert np.array_equal(normals[1], city.normals[1])
     assert offsets[0] == offsets[1] == city.plane_offsets[1]
     assert np.abs(normals[2:, 2]).max() < 1e-12
-    empty = City("none", np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int16), (), np.zeros(3))
+    empty = City(
+        "none", np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int16), (), np.zeros(3)
+    )
     assert [a.shape for a in plane_of_each_face(empty)] == [(0, 3), (0,)]
 
 
 def test_one_path_of_each_chain_of_planes():
-    """By planes, not faces; of equals the one with the lowest faces, so that the order of discovery does not matter; never a
-    bad one. Seen failing with the faces as the key."""
+    """By planes, not faces; of equals the one with the lowest faces, so that the order of discovery
+    does not matter; never a bad one. Seen failing with the faces as the key."""
     faces = np.array([(5, 2), (4, 2), (2, 5), (1, 2), (4, 3), (0, 2)])
     planes = np.array([7, 7, 3, 3, 7, 7])[faces]
     good = np.array([True, True, True, True, True, False])
@@ -207,11 +250,19 @@ def test_one_path_of_each_chain_of_planes():
 
 
 def test_walls_that_meet_in_a_point_have_no_order():
-    """Sorted where the points coincide, and nowhere else. Seen failing with all planes sorted, and with one pass only."""
+    """Sorted where the points coincide, and nowhere else. Seen failing with all planes sorted, and
+    with one pass only."""
     here, there = [1.0, 2.0, 3.0], [1.0, 2.0, 3.5]
-    points = np.array([[here, here, here], [there, here, here], [here, here, there], [here, there, here]])
+    points = np.array(
+        [[here, here, here], [there, here, here], [here, here, there], [here, there, here]]
+    )
     planes = np.array([[9, 7, 4]] * 4)
-    assert edges_in_any_order(planes, points).tolist() == [[4, 7, 9], [9, 4, 7], [7, 9, 4], [9, 7, 4]]
+    assert edges_in_any_order(planes, points).tolist() == [
+        [4, 7, 9],
+        [9, 4, 7],
+        [7, 9, 4],
+        [9, 7, 4],
+    ]
     assert planes[0].tolist() == [9, 7, 4]
 
 
@@ -224,34 +275,49 @@ def directions(count: int, seed: int = 3) -> np.ndarray:
 
 
 def test_constant_and_small_cross_sections():
-    """-12.81 dBsm seen from where it is lit; 3 sin(beta/2) less under a bistatic angle (TR 38.901 eq. 7.9.2-2)."""
+    """-12.81 dBsm seen from where it is lit; 3 sin(beta/2) less under a bistatic angle (TR 38.901
+    eq. 7.9.2-2)."""
     u = directions(40)
-    constant = CrossSection(Rcs(model="constant", value_dbsm=-7.3), "U", 1).square_metres(u, u[::-1])
+    constant = CrossSection(Rcs(model="constant", value_dbsm=-7.3), "U", 1).square_metres(
+        u, u[::-1]
+    )
     assert constant == near(np.full(40, 10**-0.73), 1e-12)
     small = CrossSection(Rcs(), "U", 1)
-    assert small.square_metres(u, u) == near(np.full(40, 10**-1.281), 1e-6)  # arccos near 1 keeps half of the digits
+    assert small.square_metres(u, u) == near(
+        np.full(40, 10**-1.281), 1e-6
+    )  # arccos near 1 keeps half of the digits
     beta = np.arccos((u * u[::-1]).sum(1))
-    assert 10 * np.log10(small.square_metres(u, u[::-1])) == pytest.approx(-12.81 - 3 * np.sin(beta / 2), abs=1e-9)
+    assert 10 * np.log10(small.square_metres(u, u[::-1])) == pytest.approx(
+        -12.81 - 3 * np.sin(beta / 2), abs=1e-9
+    )
 
 
 def test_large_uav_at_its_lobes():
-    """Peaks of the table at the lobes' centres, half of the power at half of the width, the floor between them. Seen failing with left
-    and right exchanged for front and back."""
+    """Peaks of the table at the lobes' centres, half of the power at half of the width, the floor
+    between them. Seen failing with left and right exchanged for front and back."""
     forward, right, up = np.eye(3)[1], np.eye(3)[0], np.eye(3)[2]
     half = np.radians(14.19 / 2)
     off_front = np.cos(half) * forward + np.sin(half) * right
     between = (forward + right) / np.sqrt(2)
-    seen = large_uav_db(np.array([forward, right, -right, -forward, up, -up, off_front, between]), np.zeros(8))
+    seen = large_uav_db(
+        np.array([forward, right, -right, -forward, up, -up, off_front, between]), np.zeros(8)
+    )
     assert seen == pytest.approx([1.02, 7.43, 7.43, 3.99, 13.55, 13.55, 1.02 - 3, -6.87], abs=1e-6)
 
 
 def test_mean_of_the_large_uav():
-    """TR 38.901 gives -5.85 dBsm as the mean of the linear values over all aspects (sigma_M, table 7.9.2.1-2).
+    """TR 38.901 gives -5.85 dBsm as the mean of the linear values over all aspects (sigma_M, table
+    7.9.2.1-2).
 
-    The mean over the sphere of our lobes lies within 0.6 dB of it; the table does not say over which set its mean is taken.
+    The mean over the sphere of our lobes lies within 0.6 dB of it; the table does not say over
+    which set its mean is taken.
     """
     n = 400
-    z, az = np.meshgrid(np.linspace(-1, 1, 2 * n + 1)[1::2], np.linspace(0, 2 * np.pi, 3 * n, endpoint=False), indexing="ij")
+    z, az = np.meshgrid(
+        np.linspace(-1, 1, 2 * n + 1)[1::2],
+        np.linspace(0, 2 * np.pi, 3 * n, endpoint=False),
+        indexing="ij",
+    )
     r = np.sqrt(1 - z**2)
     u = np.stack([r * np.cos(az), r * np.sin(az), z], axis=-1)
     mean = 10 * np.log10((10 ** (large_uav_db(u, np.zeros(z.shape)) / 10)).mean())
@@ -259,12 +325,14 @@ def test_mean_of_the_large_uav():
 
 
 def test_fluctuation_is_smooth_and_has_its_spread():
-    """Standard deviation in dB over many bodies, and the bound of the derivative of a sum of plane waves. Seen failing with the
-    generator drawn anew at each call and with sqrt(1/NUM_WAVES)."""
+    """Standard deviation in dB over many bodies, and the bound of the derivative of a sum of plane
+    waves. Seen failing with the generator drawn anew at each call and with sqrt(1/NUM_WAVES)."""
     std = 3.7
     rcs = Rcs(model="constant", value_dbsm=-9.1, fluctuation_db=std)
     u = directions(60, 9)
-    db = np.array([10 * np.log10(CrossSection(rcs, f"U{k}", 4).square_metres(u, u)) + 9.1 for k in range(200)])
+    db = np.array(
+        [10 * np.log10(CrossSection(rcs, f"U{k}", 4).square_metres(u, u)) + 9.1 for k in range(200)]
+    )
     # statistical: 12000 samples of which about 200 * 20 are independent: 1.1 %; 5 sigma
     assert db.std() == near(std, 0.055)
     assert db.mean() == pytest.approx(0.0, abs=5 * std / np.sqrt(4000))
@@ -287,7 +355,8 @@ def test_cross_section_belongs_to_the_body_alone():
 
 
 def test_fluctuation_fades_towards_forward_scattering():
-    """Where the bisector has no direction, the section must not jump: two ways past the forward direction agree."""
+    """Where the bisector has no direction, the section must not jump: two ways past the forward
+    direction agree."""
     section = CrossSection(Rcs(model="constant", fluctuation_db=6.0), "U", 1)
     u, side = np.array([[0.6, 0.0, 0.8]]), np.array([[0.0, 1.0, 0.0]])
     angle = 1e-6
@@ -308,29 +377,47 @@ def test_cross_sections_are_sionnas(size):
     centres = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 300, axis=0)
     to_source = directions(1800, 1) * 0.15 + centres  # where the lobes are
     to_observer = directions(1800, 2) * np.repeat([0.1, 0.4, 1.5] * 600, 1)[:, None] + centres
-    to_source, to_observer = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (to_source, to_observer))
+    to_source, to_observer = (
+        v / np.linalg.norm(v, axis=1, keepdims=True) for v in (to_source, to_observer)
+    )
 
     def in_their_axes(v):
         return mi.Vector3f(*np.stack([v[:, 1], -v[:, 0], v[:, 2]]).astype(np.float32))
 
-    expected = 10 * np.log10(np.asarray(theirs(in_their_axes(-to_source), in_their_axes(to_observer)), float))
+    expected = 10 * np.log10(
+        np.asarray(theirs(in_their_axes(-to_source), in_their_axes(to_observer)), float)
+    )
     ours = 10 * np.log10(CrossSection(Rcs(size=size), "U", 1).square_metres(to_source, to_observer))
     assert ours.std() > (0.3 if size == "small" else 2)
-    assert np.abs(ours - expected).max() < 2e-3  # float32 angles on slopes of up to 20 dB per degree
+    assert (
+        np.abs(ours - expected).max() < 2e-3
+    )  # float32 angles on slopes of up to 20 dB per degree
 
 
 # ---- free space
 
 
 def antennas(**changes) -> Antennas:
-    keys = {"tx_x": 2, "tx_z": 2, "rx_x": 8, "rx_z": 8, "spacing": 0.5774 * LAMBDA, "gain": 3.7, "pattern": "cosine"}
+    keys = {
+        "tx_x": 2,
+        "tx_z": 2,
+        "rx_x": 8,
+        "rx_z": 8,
+        "spacing": 0.5774 * LAMBDA,
+        "gain": 3.7,
+        "pattern": "cosine",
+    }
     return Antennas(**keys | changes)
 
 
 def facing(p: Pose, *others: Pose) -> Pose:
     """The pose turned so that all others lie somewhere ahead, none on boresight."""
-    towards = sum((o.position - p.position) / np.linalg.norm(o.position - p.position) for o in others)
-    return Pose(p.position, p.velocity, p.acceleration, attitude(towards + np.array([0.1, -0.07, 0.05])))
+    towards = sum(
+        (o.position - p.position) / np.linalg.norm(o.position - p.position) for o in others
+    )
+    return Pose(
+        p.position, p.velocity, p.acceleration, attitude(towards + np.array([0.1, -0.07, 0.05]))
+    )
 
 
 POSES = {"A": facing(TX, RX, BODY), "P": facing(RX, TX, BODY), "U": BODY}
@@ -352,11 +439,16 @@ def element(p: Pose, towards: np.ndarray, gain=3.7) -> float:
 
 
 def test_line_of_sight_is_friis():
-    """|gain|^2 = G G (lambda / 4 pi d)^2, phase zero. Seen failing with the receiver's element along the departure."""
+    """|gain|^2 = G G (lambda / 4 pi d)^2, phase zero. Seen failing with the receiver's element
+    along the departure."""
     paths = free_space().paths(POSES, 0.5, [("A", "P")])["A", "P"]
     (k,) = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
     d = np.linalg.norm(RX.position - TX.position)
-    expected = element(POSES["A"], RX.position) * element(POSES["P"], TX.position) * (LAMBDA / (4 * np.pi * d)) ** 2
+    expected = (
+        element(POSES["A"], RX.position)
+        * element(POSES["P"], TX.position)
+        * (LAMBDA / (4 * np.pi * d)) ** 2
+    )
     assert paths.gain[k] == near(np.sqrt(expected), 1e-12)
     assert paths.delay[k] == near(d / C, 1e-15)
     assert (paths.tx_radius[k], paths.rx_radius[k]) == pytest.approx((d, d))
@@ -368,7 +460,8 @@ def test_line_of_sight_is_friis():
 
 @pytest.mark.parametrize("rx", ["A", "P"])
 def test_echo_is_the_radar_equation(rx):
-    """P = G G lambda^2 sigma / ((4 pi)^3 r1^2 r2^2), monostatic and bistatic. Seen failing with (4 pi)^2."""
+    """P = G G lambda^2 sigma / ((4 pi)^3 r1^2 r2^2), monostatic and bistatic. Seen failing with (4
+    pi)^2."""
     paths = free_space().paths(POSES, 0.0, [("A", rx)])["A", rx]
     (k,) = np.flatnonzero((paths.kind == PathKind.TARGET) & (paths.target == 2))
     r1, r2 = (np.linalg.norm(BODY.position - POSES[end].position) for end in ("A", rx))
@@ -382,7 +475,8 @@ def test_echo_is_the_radar_equation(rx):
 
 
 def test_echo_moves_as_its_exact_delay():
-    """Delay rate and acceleration of the bistatic echo by differences, all three bodies in curved flight."""
+    """Delay rate and acceleration of the bistatic echo by differences, all three bodies in curved
+    flight."""
     paths = free_space().paths(POSES, 0.0, [("A", "P")])["A", "P"]
     (k,) = np.flatnonzero(paths.target == 2)
 
@@ -397,8 +491,9 @@ def test_echo_moves_as_its_exact_delay():
 
 
 def test_links_hold_the_right_paths():
-    """The own link has every other UAV and no line of sight; a link to a PT has no echo of its two ends. An echo has one point, the
-    body's, and it lies on no face. Planted bug: a face more than there are points."""
+    """The own link has every other UAV and no line of sight; a link to a PT has no echo of its two
+    ends. An echo has one point, the body's, and it lies on no face. Planted bug: a face more than
+    there are points."""
     found = free_space().paths(POSES, 0.0, [("A", "A"), ("A", "P")])
     assert found["A", "A"].faces.tolist() == [[-1], [-1]]
     assert np.array_equal(found["A", "A"].points, [[POSES["P"].position], [POSES["U"].position]])
@@ -419,8 +514,11 @@ def test_what_no_element_hears_is_left_out():
 
 @pytest.mark.parametrize(("rx", "reference"), [("P", "sight"), ("A", "echo")])
 def test_relative_echo_stands_at_its_level(rx, reference):
-    """20 dB and a bit under the reference path on boresight, whatever the geometry. Seen failing with 10^(level/10)."""
-    uavs = UAVS | {"U": Uav(role="target", position_m=(0, 0, 0), rcs=Rcs(model="relative", level_db=-21.3))}
+    """20 dB and a bit under the reference path on boresight, whatever the geometry. Seen failing
+    with 10^(level/10)."""
+    uavs = UAVS | {
+        "U": Uav(role="target", position_m=(0, 0, 0), rcs=Rcs(model="relative", level_db=-21.3))
+    }
     paths = free_space(uavs).paths(POSES, 0.0, [("A", rx)])["A", rx]
     (k,) = np.flatnonzero(paths.target == 2)
     d = np.linalg.norm(RX.position - TX.position)
@@ -445,7 +543,8 @@ def test_reference_is_the_strongest_echo_unshadowed_and_on_boresight():
 
 
 def test_free_space_is_reciprocal_and_knows_no_place():
-    """Exchanging the ends, and moving everything rigidly, change neither gain nor delay nor their rates."""
+    """Exchanging the ends, and moving everything rigidly, change neither gain nor delay nor their
+    rates."""
     names = ("gain", "delay", "delay_rate", "delay_accel")
     here, back = (free_space().paths(POSES, 0.0, [link])[link] for link in (("A", "P"), ("P", "A")))
     turn, shift = rotation(2), np.array([83.0, -47.0, 19.0])
@@ -458,6 +557,9 @@ def test_free_space_is_reciprocal_and_knows_no_place():
 
 
 def test_every_kind_of_path_has_its_own_number():
-    """Of the results file, from 0 on in the order of their list. Planted bug: the number of another kind."""
+    """Of the results file, from 0 on in the order of their list. Planted bug: the number of another
+    kind."""
     names = ["LINE_OF_SIGHT", "TARGET", "GHOST", "SPECULAR", "DIFFUSE", "LEAKAGE"]
-    assert {name: int(kind) for name, kind in PathKind.__members__.items()} == {name: i for i, name in enumerate(names)}
+    assert {name: int(kind) for name, kind in PathKind.__members__.items()} == {
+        name: i for i, name in enumerate(names)
+    }

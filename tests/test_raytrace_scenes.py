@@ -21,14 +21,20 @@ from isac_rt.world.swarm import Pose, attitude
 pytestmark = pytest.mark.sionna
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
 LAMBDA = C / F_C
-LENGTH = 1e-9  # rounding: float64 over coordinates of 100 m and planes known to 1e-14 (1e-9 is 1e-6 of a wavelength)
-COPLANAR = 2e-5  # of meshes whose corners are float32 numbers of up to 100 m: their walls are as flat as that
+# rounding: float64 over coordinates of 100 m and planes known to 1e-14 (1e-9 is 1e-6 of a
+# wavelength)
+LENGTH = 1e-9
+# of meshes whose corners are float32 numbers of up to 100 m: their walls are as flat as that
+COPLANAR = 2e-5
 AMPLITUDE = 2e-4  # Sionna's float32 through Fresnel's square roots
 LINKS = [("A", "A"), ("A", "P")]
 
 
 def pose(position, velocity=(0, 0, 0), acceleration=(0, 0, 0), boresight=(0.3, 1.0, 0.1)) -> Pose:
-    return Pose(*(np.array(v, float) for v in (position, velocity, acceleration)), attitude(np.array(boresight, float)))
+    return Pose(
+        *(np.array(v, float) for v in (position, velocity, acceleration)),
+        attitude(np.array(boresight, float)),
+    )
 
 
 def swarm_of(a, p, u) -> dict[str, Pose]:
@@ -41,7 +47,8 @@ def swarm_of(a, p, u) -> dict[str, Pose]:
 
 
 def tracer(mesh: City, bounces: int = 2, **changes):
-    """A ray tracer in a mesh (whatever city the scenario names), with isotropic elements of 0 dBi, and its scenario."""
+    """A ray tracer in a mesh (whatever city the scenario names), with isotropic elements of 0 dBi,
+    and its scenario."""
     rcs = {"model": "constant", "value_dbsm": -11.7}
     tree = {
         "swarm": {
@@ -51,7 +58,11 @@ def tracer(mesh: City, bounces: int = 2, **changes):
         },
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
-        "propagation": {"model": "ray_traced", "max_bounces": bounces, "leakage": {"enabled": False}},
+        "propagation": {
+            "model": "ray_traced",
+            "max_bounces": bounces,
+            "leakage": {"enabled": False},
+        },
     } | changes
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s)
@@ -63,7 +74,9 @@ def builtin(name: str, centre=(0.31, -0.17, 0.9)) -> City:
 
 
 def slab(permittivity=5.31, conductivity=1.9, scattering=0.0, thickness=0.1) -> Material:
-    return Material("slab", permittivity, conductivity, scattering, "lambertian", 1, thickness, "test")
+    return Material(
+        "slab", permittivity, conductivity, scattering, "lambertian", 1, thickness, "test"
+    )
 
 
 def rectangle(corner, along, across, material: Material, origin=(0.0, 0.0, 0.0)) -> City:
@@ -71,7 +84,9 @@ def rectangle(corner, along, across, material: Material, origin=(0.0, 0.0, 0.0))
     p, a, b = (np.array(v, float) for v in (corner, along, across))
     vertices = np.array([p, p + a, p + a + b, p + b]) - np.array(origin)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return City("wall", vertices, faces, np.zeros(2, np.int16), (material,), np.array(origin, float))
+    return City(
+        "wall", vertices, faces, np.zeros(2, np.int16), (material,), np.array(origin, float)
+    )
 
 
 # ---- the brute-force image construction
@@ -79,7 +94,8 @@ def rectangle(corner, along, across, material: Material, origin=(0.0, 0.0, 0.0))
 
 @dataclass
 class Chain:
-    """A path that the construction found; `sure` if no point lies at an edge, where the ray tracer may decide either way."""
+    """A path that the construction found; `sure` if no point lies at an edge, where the ray tracer
+    may decide either way."""
 
     length: float
     bounces: int
@@ -88,7 +104,8 @@ class Chain:
 
 
 class Images:
-    """All mirror paths of a mesh by trying every chain of its planes, with visibility from every triangle."""
+    """All mirror paths of a mesh by trying every chain of its planes, with visibility from every
+    triangle."""
 
     MARGIN = 2e-3  # [m] nearer than this to the edge of a face, or of a shadow, a path is not sure
 
@@ -110,11 +127,15 @@ class Images:
         self.offsets = offsets
 
     def inside(self, faces: list[int], point: np.ndarray) -> float:
-        """How deep a point of the plane lies in the face that holds it best [m]; negative outside of all."""
+        """How deep a point of the plane lies in the face that holds it best [m]; negative outside
+        of all."""
         best = -np.inf
         for f in faces:
             a, b, c = self.corners[f]
-            depth = min(np.dot(np.cross(self.normals[f], q - p), point - p) / np.linalg.norm(q - p) for p, q in ((a, b), (b, c), (c, a)))
+            depth = min(
+                np.dot(np.cross(self.normals[f], q - p), point - p) / np.linalg.norm(q - p)
+                for p, q in ((a, b), (b, c), (c, a))
+            )
             best = max(best, depth)
         return best
 
@@ -123,12 +144,19 @@ class Images:
         n = self.normals[faces[0]]
         side = np.cross(n, [0.36, 0.48, 0.8])
         side = self.MARGIN * side / np.linalg.norm(side)
-        around = [point, point + side, point - side, point + np.cross(n, side), point - np.cross(n, side)]
+        around = [
+            point,
+            point + side,
+            point - side,
+            point + np.cross(n, side),
+            point - np.cross(n, side),
+        ]
         found = [self.inside(faces, q) >= -1e-9 for q in around]
         return found[0], all(found) == any(found)
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> tuple[bool, bool]:
-        """Whether a triangle cuts the open segment (Moeller and Trumbore), and whether that is sure."""
+        """Whether a triangle cuts the open segment (Moeller and Trumbore), and whether that is
+        sure."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         d = end - start
         e1, e2 = b - a, c - a
@@ -169,7 +197,9 @@ class Images:
             share = (d - n @ image) / (n @ (target - image)) if n @ (target - image) else -1.0
             if not 0 < share < 1 + 1e-6:
                 return None
-            sure &= share < 1 - 1e-6  # else in the edge of two walls, which each order of them reaches
+            sure &= (
+                share < 1 - 1e-6
+            )  # else in the edge of two walls, which each order of them reaches
             target = image + share * (target - image)
             points.insert(0, target)
         for faces, point in zip(planes, points, strict=True):
@@ -183,11 +213,17 @@ class Images:
             if cut and clear:
                 return None
             sure &= clear
-        return Chain(float(np.linalg.norm(end - images[-1])), len(planes), np.array(points).reshape(-1, 3), sure)
+        return Chain(
+            float(np.linalg.norm(end - images[-1])),
+            len(planes),
+            np.array(points).reshape(-1, 3),
+            sure,
+        )
 
 
 def check_against(expected: list[Chain], lengths: np.ndarray, bounces: np.ndarray) -> None:
-    """Every sure path of the construction is found once, and nothing else than its paths is found."""
+    """Every sure path of the construction is found once, and nothing else than its paths is
+    found."""
     left = sorted(expected, key=lambda p: (p.bounces, p.length))
     for length, count in zip(lengths, bounces, strict=True):
         match = [p for p in left if p.bounces == count and abs(p.length - length) < COPLANAR]
@@ -216,8 +252,9 @@ FOUND = {  # line of sight and mirror paths of A->P by number of bounces
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
-    """Line of sight, mirrors, and ghosts as products of legs. Seen failing with the faces of a chain in reverse order, with the bounces of
-    ghosts not counted over both legs, and with the mesh's origin left out of the points."""
+    """Line of sight, mirrors, and ghosts as products of legs. Seen failing with the faces of a
+    chain in reverse order, with the bounces of ghosts not counted over both legs, and with the
+    mesh's origin left out of the points."""
     *places, bounces = SCENES[name]
     poses, city = swarm_of(*places), builtin(name)
     model, s = tracer(city, bounces)
@@ -244,18 +281,24 @@ def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
         check_points(paths, poses, images)
     if name == "box":
         own = found["A", "A"].bounces[found["A", "A"].target < 0]
-        assert np.bincount(own).tolist() == [0, *FOUND[name][1:]]  # the same lattice, of which 12 images lie behind edges
+        assert np.bincount(own).tolist() == [
+            0,
+            *FOUND[name][1:],
+        ]  # the same lattice, of which 12 images lie behind edges
     one_way = found["A", "P"].bounces[found["A", "P"].target < 0]
     assert np.bincount(one_way).tolist() == FOUND[name]
     assert model.dropped == 0
 
 
 def check_points(paths: PathSet, poses: dict[str, Pose], images: Images) -> None:
-    """Points make up the delay, lie on their faces' planes, and are stationary (Fermat): shifting a mirror point changes nothing."""
+    """Points make up the delay, lie on their faces' planes, and are stationary (Fermat): shifting a
+    mirror point changes nothing."""
     for k in range(len(paths)):
         held = ~np.isnan(paths.points[k, :, 0])
         points, faces = paths.points[k, held], paths.faces[k, held]
-        way = np.concatenate([poses[paths.tx].position[None], points, poses[paths.rx].position[None]])
+        way = np.concatenate(
+            [poses[paths.tx].position[None], points, poses[paths.rx].position[None]]
+        )
         length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
         assert length == pytest.approx(C * paths.delay[k], abs=LENGTH)
         assert (faces[faces < 0].size == 1) == (paths.target[k] >= 0)
@@ -273,7 +316,8 @@ def check_points(paths: PathSet, poses: dict[str, Pose], images: Images) -> None
 
 
 def test_rates_follow_the_exact_delays():
-    """Delay rate and acceleration of all paths of the canyon, ghosts included, by tracing the moved swarm.
+    """Delay rate and acceleration of all paths of the canyon, ghosts included, by tracing the moved
+    swarm.
 
     Differences over h = 0.01 s leave h^2/6 of the third derivative (v^3/L^2, 40 m/s^3 near by).
     """
@@ -284,12 +328,18 @@ def test_rates_follow_the_exact_delays():
 
     def traced(t):
         moved = {
-            n: Pose(p.position + t * p.velocity + t**2 / 2 * p.acceleration, p.velocity + t * p.acceleration, p.acceleration, p.rotation)
+            n: Pose(
+                p.position + t * p.velocity + t**2 / 2 * p.acceleration,
+                p.velocity + t * p.acceleration,
+                p.acceleration,
+                p.rotation,
+            )
             for n, p in poses.items()
         }
         p = model.paths(moved, t, LINKS)["A", "P"]
         return {
-            (tuple(np.where(f < 0, -1, city.plane_of_face[f])), k): i for i, (f, k) in enumerate(zip(p.faces, p.target, strict=True))
+            (tuple(np.where(f < 0, -1, city.plane_of_face[f])), k): i
+            for i, (f, k) in enumerate(zip(p.faces, p.target, strict=True))
         }, p
 
     (before, b), (now, n), (after, a) = (traced(t) for t in (-h, 0.0, h))
@@ -309,12 +359,16 @@ def test_empty_scene_is_free_space():
     """Line of sight and echoes of the closed forms, and nothing else."""
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     model, s = tracer(empty_city("none", np.array([3.0, 4.0, 5.0])))
-    closed = FreeSpace(s.swarm, antennas_of(s, waveform_of(s)), LAMBDA, s.seed).paths(poses, 0.25, LINKS)
+    closed = FreeSpace(s.swarm, antennas_of(s, waveform_of(s)), LAMBDA, s.seed).paths(
+        poses, 0.25, LINKS
+    )
     for link, paths in model.paths(poses, 0.25, LINKS).items():
         assert paths.kind.tolist() == closed[link].kind.tolist()
         assert paths.target.tolist() == closed[link].target.tolist()
         for name in ("delay", "delay_rate", "delay_accel", "tx_radius", "rx_radius"):
-            assert getattr(paths, name) == pytest.approx(getattr(closed[link], name), rel=1e-12, abs=0)
+            assert getattr(paths, name) == pytest.approx(
+                getattr(closed[link], name), rel=1e-12, abs=0
+            )
         assert paths.departure == pytest.approx(closed[link].departure, abs=1e-12)
         assert paths.arrival == pytest.approx(closed[link].arrival, abs=1e-12)
         assert paths.gain == pytest.approx(closed[link].gain, rel=1e-4, abs=0)
@@ -323,7 +377,8 @@ def test_empty_scene_is_free_space():
 
 
 def fresnel(material: Material, cos: float) -> complex:
-    """Reflection of a slab, electric field in the plane of incidence (ITU-R P.2040, section 2.2.2.2)."""
+    """Reflection of a slab, electric field in the plane of incidence (ITU-R P.2040, section
+    2.2.2.2)."""
     eta = material.relative_permittivity - 1j * material.conductivity / (2 * np.pi * F_C * EPS_0)
     root = np.sqrt(eta - (1 - cos**2))
     r = (eta * cos - root) / (eta * cos + root)
@@ -331,11 +386,16 @@ def fresnel(material: Material, cos: float) -> complex:
     return r * (1 - turn) / (1 - r**2 * turn)
 
 
-@pytest.mark.parametrize("material", [slab(), slab(permittivity=2.7, conductivity=0.6, thickness=0.004)], ids=["thick", "pane"])
+@pytest.mark.parametrize(
+    "material",
+    [slab(), slab(permittivity=2.7, conductivity=0.6, thickness=0.004)],
+    ids=["thick", "pane"],
+)
 @pytest.mark.parametrize("h", [0.9, 7.3, 31.0])
 def test_two_rays_over_a_plane(material, h):
-    """Amplitude and phase of the ground's ray, by Fresnel, far below, at, and above Brewster's angle. Seen failing with
-    conductivity 0 and with the path's amplitude in place of its complex value."""
+    """Amplitude and phase of the ground's ray, by Fresnel, far below, at, and above Brewster's
+    angle. Seen failing with conductivity 0 and with the path's amplitude in place of its complex
+    value."""
     city = rectangle((-150, -150, 0), (300, 0, 0), (0, 300, 0), material)
     a, p = np.array([-9.7, 3.1, h]), np.array([13.9, -4.3, 0.7 * h])
     model, _ = tracer(city, 1)
@@ -344,7 +404,9 @@ def test_two_rays_over_a_plane(material, h):
     length = np.hypot(np.hypot(23.6, 7.4), 1.7 * h)
     assert C * paths.delay[k] == pytest.approx(length, abs=LENGTH)
     expected = fresnel(material, 1.7 * h / length) * LAMBDA / (4 * np.pi * length)
-    assert abs(paths.gain[k] - expected) < AMPLITUDE * LAMBDA / (4 * np.pi * length) * 5  # the pane's phase turns with float32 angles
+    assert (
+        abs(paths.gain[k] - expected) < AMPLITUDE * LAMBDA / (4 * np.pi * length) * 5
+    )  # the pane's phase turns with float32 angles
     assert paths.bounces[k] == 1
 
 
@@ -364,21 +426,26 @@ def test_a_wall_shadows():
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (3.7, -2.9)], ids=["on the seam", "beside it"])
 def test_a_wall_returns_once_to_its_radar(place):
-    """Monostatic, at right angles, twice the distance; found once, also where both triangles of the wall meet."""
+    """Monostatic, at right angles, twice the distance; found once, also where both triangles of the
+    wall meet."""
     y, z = place
     wall = rectangle((31.7, -20, -20), (0, 40, 0), (0, 0, 40), slab(conductivity=1e7))
     model, _ = tracer(wall)
-    paths = model.paths(swarm_of((0.3, y, z), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4)), 0.0, [("A", "A")])["A", "A"]
+    paths = model.paths(
+        swarm_of((0.3, y, z), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4)), 0.0, [("A", "A")]
+    )["A", "A"]
     (k,) = np.flatnonzero(paths.kind == PathKind.SPECULAR)
     assert C * paths.delay[k] == pytest.approx(2 * 31.4, abs=LENGTH)
-    assert abs(paths.gain[k]) == pytest.approx(LAMBDA / (4 * np.pi * 62.8), rel=2e-3)  # metal reflects .9991
+    assert abs(paths.gain[k]) == pytest.approx(
+        LAMBDA / (4 * np.pi * 62.8), rel=2e-3
+    )  # metal reflects .9991
     assert C * paths.delay_rate[k] == pytest.approx(-2 * 4.3, rel=1e-12)
     assert paths.departure[k] == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
 
 
 def test_points_and_lengths_do_not_depend_on_the_origin():
-    """A wall and a swarm 3 km from the world's origin, recentred: paths in world coordinates. Seen failing with the origin
-    not added to the points."""
+    """A wall and a swarm 3 km from the world's origin, recentred: paths in world coordinates. Seen
+    failing with the origin not added to the points."""
     far = np.array([2100.0, -1900.0, 300.0])
     here = [np.array(v) for v in ((0.3, 1.1, 9.3), (1.7, 7.4, 8.1), (-3.3, -2.2, 7.9))]
     results = []
@@ -394,11 +461,14 @@ def test_points_and_lengths_do_not_depend_on_the_origin():
 
 @pytest.mark.parametrize("walls", [2, 3])
 def test_a_corner_returns_one_image_to_its_radar(walls):
-    """Walls at right angles send a wave back where it came from with the amplitude of one image, twice the distance to the
-    edge (corner) away; in turned axes. Seen failing without the point beside the terminal, which finds none."""
+    """Walls at right angles send a wave back where it came from with the amplitude of one image,
+    twice the distance to the edge (corner) away; in turned axes. Seen failing without the point
+    beside the terminal, which finds none."""
     turn = Rotation.from_euler("xyz", (0.3, -0.2, 0.7)).as_matrix()
     corner, away = np.array([21.3, -14.7, 3.9]), np.array([9.3, 13.1, 7.7])
-    vertices = 40 * np.array([(0, 0, -1), (0, 0, 1), (1, 0, -1), (1, 0, 1), (0, 1, -1), (0, 1, 1)], float)
+    vertices = 40 * np.array(
+        [(0, 0, -1), (0, 0, 1), (1, 0, -1), (1, 0, 1), (0, 1, -1), (0, 1, 1)], float
+    )
     faces = [(0, 2, 3), (0, 3, 1), (0, 1, 5), (0, 5, 4)]
     if walls == 3:
         vertices[:, 2] = np.maximum(vertices[:, 2], 0)
@@ -414,22 +484,35 @@ def test_a_corner_returns_one_image_to_its_radar(walls):
     )
     model, _ = tracer(mesh, walls)
     radar, distance = corner + turn @ away, np.linalg.norm(away[:walls])
-    paths = model.paths(swarm_of(radar, radar + np.array([1.0, 2.0, 1.5]), radar - np.array([2.0, 1.1, 0.7])), 0.0, [("A", "A")])["A", "A"]
-    found = np.flatnonzero((paths.kind == PathKind.SPECULAR) & (paths.bounces == walls) & (np.abs(C * paths.delay - 2 * distance) < 1e-6))
+    paths = model.paths(
+        swarm_of(radar, radar + np.array([1.0, 2.0, 1.5]), radar - np.array([2.0, 1.1, 0.7])),
+        0.0,
+        [("A", "A")],
+    )["A", "A"]
+    found = np.flatnonzero(
+        (paths.kind == PathKind.SPECULAR)
+        & (paths.bounces == walls)
+        & (np.abs(C * paths.delay - 2 * distance) < 1e-6)
+    )
     assert len(found) == 1
-    # at most all of the image; what the slanted corner turns into horizontal polarisation is not received
+    # at most all of the image; what the slanted corner turns into horizontal polarisation is not
+    # received
     assert 0.1 < abs(paths.gain[found[0]]) / (LAMBDA / (4 * np.pi * 2 * distance)) < 1.01
     towards = turn @ np.where(np.arange(3) < walls, -away, 0) / distance
     assert paths.departure[found[0]] == pytest.approx(towards, abs=1e-9)
 
 
 def test_a_wall_far_from_the_origin_reflects_once():
-    """Ten kilometres off, Sionna's float32 finds one reflection several times over, each at full amplitude. Seen failing
-    with none dropped."""
+    """Ten kilometres off, Sionna's float32 finds one reflection several times over, each at full
+    amplitude. Seen failing with none dropped."""
     far = np.array([7100.3, -6900.7, 310.1])
     city = rectangle(far + np.array([31.3, -60, -60]), (5.0, 120, 0), (0, 0, 120), slab())
     model, _ = tracer(city, 1)
-    poses = swarm_of(far + np.array([0.3, 1.1, 9.3]), far + np.array([1.7, 17.4, 8.1]), far + np.array([-3.3, -2.2, 7.9]))
+    poses = swarm_of(
+        far + np.array([0.3, 1.1, 9.3]),
+        far + np.array([1.7, 17.4, 8.1]),
+        far + np.array([-3.3, -2.2, 7.9]),
+    )
     paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
     assert paths.counts()["specular"] == 1
     assert model.duplicates > 0
@@ -437,7 +520,9 @@ def test_a_wall_far_from_the_origin_reflects_once():
 
 def test_leakage():
     """On the own link alone: isolation, delay, no Doppler, in phase over both arrays."""
-    leakage = {"propagation": {"model": "ray_traced", "leakage": {"isolation_db": 57.3, "delay_s": 1.3e-9}}}
+    leakage = {
+        "propagation": {"model": "ray_traced", "leakage": {"isolation_db": 57.3, "delay_s": 1.3e-9}}
+    }
     model, s = tracer(empty_city("none", np.zeros(3)), **leakage)
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     found = model.paths(poses, 0.0, LINKS)
@@ -452,15 +537,21 @@ def test_leakage():
 
 
 def test_antenna_patterns_weigh_each_path_by_its_own_directions():
-    """Gain with the cosine pattern over gain without it, of every path of the box: cos^q at both ends."""
+    """Gain with the cosine pattern over gain without it, of every path of the box: cos^q at both
+    ends."""
     *places, bounces = SCENES["box"]
     city, poses = builtin("box"), swarm_of(*places)
     plain, _ = tracer(city, bounces)
     shaped, _ = tracer(city, bounces, array={"element_pattern": "cosine", "element_gain_dbi": 5.0})
     a, b = (m.paths(poses, 0.0, LINKS)["A", "P"] for m in (plain, shaped))
     gain = 10**0.5
-    ends = [np.clip(d @ poses[n].rotation[:, 1], 0, None) for n, d in (("A", a.departure), ("P", a.arrival))]
-    expected = a.gain * np.prod([np.sqrt(gain) * e ** ((gain / 2 - 1) / 2) * (e > 0) for e in ends], axis=0)
+    ends = [
+        np.clip(d @ poses[n].rotation[:, 1], 0, None)
+        for n, d in (("A", a.departure), ("P", a.arrival))
+    ]
+    expected = a.gain * np.prod(
+        [np.sqrt(gain) * e ** ((gain / 2 - 1) / 2) * (e > 0) for e in ends], axis=0
+    )
     assert 0 < (expected != 0).sum() < len(expected)
     assert b.gain == pytest.approx(expected[expected != 0], rel=1e-9, abs=0)
 
@@ -469,7 +560,8 @@ def test_antenna_patterns_weigh_each_path_by_its_own_directions():
 
 
 def test_composed_echoes_are_those_of_sionnas_rcs_solver():
-    """The same echoes and ghosts, with the same amplitudes and phases, as the radar cross-section solver finds with a body in the scene.
+    """The same echoes and ghosts, with the same amplitudes and phases, as the radar cross-section
+    solver finds with a body in the scene.
 
     Seen failing with sqrt(4 pi sigma) without the wavelength, and with sqrt(sigma)."""
     import mitsuba as mi
@@ -482,13 +574,21 @@ def test_composed_echoes_are_those_of_sionnas_rcs_solver():
     city, poses = builtin("floor_wall"), swarm_of(*places)
     model, _ = tracer(city, bounces)
     scene = build_scene(city, F_C).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
     local = {n: mi.Point3f(*(p.position - city.origin).tolist()) for n, p in poses.items()}
     scene.add(rt.Transmitter("tx", local["A"]))
     scene.add(rt.Receiver("rx", local["P"]))
     size = {"length": 0.02, "width": 0.02, "height": 0.02}
     scene.add(ConstantRCSSensingTarget("body", sigma=10**-1.17, position=local["U"], **size))
-    theirs = RCSSolver(deterministic=True)(scene, max_depth=1 + bounces, buffer_size_per_sp=10_000, samples_per_sp=20_000, refraction=False)
+    theirs = RCSSolver(deterministic=True)(
+        scene,
+        max_depth=1 + bounces,
+        buffer_size_per_sp=10_000,
+        samples_per_sp=20_000,
+        refraction=False,
+    )
     valid = np.asarray(theirs.valid).ravel()
     tau = np.asarray(theirs.tau, float).ravel()[valid]
     gain = (np.asarray(theirs.a[0], float) + 1j * np.asarray(theirs.a[1], float)).ravel()[valid]
@@ -499,7 +599,11 @@ def test_composed_echoes_are_those_of_sionnas_rcs_solver():
     assert C * ours.delay[i] == pytest.approx(C * tau[j], abs=1e-5)  # their delays are float32
     off = np.abs(ours.gain[i] / gain[j] - 1)
     assert off[ours.bounces[i] < 2].max() < AMPLITUDE
-    assert off.max() < 1e-2  # two bounces: what turns horizontal on one leg and back on the other is left out, 0.23 % at the most here
+    assert (
+        off.max() < 1e-2
+        # two bounces: what turns horizontal on one leg and back on the other is left out, 0.23 % at
+        # the most here
+    )
 
 
 # ---- diffuse clutter
@@ -521,7 +625,8 @@ def lambertian(a: np.ndarray, p: np.ndarray, share: float) -> float:
 
 
 def test_diffuse_power_of_a_wall():
-    """S^2 of what hits the wall, by Lambert's cosine, one-way and back. Seen failing with S for S^2.
+    """S^2 of what hits the wall, by Lambert's cosine, one-way and back. Seen failing with S for
+    S^2.
 
     A lattice of rays integrates to better than 1 %; metal reflects .9991 of the amplitude.
     """
@@ -531,16 +636,22 @@ def test_diffuse_power_of_a_wall():
     for (tx, rx), paths in model.paths(poses, 0.0, LINKS).items():
         scattered = paths.power[paths.kind == PathKind.DIFFUSE]
         assert scattered.size > 10_000
-        assert scattered.sum() == pytest.approx(lambertian(poses[tx].position, poses[rx].position, 0.43), rel=0.01)
+        assert scattered.sum() == pytest.approx(
+            lambertian(poses[tx].position, poses[rx].position, 0.43), rel=0.01
+        )
 
 
 def test_diffuse_scatterers_stand_on_the_wall():
-    """Delay, rate, acceleration, directions and radii belong to a point at rest on the float64 wall; both links see a scatterer
-    with one phase, and phases are spread evenly. Seen failing with the arrival taken from the departing leg."""
+    """Delay, rate, acceleration, directions and radii belong to a point at rest on the float64
+    wall; both links see a scatterer with one phase, and phases are spread evenly. Seen failing with
+    the arrival taken from the departing leg."""
     wall = rectangle(*WALL, slab(conductivity=1e7, scattering=0.43))
     model, _ = tracer(wall, clutter={"model": "diffuse", "rays": 3_000})
     poses = swarm_of((1.3, -0.7, 2.1), (-13.1, 4.3, -6.6), (7.0, 12.0, 3.0))
-    found = {link: p.select(p.kind == PathKind.DIFFUSE) for link, p in model.paths(poses, 0.0, LINKS).items()}
+    found = {
+        link: p.select(p.kind == PathKind.DIFFUSE)
+        for link, p in model.paths(poses, 0.0, LINKS).items()
+    }
     a, p = poses["A"], poses["P"]
     two_way, one_way = found["A", "A"], found["A", "P"]
     assert two_way.points[:, 0, 1] == pytest.approx(50.0, abs=1e-12)
@@ -549,13 +660,18 @@ def test_diffuse_scatterers_stand_on_the_wall():
     u1, u2 = spans[0] / r1[:, None], spans[1] / r2[:, None]
     assert C * one_way.delay == pytest.approx(r1 + r2, rel=1e-13, abs=0)
     assert C * one_way.delay_rate == pytest.approx(-(u1 @ a.velocity) - u2 @ p.velocity, abs=1e-12)
-    across = [(e.velocity @ e.velocity - (u @ e.velocity) ** 2) / r - u @ e.acceleration for e, u, r in ((a, u1, r1), (p, u2, r2))]
+    across = [
+        (e.velocity @ e.velocity - (u @ e.velocity) ** 2) / r - u @ e.acceleration
+        for e, u, r in ((a, u1, r1), (p, u2, r2))
+    ]
     assert C * one_way.delay_accel == pytest.approx(sum(across), abs=1e-10)
     assert one_way.departure == pytest.approx(u1, abs=1e-13)
     assert one_way.arrival == pytest.approx(u2, abs=1e-13)
     assert (one_way.tx_radius, one_way.rx_radius) == (pytest.approx(r1), pytest.approx(r2))
     place = {tuple(q): i for i, q in enumerate(two_way.points[:, 0])}
-    pairs = np.array([(place[tuple(q)], i) for i, q in enumerate(one_way.points[:, 0]) if tuple(q) in place])
+    pairs = np.array(
+        [(place[tuple(q)], i) for i, q in enumerate(one_way.points[:, 0]) if tuple(q) in place]
+    )
     assert len(pairs) > 0.9 * len(one_way) > 300
     between = two_way.gain[pairs[:, 0]] * one_way.gain[pairs[:, 1]].conj()
     assert np.abs(np.angle(between)).max() < 1e-9
@@ -585,7 +701,9 @@ def test_inputs_and_limits_that_sionna_does_not_check(monkeypatch):
         with pytest.raises(ValueError, match="not finite"):
             model.paths(poses | {"U": bad}, 0.0, LINKS)
     monkeypatch.setattr(raytrace, "MOST_PATHS", 1000)
-    with pytest.raises(ValueError, match=r"limit of 1000 paths; lower propagation\.rays or clutter\.rays"):
+    with pytest.raises(
+        ValueError, match=r"limit of 1000 paths; lower propagation\.rays or clutter\.rays"
+    ):
         model.paths(poses, 0.0, LINKS)
 
 

@@ -13,7 +13,9 @@ from isac_rt.cli.cli import main
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
-COMMANDS = [line.split("#")[0].strip() for line in re.findall(r"^    (isac-rt .*)$", TEXT, re.MULTILINE)]
+COMMANDS = [
+    line.split("#")[0].strip() for line in re.findall(r"^    (isac-rt .*)$", TEXT, re.MULTILINE)
+]
 LONG = ("sweep", "munich", "paper_swarm", "street_canyon.yaml", "validate")
 """Parts of commands that take more than seconds."""
 
@@ -27,7 +29,9 @@ def shortened(command: str) -> list[str]:
 
 def test_the_readme_has_commands():
     assert len(COMMANDS) >= 12
-    assert {"run", "view", "paths", "sweep", "reproduce", "doctor", "new", "animate"} <= {shlex.split(c)[1] for c in COMMANDS}
+    assert {"run", "view", "paths", "sweep", "reproduce", "doctor", "new", "animate"} <= {
+        shlex.split(c)[1] for c in COMMANDS
+    }
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,14 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_passive
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import Symbols, confidence_threshold, decide_transitions, demodulate, known_cycles, moves_as_predicted
+from isac_rt.receive.symbols.powers import (
+    Symbols,
+    confidence_threshold,
+    decide_transitions,
+    demodulate,
+    known_cycles,
+    moves_as_predicted,
+)
 from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
@@ -41,7 +48,11 @@ def predict(length: float, rate: float, *others: tuple[float, float, float]) -> 
 
 
 def with_noise(clean: IFCube, power: float, seed: int) -> IFCube:
-    noise = np.random.default_rng(seed).standard_normal((*clean.samples.shape, 2), np.float32).view(np.complex64)[..., 0]
+    noise = (
+        np.random.default_rng(seed)
+        .standard_normal((*clean.samples.shape, 2), np.float32)
+        .view(np.complex64)[..., 0]
+    )
     return replace(clean, samples=clean.samples + np.float32(np.sqrt(power / 2)) * noise)
 
 
@@ -53,62 +64,98 @@ def link():
 
 
 def test_receivers_import_nothing_that_knows_the_truth():
-    """Planted bug: `from isac_rt.world.swarm import Pose` in passive.py. Mean powers of clutter are no truth: a terminal may have the mesh."""
+    """Planted bug: `from isac_rt.world.swarm import Pose` in passive.py. Mean powers of clutter are
+    no truth: a terminal may have the mesh."""
     allowed = "isac_rt.receive.types.ExpectedClutter"
     for source in File(isac_rt.receive.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(source.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            names += [f"{node.module}.{a.name}" for a in node.names] if isinstance(node, ast.ImportFrom) else []
+            names += (
+                [f"{node.module}.{a.name}" for a in node.names]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
             for name in names:
                 assert name == allowed or not any(
-                    word in name for word in ("swarm", "propagation", "PathSet", "Transmission", "simulate")
+                    word in name
+                    for word in ("swarm", "propagation", "PathSet", "Transmission", "simulate")
                 ), name
 
 
 @pytest.mark.parametrize("rate", [-29.4, 0.3, 23.7])
 def test_known_phase_is_that_of_the_picked_cells(rate: float):
-    """Sum over a chirp at the path's beat and symbol, the beat by differences of the phase: what is left after the known phase is 0.
-    Planted bugs: half of the window's half taken (a ramp of the beat, too slow for DPSK to mind); the cross term's sign.
+    """Sum over a chirp at the path's beat and symbol, the beat by differences of the phase: what is
+    left after the known phase is 0. Planted bugs: half of the window's half taken (a ramp of the
+    beat, too slow for DPSK to mind); the cross term's sign.
 
-    Bound: the beat of a moving path moves within the chirp, in proportion to the velocity (2e-4 rad at 1 m/s); rounding.
+    Bound: the beat of a moving path moves within the chirp, in proportion to the velocity (2e-4 rad
+    at 1 m/s); rounding.
     """
     w, schedule, payload = frame(waveform=Waveform(num_samples=256))
-    samples = cube(w, schedule, payload, [Path(LENGTH, rate)], replace(ANTENNAS, rx_x=1, rx_z=1)).samples[:, 0].astype(complex)
+    samples = (
+        cube(w, schedule, payload, [Path(LENGTH, rate)], replace(ANTENNAS, rx_x=1, rx_z=1))
+        .samples[:, 0]
+        .astype(complex)
+    )
     known = known_cycles(w, LENGTH / 299_792_458.0, rate / 299_792_458.0, payload.delay_symbols)
     n, middle = np.arange(256), slice(127, 130, 2)
     u = n / w.sampling_rate + w.chirp_duration - w.sampled_duration
     for m in range(w.num_groups):
-        t = u + (np.arange(w.num_chirps) * w.slot_duration + 2 * m * w.max_delay - w.frame_duration / 2)[:, None]
+        t = (
+            u
+            + (
+                np.arange(w.num_chirps) * w.slot_duration
+                + 2 * m * w.max_delay
+                - w.frame_duration / 2
+            )[:, None]
+        )
         tau = (LENGTH + rate * t) / 299_792_458.0
-        beat = np.diff((w.carrier_frequency * tau + w.slope * tau * (u - tau / 2))[:, middle])[:, 0] / 2
-        spun = samples[m] * np.exp(-2j * np.pi * (beat + payload.delay_symbols[m] / 256)[:, None] * n)
-        left = np.angle(spun.sum(axis=1) * payload.phases[m].conj() * np.exp(-2j * np.pi * known[m]))
+        beat = (
+            np.diff((w.carrier_frequency * tau + w.slope * tau * (u - tau / 2))[:, middle])[:, 0]
+            / 2
+        )
+        spun = samples[m] * np.exp(
+            -2j * np.pi * (beat + payload.delay_symbols[m] / 256)[:, None] * n
+        )
+        left = np.angle(
+            spun.sum(axis=1) * payload.phases[m].conj() * np.exp(-2j * np.pi * known[m])
+        )
         assert np.abs(left).max() < 1e-4 + 3e-4 * abs(rate)
 
 
 @pytest.mark.parametrize("cell", [0.61, 22.5, 137.28, 401.93])
 def test_cleaned_frame_is_the_unmodulated_frame(cell: float):
-    """At fractional cells too. Planted bugs: the cross term's ramp left out, the window not moved, phases not conjugated."""
+    """At fractional cells too. Planted bugs: the cross term's ramp left out, the window not moved,
+    phases not conjugated."""
     w, schedule, payload = frame()
     path = [Path(cell * w.range_cell(1), 0.0, 0.7 - 0.4j)]
-    modulated = clean_spectrum(cube(w, schedule, payload, path, FEW), payload.delay_symbols, payload.phases, 512)
+    modulated = clean_spectrum(
+        cube(w, schedule, payload, path, FEW), payload.delay_symbols, payload.phases, 512
+    )
     pilot = unmodulated(w)
-    plain = clean_spectrum(cube(w, schedule, pilot, path, FEW), pilot.delay_symbols, pilot.phases, 512)
+    plain = clean_spectrum(
+        cube(w, schedule, pilot, path, FEW), pilot.delay_symbols, pilot.phases, 512
+    )
     rounding = 2e-6  # of the peak: complex64 samples and transform
     assert np.abs(plain).max() > 100
     assert np.abs(modulated - plain).max() < rounding * np.abs(plain).max()
 
 
 def test_transitions_with_their_spread_and_share():
-    """Phases off their symbols by known angles, receivers that disagree by others: symbols, the RMS angle and the share of the aligned
-    sum by hand. Planted bugs: degrees of the circle over D twice; the earlier chirp not conjugated; the share of powers."""
+    """Phases off their symbols by known angles, receivers that disagree by others: symbols, the RMS
+    angle and the share of the aligned sum by hand. Planted bugs: degrees of the circle over D
+    twice; the earlier chirp not conjugated; the share of powers."""
     rng, schedule = np.random.default_rng(7), np.tile([[0, 1, 2]], (1, 8))
     symbols = rng.integers(0, 8, (1, 3, 7))
     off, apart = rng.uniform(-0.3, 0.3, (1, 3, 7)), 0.4
-    total = np.concatenate([np.zeros((1, 3, 1)), np.cumsum(2 * np.pi / 8 * symbols + off, axis=2)], axis=2)
+    total = np.concatenate(
+        [np.zeros((1, 3, 1)), np.cumsum(2 * np.pi / 8 * symbols + off, axis=2)], axis=2
+    )
     chirps = np.empty((1, 2, 24), complex)
     for tx in range(3):
-        for rx, sign in enumerate((1, -1)):  # the receivers see the phases advance by more and by less
+        for rx, sign in enumerate(
+            (1, -1)
+        ):  # the receivers see the phases advance by more and by less
             chirps[0, rx, tx::3] = 1.7 * np.exp(1j * (total[0, tx] + sign * apart * np.arange(8)))
     found, share, spread = decide_transitions(chirps, schedule, 3, 8)
     assert np.array_equal(found, symbols)
@@ -118,16 +165,28 @@ def test_transitions_with_their_spread_and_share():
 
 @pytest.mark.parametrize(("order", "receivers"), [(8, 3), (2, 1)])
 def test_phases_that_lie_anywhere_are_said_where_noise_lets_it_be_seen(order: int, receivers: int):
-    """Symbols' phases anywhere, or gathered, at SNRs of a cell at which the noise's own spread, by drawing, is well below and well above
-    0.6 of what phases anywhere have. Planted bugs: divided by what they have; one receiver for all."""
+    """Symbols' phases anywhere, or gathered, at SNRs of a cell at which the noise's own spread, by
+    drawing, is well below and well above 0.6 of what phases anywhere have. Planted bugs: divided by
+    what they have; one receiver for all."""
     rng, anywhere, seen = np.random.default_rng(13), np.pi / order / np.sqrt(3), set()
     for snr in (0.3, 1.0, 4.0, 16.0, 32.0, 64.0):
-        two = np.sqrt(snr) + rng.standard_normal((2, receivers, 40_000, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+        two = np.sqrt(snr) + rng.standard_normal((2, receivers, 40_000, 2)) @ np.array(
+            [1, 1j]
+        ) / np.sqrt(2)
         spread = np.angle((two[0] * two[1].conj()).sum(axis=0)).std()
         if not 0.8 < spread / (0.6 * anywhere) < 1.3:  # the formula is of first order in the noise
             none = np.zeros((1, 1), int)
-            one = Symbols(raw=none, delay=none, delay_confidence=np.full((1, 1), snr + 1), transitions=none, transition_confidence=none,
-                          phase_spread=anywhere, phases=none, bits=none, looks=receivers)  # fmt: skip
+            one = Symbols(
+                raw=none,
+                delay=none,
+                delay_confidence=np.full((1, 1), snr + 1),
+                transitions=none,
+                transition_confidence=none,
+                phase_spread=anywhere,
+                phases=none,
+                bits=none,
+                looks=receivers,
+            )
             hidden = spread > 0.6 * anywhere
             assert moves_as_predicted(one, order) == hidden, snr
             assert moves_as_predicted(replace(one, phase_spread=0.5 * anywhere), order)
@@ -136,13 +195,20 @@ def test_phases_that_lie_anywhere_are_said_where_noise_lets_it_be_seen(order: in
 
 
 def test_cleaned_spectra_against_their_sums():
-    """Noise through the definition, written as sums with each phase in cycles: window, data phase and turn, and rows on which the symbol
-    leads round the end of the spectrum. Planted bugs: the wrap one cell late; the window of another length; half the data's own chirp
-    phase."""
+    """Noise through the definition, written as sums with each phase in cycles: window, data phase
+    and turn, and rows on which the symbol leads round the end of the spectrum. Planted bugs: the
+    wrap one cell late; the window of another length; half the data's own chirp phase."""
     w = Waveform(num_samples=48, num_chirps=12)
-    schedule, rng = pseudo_random_schedule(w.num_groups, 12, w.num_tx, np.random.default_rng(5)), np.random.default_rng(6)
+    schedule, rng = (
+        pseudo_random_schedule(w.num_groups, 12, w.num_tx, np.random.default_rng(5)),
+        np.random.default_rng(6),
+    )
     payload = random_payload(w, schedule, 8, rng)
-    samples = rng.standard_normal((w.num_groups, 2, 12, 48, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    samples = (
+        rng.standard_normal((w.num_groups, 2, 12, 48, 2))
+        .astype(np.float32)
+        .view(np.complex64)[..., 0]
+    )
     received = IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0)
     found = clean_spectrum(received, payload.delay_symbols, payload.phases, 48)
     n, T, alpha = np.arange(48), 48 / w.sampling_rate, w.bandwidth / w.chirp_duration
@@ -152,18 +218,25 @@ def test_cleaned_spectra_against_their_sums():
         tau = symbol / (alpha * T)
         shift = tau * w.sampling_rate
         length = 48 - 24 / (alpha * T) * w.sampling_rate
-        window = np.where((n >= shift) & (n <= shift + length), np.sin(np.pi * (n - shift) / length) ** 2, 0)
+        window = np.where(
+            (n >= shift) & (n <= shift + length), np.sin(np.pi * (n - shift) / length) ** 2, 0
+        )
         data = w.carrier_frequency * tau + alpha * (w.chirp_duration - T) * tau - alpha * tau**2 / 2
         for k in (0, 1, 17, 46 - symbol, 47 - symbol, 48 - symbol, 47):
             cycles = -(k + symbol) * n / 48 + k * shift / 48 - data
-            truth = samples[m, 1, p] @ (window * np.exp(2j * np.pi * cycles)) * payload.phases[m, p].conj()
+            truth = (
+                samples[m, 1, p]
+                @ (window * np.exp(2j * np.pi * cycles))
+                * payload.phases[m, p].conj()
+            )
             assert abs(found[m, 1, k % 48, p] - truth) < 3e-5  # complex64: 1e-7 of sums of some 20
 
 
 @pytest.mark.parametrize("order", [2, 4, 8, 16])
 @pytest.mark.parametrize("rate", [-29.4, 17.3])
 def test_noise_free_symbols_are_right_at_the_ends_of_the_velocity(order: int, rate: float):
-    """Planted bugs: running product with the index of the transition, conjugate on the later chirp, group offsets forgotten."""
+    """Planted bugs: running product with the index of the transition, conjugate on the later chirp,
+    group offsets forgotten."""
     w, schedule, payload = frame(order)
     signal = cube(w, schedule, payload, [Path(71.39, rate, 1j, ARRIVAL, DEPARTURE)], FEW)
     found = demodulate(signal, predict(71.42, rate + 0.05), order)
@@ -173,10 +246,13 @@ def test_noise_free_symbols_are_right_at_the_ends_of_the_velocity(order: int, ra
     assert np.abs(found.phases - payload.phases).max() < 1e-12  # rounding
 
 
-@pytest.mark.parametrize(("cell", "error"), [(0.0, 0.0), (22.5, 0.0), (22.5, 0.4), (22.2, -0.4), (255.9, 0.3), (600.4, 0.2), (700.0, -0.3)])
+@pytest.mark.parametrize(
+    ("cell", "error"),
+    [(0.0, 0.0), (22.5, 0.0), (22.5, 0.4), (22.2, -0.4), (255.9, 0.3), (600.4, 0.2), (700.0, -0.3)],
+)
 def test_delay_decision_at_fractions_and_beyond_the_wrap(cell: float, error: float):
-    """At cells above N/2 the tone passes N in many chirps and comes back at f + D - N. Planted bugs: rounding the peak less the
-    prediction; cells not taken modulo N; floor."""
+    """At cells above N/2 the tone passes N in many chirps and comes back at f + D - N. Planted
+    bugs: rounding the peak less the prediction; cells not taken modulo N; floor."""
     w, schedule, payload = frame()
     signal = cube(w, schedule, payload, [Path(cell * w.range_cell(1), 0.0)], FEW)
     found = demodulate(signal, predict((cell + error) * w.range_cell(1), 0.0), 8)
@@ -187,8 +263,8 @@ def test_delay_decision_at_fractions_and_beyond_the_wrap(cell: float, error: flo
 
 @pytest.mark.parametrize("slip", [-3, -1, 1, 3])
 def test_a_slip_shows_in_the_raw_symbols(link, slip: int):
-    """A prediction that is whole cells too long reads every symbol as many too low, below 0 at the bottom of the alphabet.
-    Planted bug: raw clipped to the alphabet."""
+    """A prediction that is whole cells too long reads every symbol as many too low, below 0 at the
+    bottom of the alphabet. Planted bug: raw clipped to the alphabet."""
     w, payload, signal = link
     symbols = payload.delay_symbols.copy()
     symbols[0, 5], symbols[1, 7] = 0, w.num_delay_symbols - 1
@@ -203,8 +279,9 @@ def test_a_slip_shows_in_the_raw_symbols(link, slip: int):
 
 
 def test_velocity_is_taken_out_chirp_by_chirp():
-    """D = 16 at high speed with large symbols: the path moves through 0.47 cells in the frame. Planted bugs: the middle of the window
-    at the end of the chirp; the cross term of the data and the path left out."""
+    """D = 16 at high speed with large symbols: the path moves through 0.47 cells in the frame.
+    Planted bugs: the middle of the window at the end of the chirp; the cross term of the data and
+    the path left out."""
     w, schedule, payload = frame(16)
     signal = cube(w, schedule, payload, [Path(199.13, 29.2)], FEW)
     found = demodulate(signal, predict(199.13, 29.2), 16)
@@ -213,8 +290,8 @@ def test_velocity_is_taken_out_chirp_by_chirp():
 
 
 def test_weaker_reference_is_read_with_the_stronger_path_predicted():
-    """A path of 1.5 times the amplitude 30 cells behind the line of sight takes every decision unless it votes too.
-    Planted bug: the votes' offsets with the wrong sign."""
+    """A path of 1.5 times the amplitude 30 cells behind the line of sight takes every decision
+    unless it votes too. Planted bug: the votes' offsets with the wrong sign."""
     w, schedule, payload = frame()
     behind = LENGTH + 30 * w.range_cell(1)
     signal = cube(w, schedule, payload, [Path(LENGTH, 3.1), Path(behind, 3.1, 1.5)], FEW)
@@ -229,24 +306,33 @@ def test_weaker_reference_is_read_with_the_stronger_path_predicted():
     [(-28, 0.1421, 0.3427), (-25, 0.0008, 0.0265)],
 )
 def test_symbol_errors_in_noise(link, snr_db: float, delay_ser: float, dpsk_ser: float):
-    """Against an independent simulation's rates (1200 and 1170 symbols). Planted bugs: every second receiver left out of
-    the sum, a Hann window before the decision."""
+    """Against an independent simulation's rates (1200 and 1170 symbols). Planted bugs: every second
+    receiver left out of the sum, a Hann window before the decision."""
     _, payload, clean = link
     frames, wrong_delay, wrong_dpsk = 3, 0, 0
     for seed in range(frames):
-        found = demodulate(with_noise(clean, 10 ** (-snr_db / 10), 100 + seed), predict(LENGTH + 0.05, RATE - 0.1), 8)
+        found = demodulate(
+            with_noise(clean, 10 ** (-snr_db / 10), 100 + seed),
+            predict(LENGTH + 0.05, RATE - 0.1),
+            8,
+        )
         wrong_delay += int((found.raw != payload.delay_symbols).sum())
         wrong_dpsk += int((found.transitions != payload.transitions).sum())
     count = frames * payload.delay_symbols.size, frames * payload.transitions.size
-    for wrong, n, rate, n_rate in ((wrong_delay, count[0], delay_ser, 1200), (wrong_dpsk, count[1], dpsk_ser, 1170)):
+    for wrong, n, rate, n_rate in (
+        (wrong_delay, count[0], delay_ser, 1200),
+        (wrong_dpsk, count[1], dpsk_ser, 1170),
+    ):
         pooled = (wrong + rate * n_rate + 1) / (n + n_rate)
-        # a wrong delay breaks two transitions: their errors come in pairs, which doubles the variance
+        # a wrong delay breaks two transitions: their errors come in pairs, which doubles the
+        # variance
         spread = np.sqrt(2 * pooled * (1 - pooled) * (1 / n + 1 / n_rate))
         assert abs(wrong / n - rate) < FIVE_SIGMA * spread
 
 
 def test_confidence_threshold_in_noise():
-    """The median of the confidences of noise stays below it, but close. Planted bug: the level of a single cell."""
+    """The median of the confidences of noise stays below it, but close. Planted bug: the level of a
+    single cell."""
     cells, chirps, num_rx = 520, 360, 15
     level = confidence_threshold(num_rx, cells, chirps)
     rng = np.random.default_rng(8)
@@ -259,17 +345,24 @@ def test_confidence_threshold_in_noise():
 
 
 def test_a_blocked_line_of_sight_is_said_and_nothing_invented(link):
-    """Noise alone, and a reflection that moves otherwise than predicted. Planted bug: decoded set when a prediction is given."""
+    """Noise alone, and a reflection that moves otherwise than predicted. Planted bug: decoded set
+    when a prediction is given."""
     w, payload, clean = link
     silent = replace(clean, samples=np.zeros_like(clean.samples))
     for seed in range(2):
-        r = receive_passive(with_noise(silent, 1.0, seed), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True)
+        r = receive_passive(
+            with_noise(silent, 1.0, seed), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True
+        )
         assert not r.line_of_sight and not r.decoded and len(r.detections) == 0
         assert (r.delay_symbols == -1).all() and (r.transitions == -1).all()
         assert r.bits.size == 0 and r.raw_delay_symbols.size == 0 and np.isnan(r.reference_power)
     reflection = cube(w, clean.schedule, payload, [Path(LENGTH + 9.31, RATE + 11.7, 0.3)])
-    r = receive_passive(with_noise(reflection, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True)
-    assert not r.line_of_sight and not r.decoded and r.bits.size == 0 and np.isnan(r.reference_power)
+    r = receive_passive(
+        with_noise(reflection, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True
+    )
+    assert (
+        not r.line_of_sight and not r.decoded and r.bits.size == 0 and np.isnan(r.reference_power)
+    )
 
 
 def test_a_modulated_frame_without_prediction_is_not_read(link):
@@ -279,45 +372,69 @@ def test_a_modulated_frame_without_prediction_is_not_read(link):
 
 
 def test_reception_of_a_frame(link):
-    """The line of sight and a weak reflection: symbols, bits, the reference first, its power. Planted bugs: power of the strongest
-    sample; cleaning with the clipped symbols' phases of the wrong antenna."""
+    """The line of sight and a weak reflection: symbols, bits, the reference first, its power.
+    Planted bugs: power of the strongest sample; cleaning with the clipped symbols' phases of the
+    wrong antenna."""
     w, payload, clean = link
     weak = cube(w, clean.schedule, payload, [Path(61.27, 4.44, 0.05, (-0.4, 0.1))])
     mixed = with_noise(replace(clean, samples=clean.samples + weak.samples), 0.1, 5)
-    r = receive_passive(mixed, ANTENNAS, SETTINGS, 8, predict(LENGTH + 0.07, RATE + 0.1), True, maps=True)
+    r = receive_passive(
+        mixed, ANTENNAS, SETTINGS, 8, predict(LENGTH + 0.07, RATE + 0.1), True, maps=True
+    )
     d = r.detections
     assert r.decoded and r.line_of_sight and np.array_equal(r.bits, payload.bits)
-    assert np.array_equal(r.delay_symbols, payload.delay_symbols) and np.array_equal(r.transitions, payload.transitions)
+    assert np.array_equal(r.delay_symbols, payload.delay_symbols) and np.array_equal(
+        r.transitions, payload.transitions
+    )
     assert d.is_reference.tolist() == [True] + [False] * (len(d) - 1)
-    assert r.reference_power == pytest.approx(1.0, rel=0.01)  # migration and the group offsets leave under 1 %
-    assert abs(d.range[0] - LENGTH) < 5 * d.std[0, 0] and abs(d.velocity[0] - RATE) < 5 * d.std[0, 1]
+    assert r.reference_power == pytest.approx(
+        1.0, rel=0.01
+    )  # migration and the group offsets leave under 1 %
+    assert (
+        abs(d.range[0] - LENGTH) < 5 * d.std[0, 0] and abs(d.velocity[0] - RATE) < 5 * d.std[0, 1]
+    )
     near = np.flatnonzero(np.abs(d.range - 61.27) < 0.25)
     assert near.size == 1 and abs(d.velocity[near[0]] - 4.44) < 0.1
     assert np.abs(d.direction[near[0]] - [-0.4, 0.1]).max() < 0.02
     assert r.maps is not None and r.maps.range_doppler.shape == (w.num_delay_symbols, w.num_chirps)
     again = receive_passive(mixed, ANTENNAS, SETTINGS, 8, predict(LENGTH + 0.07, RATE + 0.1), True)
-    assert np.array_equal(again.detections.range, d.range) and np.array_equal(again.delay_confidence, r.delay_confidence)
+    assert np.array_equal(again.detections.range, d.range) and np.array_equal(
+        again.delay_confidence, r.delay_confidence
+    )
 
 
 def test_acquisition_takes_the_earliest_path(link):
-    """In a pilot the line of sight is the first of the strong paths, not the strongest. Planted bug: argmax of the power."""
+    """In a pilot the line of sight is the first of the strong paths, not the strongest. Planted
+    bug: argmax of the power."""
     w, _, clean = link
     paths = [Path(33.4, 2.2, 0.5, ARRIVAL), Path(57.9, -6.1, 1.0), Path(12.2, 0.7, 0.01)]
     pilot = cube(w, clean.schedule, unmodulated(w), paths)
     r = receive_passive(with_noise(pilot, 0.1, 2), ANTENNAS, SETTINGS, 8, None, False)
     d = r.detections
     assert len(d) == 3 and r.line_of_sight and not r.decoded and d.is_reference.sum() == 1
-    assert abs(d.range[d.is_reference][0] - 33.4) < 0.01 and abs(d.velocity[d.is_reference][0] - 2.2) < 0.02
+    assert (
+        abs(d.range[d.is_reference][0] - 33.4) < 0.01
+        and abs(d.velocity[d.is_reference][0] - 2.2) < 0.02
+    )
     assert r.reference_power == pytest.approx(0.25, rel=0.02)
 
 
 def test_a_terminal_that_reads_some_groups(link):
-    """What it decides of its own groups is what was sent in them, and -1 and no confidence stand where it does not read, in the shapes of
-    all. Planted bugs: its groups put first; the shapes of its own."""
+    """What it decides of its own groups is what was sent in them, and -1 and no confidence stand
+    where it does not read, in the shapes of all. Planted bugs: its groups put first; the shapes of
+    its own."""
     _, payload, clean = link
-    r = receive_passive(with_noise(clean, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True, groups=(0, 2))
-    assert r.delay_symbols.shape == payload.delay_symbols.shape and r.transitions.shape == payload.transitions.shape
-    for name, sent in (("delay_symbols", payload.delay_symbols), ("transitions", payload.transitions)):
+    r = receive_passive(
+        with_noise(clean, 0.1, 3), ANTENNAS, SETTINGS, 8, predict(LENGTH, RATE), True, groups=(0, 2)
+    )
+    assert (
+        r.delay_symbols.shape == payload.delay_symbols.shape
+        and r.transitions.shape == payload.transitions.shape
+    )
+    for name, sent in (
+        ("delay_symbols", payload.delay_symbols),
+        ("transitions", payload.transitions),
+    ):
         found = getattr(r, name)
         assert np.array_equal(found[[0, 2]], sent[[0, 2]]) and (found[1] == -1).all()
     for sure in (r.delay_confidence, r.transition_confidence):

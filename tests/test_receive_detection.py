@@ -1,4 +1,5 @@
-"""Maps, CFAR, off-grid estimates and angles at the receivers, on cubes written from the signal's equation."""
+"""Maps, CFAR, off-grid estimates and angles at the receivers, on cubes written from the signal's
+equation."""
 
 from __future__ import annotations
 
@@ -38,7 +39,14 @@ from isac_rt.receive.estimate import (
     standard_deviations,
     start_point,
 )
-from isac_rt.receive.maps import accumulate, channel_maps, correlation_operator, slow_times, slow_window, union_operator
+from isac_rt.receive.maps import (
+    accumulate,
+    channel_maps,
+    correlation_operator,
+    slow_times,
+    slow_window,
+    union_operator,
+)
 from isac_rt.receive.omp import omp
 from isac_rt.receive.sense import sense, velocity_method
 from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
@@ -52,17 +60,22 @@ FALSE_FAILURE = 1e-6  # statistical
 
 def white(w: Waveform, schedule: np.ndarray, num_rx: int, seed: int) -> IFCube:
     shape = (w.num_groups, num_rx, w.num_chirps, w.num_samples, 2)
-    samples = np.random.default_rng(seed).standard_normal(shape, np.float32).view(np.complex64)[..., 0]
+    samples = (
+        np.random.default_rng(seed).standard_normal(shape, np.float32).view(np.complex64)[..., 0]
+    )
     return IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0)
 
 
 # --- Doppler
 
 
-@pytest.mark.parametrize(("tone", "bound_db"), [(0.0, -60), (10.3, -60), (-30.5, -60), (50.5, -60), (58.2, -48)])
+@pytest.mark.parametrize(
+    ("tone", "bound_db"), [(0.0, -60), (10.3, -60), (-30.5, -60), (50.5, -60), (58.2, -48)]
+)
 def test_union_of_groups_is_the_uniform_sampling(tone: float, bound_db: float):
-    """One antenna's samples at their true times against the windowed DFT of uniform samples, over all bins. Planted bugs: offsets of
-    the groups left out (-25 dB), offsets of the data left out (-45 dB), times not about their mean."""
+    """One antenna's samples at their true times against the windowed DFT of uniform samples, over
+    all bins. Planted bugs: offsets of the groups left out (-25 dB), offsets of the data left out
+    (-45 dB), times not about their mean."""
     w, schedule, payload = frame()
     sent = schedule == 1
     groups, slots = np.nonzero(sent)
@@ -99,8 +112,8 @@ def test_sparse_correlation_is_the_sum_over_the_samples():
 
 
 def test_omp_against_a_plain_loop():
-    """Batch-OMP against least squares on a growing support. Planted bugs: correlation updated with the transposed Gram matrix,
-    first atom chosen twice."""
+    """Batch-OMP against least squares on a growing support. Planted bugs: correlation updated with
+    the transposed Gram matrix, first atom chosen twice."""
     rng = np.random.default_rng(6)
     chosen = np.sort(rng.choice(120, 40, replace=False))
     vectors = rng.standard_normal((12, 40)) + 1j * rng.standard_normal((12, 40))
@@ -130,17 +143,24 @@ def test_method_follows_the_schedule():
     assert velocity_method(SETTINGS, schedule[:2], 3) == "omp"
     assert velocity_method(SETTINGS, conventional_schedule(2, 120, 3), 3) == "conventional"
     assert velocity_method(Receivers(velocity_method="omp"), schedule, 3) == "omp"
-    assert velocity_method(Receivers(velocity_method="latin_union"), schedule[:2], 3) == "latin_union"
+    assert (
+        velocity_method(Receivers(velocity_method="latin_union"), schedule[:2], 3) == "latin_union"
+    )
 
 
 # --- CFAR
 
 
-@pytest.mark.parametrize(("rate", "looks", "cells"), [(1e-6, 45, 30.0), (1e-3, 9, 4.7), (1e-2, 1, 11.0)])
+@pytest.mark.parametrize(
+    ("rate", "looks", "cells"), [(1e-6, 45, 30.0), (1e-3, 9, 4.7), (1e-2, 1, 11.0)]
+)
 def test_factor_of_one_side_is_the_f_distribution(rate: float, looks: int, cells: float):
-    """A cell over a mean of n cells is F(2 L, 2 L n). Planted bug: looks of the cell used for the training mean."""
+    """A cell over a mean of n cells is F(2 L, 2 L n). Planted bug: looks of the cell used for the
+    training mean."""
     quadrature = 1e-4
-    assert greatest_of_factor(rate, looks, cells, 0.0) == pytest.approx(stats.f.isf(rate, 2 * looks, 2 * looks * cells), rel=quadrature)
+    assert greatest_of_factor(rate, looks, cells, 0.0) == pytest.approx(
+        stats.f.isf(rate, 2 * looks, 2 * looks * cells), rel=quadrature
+    )
     many = greatest_of_factor(rate, looks, 1e6, 1e6)
     assert many == pytest.approx(stats.gamma(looks, scale=1 / looks).isf(rate), rel=1e-3)
 
@@ -156,13 +176,15 @@ def test_factor_of_the_greater_side_by_drawing():
 
 
 def test_false_alarm_rate_of_the_whole_chain():
-    """White noise through data removal, union and accumulation. Neighbouring cells of the map are alike, so false alarms come in
-    groups: the bounds are for a third as many independent trials; few training cells, so that they matter. Planted bug:
-    one look too many."""
+    """White noise through data removal, union and accumulation. Neighbouring cells of the map are
+    alike, so false alarms come in groups: the bounds are for a third as many independent trials;
+    few training cells, so that they matter. Planted bug: one look too many."""
     w, schedule, payload = frame()
     rate, false, trials = 1e-2, 0, 0
     for seed in range(4):
-        spectra = clean_spectrum(white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512)
+        spectra = clean_spectrum(
+            white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512
+        )
         power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
         above, _ = detect(power, 9, rate, GUARD, (1, 1))
         false, trials = false + int(above.sum()), trials + above.size
@@ -181,19 +203,30 @@ def test_independent_cells_of_a_windowed_axis(count: int):
 
 @pytest.mark.parametrize(("guard", "training"), [((1, 0), (2, 1)), ((3, 2), (5, 1))])
 def test_threshold_of_a_map_by_its_integral(guard: tuple[int, int], training: tuple[int, int]):
-    """A cell over the greater mean of two blocks of training[0] rows and 2 (guard + training) + 1 bins each, neighbours weighed by the
-    window; in the first row over the block behind alone. Planted bugs: a bin more; the guard's rows among the training's."""
+    """A cell over the greater mean of two blocks of training[0] rows and 2 (guard + training) + 1
+    bins each, neighbours weighed by the window; in the first row over the block behind alone.
+    Planted bugs: a bin more; the guard's rows among the training's."""
 
     def independent(count: int) -> float:
         squared = np.fft.fft(np.sin(np.pi * (np.arange(120) + 0.5) / 120) ** 4)
         alike = np.abs(squared / squared[0]) ** 2
         return count**2 / sum(alike[abs(i - j)] for i in range(count) for j in range(count))
 
-    looks, rate, quadrature = 3, 2e-3, 1e-3  # of the rate; the factor is good to 1e-4 and the tail is steep
+    looks, rate, quadrature = (
+        3,
+        2e-3,
+        1e-3,
+    )  # of the rate; the factor is good to 1e-4 and the tail is steep
     size = looks * independent(training[0]) * independent(2 * (guard[1] + training[1]) + 1)
     cell, mean = stats.gamma(looks, scale=1 / looks), stats.gamma(size, scale=1 / size)
     z = threshold(looks, rate, guard, training)
-    both = quad(lambda y: 2 * mean.pdf(y) * mean.cdf(y) * cell.sf(z * y), 0, 12, points=[0.3, 1, 2], limit=200)[0]
+    both = quad(
+        lambda y: 2 * mean.pdf(y) * mean.cdf(y) * cell.sf(z * y),
+        0,
+        12,
+        points=[0.3, 1, 2],
+        limit=200,
+    )[0]
     assert both == pytest.approx(rate, rel=quadrature, abs=0)
     first = row_factors(60, looks, rate, guard, training)[0]
     one = quad(lambda y: mean.pdf(y) * cell.sf(first * y), 0, 12, points=[0.3, 1, 2], limit=200)[0]
@@ -206,14 +239,24 @@ def test_training_at_the_ends_and_across_the_doppler_wrap():
     level = background(power, np.ones(power.shape, bool), (1, 1), (4, 2))
     assert np.isfinite(level).all()
     share = (6 * 1.0 + 5.0) / 7  # width 2 (1 + 2) + 1 = 7 columns, one of them the bright one
-    assert level[20, 19] == pytest.approx(share) and level[0, 2] == pytest.approx(share) and level[39, 10] == pytest.approx(1.0)
+    assert (
+        level[20, 19] == pytest.approx(share)
+        and level[0, 2] == pytest.approx(share)
+        and level[39, 10] == pytest.approx(1.0)
+    )
     counts = side_rows(40, 1, 4)
-    assert counts[0].tolist() == [0, 4] and counts[2].tolist() == [0, 4] and counts[3].tolist() == [2, 4] and counts[39].tolist() == [4, 0]
+    assert (
+        counts[0].tolist() == [0, 4]
+        and counts[2].tolist() == [0, 4]
+        and counts[3].tolist() == [2, 4]
+        and counts[39].tolist() == [4, 0]
+    )
 
 
 def test_background_against_plain_loops():
-    """Guard and training of four different sizes, cells left out, both ends of the range axis, Doppler round its ends: the greater of
-    both sides' means. Planted bugs: the guard of Doppler in range; the rows of the other side; a side of too few cells that counts."""
+    """Guard and training of four different sizes, cells left out, both ends of the range axis,
+    Doppler round its ends: the greater of both sides' means. Planted bugs: the guard of Doppler in
+    range; the rows of the other side; a side of too few cells that counts."""
     rng, guard, training = np.random.default_rng(17), (2, 1), (5, 3)
     power, keep = rng.exponential(1.0, (23, 17)), rng.random((23, 17)) > 0.3
     found = background(power, keep, guard, training)
@@ -229,12 +272,14 @@ def test_background_against_plain_loops():
 
 
 def test_a_clutter_edge_raises_no_alarms():
-    """A step of 20 dB in range. Planted bug: the mean of both sides, which gives thousands of alarms before the edge's far side."""
+    """A step of 20 dB in range. Planted bug: the mean of both sides, which gives thousands of
+    alarms before the edge's far side."""
     rng = np.random.default_rng(4)
     power = rng.gamma(45, 1 / 45, (200, 120))
     power[100:] *= 100
     above, _ = detect(power, 45, 1e-4, GUARD, TRAINING)
-    # the four rows behind the edge see it in their guard cells only: their own side holds the rate to a few times the design
+    # the four rows behind the edge see it in their guard cells only: their own side holds the rate
+    # to a few times the design
     assert above.sum() <= stats.binom.isf(FALSE_FAILURE, power.size, 3e-4)
 
 
@@ -252,7 +297,10 @@ def test_hann_envelope_bounds_the_window_spectrum():
     relative, distance = spectrum / spectrum[0], np.arange(16 * 40) / 16
     bound = hann_envelope(distance)
     assert (relative <= bound * 1.01).all()
-    peak = [relative[(distance >= k) & (distance < k + 1)].max() / bound[16 * k + 8] for k in range(3, 30)]
+    peak = [
+        relative[(distance >= k) & (distance < k + 1)].max() / bound[16 * k + 8]
+        for k in range(3, 30)
+    ]
     assert min(peak) > 0.7  # not loose either
 
 
@@ -268,8 +316,9 @@ def test_sidelobes_are_told_from_targets():
 
 
 def test_sidelobes_lie_round_the_ends_of_the_doppler_axis():
-    """What is told from what does not change when all bins are turned round: a lobe three rows and bins from a strong path, beyond the end
-    of the axis too, is one; the same power further off is a target. Planted bug: bins apart not counted round the end."""
+    """What is told from what does not change when all bins are turned round: a lobe three rows and
+    bins from a strong path, beyond the end of the axis too, is one; the same power further off is a
+    target. Planted bug: bins apart not counted round the end."""
     rows, bins, size = np.array([50, 53, 53]), np.array([2, 5, 42]), 120
     for turn in range(0, size, 7):
         power = np.ones((100, size))
@@ -279,9 +328,15 @@ def test_sidelobes_lie_round_the_ends_of_the_doppler_axis():
 
 
 def test_compiled_match_is_the_template():
-    """Planted bugs: Doppler without the data delay, phase at the first sample, window's transform about its start."""
+    """Planted bugs: Doppler without the data delay, phase at the first sample, window's transform
+    about its start."""
     w, schedule, _ = frame()
-    spectra = np.random.default_rng(2).standard_normal((3, 2, 30, 120, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    spectra = (
+        np.random.default_rng(2)
+        .standard_normal((3, 2, 30, 120, 2))
+        .astype(np.float32)
+        .view(np.complex64)[..., 0]
+    )
     tau, rate, row = 14.37 * w.delay_step, 3.1e-8, 14
     got = LocalSpectra(spectra, w, schedule, np.zeros_like(schedule), row).respond(tau, rate)
     rows = np.arange(row - 3, row + 4)
@@ -290,7 +345,10 @@ def test_compiled_match_is_the_template():
     template = shape * np.exp(2j * np.pi * turn)
     for tx in range(3):
         weight = (schedule == tx) * slow_window(w)
-        expected = np.einsum("mxkp,mpk,mp->x", spectra[:, :, rows], template.conj(), weight) / (shape**2 * weight[..., None]).sum()
+        expected = (
+            np.einsum("mxkp,mpk,mp->x", spectra[:, :, rows], template.conj(), weight)
+            / (shape**2 * weight[..., None]).sum()
+        )
         assert np.abs(got[tx] - expected).max() < 1e-9 * np.abs(expected).max()  # rounding
 
 
@@ -299,25 +357,37 @@ def test_window_transform_is_closed_form():
     w = Waveform()
     n, length = np.arange(w.num_samples), window_length(w)
     for offset in (0.0, 0.37, -1.2, 2.6):
-        slow = (hann(n, length) * np.exp(2j * np.pi * offset * (n - length / 2) / w.num_samples)).sum()
+        slow = (
+            hann(n, length) * np.exp(2j * np.pi * offset * (n - length / 2) / w.num_samples)
+        ).sum()
         assert abs(slow - hann_response(w, np.array(offset))) < 1e-4 * length / 2
 
 
-CASES = [(10.123, -3.266, 0.43, -0.31), (46.3217, 13.277, -0.52, 0.17), (97.618, 14.62, 0.05, 0.61), (3.417, -14.5, -0.2, -0.2)]
+CASES = [
+    (10.123, -3.266, 0.43, -0.31),
+    (46.3217, 13.277, -0.52, 0.17),
+    (97.618, 14.62, 0.05, 0.61),
+    (3.417, -14.5, -0.2, -0.2),
+]
 
 
 @pytest.mark.parametrize(("distance", "speed", "x", "z"), CASES)
 def test_an_echo_is_estimated_without_bias(distance: float, speed: float, x: float, z: float):
-    """One noise-free modulated path at the AT, off the grid: nothing else is seen. Planted bugs: coupling with the wrong sign,
-    range not referred to mid-frame, carrier at the start of the chirp, X and Z arm exchanged, steering with the other sign."""
+    """One noise-free modulated path at the AT, off the grid: nothing else is seen. Planted bugs:
+    coupling with the wrong sign, range not referred to mid-frame, carrier at the start of the
+    chirp, X and Z arm exchanged, steering with the other sign."""
     w, schedule, payload = frame()
     signal = cube(w, schedule, payload, [Path(2 * distance, 2 * speed, 1.0, (x, z), (x, z))])
     d = receive_active(signal, payload, ANTENNAS, SETTINGS).detections
     assert len(d) == 1
-    rounding_range, rounding_velocity = 2e-4, 1e-5  # element delays of opposite sign do not cancel exactly in the summed power
+    rounding_range, rounding_velocity = (
+        2e-4,
+        1e-5,
+    )  # element delays of opposite sign do not cancel exactly in the summed power
     assert abs(d.range[0] - distance) < rounding_range
     assert abs(d.velocity[0] - speed) < rounding_velocity
-    # the cube has plane waves, the receiver expects spheres: |r|^2/(2 R) over the array, falling with the distance
+    # the cube has plane waves, the receiver expects spheres: |r|^2/(2 R) over the array, falling
+    # with the distance
     assert np.abs(d.direction[0] - [x, z]).max() < 1e-4 + 4e-3 / distance
 
 
@@ -334,12 +404,18 @@ def test_one_way_angles_use_the_receive_arm_only():
 
 @pytest.mark.parametrize("virtual", [True, False])
 def test_beamformer_against_its_signal(virtual: bool):
-    """Channels straight from the positions, all over the field of view. Planted bug: spacing of half a wavelength."""
+    """Channels straight from the positions, all over the field of view. Planted bug: spacing of
+    half a wavelength."""
     w, middle = Waveform(), 2 * np.pi * Waveform().effective_carrier / SPEED_OF_LIGHT
     for axis, u in ((0, -0.83), (0, 0.271), (2, 0.64), (2, -0.07)):
-        tx, rx = ANTENNAS.tx_positions[:, axis] * (u if virtual else -0.3), ANTENNAS.rx_positions[:, axis] * u
+        tx, rx = (
+            ANTENNAS.tx_positions[:, axis] * (u if virtual else -0.3),
+            ANTENNAS.rx_positions[:, axis] * u,
+        )
         channels = np.exp(-1j * middle * (tx[:, None] + rx[None, :]))
-        assert direction_cosine(channels, ANTENNAS, w, axis, virtual) == pytest.approx(u, abs=1e-4)  # window's middle is 9 samples off
+        assert direction_cosine(channels, ANTENNAS, w, axis, virtual) == pytest.approx(
+            u, abs=1e-4
+        )  # window's middle is 9 samples off
 
 
 def test_outside_the_field_of_view_there_is_no_direction():
@@ -351,15 +427,18 @@ def test_outside_the_field_of_view_there_is_no_direction():
 
 
 def test_standard_deviations_match_the_scatter():
-    """Noise at -24 dB per sample, 10 frames of one path: each estimate's scatter is what `std` says, within the chi-square spread and
-    the factor 2 to which the bound is meant. Planted bug: variance for deviation."""
+    """Noise at -24 dB per sample, 10 frames of one path: each estimate's scatter is what `std`
+    says, within the chi-square spread and the factor 2 to which the bound is meant. Planted bug:
+    variance for deviation."""
     w, schedule, _ = frame()
     pilot = unmodulated(w)
     clean = cube(w, schedule, pilot, [Path(71.3, -4.6, 1.0, (0.2, -0.3), (0.1, 0.2))], FEW)
     errors, std = [], np.zeros(4)
     for seed in range(10):
         noisy = white(w, schedule, 3, 50 + seed)
-        noisy = replace(noisy, samples=clean.samples + noisy.samples * np.float32(np.sqrt(10**2.4 / 2)))
+        noisy = replace(
+            noisy, samples=clean.samples + noisy.samples * np.float32(np.sqrt(10**2.4 / 2))
+        )
         spectra = clean_spectrum(noisy, pilot.delay_symbols, pilot.phases, 512)
         d = sense(spectra, w, schedule, pilot.delay_symbols, FEW, SETTINGS, 1).detections
         errors.append([d.range[0] - 71.3, d.velocity[0] + 4.6, *(d.direction[0] - [0.2, -0.3])])
@@ -370,14 +449,16 @@ def test_standard_deviations_match_the_scatter():
 
 @pytest.mark.parametrize("passes", [1, 2])
 def test_pictures_hold_the_first_groups_mean_power_and_their_axes(passes: int):
-    """The equivalent range map by its definition, and a path of the frame where the axes say. Planted bugs: divided by the chirps; speed
-    of the other sign, of one pass for two."""
+    """The equivalent range map by its definition, and a path of the frame where the axes say.
+    Planted bugs: divided by the chirps; speed of the other sign, of one pass for two."""
     w, schedule, _ = frame(waveform=Waveform(num_samples=256))
     length, rate = passes * 40.3 * w.range_cell(passes), passes * 17.2 * w.velocity_cell(passes)
     pilot = unmodulated(w)
     signal = cube(w, schedule, pilot, [Path(length, rate)], FEW, noise=0.3)
     maps = sense_pictures(signal, pilot, passes)
-    truth = np.sqrt((np.abs(np.fft.fft(signal.samples[0].astype(complex), axis=2)) ** 2).mean(axis=0).T)
+    truth = np.sqrt(
+        (np.abs(np.fft.fft(signal.samples[0].astype(complex), axis=2)) ** 2).mean(axis=0).T
+    )
     assert maps.equivalent_range == pytest.approx(truth, rel=1e-4, abs=0)
     row, column = np.unravel_index(maps.range_doppler.argmax(), maps.range_doppler.shape)
     assert abs(maps.range_axis[row] - length / passes) < 0.6 * w.range_cell(passes)
@@ -392,9 +473,10 @@ def sense_pictures(signal: IFCube, pilot, passes: int):
 
 @pytest.mark.parametrize("passes", [1, 2])
 def test_stated_deviations_are_the_bound_of_a_tone(passes: int):
-    """Fisher information of a tone's frequency on each axis by differences, with all the SNR on range and velocity, Hann's loss of 2 there,
-    and each arm's share on its direction; the floors at high SNR. Planted bugs: the loss taken twice; the receivers' aperture alone for
-    an echo; the share of the other arm."""
+    """Fisher information of a tone's frequency on each axis by differences, with all the SNR on
+    range and velocity, Hann's loss of 2 there, and each arm's share on its direction; the floors at
+    high SNR. Planted bugs: the loss taken twice; the receivers' aperture alone for an echo; the
+    share of the other arm."""
     w, few, snr = Waveform(), replace(ANTENNAS, rx_x=5, rx_z=3), 37.3
     stated = standard_deviations(snr, few, w, passes)
     x = np.linspace(-0.5, 0.5, 20001)  # the share of the axis: its frequency is in cells
@@ -402,49 +484,81 @@ def test_stated_deviations_are_the_bound_of_a_tone(passes: int):
     assert stated[0] == pytest.approx(np.sqrt(2) * tone * w.range_cell(passes), rel=1e-3, abs=0)
     assert stated[1] == pytest.approx(np.sqrt(2) * tone * w.velocity_cell(passes), rel=1e-3, abs=0)
     k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
-    for i, (axis, receivers, senders) in enumerate(((0, range(5), range(2)), (2, range(4, 7), range(1, 3)))):
+    for i, (axis, receivers, senders) in enumerate(
+        ((0, range(5), range(2)), (2, range(4, 7), range(1, 3)))
+    ):
         if passes == 2:
-            places = np.array([few.rx_positions[r, axis] + few.tx_positions[t, axis] for r in receivers for t in senders])
+            places = np.array(
+                [
+                    few.rx_positions[r, axis] + few.tx_positions[t, axis]
+                    for r in receivers
+                    for t in senders
+                ]
+            )
         else:
             places = np.array([few.rx_positions[r, axis] for r in receivers for _ in range(3)])
         information = 2 * snr * len(places) / (3 * 7) * k**2 * places.var()
         assert stated[2 + i] == pytest.approx(1 / np.sqrt(information), rel=1e-9, abs=0)
     floors = [2e-3 * w.range_cell(passes), 4e-3 * w.velocity_cell(passes), 2e-4, 2e-4]
     assert standard_deviations(1e9, few, w, passes) == pytest.approx(floors)
-    assert (standard_deviations(0.1, few, w, passes) == standard_deviations(1.0, few, w, passes)).all()
+    assert (
+        standard_deviations(0.1, few, w, passes) == standard_deviations(1.0, few, w, passes)
+    ).all()
 
 
 def test_the_active_terminal_reports_no_symbols():
-    """`Reception` says -1 for what was not decided, at the symbols' shapes. Planted bugs: another number."""
+    """`Reception` says -1 for what was not decided, at the symbols' shapes. Planted bugs: another
+    number."""
     w, schedule, payload = frame(waveform=Waveform(num_samples=256))
     r = receive_active(cube(w, schedule, payload, [Path(30.0, 2.0)], FEW), payload, FEW, SETTINGS)
     assert (r.delay_symbols == -1).all() and r.delay_symbols.shape == payload.delay_symbols.shape
     assert (r.transitions == -1).all() and r.transitions.shape == payload.transitions.shape
-    assert not r.decoded and not r.bits.size and not r.delay_confidence.any() and not r.transition_confidence.any()
+    assert (
+        not r.decoded
+        and not r.bits.size
+        and not r.delay_confidence.any()
+        and not r.transition_confidence.any()
+    )
 
 
 @pytest.mark.parametrize(
-    ("groups", "method", "strongest"), [(3, "latin_union", 5.0), (3, "omp", 0.07), (2, "auto", 0.07), (1, "auto", 0.05)]
+    ("groups", "method", "strongest"),
+    [(3, "latin_union", 5.0), (3, "omp", 0.07), (2, "auto", 0.07), (1, "auto", 0.05)],
 )
 def test_three_targets_in_noise(groups: int, method: str, strongest: float):
-    """Two of them in one range cell, one stronger (40 dB with the union; with sparse sampling nearly alike, for off the grid the
-    stronger one uses up OMP's atoms). Sparse sampling's sidelobes are not reported. Planted bugs: sidelobes of the strong one kept; OMP's
-    correlation updated with the transposed Gram matrix."""
+    """Two of them in one range cell, one stronger (40 dB with the union; with sparse sampling
+    nearly alike, for off the grid the stronger one uses up OMP's atoms). Sparse sampling's
+    sidelobes are not reported. Planted bugs: sidelobes of the strong one kept; OMP's correlation
+    updated with the transposed Gram matrix."""
     w, schedule, payload = frame(waveform=Waveform(num_groups=groups), seed=7)
     targets = [(33.371, 3.3, strongest), (33.47, -5.1, 0.05), (51.12, -7.9, 0.05)]
-    signal = cube(w, schedule, payload, [Path(2 * r, 2 * v, a, (0.2, 0.1), (0.2, 0.1)) for r, v, a in targets], noise=0.1)
+    signal = cube(
+        w,
+        schedule,
+        payload,
+        [Path(2 * r, 2 * v, a, (0.2, 0.1), (0.2, 0.1)) for r, v, a in targets],
+        noise=0.1,
+    )
     d = receive_active(signal, payload, ANTENNAS, Receivers(velocity_method=method)).detections
     assert len(d) == 3
     for r, v, _ in targets:
         i = int(np.argmin(np.abs(d.range - r) + np.abs(d.velocity - v)))
-        assert abs(d.range[i] - r) < 0.05 and abs(d.velocity[i] - v) < 0.08  # a fifth, a third of a cell beside the strong one
+        assert (
+            abs(d.range[i] - r) < 0.05 and abs(d.velocity[i] - v) < 0.08
+        )  # a fifth, a third of a cell beside the strong one
 
 
 def test_leakage_is_passed_over_and_hides_nothing():
     """60 dB over an echo at 12 m that stands still as well. Planted bug: min_range_m ignored."""
     w, schedule, payload = frame()
-    paths = [Path(0.3, 0.0, 30.0), Path(2 * 12.34, 0.0, 0.03, (0.1, 0.0), (0.1, 0.0)), Path(2 * 30.1, 2 * 4.0, 0.03)]
-    d = receive_active(cube(w, schedule, payload, paths, FEW, noise=0.1, seed=1), payload, FEW, SETTINGS).detections
+    paths = [
+        Path(0.3, 0.0, 30.0),
+        Path(2 * 12.34, 0.0, 0.03, (0.1, 0.0), (0.1, 0.0)),
+        Path(2 * 30.1, 2 * 4.0, 0.03),
+    ]
+    d = receive_active(
+        cube(w, schedule, payload, paths, FEW, noise=0.1, seed=1), payload, FEW, SETTINGS
+    ).detections
     assert sorted(np.round(d.range, 2).tolist()) == [12.34, 30.1]
 
 
@@ -458,12 +572,16 @@ def test_start_point_is_near_and_refinement_moves_to_the_truth():
     assert abs(delay * SPEED_OF_LIGHT - 57.77) < 0.2 * w.range_cell(1)
     assert abs(rate * SPEED_OF_LIGHT - 9.21) < 0.1 * w.velocity_cell(1)
     found = refine(LocalSpectra(spectra, w, schedule, payload.delay_symbols, row), delay, rate)
-    assert abs(found.delay * SPEED_OF_LIGHT - 57.77) < 2e-4 and abs(found.delay_rate * SPEED_OF_LIGHT - 9.21) < 1e-5
+    assert (
+        abs(found.delay * SPEED_OF_LIGHT - 57.77) < 2e-4
+        and abs(found.delay_rate * SPEED_OF_LIGHT - 9.21) < 1e-5
+    )
     assert np.abs(np.abs(found.channels) - 1).max() < 2e-3  # the amplitude of a sample
 
 
 class Hill:
-    """In place of `LocalSpectra`: the logarithm of the power is a paraboloid over beat [cells] and Doppler [bins] at mid-frame."""
+    """In place of `LocalSpectra`: the logarithm of the power is a paraboloid over beat [cells] and
+    Doppler [bins] at mid-frame."""
 
     def __init__(self, w: Waveform, top: tuple[float, float], bend: np.ndarray) -> None:
         self.waveform, self._top, self._bend = w, np.array(top), bend
@@ -481,9 +599,11 @@ class Hill:
 
 @pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
 def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
-    """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a half of it; the gradient over a step
-    for over two; the coupling of beat and Doppler left out; one end of the reach left open. Where the paraboloid is none the step is up,
-    and a far top is come near by no more than three times the stencil, for the power is no paraboloid as far as that."""
+    """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a
+    half of it; the gradient over a step for over two; the coupling of beat and Doppler left out;
+    one end of the reach left open. Where the paraboloid is none the step is up, and a far top is
+    come near by no more than three times the stencil, for the power is no paraboloid as far as
+    that."""
     w = Waveform()
     rate_unit = 1 / (w.frame_duration * w.effective_carrier)
     start = 101.3 * w.delay_step, 7.7 * rate_unit
@@ -492,7 +612,9 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
         hill = Hill(w, (beat + off[0], 7.7 + off[1]), np.array(bend))
         found = refine(hill, *start, iterations=1)
         assert found.delay_rate / rate_unit == pytest.approx(7.7 + off[1], abs=1e-6)
-        there = (w.slope * found.delay + found.delay_rate * w.effective_carrier) * w.sampled_duration
+        there = (
+            w.slope * found.delay + found.delay_rate * w.effective_carrier
+        ) * w.sampled_duration
         assert there == pytest.approx(beat + off[0], abs=1e-6)
         assert found.channels.tolist() == [[found.delay, found.delay_rate]]
     valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
@@ -500,13 +622,16 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     assert valley.power(found.delay, found.delay_rate) > valley.power(*start)
     for far in ([4.3, -5.1], [-2.9, 3.7]):
         found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, iterations=1)
-        there = (w.slope * found.delay + found.delay_rate * w.effective_carrier) * w.sampled_duration
+        there = (
+            w.slope * found.delay + found.delay_rate * w.effective_carrier
+        ) * w.sampled_duration
         moved = there - beat, found.delay_rate / rate_unit - 7.7
         assert moved == pytest.approx(0.6 * np.sign(far), abs=1e-6)  # three times the stencil
 
 
 def test_two_cells_of_a_hann_tone_give_its_place():
-    """Exact at any fraction, by the window's closed form. Planted bugs: the ratio's two for a one; the side of the greater neighbour."""
+    """Exact at any fraction, by the window's closed form. Planted bugs: the ratio's two for a one;
+    the side of the greater neighbour."""
     w = Waveform()
     length = window_length(w) / w.num_samples
     for d in (-0.49, -0.2, 0.0, 0.13, 0.5):
@@ -517,16 +642,23 @@ def test_two_cells_of_a_hann_tone_give_its_place():
         found, rate = start_point(power, 20, 33, w)
         bins = rate * w.frame_duration * w.effective_carrier
         assert bins == pytest.approx(33 - w.num_chirps // 2 + d, abs=1e-9)
-        assert (w.slope * found + rate * w.effective_carrier) * w.sampled_duration == pytest.approx(20 + d, abs=1e-9)
+        assert (w.slope * found + rate * w.effective_carrier) * w.sampled_duration == pytest.approx(
+            20 + d, abs=1e-9
+        )
 
 
 def test_threshold_grows_with_fewer_training_cells():
-    assert threshold(45, 1e-6, (3, 3), (2, 1)) > threshold(45, 1e-6, (3, 3), (8, 6)) > stats.gamma(45, scale=1 / 45).isf(1e-6) * 0.9
+    assert (
+        threshold(45, 1e-6, (3, 3), (2, 1))
+        > threshold(45, 1e-6, (3, 3), (8, 6))
+        > stats.gamma(45, scale=1 / 45).isf(1e-6) * 0.9
+    )
 
 
 def test_one_dimensional_cfar_keeps_its_rate_and_finds_a_tone():
-    """Noise of 15 receivers without a window: 2e5 cells at 1e-3, binomial within 4.5 sigma (one false failure in 1e5), ends included; a
-    tone 12 dB over the noise of a cell is found in every chirp. Planted bug: looks of one receiver."""
+    """Noise of 15 receivers without a window: 2e5 cells at 1e-3, binomial within 4.5 sigma (one
+    false failure in 1e5), ends included; a tone 12 dB over the noise of a cell is found in every
+    chirp. Planted bug: looks of one receiver."""
     rng = np.random.default_rng(21)
     power = rng.gamma(15, 1 / 15, (1000, 200))
     above = detect_chirps(power, 15, 1e-3, 3, 8)
@@ -536,12 +668,16 @@ def test_one_dimensional_cfar_keeps_its_rate_and_finds_a_tone():
 
 
 def test_a_strong_path_does_not_hide_a_target_beside_it():
-    """A target 20 dB over the noise, 10 rows and 5 bins from a path at 60 dB, whose lobes fill part of the target's training block. Planted
-    bug: all cells train."""
+    """A target 20 dB over the noise, 10 rows and 5 bins from a path at 60 dB, whose lobes fill part
+    of the target's training block. Planted bug: all cells train."""
     rng = np.random.default_rng(4)
     power = rng.gamma(45, 1 / 45, (200, 120))
     rows, bins = np.abs(np.arange(200) - 90), np.abs(np.arange(120) - 50)
-    power += 1e6 * np.outer(hann_envelope(rows), hann_envelope(bins)) * (np.maximum.outer(rows, bins) < 40)
+    power += (
+        1e6
+        * np.outer(hann_envelope(rows), hann_envelope(bins))
+        * (np.maximum.outer(rows, bins) < 40)
+    )
     power[100, 55] += 100
     above, _ = detect(power, 45, 1e-6, (3, 3), (8, 6))
     assert above[100, 55]

@@ -1,4 +1,5 @@
-"""Joint maximum likelihood against the Cramer-Rao bound, and paths in one cell, on signals made from points in space."""
+"""Joint maximum likelihood against the Cramer-Rao bound, and paths in one cell, on signals made
+from points in space."""
 
 from __future__ import annotations
 
@@ -48,10 +49,13 @@ def in_cells(w: Waveform, passes: int) -> np.ndarray:
 
 
 def test_sums_of_a_tone():
-    """Against sums written out, on both sides of where the series takes over. Planted bug: the sign of the second moment."""
+    """Against sums written out, on both sides of where the series takes over. Planted bug: the sign
+    of the second moment."""
     for size in (24, 101):
         n = np.arange(size) - (size - 1) / 2
-        x = np.array([0.0, 3e-5, -0.0099 / size, 0.011 / size, 0.5 / size, -1.7 / size, 0.213, -0.44])
+        x = np.array(
+            [0.0, 3e-5, -0.0099 / size, 0.011 / size, 0.5 / size, -1.7 / size, 0.213, -0.44]
+        )
         tone = np.exp(2j * np.pi * np.outer(x, n))
         s0, s1, s2 = tone_sums(x, size)
         series = 1e-6  # of the largest: what the two terms leave
@@ -61,8 +65,9 @@ def test_sums_of_a_tone():
 
 
 def test_elements_hear_a_spherical_wave():
-    """Against the distance from a source point; the formula leaves out the cube of element over radius (7 mm, 3 m: 4e-9 m at most), the
-    derivative is its central difference. Planted bugs: curvature of the other sign in the delay; in the derivative; half the curvature."""
+    """Against the distance from a source point; the formula leaves out the cube of element over
+    radius (7 mm, 3 m: 4e-9 m at most), the derivative is its central difference. Planted bugs:
+    curvature of the other sign in the delay; in the derivative; half the curvature."""
     positions, u, radius = ANTENNAS.rx_positions, np.array([0.41, -0.33]), 3.17
     source = radius * np.array([u[0], np.sqrt(1 - u @ u), u[1]])
     exact = (np.linalg.norm(source - positions, axis=1) - radius) / C
@@ -72,15 +77,21 @@ def test_elements_hear_a_spherical_wave():
     assert np.abs(positions).max() ** 2 / radius > 30 * cube  # the curvature is seen
     step = 1e-4
     for i, by in enumerate(np.eye(2) * step):
-        difference = (element_delays(positions, u + by, radius)[0] - element_delays(positions, u - by, radius)[0]) / (2 * step)
-        assert slope[i] == pytest.approx(difference, rel=1e-9, abs=1e-21)  # quadratic in u: only rounding
+        difference = (
+            element_delays(positions, u + by, radius)[0]
+            - element_delays(positions, u - by, radius)[0]
+        ) / (2 * step)
+        assert slope[i] == pytest.approx(
+            difference, rel=1e-9, abs=1e-21
+        )  # quadratic in u: only rounding
 
 
 @pytest.mark.parametrize(("passes", "snr_db"), [(2, 10.0), (1, -8.0)])
 def test_an_isolated_path_reaches_the_bound(passes: int, snr_db: float):
-    """Mean square errors of 100 frames from starts a tenth of a cell off, over the least variance of the exact model. In chi-square terms
-    four deviations are 0.57; the bound itself is kept from below as well, and the deviations that the fit states are the
-    bound's. Planted bugs: the transmit elements left out; time counted from the frame's start."""
+    """Mean square errors of 100 frames from starts a tenth of a cell off, over the least variance
+    of the exact model. In chi-square terms four deviations are 0.57; the bound itself is kept from
+    below as well, and the deviations that the fit states are the bound's. Planted bugs: the
+    transmit elements left out; time counted from the frame's start."""
     w, schedule, payload = frame(waveform=SHORT)
     theta, snr, trials = np.array(LOS[: 6 if passes == 2 else 8]), 10 ** (snr_db / 10), 100
     clean = samples(w, schedule, payload, FEW, theta, passes)
@@ -88,59 +99,103 @@ def test_an_isolated_path_reaches_the_bound(passes: int, snr_db: float):
     errors = np.empty((trials, 4))
     for seed in range(trials):
         cube = noisy(w, schedule, clean, snr, seed)
-        off = np.random.default_rng([seed, 7]).uniform(-0.15, 0.15, 4) * in_cells(w, passes) * [1, 1, 0.3, 0.3]
-        start = JointPath(passes * (theta[0] + off[0]) / C, passes * (theta[1] + off[1]) / C, theta[2:4] + off[2:], np.ones(1), np.zeros(4))
+        off = (
+            np.random.default_rng([seed, 7]).uniform(-0.15, 0.15, 4)
+            * in_cells(w, passes)
+            * [1, 1, 0.3, 0.3]
+        )
+        start = JointPath(
+            passes * (theta[0] + off[0]) / C,
+            passes * (theta[1] + off[1]) / C,
+            theta[2:4] + off[2:],
+            np.ones(1),
+            np.zeros(4),
+        )
         found = fit(Frame(cube, payload.delay_symbols, payload.phases, FEW, passes), [start])[0]
-        errors[seed] = [found.delay * C / passes - theta[0], found.delay_rate * C / passes - theta[1], *(found.direction - theta[2:4])]
+        errors[seed] = [
+            found.delay * C / passes - theta[0],
+            found.delay_rate * C / passes - theta[1],
+            *(found.direction - theta[2:4]),
+        ]
     ratio = (errors**2).mean(axis=0) / least
     spread = 4 * np.sqrt(2 / trials)
     assert (ratio < 1 + spread).all() and (ratio > 1 - spread).all()
-    assert found.std * [C / passes, C / passes, 1, 1] == pytest.approx(np.sqrt(least), rel=0.05)  # the noise's power is estimated
+    assert found.std * [C / passes, C / passes, 1, 1] == pytest.approx(
+        np.sqrt(least), rel=0.05
+    )  # the noise's power is estimated
 
 
 def model(w, schedule, payload, path: np.ndarray, passes: int) -> np.ndarray:
-    """Signal over cells of delay, bins of rate, u_x, u_z and the real and imaginary parts of the amplitudes (one per antenna at a PT)."""
+    """Signal over cells of delay, bins of rate, u_x, u_z and the real and imaginary parts of the
+    amplitudes (one per antenna at a PT)."""
     r, v = path[0] * w.range_cell(passes), path[1] * w.velocity_cell(passes)
     amplitudes = path[4::2] + 1j * path[5::2]
-    unit = samples(w, schedule, payload, FEW, np.array([r, v, path[2], path[3], 0.0, 1.0, 0.0, 0.0]), passes)
+    unit = samples(
+        w, schedule, payload, FEW, np.array([r, v, path[2], path[3], 0.0, 1.0, 0.0, 0.0]), passes
+    )
     return unit * (amplitudes[schedule][:, None, :, None] if passes == 1 else amplitudes[0])
 
 
 @pytest.mark.parametrize("passes", [2, 1])
 def test_normal_equations_are_those_of_the_signal(passes: int):
-    """Gradient Re J^H r and Gram matrix Re J^H J of two paths in neighbouring cells, J by central differences of signals made from points
-    in space (steps of 1e-5 cell: 3e-5 of it); and the noise that the paths leave. Planted bugs: the phase's acceleration by the rate left
-    out; the paths' cross terms conjugated; the ramp of the receivers' delays with the other sign."""
+    """Gradient Re J^H r and Gram matrix Re J^H J of two paths in neighbouring cells, J by central
+    differences of signals made from points in space (steps of 1e-5 cell: 3e-5 of it); and the noise
+    that the paths leave. Planted bugs: the phase's acceleration by the rate left out; the paths'
+    cross terms conjugated; the ramp of the receivers' delays with the other sign."""
     w, schedule, payload = frame(waveform=SHORT)
     rng, count = np.random.default_rng(8), FEW.num_tx if passes == 1 else 1
     ends = [[68.3, 7.7, 0.31, -0.22], [68.9, 6.9, 0.27, -0.13]]
     theta = [np.concatenate([e, rng.uniform(0.5, 1.0, 2 * count)]) for e in ends]
-    noise = (rng.standard_normal((*schedule.shape[:1], FEW.num_rx, schedule.shape[1], w.num_samples, 2)) @ np.array([1, 1j])) * 0.1
+    noise = (
+        rng.standard_normal((*schedule.shape[:1], FEW.num_rx, schedule.shape[1], w.num_samples, 2))
+        @ np.array([1, 1j])
+    ) * 0.1
     off = np.concatenate([[1e-3, 0.1, 0.02, -0.01], np.full(2 * count, 0.1)])
-    received = (sum(model(w, schedule, payload, t + off, passes) for t in theta) + noise).astype(np.complex64)
+    received = (sum(model(w, schedule, payload, t + off, passes) for t in theta) + noise).astype(
+        np.complex64
+    )
     steps = np.concatenate([[1e-5, 1e-3, 1e-4, 1e-4], np.full(2 * count, 1e-3)])
     columns = [
-        (model(w, schedule, payload, t + h * one, passes) - model(w, schedule, payload, t - h * one, passes)).ravel() / (2 * h)
+        (
+            model(w, schedule, payload, t + h * one, passes)
+            - model(w, schedule, payload, t - h * one, passes)
+        ).ravel()
+        / (2 * h)
         for t in theta
         for h, one in zip(steps, np.eye(len(steps)), strict=True)
     ]
-    J, left = np.stack(columns, axis=1), (received - sum(model(w, schedule, payload, t, passes) for t in theta)).ravel()
+    J, left = (
+        np.stack(columns, axis=1),
+        (received - sum(model(w, schedule, payload, t, passes) for t in theta)).ravel(),
+    )
     cube = IFCube(samples=received, waveform=w, schedule=schedule, start_time=0.0)
     paths = [
-        JointPath(t[0] * w.delay_step, t[1] * w.velocity_cell(1) / C, t[2:4], t[4::2] + 1j * t[5::2], np.zeros(4)) for t in theta
+        JointPath(
+            t[0] * w.delay_step,
+            t[1] * w.velocity_cell(1) / C,
+            t[2:4],
+            t[4::2] + 1j * t[5::2],
+            np.zeros(4),
+        )
+        for t in theta
     ]
-    gradient, gram, power = _normal_equations(Frame(cube, payload.delay_symbols, payload.phases, FEW, passes), paths)
+    gradient, gram, power = _normal_equations(
+        Frame(cube, payload.delay_symbols, payload.phases, FEW, passes), paths
+    )
     size = np.sqrt(np.diag((J.conj().T @ J).real))
     apart = 1e-3  # curvature of the wavefront, of the chirps between the paths: 4e-4 at most
     assert np.abs((gram - (J.conj().T @ J).real) / np.outer(size, size)).max() < apart
-    assert np.abs((gradient - (J.conj().T @ left).real) / size).max() < apart * np.linalg.norm(received)
+    assert np.abs((gradient - (J.conj().T @ left).real) / size).max() < apart * np.linalg.norm(
+        received
+    )
     assert np.abs((J.conj().T @ left).real / size).max() > 0.2 * np.linalg.norm(left)
     assert power == pytest.approx((np.abs(left) ** 2).mean(), rel=0.01)
 
 
 def test_a_path_against_its_own_template_has_no_slope():
-    """Every chirp at every receiver sums to its amplitude, and weighed by the sample's number to nothing: the template has each element's
-    own delay over the whole chirp, and the data. Planted bug: the receivers' ramps turned the other way."""
+    """Every chirp at every receiver sums to its amplitude, and weighed by the sample's number to
+    nothing: the template has each element's own delay over the whole chirp, and the data. Planted
+    bug: the receivers' ramps turned the other way."""
     w, schedule, payload = frame(waveform=LONGER)
     wide = replace(ANTENNAS, spacing=5 * ANTENNAS.spacing)
     clean = samples(w, schedule, payload, wide, np.array(NEAR), 2)
@@ -154,16 +209,26 @@ def test_a_path_against_its_own_template_has_no_slope():
 
 @pytest.mark.parametrize("passes", [2, 1])
 def test_energy_of_a_path_in_the_residual(passes: int):
-    """What a fit leaves holds a second path whole in its own direction and Doppler bin, |b|^2 times all samples, and in noise a beam holds
-    its power, as a sum over the antennas whose departure is free. Planted bugs: Doppler turned the other way; the share of one array;
-    the root of the samples left out."""
+    """What a fit leaves holds a second path whole in its own direction and Doppler bin, |b|^2 times
+    all samples, and in noise a beam holds its power, as a sum over the antennas whose departure is
+    free. Planted bugs: Doppler turned the other way; the share of one array; the root of the
+    samples left out."""
     w, schedule, payload = frame(waveform=SHORT)
     first = np.array([17.3147, 1.7, 0.31, -0.22, 0.7, 1.0, 0.0, 0.0])
     second = first + np.array([0, 1.5 * w.velocity_cell(passes), -0.5, 0.43, 0, -0.97, 0, 0])
     b, direction = second[5], second[2:4]
-    clean = sum(samples(w, schedule, payload, FEW, t[:6] if passes == 2 else t, passes) for t in (first, second))
+    clean = sum(
+        samples(w, schedule, payload, FEW, t[:6] if passes == 2 else t, passes)
+        for t in (first, second)
+    )
     count = FEW.num_tx if passes == 1 else 1
-    path = JointPath(passes * first[0] / C, passes * first[1] / C, first[2:4], np.full(count, np.exp(0.7j)), np.zeros(4))
+    path = JointPath(
+        passes * first[0] / C,
+        passes * first[1] / C,
+        first[2:4],
+        np.full(count, np.exp(0.7j)),
+        np.zeros(4),
+    )
     offsets = np.array([-1.5, 0.0, 1.5])
 
     def beams(cube: IFCube) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +237,9 @@ def test_energy_of_a_path_in_the_residual(passes: int):
         grid = np.array([direction, -direction, [0.1, 0.3]])
         return _beams(f, of, channels, grid), counts
 
-    quiet = IFCube(samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0)
+    quiet = IFCube(
+        samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0
+    )
     power, counts = beams(quiet)
     total = clean.size * b**2
     assert counts.sum() == clean.size
@@ -182,7 +249,9 @@ def test_energy_of_a_path_in_the_residual(passes: int):
     own = samples(w, schedule, payload, FEW, first[:6] if passes == 2 else first, passes)
     mean = np.mean([beams(noisy(w, schedule, own, 1.0, seed))[0].mean() for seed in range(30)])
     sums = 1 if passes == 2 else FEW.num_tx
-    assert mean == pytest.approx(sums, rel=5 / np.sqrt(30 * 3 * sums))  # statistical: of beams and bins alike three are apart
+    assert mean == pytest.approx(
+        sums, rel=5 / np.sqrt(30 * 3 * sums)
+    )  # statistical: of beams and bins alike three are apart
 
 
 def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
@@ -198,9 +267,10 @@ def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
 
 
 def test_wrong_transitions_are_undone_by_the_path_itself():
-    """Two transitions decided wrong turn the rest of their chains, and the velocity starts half a bin off: the phases come back as sent,
-    all but those that noise alone moves. Per chirp over the receivers 12.6 dB: 8-PSK errs in 1.4 %, of 72 chirps one; four are 3 sigma.
-    Planted bugs: the carrier of one antenna for all; the first phases handed back."""
+    """Two transitions decided wrong turn the rest of their chains, and the velocity starts half a
+    bin off: the phases come back as sent, all but those that noise alone moves. Per chirp over the
+    receivers 12.6 dB: 8-PSK errs in 1.4 %, of 72 chirps one; four are 3 sigma. Planted bugs: the
+    carrier of one antenna for all; the first phases handed back."""
     w, schedule, payload = frame(waveform=SHORT)
     theta = np.array(LOS)
     cube = noisy(w, schedule, samples(w, schedule, payload, FEW, theta, 1), 10**-1.32, 3)
@@ -208,7 +278,9 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
     for group, tx in ((0, 1), (2, 0)):
         later = np.flatnonzero(schedule[group] == tx)[3:]
         wrong[group, later] *= np.exp(2j * np.pi / 8)
-    start = JointPath(theta[0] / C, (theta[1] + 0.5 * w.velocity_cell(1)) / C, theta[2:4], np.ones(1), np.zeros(4))
+    start = JointPath(
+        theta[0] / C, (theta[1] + 0.5 * w.velocity_cell(1)) / C, theta[2:4], np.ones(1), np.zeros(4)
+    )
     found = decide_phases(Frame(cube, payload.delay_symbols, wrong, FEW, 1), start, 8)
     apart = np.abs(found - payload.phases) > 0.1
     assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 4
@@ -219,15 +291,25 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [2, 1])
 def test_receivers_stay_within_one_decibel_of_the_bound(passes: int):
-    """The whole receiver (data, map, CFAR, estimates) on modulated frames off the grid, from -20 to +10 dB per sample. Each method sees the
-    same samples; run with -s for the table of 10 log10(MSE / bound). 300 frames leave a deviation of 0.35 dB in each figure. Planted bug:
-    at a PT the phases as they were decided first (25 dB over in velocity at -20 dB)."""
+    """The whole receiver (data, map, CFAR, estimates) on modulated frames off the grid, from -20 to
+    +10 dB per sample. Each method sees the same samples; run with -s for the table of 10 log10(MSE
+    / bound). 300 frames leave a deviation of 0.35 dB in each figure. Planted bug: at a PT the
+    phases as they were decided first (25 dB over in velocity at -20 dB)."""
     w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
     trials, ratios = {"grid": 40, "local": 40, "joint": 300}, []
     print(f"\npasses {passes}: dB over the bound in range, velocity, u_x, u_z")
     for i, snr_db in enumerate((-20.0, -10.0, 0.0, 10.0)):
         rng, snr = np.random.default_rng([i, 5]), 10 ** (snr_db / 10)
-        theta = np.array([rng.uniform(8, 25), rng.uniform(-10, 10), *rng.uniform(-0.5, 0.5, 2), 0.7, 1.0, *rng.uniform(-0.4, 0.4, 2)])
+        theta = np.array(
+            [
+                rng.uniform(8, 25),
+                rng.uniform(-10, 10),
+                *rng.uniform(-0.5, 0.5, 2),
+                0.7,
+                1.0,
+                *rng.uniform(-0.4, 0.4, 2),
+            ]
+        )
         theta = theta[: 6 if passes == 2 else 8]
         clean = samples(w, schedule, payload, ANTENNAS, theta, passes)
         least = bound(w, schedule, payload, ANTENNAS, theta, passes, snr)[:4]
@@ -241,30 +323,60 @@ def test_receivers_stay_within_one_decibel_of_the_bound(passes: int):
                 if passes == 2:
                     d = receive_active(cube, payload, ANTENNAS, settings).detections
                 else:
-                    d = receive_passive(cube, ANTENNAS, settings, 8, predicted(theta, w), True).detections
-                total += np.square([d.range[0] - theta[0], d.velocity[0] - theta[1], *(d.direction[0] - theta[2:4])]) / trials[name]
+                    d = receive_passive(
+                        cube, ANTENNAS, settings, 8, predicted(theta, w), True
+                    ).detections
+                total += (
+                    np.square(
+                        [
+                            d.range[0] - theta[0],
+                            d.velocity[0] - theta[1],
+                            *(d.direction[0] - theta[2:4]),
+                        ]
+                    )
+                    / trials[name]
+                )
         ratios.append(square["joint"] / least)
         for name, total in square.items():
-            print(f"{snr_db:6.0f} dB  {name:6s}", np.round(10 * np.log10(total / least), 2), flush=True)
+            print(
+                f"{snr_db:6.0f} dB  {name:6s}",
+                np.round(10 * np.log10(total / least), 2),
+                flush=True,
+            )
     print("joint, mean of the rows", np.round(10 * np.log10(np.mean(ratios, axis=0)), 2))
-    assert (np.array(ratios) < ONE_DB).all() and (np.mean(ratios, axis=0) < 1 + 3 * np.sqrt(2 / 1200)).all()  # 3 deviations of the mean
+    assert (np.array(ratios) < ONE_DB).all() and (
+        np.mean(ratios, axis=0) < 1 + 3 * np.sqrt(2 / 1200)
+    ).all()  # 3 deviations of the mean
 
 
 def two_paths(w: Waveform) -> list[list[float]]:
-    """A line of sight and a reflection 0.35 cell and 0.3 bin beside it, 4.4 dB weaker, from elsewhere."""
-    reflection = [LOS[0] + 0.35 * w.range_cell(1), LOS[1] + 0.3 * w.velocity_cell(1), -0.25, 0.15, 2.1, 0.6, 0.3, -0.4]
+    """A line of sight and a reflection 0.35 cell and 0.3 bin beside it, 4.4 dB weaker, from
+    elsewhere."""
+    reflection = [
+        LOS[0] + 0.35 * w.range_cell(1),
+        LOS[1] + 0.3 * w.velocity_cell(1),
+        -0.25,
+        0.15,
+        2.1,
+        0.6,
+        0.3,
+        -0.4,
+    ]
     return [LOS, reflection]
 
 
 def test_a_second_path_in_the_cell_no_longer_pulls_the_range():
-    """The windowed estimate is 0.08 cells off whatever the noise; the joint one is off by less than five deviations. Planted bug: the
-    steering of the search with the other sign (nothing is found)."""
+    """The windowed estimate is 0.08 cells off whatever the noise; the joint one is off by less than
+    five deviations. Planted bug: the steering of the search with the other sign (nothing is
+    found)."""
     w, schedule, _ = frame(waveform=LONGER)
     pilot = unmodulated(w)
     clean = sum(samples(w, schedule, pilot, FEW, np.array(t), 1) for t in two_paths(w))
     off = {}
     for name in ("local", "joint"):
-        r = receive_passive(noisy(w, schedule, clean, 3.0, 5), FEW, Receivers(refinement=name), 8, None, False)
+        r = receive_passive(
+            noisy(w, schedule, clean, 3.0, 5), FEW, Receivers(refinement=name), 8, None, False
+        )
         d = r.detections
         off[name] = np.abs(d.range[d.is_reference][0] - LOS[0]) / w.range_cell(1)
         if name == "joint":
@@ -280,7 +392,12 @@ def test_a_second_path_in_the_cell_no_longer_pulls_the_range():
 def test_two_echoes_in_one_cell_at_the_active_terminal():
     w, schedule, payload = frame(waveform=LONGER)
     cell, bin_ = w.range_cell(2), w.velocity_cell(2)
-    echoes = np.array([[8.3, 2.37, 0.31, -0.22, 0.7, 1.0], [8.3 + 0.3 * cell, 2.37 - 0.4 * bin_, 0.05, 0.2, 0.1, 0.5]])
+    echoes = np.array(
+        [
+            [8.3, 2.37, 0.31, -0.22, 0.7, 1.0],
+            [8.3 + 0.3 * cell, 2.37 - 0.4 * bin_, 0.05, 0.2, 0.1, 0.5],
+        ]
+    )
     clean = sum(samples(w, schedule, payload, FEW, e, 2) for e in echoes)
     cube = noisy(w, schedule, clean, 10.0, 3)
     assert len(receive_active(cube, payload, FEW, Receivers()).detections) == 1
@@ -288,52 +405,73 @@ def test_two_echoes_in_one_cell_at_the_active_terminal():
     assert len(d) == 2
     found = np.column_stack([d.range, d.velocity, d.direction])
     assert (np.abs(found - echoes[:, :4]) < 5 * d.std).all()
-    assert d.snr[1] / d.snr[0] == pytest.approx(0.25, rel=0.05)  # as their powers: the weaker one has an amplitude of a half
+    assert d.snr[1] / d.snr[0] == pytest.approx(
+        0.25, rel=0.05
+    )  # as their powers: the weaker one has an amplitude of a half
 
 
 @pytest.mark.parametrize(("level_db", "looked_at"), [(-22.0, True), (-29.0, False)])
 def test_what_is_too_weak_beside_a_path_is_not_looked_at(level_db: float, looked_at: bool):
-    """Beside an echo nearly 60 dB over the noise another direction holds a second one, well over the noise too: on this side of 25 dB it
-    is a path to fit, on the other it is left. Planted bug: the first one's energy not over all samples."""
+    """Beside an echo nearly 60 dB over the noise another direction holds a second one, well over
+    the noise too: on this side of 25 dB it is a path to fit, on the other it is left. Planted bug:
+    the first one's energy not over all samples."""
     w, schedule, payload = frame(waveform=LONGER)
     weak = [NEAR[0] + 0.2 * w.range_cell(2), NEAR[1], -0.4, 0.35, 0.1, 10 ** (level_db / 20)]
     clean = sum(samples(w, schedule, payload, FEW, np.array(e), 2) for e in (NEAR, weak))
     one = Frame(noisy(w, schedule, clean, 10.0, 3), payload.delay_symbols, payload.phases, FEW, 2)
-    start = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
+    start = JointPath(
+        2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4)
+    )
     found = _hidden(one, fit(one, [start]))
     assert (found is not None) == looked_at
     if found:
-        assert found[0] == 0 and found[1].direction == pytest.approx(weak[2:4], abs=0.15)  # a fraction of the arms' lobe
+        assert found[0] == 0 and found[1].direction == pytest.approx(
+            weak[2:4], abs=0.15
+        )  # a fraction of the arms' lobe
 
 
 def test_the_earlier_of_two_paths_in_a_cell_is_the_line_of_sight():
-    """Found beside the reference, not beside others, and within 10 dB of it. Planted bugs: the strongest taken; those of other cells."""
+    """Found beside the reference, not beside others, and within 10 dB of it. Planted bugs: the
+    strongest taken; those of other cells."""
     power = np.array([1.0, 0.5, 0.2, 0.3, 0.05])
     source, ranges = np.array([0, 1, 0, 1, 0]), np.array([9.1, 7.0, 8.9, 8.0, 8.5])
     for change, expected in ((1.0, 2), (0.4, 0)):
-        values = {"is_reference": np.array([True, False, False, False, False]), "range": ranges.copy()}
+        values = {
+            "is_reference": np.array([True, False, False, False, False]),
+            "range": ranges.copy(),
+        }
         _earlier_reference(values, power * np.array([1, 1, change, 1, 1]), source, 2)
         assert np.flatnonzero(values["is_reference"]).tolist() == [expected]
 
 
 def test_one_path_and_noise_are_not_split():
-    """16 frames at a rate of 1e-4: one split comes about once in 600 runs of this test. Planted bug: the level of one beam for all."""
+    """16 frames at a rate of 1e-4: one split comes about once in 600 runs of this test. Planted
+    bug: the level of one beam for all."""
     w, schedule, _ = frame(waveform=LONGER)
     pilot = unmodulated(w)
     clean = samples(w, schedule, pilot, FEW, np.array(LOS), 1)
     for seed in range(16):
         cube = noisy(w, schedule, clean, 10.0, seed)
-        assert len(receive_passive(cube, FEW, Receivers(refinement="joint"), 8, None, False).detections) == 1
+        assert (
+            len(
+                receive_passive(cube, FEW, Receivers(refinement="joint"), 8, None, False).detections
+            )
+            == 1
+        )
 
 
 def test_grid_refinement_is_the_cell():
-    """The paper's estimate: multiples of the cells, the one that holds the path. Planted bugs: refined all the same; bins counted from the
-    other end of the Doppler axis."""
+    """The paper's estimate: multiples of the cells, the one that holds the path. Planted bugs:
+    refined all the same; bins counted from the other end of the Doppler axis."""
     w, schedule, payload = frame(waveform=LONGER)
     clean = samples(w, schedule, payload, FEW, np.array(NEAR), 2)
-    d = receive_active(noisy(w, schedule, clean, 10.0, 1), payload, FEW, Receivers(refinement="grid")).detections
+    d = receive_active(
+        noisy(w, schedule, clean, 10.0, 1), payload, FEW, Receivers(refinement="grid")
+    ).detections
     bins = d.velocity[0] / w.velocity_cell(2)
     beat = d.range[0] / w.range_cell(2) + bins * w.sampled_duration / w.frame_duration
     assert abs(bins - round(bins)) < 1e-9 and abs(beat - round(beat)) < 1e-9  # rounding
-    assert abs(d.range[0] - NEAR[0]) < w.range_cell(2) and abs(d.velocity[0] - NEAR[1]) < w.velocity_cell(2)
+    assert abs(d.range[0] - NEAR[0]) < w.range_cell(2) and abs(
+        d.velocity[0] - NEAR[1]
+    ) < w.velocity_cell(2)
     assert np.abs(d.direction[0] - LOS[2:4]).max() < 0.1

@@ -1,4 +1,5 @@
-"""Conventional sampling at the receiver, and its decision whether a scene is sparse enough for a pseudo-random schedule."""
+"""Conventional sampling at the receiver, and its decision whether a scene is sparse enough for a
+pseudo-random schedule."""
 
 from __future__ import annotations
 
@@ -32,28 +33,52 @@ def one_row(rng: np.random.Generator, w: Waveform, count: int) -> list[Path]:
     paths = []
     for _ in range(count):
         u = (float(rng.uniform(-0.4, 0.4)), float(rng.uniform(-0.4, 0.4)))
-        paths.append(Path(length, 2 * rng.uniform(-limit, limit), np.exp(2j * np.pi * rng.random()), u, u))
+        paths.append(
+            Path(length, 2 * rng.uniform(-limit, limit), np.exp(2j * np.pi * rng.random()), u, u)
+        )
     return paths
 
 
 def heard(w: Waveform, schedule: np.ndarray, paths: list[Path], seed: int, noise: float = NOISE):
     payload = random_payload(w, schedule, 8, np.random.default_rng(seed))
-    return receive_active(cube(w, schedule, payload, paths, FEW, noise=noise, seed=seed), payload, FEW, SETTINGS)
+    return receive_active(
+        cube(w, schedule, payload, paths, FEW, noise=noise, seed=seed), payload, FEW, SETTINGS
+    )
 
 
 def test_method_follows_the_schedule():
     """Planted bug: a conventional schedule of two groups taken for random."""
-    for groups, conventional, random in ((1, "conventional", "omp"), (2, "conventional", "omp"), (3, "latin_union", "latin_union")):
+    for groups, conventional, random in (
+        (1, "conventional", "omp"),
+        (2, "conventional", "omp"),
+        (3, "latin_union", "latin_union"),
+    ):
         assert velocity_method(SETTINGS, conventional_schedule(groups, 120, 3), 3) == conventional
-        assert velocity_method(SETTINGS, pseudo_random_schedule(groups, 120, 3, np.random.default_rng(2)), 3) == random
-    assert velocity_method(Receivers(velocity_method="conventional"), conventional_schedule(3, 120, 3), 3) == "conventional"
+        assert (
+            velocity_method(
+                SETTINGS, pseudo_random_schedule(groups, 120, 3, np.random.default_rng(2)), 3
+            )
+            == random
+        )
+    assert (
+        velocity_method(
+            Receivers(velocity_method="conventional"), conventional_schedule(3, 120, 3), 3
+        )
+        == "conventional"
+    )
 
 
 def test_conventional_map_is_each_antennas_own_transform():
-    """Against sums written out. Planted bugs: the groups added before the power is taken, the tiles not centred."""
+    """Against sums written out. Planted bugs: the groups added before the power is taken, the tiles
+    not centred."""
     w = Waveform(num_samples=64, num_chirps=24, num_groups=2)
     schedule = conventional_schedule(2, 24, 3)
-    spectra = np.random.default_rng(4).standard_normal((2, 2, 5, 24, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    spectra = (
+        np.random.default_rng(4)
+        .standard_normal((2, 2, 5, 24, 2))
+        .astype(np.float32)
+        .view(np.complex64)[..., 0]
+    )
     got = conventional_power(spectra, w, schedule)
     i = np.arange(8)
     window = np.sin(np.pi * (i + 0.5) / 8) ** 2
@@ -62,24 +87,34 @@ def test_conventional_map_is_each_antennas_own_transform():
         for m in range(2):
             for tx in range(3):
                 for rx in range(2):
-                    power += abs((spectra[m, rx, row, schedule[m] == tx] * window * tone).sum()) ** 2 / 12
+                    power += (
+                        abs((spectra[m, rx, row, schedule[m] == tx] * window * tone).sum()) ** 2
+                        / 12
+                    )
         assert got[row, number + 12] == pytest.approx(power, rel=1e-5, abs=0)  # complex64
     assert own_bins(w).sum() == 8
 
 
 @pytest.mark.parametrize("groups", [1, 2])
 def test_a_conventional_schedule_measures_up_to_a_third_of_the_velocity(groups: int):
-    """Range, velocity and direction within the limit; an echo beyond it is reported a whole period slower. Planted bugs: the limit
-    of the full sampling."""
+    """Range, velocity and direction within the limit; an echo beyond it is reported a whole period
+    slower. Planted bugs: the limit of the full sampling."""
     w = short(groups)
-    schedule, u, period = conventional_schedule(groups, 120, 3), (0.23, -0.31), 2 * w.max_velocity(2) / 3
+    schedule, u, period = (
+        conventional_schedule(groups, 120, 3),
+        (0.23, -0.31),
+        2 * w.max_velocity(2) / 3,
+    )
     range_, slow, fast = 21.337, 3.271, 3.271 + period
     for speed in (slow, fast):
         payload = random_payload(w, schedule, 8, np.random.default_rng(5))
-        signal = cube(w, schedule, payload, [Path(2 * range_, 2 * speed, 1.0, u, u)], noise=1e-4, seed=6)
+        signal = cube(
+            w, schedule, payload, [Path(2 * range_, 2 * speed, 1.0, u, u)], noise=1e-4, seed=6
+        )
         d = receive_active(signal, payload, ANTENNAS, SETTINGS).detections
         assert len(d) == 1
-        # an alias is matched with the wrong migration, 2 Doppler cells per antenna of 18 in range at most
+        # an alias is matched with the wrong migration, 2 Doppler cells per antenna of 18 in range
+        # at most
         assert abs(d.range[0] - range_) < (2e-3 if speed == slow else w.range_cell(2) / 2)
         assert abs(d.velocity[0] - slow) < (1e-3 if speed == slow else 0.1 * w.velocity_cell(2))
         if speed == slow:
@@ -87,7 +122,8 @@ def test_a_conventional_schedule_measures_up_to_a_third_of_the_velocity(groups: 
 
 
 def test_a_passive_terminal_reads_a_conventional_schedule_beyond_the_limit():
-    """The prediction says which alias the reference is. Planted bug: the reference sought within the limit."""
+    """The prediction says which alias the reference is. Planted bug: the reference sought within
+    the limit."""
     w = short(1)
     schedule, rng = conventional_schedule(1, 120, 3), np.random.default_rng(6)
     payload, rate = random_payload(w, schedule, 8, rng), 0.71 * w.max_velocity(1)
@@ -107,7 +143,8 @@ def test_a_passive_terminal_reads_a_conventional_schedule_beyond_the_limit():
 
 
 def test_groups_add_up_beyond_the_limit():
-    """Two groups see an aliased path in phases of their own, antenna by antenna. Planted bug: responses added without turning."""
+    """Two groups see an aliased path in phases of their own, antenna by antenna. Planted bug:
+    responses added without turning."""
     w = short(2)
     schedule, pilot = conventional_schedule(2, 120, 3), unmodulated(w)
     signal = cube(w, schedule, pilot, [Path(41.83, 0.71 * w.max_velocity(1))], FEW, noise=1e-3)
@@ -116,7 +153,9 @@ def test_groups_add_up_beyond_the_limit():
     assert r.reference_power == pytest.approx(1.0, rel=0.1)  # matched with the alias's migration
 
 
-@pytest.mark.parametrize(("count", "sparse"), [(0, True), (1, True), (3, True), (9, False), (14, False)])
+@pytest.mark.parametrize(
+    ("count", "sparse"), [(0, True), (1, True), (3, True), (9, False), (14, False)]
+)
 @pytest.mark.parametrize("groups", [1, 2])
 def test_receiver_decides_whether_the_scene_is_sparse(count: int, sparse: bool, groups: int):
     """40 random chirps of 120 recover 4 atoms. Planted bug: the limit without the logarithm."""
@@ -129,7 +168,8 @@ def test_receiver_decides_whether_the_scene_is_sparse(count: int, sparse: bool, 
 
 
 def test_noise_does_not_make_a_scene_dense():
-    """Two paths, each weaker in a chirp of their range cell than the noise. Planted bug: noise counted as unexplained."""
+    """Two paths, each weaker in a chirp of their range cell than the noise. Planted bug: noise
+    counted as unexplained."""
     w, rng = short(1), np.random.default_rng(11)
     r = heard(w, pseudo_random_schedule(1, 120, 3, rng), one_row(rng, w, 2), 7, noise=500.0)
     assert len(r.detections) and r.sparse is True
@@ -138,8 +178,9 @@ def test_noise_does_not_make_a_scene_dense():
 @pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 2])
 def test_fall_back_pays_where_the_rule_asks_for_it(groups: int):
-    """Hits of schemes (d) and (c) on the same scenes against the paths in a range row, with the share of frames called sparse: where
-    the rule says sparse (d) loses nothing, where it says not (c) is at least as good. Run with -s for the table."""
+    """Hits of schemes (d) and (c) on the same scenes against the paths in a range row, with the
+    share of frames called sparse: where the rule says sparse (d) loses nothing, where it says not
+    (c) is at least as good. Run with -s for the table."""
     w, trials = short(groups), 24
     hits = np.zeros((2, 2))  # (sparse, scheme)
     paths_seen = np.zeros(2)
@@ -149,14 +190,20 @@ def test_fall_back_pays_where_the_rule_asks_for_it(groups: int):
         for trial in range(trials):
             rng = np.random.default_rng([count, trial])
             paths = one_row(rng, w, count)
-            schedules = pseudo_random_schedule(groups, 120, 3, rng), conventional_schedule(groups, 120, 3)
+            schedules = (
+                pseudo_random_schedule(groups, 120, 3, rng),
+                conventional_schedule(groups, 120, 3),
+            )
             both = [heard(w, s, paths, trial) for s in schedules]
             one = np.array([sum(_hit(r.detections, p, w) for p in paths) for r in both])
             verdicts.append(bool(both[0].sparse))
             found += one
             hits[int(verdicts[-1])] += one
             paths_seen[int(verdicts[-1])] += count
-        print(f"{count:5d}  {found[0] / count / trials:12.3f}  {found[1] / count / trials:12.3f}  {np.mean(verdicts):6.2f}")
+        print(
+            f"{count:5d}  {found[0] / count / trials:12.3f}  {found[1] / count / trials:12.3f}  "
+            f"{np.mean(verdicts):6.2f}"
+        )
     rate = hits / paths_seen[:, None]
     spread = np.sqrt(0.25 / paths_seen)  # binomial, at most
     assert rate[1, 0] > rate[1, 1] - 2 * spread[1]

@@ -14,7 +14,8 @@ from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform, transform_plain
 
 ROUNDING = 1e-6
-"""Of sums in float32 over some hundred terms, relative RMS: some eps = 6e-8 times the root of the stages."""
+"""Of sums in float32 over some hundred terms, relative RMS: some eps = 6e-8 times the root of the
+stages."""
 
 
 def drawn(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -24,14 +25,19 @@ def drawn(rng: np.random.Generator, *shape: int) -> np.ndarray:
 @pytest.mark.parametrize(("size", "chirps"), [(40, 3), (96, 37), (256, 16), (56, 17), (100, 5)])
 @pytest.mark.parametrize("plain", [False, True])
 def test_transform_is_the_sum(size: int, chirps: int, plain: bool):
-    """Blocks of sixteen chirps that are full and not; sizes with a factor 5, 3, 7 (scipy's) and one that is no multiple of 8.
+    """Blocks of sixteen chirps that are full and not; sizes with a factor 5, 3, 7 (scipy's) and one
+    that is no multiple of 8.
 
     Planted bug: the cells of the lane transform read at k instead of -k, which turns the other way.
     """
     rng = np.random.default_rng(size)
     samples, factor = drawn(rng, 2, chirps, size), drawn(rng, chirps, size)
     cells = np.array([-3, 0, 5, size // 2 + 1, size - 3])  # the first and the last are one
-    turn, power, out = drawn(rng, cells.size, chirps), np.full((chirps, size), 0.37, np.float32), np.empty((2, 5, chirps), np.complex64)
+    turn, power, out = (
+        drawn(rng, cells.size, chirps),
+        np.full((chirps, size), 0.37, np.float32),
+        np.empty((2, 5, chirps), np.complex64),
+    )
     (transform_plain if plain else transform)(samples, factor, cells, out, turn=turn, power=power)
     wave = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
     every = np.einsum("kn,rpn->rpk", wave, samples.astype(complex) * factor)
@@ -54,8 +60,9 @@ def test_tones_are_exponentials():
 
 @pytest.mark.parametrize(("groups", "chirps"), [(3, 36), (3, 33), (2, 36)])
 def test_power_map_is_the_mean_over_antennas(groups: int, chirps: int):
-    """Samples that follow a tone of a fraction of a bin, with delays of the data: the united groups show what one antenna that sends in
-    every slot would; two groups the plain correlation. Even and odd numbers of chirps.
+    """Samples that follow a tone of a fraction of a bin, with delays of the data: the united groups
+    show what one antenna that sends in every slot would; two groups the plain correlation. Even and
+    odd numbers of chirps.
 
     Planted bug: the conjugate bin from b x + a y in place of a y - b x.
     """
@@ -64,7 +71,9 @@ def test_power_map_is_the_mean_over_antennas(groups: int, chirps: int):
     symbols = rng.integers(0, w.num_delay_symbols, schedule.shape)
     tone, amplitude = np.array([3.3, -7.2]), drawn(rng, w.num_tx, 2, 2)  # tx, rx, row
     times = slow_times(w, symbols)
-    spectra = amplitude[schedule].transpose(0, 2, 3, 1) * np.exp(2j * np.pi * tone[:, None] * times[:, None, None, :] / chirps)
+    spectra = amplitude[schedule].transpose(0, 2, 3, 1) * np.exp(
+        2j * np.pi * tone[:, None] * times[:, None, None, :] / chirps
+    )
     got = power_map(spectra.astype(np.complex64), w, schedule, symbols)
     bins = np.fft.fftshift(np.fft.fftfreq(chirps, 1 / chirps))
     window = slow_window(w).astype(float)
@@ -74,10 +83,13 @@ def test_power_map_is_the_mean_over_antennas(groups: int, chirps: int):
         slots = np.arange(chirps)[None] + np.zeros((groups, 1), int)
         at = slots[sent] if groups == 3 else times[sent]
         for row in range(2):
-            seen = np.exp(2j * np.pi * (tone[row] - bins)[:, None] * at / chirps) @ window[slots[sent]]
+            seen = (
+                np.exp(2j * np.pi * (tone[row] - bins)[:, None] * at / chirps) @ window[slots[sent]]
+            )
             expected[row] += np.abs(seen) ** 2 * (np.abs(amplitude[tx, :, row]) ** 2).sum()
     expected /= w.num_tx * 2
-    # the resampling of the united groups leaves -60 dB at other velocities; the correlation only rounds
+    # the resampling of the united groups leaves -60 dB at other velocities; the correlation only
+    # rounds
     tolerance = 3e-3 if groups == 3 else 1e-5
     assert np.abs(np.sqrt(got) - np.sqrt(expected)).max() < tolerance * np.sqrt(expected.max())
 
@@ -87,7 +99,11 @@ def test_peaks_against_a_maximum_filter(reach: tuple[int, int]):
     """Planted bug: the window along range ends a row early."""
     power = np.random.default_rng(2).gamma(2.0, size=(60, 35)).astype(np.float32)
     above = power > 4.0
-    largest = ndimage.maximum_filter(power, size=(2 * reach[0] + 1, 2 * min(reach[1], 17) + 1), mode=("nearest", "wrap"))
+    largest = ndimage.maximum_filter(
+        power, size=(2 * reach[0] + 1, 2 * min(reach[1], 17) + 1), mode=("nearest", "wrap")
+    )
     rows, bins = peaks(power, above, reach)
-    assert rows.size and set(zip(rows, bins, strict=True)) == set(zip(*np.nonzero(above & (power == largest)), strict=True))
+    assert rows.size and set(zip(rows, bins, strict=True)) == set(
+        zip(*np.nonzero(above & (power == largest)), strict=True)
+    )
     assert (np.diff(power[rows, bins]) <= 0).all()

@@ -1,4 +1,5 @@
-"""Results: what was handed over is what is read back; files appear whole or not at all; the summary by hand."""
+"""Results: what was handed over is what is read back; files appear whole or not at all; the summary
+by hand."""
 
 from __future__ import annotations
 
@@ -20,8 +21,23 @@ from isac_rt.results.records import KINDS
 from isac_rt.scenario.file import to_yaml
 from isac_rt.views.interchange import write_ledger
 
-TERMINAL_KEYS = {"counts", "role", "ser_dpsk", "ser_delay", "ber", "bits", "bit_rate_bps", "hit_rate", "rmse", "rmse_tracked", "erased",
-                 "matched", "matched_tracked", "false_per_frame", "clutter_per_frame"}  # fmt: skip
+TERMINAL_KEYS = {
+    "counts",
+    "role",
+    "ser_dpsk",
+    "ser_delay",
+    "ber",
+    "bits",
+    "bit_rate_bps",
+    "hit_rate",
+    "rmse",
+    "rmse_tracked",
+    "erased",
+    "matched",
+    "matched_tracked",
+    "false_per_frame",
+    "clutter_per_frame",
+}
 RMSE_KEYS = {"range_m", "velocity_mps", "azimuth_deg", "elevation_deg"}
 ROUNDING = 1e-12
 """Differences of numbers around 30 in float64, a few operations each."""
@@ -38,85 +54,136 @@ def _same(a: xr.Dataset, b: xr.Dataset) -> None:
         x, y = a[name].values, b[name].values
         assert x.shape == y.shape, name
         text = x.dtype.kind in "OUT"  # numpy and pandas have several array types for text
-        assert x.tolist() == y.tolist() if text else x.dtype == y.dtype and x.tobytes() == y.tobytes(), name
+        assert (
+            x.tolist() == y.tolist() if text else x.dtype == y.dtype and x.tobytes() == y.tobytes()
+        ), name
         assert a[name].attrs["units"] == b[name].attrs["units"] and a[name].attrs["long_name"]
 
 
 @pytest.mark.parametrize("detections", [3, 0])
 def test_round_trip_is_bit_exact(tmp_path, detections):
-    """Exact. Seen to fail with a float32 encoding in `_write_dataset`; 0 detections is the empty ragged dimension."""
+    """Exact. Seen to fail with a float32 encoding in `_write_dataset`; 0 detections is the empty
+    ragged dimension."""
     made = fake_run(detections=detections)
     save(made, tmp_path / "a" / "b")
     back = load(tmp_path / "a" / "b")
     _same(made.dataset, back.dataset)
-    assert back.summary == json.loads(json.dumps(made.summary)) and to_yaml(back.scenario) == to_yaml(made.scenario)
+    assert back.summary == json.loads(json.dumps(made.summary)) and to_yaml(
+        back.scenario
+    ) == to_yaml(made.scenario)
     assert back.dataset.attrs["scenario"] == made.dataset.attrs["scenario"]
 
 
 def test_two_runs_are_bit_identical(tmp_path, run):
-    """Exact, for other timings too: nothing of the clock is in the dataset. Seen to fail with time.time() as an attribute."""
+    """Exact, for other timings too: nothing of the clock is in the dataset. Seen to fail with
+    time.time() as an attribute."""
     w = waveform_of(run.scenario)
-    scores = {("AT", name): SensingScore(resolutions(w, antennas_of(run.scenario, w), 1)) for name in ("AT", "PT1")}
+    scores = {
+        ("AT", name): SensingScore(resolutions(w, antennas_of(run.scenario, w), 1))
+        for name in ("AT", "PT1")
+    }
     recorder = fake_recorder(run.scenario)
     for record in fake_records(run.scenario):
         recorder.add(record)
-    other = recorder.finish(scores=scores, timing={k: 9 * v for k, v in TIMING.items()}, fidelity=run.summary["fidelity"],
-                            link_budget=json.loads(run.dataset.attrs["link_budget"]))  # fmt: skip
+    other = recorder.finish(
+        scores=scores,
+        timing={k: 9 * v for k, v in TIMING.items()},
+        fidelity=run.summary["fidelity"],
+        link_budget=json.loads(run.dataset.attrs["link_budget"]),
+    )
     _same(run.dataset, other.dataset)
     assert run.dataset.attrs == other.dataset.attrs
 
 
 def test_what_was_recorded_is_found_by_name(run):
-    """Every value against the record it came from. Seen to fail with the observers' order reversed in `over`."""
+    """Every value against the record it came from. Seen to fail with the observers' order reversed
+    in `over`."""
     d, records = run.dataset, fake_records(run.scenario)
     o = records[4].observers["PT1"]
     here = {"observer": list(d.observer.values).index("PT1"), "frame": 4}
     assert np.array_equal(d.truth_range.isel(here).values, o.truth.range)
     assert np.array_equal(d.tracked_azimuth.isel(here).values, o.tracked.azimuth, equal_nan=True)
     assert np.isnan(d.truth_range.isel(frame=3, observer=0)).all() and not d.processed.values[3, 0]
-    assert np.array_equal(d.uav_position.sel(uav="U1").values, [r.poses["U1"].position for r in records])
+    assert np.array_equal(
+        d.uav_position.sel(uav="U1").values, [r.poses["U1"].position for r in records]
+    )
     of = (d.det_frame.values == 4) & (d.det_observer.values == here["observer"])
     assert np.array_equal(d.det_velocity.values[of], o.reception.detections.velocity)
     assert np.array_equal(d.det_range.values[of], o.reception.detections.range)
-    assert d.symbol_errors.values[3, here["observer"]].tolist() == [30, 90, 180] and d.symbol_erased.values[3, here["observer"], 1] == 45
+    assert (
+        d.symbol_errors.values[3, here["observer"]].tolist() == [30, 90, 180]
+        and d.symbol_erased.values[3, here["observer"], 1] == 45
+    )
     assert d.det_kind.values[of].tolist() == [1, 3, -1]
-    assert d.det_order.values[of].tolist() == [0, 1, -1] and d.det_face.values[of].tolist() == [-1, 70123, -1]
+    assert d.det_order.values[of].tolist() == [0, 1, -1] and d.det_face.values[of].tolist() == [
+        -1,
+        70123,
+        -1,
+    ]
     for k, kind in enumerate(KINDS):
         assert d.path_count.sel(kind=kind).values[4, here["observer"]] == (o.paths.kind == k).sum()
     assert set(d.path_frame.values) == {2}
     rows = d.path_observer.values == here["observer"]
     ledger = records[2].observers["PT1"].paths
     assert np.array_equal((d.path_gain_re + 1j * d.path_gain_im).values[rows], ledger.gain)
-    assert np.array_equal(d.map_power.values[0, 1], records[2].observers["PT1"].reception.maps.range_doppler.astype(np.float32))
+    assert np.array_equal(
+        d.map_power.values[0, 1],
+        records[2].observers["PT1"].reception.maps.range_doppler.astype(np.float32),
+    )
 
 
 def test_every_variable_has_units_and_a_meaning(run, tmp_path):
-    write_ledger({("AT", "PT1"): fake_records(run.scenario)[0].observers["PT1"].paths}, tmp_path / "l.nc", run.scenario)
+    write_ledger(
+        {("AT", "PT1"): fake_records(run.scenario)[0].observers["PT1"].paths},
+        tmp_path / "l.nc",
+        run.scenario,
+    )
     with xr.open_dataset(tmp_path / "l.nc", engine="h5netcdf") as ledger:
         for d in (run.dataset, ledger):
-            assert all(v.attrs.get("units") and v.attrs.get("long_name") for v in d.variables.values())
+            assert all(
+                v.attrs.get("units") and v.attrs.get("long_name") for v in d.variables.values()
+            )
             assert {"scenario", "seed", "versions", "commit", "platform"} <= set(d.attrs)
 
 
 def test_summary_has_the_fixed_keys(run):
     s = run.summary
-    assert {"scenario", "seed", "frames", "terminals", "paths", "timing_s", "fidelity", "access", "sparsity", "versions", "links"} == set(s)
+    assert {
+        "scenario",
+        "seed",
+        "frames",
+        "terminals",
+        "paths",
+        "timing_s",
+        "fidelity",
+        "access",
+        "sparsity",
+        "versions",
+        "links",
+    } == set(s)
     assert set(s["terminals"]) == {"AT", "PT1"} and set(s["links"]) == {"AT->AT", "AT->PT1"}
     for part in (*s["terminals"].values(), *s["links"].values()):
-        assert set(part) == TERMINAL_KEYS and set(part["rmse"]) == RMSE_KEYS == set(part["rmse_tracked"])
+        assert set(part) == TERMINAL_KEYS and set(part["rmse"]) == RMSE_KEYS == set(
+            part["rmse_tracked"]
+        )
     assert set(s["timing_s"]) == {"setup", "trace", "synthesis", "receive", "track", "total"}
     assert set(s["paths"]) == set(KINDS) and sum(s["paths"].values()) == 23 * 11
     json.dumps(s, allow_nan=False)
 
 
 def test_summary_numbers_by_hand(run):
-    """6 data frames to PT1, of which one lost 30 of 360, 90 of 351 and 180 of 4293. Seen to fail with erased symbols
-    taken off."""
+    """6 data frames to PT1, of which one lost 30 of 360, 90 of 351 and 180 of 4293. Seen to fail
+    with erased symbols taken off."""
     pt, at = run.summary["terminals"]["PT1"], run.summary["terminals"]["AT"]
     assert (pt["ser_delay"], pt["ser_dpsk"], pt["ber"]) == (30 / 2160, 90 / 2106, 180 / 25758)
     assert pt["erased"] == (30 + 45) / (2160 + 2106) and pt["bits"] == 25758
     assert abs(pt["bit_rate_bps"] - 25758 / (6 * 0.043 + 0.0077824)) < 1e-5
-    assert at["ser_delay"] is None and at["bits"] is None and at["bit_rate_bps"] is None and at["role"] == "active"
+    assert (
+        at["ser_delay"] is None
+        and at["bits"] is None
+        and at["bit_rate_bps"] is None
+        and at["role"] == "active"
+    )
     assert pt["false_per_frame"] is not None and pt["role"] == "passive"
 
 
@@ -124,8 +191,15 @@ def test_errors_of_angles_wrap(run):
     """2 pi more is no error. Seen to fail without the wrap."""
     turned = run.dataset.copy()
     turned["detected_azimuth"] = turned.detected_azimuth + 2 * np.pi
-    e, plain = errors_of(turned, "detected", "azimuth"), errors_of(run.dataset, "detected", "azimuth")
-    assert np.isfinite(plain).any() and np.nanmax(np.abs(e - plain)) < ROUNDING and abs(e[0, 0, 2] - 0.00637) < ROUNDING
+    e, plain = (
+        errors_of(turned, "detected", "azimuth"),
+        errors_of(run.dataset, "detected", "azimuth"),
+    )
+    assert (
+        np.isfinite(plain).any()
+        and np.nanmax(np.abs(e - plain)) < ROUNDING
+        and abs(e[0, 0, 2] - 0.00637) < ROUNDING
+    )
 
 
 def test_failure_while_writing_leaves_the_old_file_and_no_rest(tmp_path, run, monkeypatch):
@@ -159,7 +233,11 @@ def test_interrupt_while_writing_leaves_nothing(tmp_path, run, monkeypatch):
 
 def test_bad_folders_get_one_message(tmp_path, run):
     (tmp_path / "file").write_text("x")
-    for call in (lambda: save(run, tmp_path / "file"), lambda: check_folder(tmp_path / "file" / "deeper"), lambda: load(tmp_path / "none")):
+    for call in (
+        lambda: save(run, tmp_path / "file"),
+        lambda: check_folder(tmp_path / "file" / "deeper"),
+        lambda: load(tmp_path / "none"),
+    ):
         with pytest.raises(ResultsError) as caught:
             call()
         assert "\n" not in str(caught.value)
@@ -182,7 +260,9 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
     assert d.sizes["path"] == 46 and np.array_equal(mine.gain_re + 1j * mine.gain_im, p.gain)
     assert np.array_equal(mine.points, p.points) and np.array_equal(mine.faces, p.faces)
     assert np.allclose(mine.doppler, -77e9 * p.delay_rate, rtol=1e-15)
-    assert np.array_equal(mine.target_name.values[mine.target.values[mine.target.values >= 0]], ["U1"])
+    assert np.array_equal(
+        mine.target_name.values[mine.target.values[mine.target.values >= 0]], ["U1"]
+    )
     write_ledger({}, tmp_path / "empty.nc", run.scenario)
 
 

@@ -17,9 +17,11 @@ PROGRAM = Path(runtime.__file__)
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A machine without GPU whose only libraries are the files made in one folder; returns a maker of libraries.
+    """A machine without GPU whose only libraries are the files made in one folder; returns a maker
+    of libraries.
 
-    A made library is empty; `answers` says what it would tell of its version (None: it cannot be loaded)."""
+    A made library is empty; `answers` says what it would tell of its version (None: it cannot be
+    loaded)."""
     answers: dict[str, str | None] = {}
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
@@ -38,11 +40,15 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nothing_found_names_the_remedy(machine):
-    with pytest.raises(RuntimeProblem, match=r"found none; install LLVM 19 .*libllvm19.*DRJIT_LIBLLVM_PATH"):
+    with pytest.raises(
+        RuntimeProblem, match=r"found none; install LLVM 19 .*libllvm19.*DRJIT_LIBLLVM_PATH"
+    ):
         runtime.choose_backend()
 
 
-@pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so", "libLLVM.so.16.0", "libLLVM.so.23.1"])
+@pytest.mark.parametrize(
+    "name", ["libLLVM-14.so.1", "libLLVM-15.so", "libLLVM.so.16.0", "libLLVM.so.23.1"]
+)
 def test_unfit_versions_are_not_even_loaded(machine, name):
     """14 is refused by Dr.Jit, 15 and 16 abort it; planted bug: OLDEST_LLVM = 15."""
     machine(name, "19.1.7")  # would be taken if it were asked
@@ -64,7 +70,8 @@ def test_best_version_is_taken(machine, names, best):
 
 
 def test_a_library_that_lies_about_its_version_is_passed_over(machine):
-    """The name says 19, the library 15; and one that cannot be loaded. Planted bug: the name alone is believed."""
+    """The name says 19, the library 15; and one that cannot be loaded. Planted bug: the name alone
+    is believed."""
     machine("libLLVM-19.so", "15.0.7")
     machine("libLLVM.so.20.1", None)
     good = machine("libLLVM.so.17.0", "17.0.6")
@@ -111,14 +118,21 @@ def test_doctor_names_missing_packages():
 
 
 def test_too_old_llvm_ends_a_process_with_one_message(tmp_path):
-    """The whole program with no other libLLVM than a made-up 15: exit 2, one line, no abort (which would be -6)."""
+    """The whole program with no other libLLVM than a made-up 15: exit 2, one line, no abort (which
+    would be -6)."""
     fake = tmp_path / "libLLVM-15.so"
     fake.write_bytes(b"not a library")
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(fake), "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run([sys.executable, "-I", str(PROGRAM)], capture_output=True, text=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-I", str(PROGRAM)], capture_output=True, text=True, env=environment
+    )
     assert done.returncode == 2
     assert done.stdout == ""
-    assert len(done.stderr.splitlines()) == 1 and "LLVM 15" in done.stderr and "Traceback" not in done.stderr
+    assert (
+        len(done.stderr.splitlines()) == 1
+        and "LLVM 15" in done.stderr
+        and "Traceback" not in done.stderr
+    )
 
 
 def test_a_file_that_is_no_library_does_not_answer(tmp_path):
@@ -129,22 +143,28 @@ def test_a_file_that_is_no_library_does_not_answer(tmp_path):
 
 @pytest.mark.sionna
 def test_sionna_keeps_the_variant_that_activate_set():
-    """In a process of its own: Sionna sets a variant on import only if none is set. Planted bug: activate() sets no variant."""
+    """In a process of its own: Sionna sets a variant on import only if none is set. Planted bug:
+    activate() sets no variant."""
     program = (
         "from isac_rt.runtime import VARIANTS, activate\n"
         "backend = activate()\nassert activate() is backend\n"
         "import mitsuba as mi\nbefore = mi.variant()\nimport sionna.rt\n"
         "print(before == mi.variant() == VARIANTS[backend.kind])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PROGRAM.parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=PROGRAM.parent.parent
+    )
     assert done.stdout.strip() == "True", done.stderr
 
 
 @pytest.mark.sionna
 def test_a_foreign_variant_is_refused():
     program = (
-        "import mitsuba as mi\nmi.set_variant('scalar_rgb')\nfrom isac_rt.runtime import RuntimeProblem, activate\n"
+        "import mitsuba as mi\nmi.set_variant('scalar_rgb')\nfrom isac_rt.runtime import "
+        "RuntimeProblem, activate\n"
         "try:\n    activate()\nexcept RuntimeProblem as problem:\n    print(problem)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=PROGRAM.parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=PROGRAM.parent.parent
+    )
     assert "already set to the variant scalar_rgb" in done.stdout, done.stderr

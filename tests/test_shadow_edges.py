@@ -1,4 +1,5 @@
-"""Line of sight and echoes across shadow edges of a city, and past the swarm's own bodies, in traced scenes."""
+"""Line of sight and echoes across shadow edges of a city, and past the swarm's own bodies, in
+traced scenes."""
 
 from __future__ import annotations
 
@@ -27,11 +28,16 @@ LAMBDA = C / F_C
 
 
 def tracer(city: City, **radii):
-    """A tracer for A (active), P (passive) and the target U, isotropic elements of 0 dBi, no mirror reflections."""
+    """A tracer for A (active), P (passive) and the target U, isotropic elements of 0 dBi, no mirror
+    reflections."""
     uavs = {
         "A": {"role": "active", "position_m": [0, 0, 0]},
         "P": {"role": "passive", "position_m": [1, 0, 0]},
-        "U": {"role": "target", "position_m": [2, 0, 0], "rcs": {"model": "constant", "value_dbsm": -11.3}},
+        "U": {
+            "role": "target",
+            "position_m": [2, 0, 0],
+            "rcs": {"model": "constant", "value_dbsm": -11.3},
+        },
     }
     for name in uavs:
         uavs[name]["body_radius_m"] = radii.get(name, 0.0)
@@ -60,7 +66,11 @@ def one(paths, kind: PathKind):
 
 def field(path) -> complex:
     """What arrives, carrier phase included."""
-    return 0j if path is None else complex(path.gain[0] * np.exp(-2j * np.pi * np.mod(F_C * path.delay[0], 1.0)))
+    return (
+        0j
+        if path is None
+        else complex(path.gain[0] * np.exp(-2j * np.pi * np.mod(F_C * path.delay[0], 1.0)))
+    )
 
 
 def wave(distance: float) -> complex:
@@ -76,16 +86,20 @@ WALL = rectangle((-70.3, 31.0, -90.0), (141.0, 0, 0), (0, 0, 90.0), METAL)
 
 
 def test_line_of_sight_and_echo_of_a_half_plane():
-    """P and U rise out of the shadow of a wall, 31 + 47 m from A: the line of sight follows the Fresnel integral of
-    nu = h sqrt(2 (d1 + d2)/(lambda d1 d2)), amplitude and phase, the echo (both ways) its square.
+    """P and U rise out of the shadow of a wall, 31 + 47 m from A: the line of sight follows the
+    Fresnel integral of nu = h sqrt(2 (d1 + d2)/(lambda d1 d2)), amplitude and phase, the echo (both
+    ways) its square.
 
-    Within 3e-3 of the unshadowed field over -2.8 < nu < 8: between the small-angle nu and the true detour lies (h/d)^2/4 of the
-    phase pi nu^2/2, 2e-4 of 100 rad. Planted bug: the detour's phase both in the gain and in the delay.
+    Within 3e-3 of the unshadowed field over -2.8 < nu < 8: between the small-angle nu and the true
+    detour lies (h/d)^2/4 of the phase pi nu^2/2, 2e-4 of 100 rad. Planted bug: the detour's phase
+    both in the gain and in the delay.
     """
     model, a = tracer(WALL), pose((-8.3, 0.0, -1.1))
     worst, dark = 0.0, 0
     for h in np.linspace(-0.55, 1.6, 16):  # of the edge over the path
-        top = (-1.1 * 47 / 78 + h) * 78 / 31  # z = -top lies so that the path passes h under the edge
+        top = (
+            (-1.1 * 47 / 78 + h) * 78 / 31
+        )  # z = -top lies so that the path passes h under the edge
         end = pose((9.1, 78.0, -top))
         d = np.linalg.norm(end.position - a.position)
         at = a.position + 31 / 78 * (end.position - a.position)
@@ -99,7 +113,12 @@ def test_line_of_sight_and_echo_of_a_half_plane():
         los = one(model.paths(poses, 0.0, [("A", "P")])["A", "P"], PathKind.LINE_OF_SIGHT)
         expected = fresnel(nu) * wave(d)
         worst = max(worst, abs(field(los) / (LAMBDA / (4 * np.pi * d)) - expected))
-        echo = one(model.paths(poses | {"U": end, "P": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "A")])["A", "A"], PathKind.TARGET)
+        echo = one(
+            model.paths(poses | {"U": end, "P": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "A")])[
+                "A", "A"
+            ],
+            PathKind.TARGET,
+        )
         whole = np.sqrt(10**-1.13 * LAMBDA**2 / (4 * np.pi) ** 3) / d**2
         worst = max(worst, abs(field(echo) / whole - expected**2))
         dark += nu > 0
@@ -109,32 +128,51 @@ def test_line_of_sight_and_echo_of_a_half_plane():
 
 
 def test_delay_rate_of_a_bent_path_is_its_delays():
-    """In the shadow of the same wall, both ends in flight: delay_rate against central differences over 1 ms, 1e-13 (that is 0.01 Hz).
-    Planted bug: the rate of the straight line."""
+    """In the shadow of the same wall, both ends in flight: delay_rate against central differences
+    over 1 ms, 1e-13 (that is 0.01 Hz). Planted bug: the rate of the straight line."""
     model = tracer(WALL)
     step = 5e-4
 
     def at(t: float):
         a, p = pose((-8.3, 0.0, -1.1), (3.1, 1.7, -4.3)), pose((9.1, 78.0, -4.9), (-2.2, 5.9, 7.7))
-        moved = {n: replace(q, position=q.position + t * q.velocity) for n, q in {"A": a, "P": p}.items()}
-        return one(model.paths(moved | {"U": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "P")])["A", "P"], PathKind.LINE_OF_SIGHT)
+        moved = {
+            n: replace(q, position=q.position + t * q.velocity) for n, q in {"A": a, "P": p}.items()
+        }
+        return one(
+            model.paths(moved | {"U": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "P")])["A", "P"],
+            PathKind.LINE_OF_SIGHT,
+        )
 
     before, now, after = at(-step), at(0.0), at(step)
     assert now.bent.all()
-    assert now.delay_rate[0] == pytest.approx((after.delay[0] - before.delay[0]) / (2 * step), rel=0, abs=1e-13)
-    assert np.linalg.norm(now.departure[0] - (np.array([9.1, 78.0, -4.9]) - [-8.3, 0.0, -1.1]) / np.linalg.norm([17.4, 78.0, -3.8])) > 0.01
+    assert now.delay_rate[0] == pytest.approx(
+        (after.delay[0] - before.delay[0]) / (2 * step), rel=0, abs=1e-13
+    )
+    assert (
+        np.linalg.norm(
+            now.departure[0]
+            - (np.array([9.1, 78.0, -4.9]) - [-8.3, 0.0, -1.1]) / np.linalg.norm([17.4, 78.0, -3.8])
+        )
+        > 0.01
+    )
 
 
 def test_nothing_is_switched_when_flying_round_a_corner():
-    """P flies across the crossing's streets and over a roof's edge, in steps of 5 mm, in and out of A's sight: its line of sight (over
-    Friis, carrier phase taken along the straight line out) changes by at most 0.09 from step to step. Its slope is at most 1/sqrt(2)
-    per Fresnel unit (0.08 m and more here) over the lever of the step. Planted bug: lit paths left at 1."""
+    """P flies across the crossing's streets and over a roof's edge, in steps of 5 mm, in and out of
+    A's sight: its line of sight (over Friis, carrier phase taken along the straight line out)
+    changes by at most 0.09 from step to step. Its slope is at most 1/sqrt(2) per Fresnel unit (0.08
+    m and more here) over the lever of the step. Planted bug: lit paths left at 1."""
     edges, worst, states = tracer(crossing())._edges, 0.0, set()
     a = pose((-2.1, -26.0, 7.3))
-    for start, ahead in (((24.0, 1.3, 8.9), (-1.0, 0.05, 0.0)), ((-21.3, 6.0, 9.0), (0.1, -0.2, 1.0))):
+    for start, ahead in (
+        ((24.0, 1.3, 8.9), (-1.0, 0.05, 0.0)),
+        ((-21.3, 6.0, 9.0), (0.1, -0.2, 1.0)),
+    ):
         places = np.array(start) + np.arange(0.0, 28.0, 0.005)[:, None] * np.array(ahead)
         poses = {"A": a} | {str(i): pose(q) for i, q in enumerate(places)}
-        legs = direct_legs(poses, [("A", str(i)) for i in range(len(places))], edges, Bodies.of({}, {}), LAMBDA)
+        legs = direct_legs(
+            poses, [("A", str(i)) for i in range(len(places))], edges, Bodies.of({}, {}), LAMBDA
+        )
         distance = np.linalg.norm(places - a.position, axis=1)
         now = np.zeros(len(places), complex)
         for i, d in enumerate(distance):
@@ -150,8 +188,9 @@ def test_nothing_is_switched_when_flying_round_a_corner():
 
 
 def test_bodies_shadow_what_is_behind_them_and_not_themselves():
-    """U near the straight path from A to P, and P near that from A to U: the line of sight and the echo take a disc's factor, by strips, of
-    the body in between; the bodies at the ends of a leg, and those of radius 0, none. Planted bug: the Fresnel unit of the near end alone.
+    """U near the straight path from A to P, and P near that from A to U: the line of sight and the
+    echo take a disc's factor, by strips, of the body in between; the bodies at the ends of a leg,
+    and those of radius 0, none. Planted bug: the Fresnel unit of the near end alone.
     """
     a, p, u = pose((0.4, -0.7, 0.3)), pose((3.1, 41.3, 1.9)), pose((1.77, 17.9, 1.15))
     d = np.linalg.norm(p.position - a.position)
@@ -163,7 +202,9 @@ def test_bodies_shadow_what_is_behind_them_and_not_themselves():
     links = [("A", "P"), ("A", "A"), ("P", "P")]
     bare = tracer(empty_city("none", np.zeros(3))).paths({"A": a, "P": p, "U": u}, 0.0, links)
     for radius in (0.0, 0.17, 0.43):
-        paths = tracer(empty_city("none", np.zeros(3)), A=0.31, P=0.23, U=radius).paths({"A": a, "P": p, "U": u}, 0.0, links)
+        paths = tracer(empty_city("none", np.zeros(3)), A=0.31, P=0.23, U=radius).paths(
+            {"A": a, "P": p, "U": u}, 0.0, links
+        )
         factor = chopped(nu, radius / unit) if radius else 1.0
         assert abs(factor - 1) > 0.05 or not radius
         los, free = (one(x["A", "P"], PathKind.LINE_OF_SIGHT) for x in (paths, bare))
@@ -175,10 +216,17 @@ def test_bodies_shadow_what_is_behind_them_and_not_themselves():
 
 
 def test_clutter_behind_a_body_is_in_its_shadow():
-    """A body 8.3 m in front of A: each scatterer of a wall takes the disc's modulus on the way there and on the way back, by strips; the
-    terminal's own body none. Planted bug: one way only."""
+    """A body 8.3 m in front of A: each scatterer of a wall takes the disc's modulus on the way
+    there and on the way back, by strips; the terminal's own body none. Planted bug: one way
+    only."""
     city = rectangle((-20.0, 25.0, -9.0), (40.0, 0, 0), (0, 0, 22.0), METAL)
-    model, _ = flown(city, (0.3, -1.1, 0.9), (-9.0, -7.0, 2.2), cell_area_per_metre_m=0.008, smallest_cell_m2=0.05)
+    model, _ = flown(
+        city,
+        (0.3, -1.1, 0.9),
+        (-9.0, -7.0, 2.2),
+        cell_area_per_metre_m=0.008,
+        smallest_cell_m2=0.05,
+    )
     a, body = pose((0.3, -1.1, 0.9)), np.array([0.9, 7.1, 1.3])
     bare = model.field.seen("A", "A", a, a, 0.0)
     for names in (("U",), ("A", "U")):
@@ -195,7 +243,9 @@ def test_clutter_behind_a_body_is_in_its_shadow():
             if off > 0.23 + 7 * unit:
                 assert ratio[i] == pytest.approx(1.0, rel=1e-6, abs=0)  # float32
             elif off < 0.23 + 2.9 * unit:
-                assert ratio[i] == pytest.approx(abs(chopped(off / unit, 0.23 / unit)) ** 2, rel=0, abs=1e-5)
+                assert ratio[i] == pytest.approx(
+                    abs(chopped(off / unit, 0.23 / unit)) ** 2, rel=0, abs=1e-5
+                )
                 checked += 1
         assert checked > 10
         assert ratio.min() < 0.2

@@ -10,7 +10,12 @@ from isac_rt.world.swarm import Trajectory, attitude
 
 WAYPOINTS = tuple(
     Waypoint(time_s=t, position_m=p)
-    for t, p in [(0.0, (0.3, 1.7, 20.1)), (1.3, (8.2, 9.1, 22.7)), (2.9, (17.4, 8.8, 25.3)), (4.1, (22.9, -3.1, 24.2))]
+    for t, p in [
+        (0.0, (0.3, 1.7, 20.1)),
+        (1.3, (8.2, 9.1, 22.7)),
+        (2.9, (17.4, 8.8, 25.3)),
+        (4.1, (22.9, -3.1, 24.2)),
+    ]
 )
 
 
@@ -30,15 +35,21 @@ def test_vertical_boresight_has_an_attitude():
 
 
 def test_spline_derivatives_match_differences():
-    """Velocity and acceleration against central differences of the position; planted bug: derivative orders swapped."""
+    """Velocity and acceleration against central differences of the position; planted bug:
+    derivative orders swapped."""
     trajectory, h = Trajectory(Uav(role="target", waypoints=WAYPOINTS)), 1e-4
     for t in (0.37, 1.3, 2.05, 3.71):
         before, now, after = (trajectory.pose(s) for s in (t - h, t, t + h))
-        # discretisation: h^2/6 of the third derivative, about 1e-8 here; second difference loses 1e-15*20/h^2 = 2e-6
+        # discretisation: h^2/6 of the third derivative, about 1e-8 here; second difference loses
+        # 1e-15*20/h^2 = 2e-6
         assert (after.position - before.position) / (2 * h) == pytest.approx(now.velocity, abs=1e-6)
-        assert (after.position - 2 * now.position + before.position) / h**2 == pytest.approx(now.acceleration, abs=2e-3)
+        assert (after.position - 2 * now.position + before.position) / h**2 == pytest.approx(
+            now.acceleration, abs=2e-3
+        )
     for w in WAYPOINTS:
-        assert trajectory.pose(w.time_s).position == pytest.approx(np.array(w.position_m), abs=1e-12)
+        assert trajectory.pose(w.time_s).position == pytest.approx(
+            np.array(w.position_m), abs=1e-12
+        )
 
 
 def test_beyond_the_waypoints_it_flies_straight_on():

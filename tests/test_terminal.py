@@ -1,4 +1,5 @@
-"""Terminals frame by frame on synthetic cubes: acquisition, loss and return, slips, and that a capture is all they need."""
+"""Terminals frame by frame on synthetic cubes: acquisition, loss and return, slips, and that a
+capture is all they need."""
 
 from __future__ import annotations
 
@@ -14,15 +15,25 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.receivers import Receivers, Tracking
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState, flat, save_capture
+from isac_rt.terminal.terminal import (
+    ActiveTerminal,
+    PassiveTerminal,
+    TerminalState,
+    flat,
+    save_capture,
+)
 from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)
 SCHEDULE = pseudo_random_schedule(3, W.num_chirps, 3, np.random.default_rng(8))
-OWN = Pose(np.array([3.1, -2.2, 40.7]), np.zeros(3), np.zeros(3), attitude(np.array([0.3, 1.0, 0.0])))
+OWN = Pose(
+    np.array([3.1, -2.2, 40.7]), np.zeros(3), np.zeros(3), attitude(np.array([0.3, 1.0, 0.0]))
+)
 LENGTH, RATE, ARRIVAL = 23.457, 2.31, (0.12, -0.07)
 INTERVAL = 0.0137
-LEVEL = ANTENNAS.gain * W.wavelength / (4 * np.pi)  # amplitude of a line of sight at 1 m, unit transmit amplitude
+LEVEL = (
+    ANTENNAS.gain * W.wavelength / (4 * np.pi)
+)  # amplitude of a line of sight at 1 m, unit transmit amplitude
 
 
 def sight(frame: int, scale: float = 1.0) -> Path:
@@ -58,15 +69,20 @@ def acquired(frames: int = 2) -> PassiveTerminal:
 
 
 def test_acquires_from_pilots_then_decodes():
-    """Planted bug: the reference is not predicted to the frame's time (the range lags by RATE * INTERVAL)."""
+    """Planted bug: the reference is not predicted to the frame's time (the range lags by RATE *
+    INTERVAL)."""
     pt = acquired()
     for frame in range(2, 6):
         reception, tracks, payload = step(pt, frame, [sight(frame)], True)
         assert (reception.delay_symbols == payload.delay_symbols).all()
-        assert (reception.bits == payload.bits).mean() > 0.99  # statistical: D = 8 at 5 dB has no errors in 900 symbols but by bad luck
+        assert (
+            reception.bits == payload.bits
+        ).mean() > 0.99  # statistical: D = 8 at 5 dB has no errors in 900 symbols but by bad luck
         assert tracks.is_reference[0]
         # discretisation: interpolation between cells of the map, a hundredth of a cell at most
-        assert tracks.range[0] == pytest.approx(LENGTH + RATE * INTERVAL * frame, abs=0.01 * W.range_cell(1))
+        assert tracks.range[0] == pytest.approx(
+            LENGTH + RATE * INTERVAL * frame, abs=0.01 * W.range_cell(1)
+        )
 
 
 def test_nothing_is_read_before_acquisition():
@@ -97,7 +113,8 @@ def test_says_that_it_lost_the_line_of_sight_and_comes_back():
 
 
 def test_a_reflection_in_the_shadow_is_not_the_line_of_sight():
-    """Blocked, with a later path 14 dB down in its place a few cells on: not decoded as if nothing had happened."""
+    """Blocked, with a later path 14 dB down in its place a few cells on: not decoded as if nothing
+    had happened."""
     pt = acquired()
     late = replace(sight(2, scale=0.2), length=LENGTH + 3.3 * W.range_cell(1))
     step(pt, 2, [late], True)
@@ -106,9 +123,9 @@ def test_a_reflection_in_the_shadow_is_not_the_line_of_sight():
 
 @pytest.mark.parametrize("cells", [-3, -1, 1, 3])
 def test_planted_slips_are_repaired_while_data_flow(cells):
-    """The track is pushed by whole cells along the line of sight. A frame here has 108 chirps and 128 symbols, so a slip of one
-    cell shows in 1 - (1 - 1/128)^108 = 57 % of the frames; ten frames miss it with probability 2e-4 (seeds are fixed).
-    Planted bug: the sign of the move."""
+    """The track is pushed by whole cells along the line of sight. A frame here has 108 chirps and
+    128 symbols, so a slip of one cell shows in 1 - (1 - 1/128)^108 = 57 % of the frames; ten frames
+    miss it with probability 2e-4 (seeds are fixed). Planted bug: the sign of the move."""
     pt = acquired(3)
     assert pt.reference is not None
     state = pt.reference.state
@@ -136,7 +153,9 @@ def test_the_active_terminal_tracks_an_echo():
     at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
     for frame in range(5):
         length = 2 * (17.31 + 1.7 * INTERVAL * frame)
-        samples, payload = heard(frame, [Path(length, 2 * 1.7, LEVEL / LENGTH, ARRIVAL, ARRIVAL)], frame > 1)
+        samples, payload = heard(
+            frame, [Path(length, 2 * 1.7, LEVEL / LENGTH, ARRIVAL, ARRIVAL)], frame > 1
+        )
         _, tracks = at.step(samples, payload, OWN, frame * INTERVAL)
     assert tracks.confirmed.any()
     best = int(np.flatnonzero(tracks.confirmed)[0])
@@ -147,10 +166,13 @@ def test_the_active_terminal_tracks_an_echo():
 
 @pytest.mark.parametrize("active", [False, True])
 def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
-    """Samples and public parameters in one file, run in a fresh process: bit-identical to the live run. Planted bug: the replay
-    forgets the frame's time."""
+    """Samples and public parameters in one file, run in a fresh process: bit-identical to the live
+    run. Planted bug: the replay forgets the frame's time."""
     scale = 2 if active else 1
-    frames = [heard(f, [replace(sight(f), length=scale * sight(f).length, departure=ARRIVAL)], f > 1) for f in range(4)]
+    frames = [
+        heard(f, [replace(sight(f), length=scale * sight(f).length, departure=ARRIVAL)], f > 1)
+        for f in range(4)
+    ]
     poses, times = [OWN] * 4, [f * INTERVAL for f in range(4)]
     live = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
     expected = {}
@@ -164,11 +186,25 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
     file, out = tmp_path / "capture.npz", tmp_path / "out.npz"
     payloads = [p for _, p in frames] if active else None
     modulated = [f > 1 for f in range(4)]
-    save_capture(file, [c for c, _ in frames], poses, times, modulated, ANTENNAS, Receivers(), Tracking(), 8, 1.0, payloads)
-    subprocess.run([sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)], check=True, timeout=120)
+    save_capture(
+        file,
+        [c for c, _ in frames],
+        poses,
+        times,
+        modulated,
+        ANTENNAS,
+        Receivers(),
+        Tracking(),
+        8,
+        1.0,
+        payloads,
+    )
+    subprocess.run(
+        [sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)],
+        check=True,
+        timeout=120,
+    )
     with np.load(out) as found:
         assert sorted(found.files) == sorted(expected)
         for name, value in expected.items():
             assert np.array_equal(found[name], value, equal_nan=value.dtype.kind == "f"), name
-
-

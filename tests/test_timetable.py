@@ -14,7 +14,10 @@ from isac_rt.scenario.radio import Modulation, Radio
 from isac_rt.scenario.swarm import RoleChange, Uav
 from isac_rt.scenario.tree import Scenario
 
-AT, PT1, PT2 = (Uav(role=role, position_m=(3.1 * i, 7.7, 20.0)) for i, role in enumerate(("active", "passive", "passive")))
+AT, PT1, PT2 = (
+    Uav(role=role, position_m=(3.1 * i, 7.7, 20.0))
+    for i, role in enumerate(("active", "passive", "passive"))
+)
 SECOND = Uav(role="active", position_m=(-9.3, 1.2, 33.0))
 
 
@@ -22,7 +25,11 @@ def timetable(**changes) -> Timetable:
     """Of a scenario of 40 frames with a terminal AT and two that listen, changed by keywords."""
     scenario = Scenario(**{"frames": 40, "swarm": {"AT": AT, "PT1": PT1, "PT2": PT2}} | changes)
     w = waveform_of(scenario)
-    return Timetable(scenario, w, pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, np.random.default_rng(5)))
+    return Timetable(
+        scenario,
+        w,
+        pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, np.random.default_rng(5)),
+    )
 
 
 def test_one_transmitter_names_its_links_by_the_receiver():
@@ -33,9 +40,12 @@ def test_one_transmitter_names_its_links_by_the_receiver():
 
 
 def test_a_change_of_roles():
-    """From frame 17 on PT1 sends in the AT's blocks, first without data, and the AT listens. Planted bugs: the change one frame late;
-    pilots counted from the start only."""
-    t = timetable(role_changes=(RoleChange(frame=17, from_uav="AT", to_uav="PT1"),), modulation=Modulation(pilot_every_frames=25))
+    """From frame 17 on PT1 sends in the AT's blocks, first without data, and the AT listens.
+    Planted bugs: the change one frame late; pilots counted from the start only."""
+    t = timetable(
+        role_changes=(RoleChange(frame=17, from_uav="AT", to_uav="PT1"),),
+        modulation=Modulation(pilot_every_frames=25),
+    )
     assert t.with_role("active", 16) == ["AT"] and t.with_role("active", 17) == ["PT1"]
     assert t.links(17) == [("PT1", "PT1"), ("PT1", "AT"), ("PT1", "PT2")]
     assert [f for f in range(40) if not t.modulated(f)] == [0, 1, 2, 17, 18, 19, 25]
@@ -48,21 +58,31 @@ def test_changes_streams_and_blocks_survive_a_file(tmp_path):
     """Planted bug: role_changes missing from the written file."""
     swarm = {"AT": AT.model_copy(update={"resource_block": 5}), "PT1": PT1}
     change = RoleChange(frame=17, from_uav="AT", to_uav="PT1")
-    t = timetable(swarm=swarm, role_changes=(change,), modulation=Modulation(streams={"PT1": (2, 0)}))
+    t = timetable(
+        swarm=swarm, role_changes=(change,), modulation=Modulation(streams={"PT1": (2, 0)})
+    )
     (tmp_path / "s.yaml").write_text(to_yaml(t.scenario))
     assert load(tmp_path / "s.yaml").model_dump() == t.scenario.model_dump()
 
 
 def test_a_role_that_comes_back_is_the_same_link():
-    changes = (RoleChange(frame=9, from_uav="AT", to_uav="PT1"), RoleChange(frame=23, from_uav="PT1", to_uav="AT"))
+    changes = (
+        RoleChange(frame=9, from_uav="AT", to_uav="PT1"),
+        RoleChange(frame=23, from_uav="PT1", to_uav="AT"),
+    )
     t = timetable(role_changes=changes)
     assert t.roles_taken("AT") == ["active", "passive", "active"]
     assert len(t.all_links) == 6
 
 
 def test_resource_blocks_are_given_in_order_around_those_that_are_fixed():
-    """Three groups each: 0..2 free, 4..6 taken by name, so the third goes to 7..9. Planted bug: only first blocks compared."""
-    swarm = {"A": AT, "B": SECOND.model_copy(update={"resource_block": 4}), "C": Uav(role="active", position_m=(50.0, 0, 9))}
+    """Three groups each: 0..2 free, 4..6 taken by name, so the third goes to 7..9. Planted bug:
+    only first blocks compared."""
+    swarm = {
+        "A": AT,
+        "B": SECOND.model_copy(update={"resource_block": 4}),
+        "C": Uav(role="active", position_m=(50.0, 0, 9)),
+    }
     t = timetable(swarm=swarm | {"PT1": PT1})
     assert t.scenario.first_blocks() == {"A": 0, "B": 4, "C": 7}
     assert t.links(0)[3:] == [("A", "PT1"), ("B", "PT1"), ("C", "PT1")]
@@ -71,7 +91,8 @@ def test_resource_blocks_are_given_in_order_around_those_that_are_fixed():
 def test_active_terminals_in_the_same_blocks_are_doubted(tmp_path):
     file = tmp_path / "s.yaml"
     file.write_text(
-        "swarm:\n  A: {role: active, position_m: [0, 0, 9]}\n  B: {role: active, position_m: [9, 0, 9], resource_block: 2}\n"
+        "swarm:\n  A: {role: active, position_m: [0, 0, 9]}\n  B: {role: active, position_m: [9, "
+        "0, 9], resource_block: 2}\n"
         "  C: {role: active, position_m: [19, 0, 9], resource_block: 4}\n"
     )
     with pytest.warns(ScenarioWarning, match="C and B send in the same resource blocks"):
@@ -79,13 +100,17 @@ def test_active_terminals_in_the_same_blocks_are_doubted(tmp_path):
 
 
 def test_streams_hold_the_bits_of_their_groups():
-    """Against the mapping of the symbols of these groups alone. Planted bug: the DPSK bits of all groups."""
+    """Against the mapping of the symbols of these groups alone. Planted bug: the DPSK bits of all
+    groups."""
     t = timetable(modulation=Modulation(streams={"PT1": (2, 0)}, dpsk_order=16))
     assert t.groups(("AT", "PT1")) == (0, 2)
     assert t.groups(("AT", "PT2")) is None and t.groups(("AT", "AT")) is None
     sent = t.payload("AT", 5)
     mine = [0, 2]
-    assert np.array_equal(sent.bits_of(mine), demodulate_bits(sent.delay_symbols[mine], sent.transitions[mine], t.waveform, 16))
+    assert np.array_equal(
+        sent.bits_of(mine),
+        demodulate_bits(sent.delay_symbols[mine], sent.transitions[mine], t.waveform, 16),
+    )
     assert t.payload("AT", 1).bits_of(mine).size == 0
 
 
@@ -106,5 +131,7 @@ def test_all_groups_hold_all_bits(groups, order):
 
 def test_a_swarm_with_more_transmitters_than_blocks_is_refused():
     swarm = {f"A{i}": Uav(role="active", position_m=(11.0 * i, 0, 9)) for i in range(7)}
-    with pytest.raises(ValueError, match="A6 would need the resource blocks 18 to 20; a slot has 19"):
+    with pytest.raises(
+        ValueError, match="A6 would need the resource blocks 18 to 20; a slot has 19"
+    ):
         Scenario(swarm=swarm, radio=Radio())

@@ -29,7 +29,12 @@ from isac_rt.terminal.filter import (
 from isac_rt.terminal.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 
-OWN = Pose(np.array([3.1, -2.7, 31.3]), np.array([4.3, 7.9, -0.6]), np.zeros(3), attitude(np.array([0.5, 1.2, -0.15])))
+OWN = Pose(
+    np.array([3.1, -2.7, 31.3]),
+    np.array([4.3, 7.9, -0.6]),
+    np.zeros(3),
+    attitude(np.array([0.5, 1.2, -0.15])),
+)
 BODY = np.array([14.7, 28.9, 27.1, -3.7, 6.1, 1.3])
 AT = np.array([-21.3, 33.7, 40.9, 8.3, -2.1, 0.4])
 STD = np.array([0.031, 0.083, 0.0047, 0.0061])
@@ -49,38 +54,53 @@ def detections(z: np.ndarray, std: np.ndarray = STD, snr: float = 50.0) -> Detec
 
 
 def test_measurement_by_hand():
-    """Range, rate and direction of a body straight ahead and to the right; planted bug: rate without the own velocity."""
+    """Range, rate and direction of a body straight ahead and to the right; planted bug: rate
+    without the own velocity."""
     own = Pose(np.array([1.0, 2.0, 3.0]), np.array([0.0, 4.0, 0.0]), np.zeros(3), np.eye(3))
     z = measure(np.array([4.0, 6.0, 3.0, 0.0, 9.0, 0.0]), own)
     assert z == pytest.approx([5.0, 4.0, 0.6, 0.0], abs=1e-14)  # rounding
-    z = measure(np.array([4.0, 6.0, 3.0, 0.0, 9.0, 0.0]), own, np.array([4.0, 6.0, 15.0, 1.0, 2.0, -3.0]))
+    z = measure(
+        np.array([4.0, 6.0, 3.0, 0.0, 9.0, 0.0]), own, np.array([4.0, 6.0, 15.0, 1.0, 2.0, -3.0])
+    )
     assert z == pytest.approx([17.0, 4.0 + 3.0 * -1.0, 0.6, 0.0], abs=1e-14)
 
 
 @pytest.mark.parametrize("transmitter", [None, AT])
 def test_rate_is_the_derivative_of_range(transmitter):
-    """Central difference over time of the first component; planted bug: rate of the outward leg left out."""
+    """Central difference over time of the first component; planted bug: rate of the outward leg
+    left out."""
     h = 1e-4
 
     def range_at(t: float) -> float:
         move = np.concatenate([t * BODY[3:], np.zeros(3)])
         own = Pose(OWN.position + t * OWN.velocity, OWN.velocity, OWN.acceleration, OWN.rotation)
-        at = None if transmitter is None else transmitter + np.concatenate([t * transmitter[3:], np.zeros(3)])
+        at = (
+            None
+            if transmitter is None
+            else transmitter + np.concatenate([t * transmitter[3:], np.zeros(3)])
+        )
         return measure(BODY + move, own, at)[0]
 
     discretisation = 1e-7  # h^2/6 of the third derivative (< 1 m/s^3) and 50 m * eps / h
-    assert measure(BODY, OWN, transmitter)[1] == pytest.approx((range_at(h) - range_at(-h)) / (2 * h), abs=discretisation)
+    assert measure(BODY, OWN, transmitter)[1] == pytest.approx(
+        (range_at(h) - range_at(-h)) / (2 * h), abs=discretisation
+    )
 
 
 @pytest.mark.parametrize("transmitter", [None, AT])
 def test_jacobians_against_complex_step(transmitter):
     """Planted bug: projector I - e e^T without the division by the distance."""
     h, rounding = 1e-30, 1e-13
-    step = np.stack([measure(BODY + 1j * h * d, OWN, transmitter).imag / h for d in np.eye(6)], axis=1)
+    step = np.stack(
+        [measure(BODY + 1j * h * d, OWN, transmitter).imag / h for d in np.eye(6)], axis=1
+    )
     assert np.abs(step).max() > 0.1
     assert jacobian(BODY, OWN, transmitter) == pytest.approx(step, abs=rounding)
     if transmitter is not None:
-        step = np.stack([measure(BODY.astype(complex), OWN, AT + 1j * h * d).imag / h for d in np.eye(6)], axis=1)
+        step = np.stack(
+            [measure(BODY.astype(complex), OWN, AT + 1j * h * d).imag / h for d in np.eye(6)],
+            axis=1,
+        )
         assert transmitter_jacobian(BODY, AT) == pytest.approx(step, abs=rounding)
 
 
@@ -92,18 +112,25 @@ def test_bistatic_distance_inverts_the_path_length():
         rho = np.linalg.norm(offset)
         length = rho + np.linalg.norm(offset - baseline)
         if length - np.linalg.norm(baseline) > 1.0:
-            assert bistatic_distance(length, baseline, offset / rho) == pytest.approx(rho, rel=1e-11)  # rounding, conditioning 1e4
+            assert bistatic_distance(length, baseline, offset / rho) == pytest.approx(
+                rho, rel=1e-11
+            )  # rounding, conditioning 1e4
 
 
-@pytest.mark.parametrize("transmitter", [None, Gaussian(AT, np.diag([1e-4, 2e-4, 1e-4, 0.01, 0.02, 0.01]))])
+@pytest.mark.parametrize(
+    "transmitter", [None, Gaussian(AT, np.diag([1e-4, 2e-4, 1e-4, 0.01, 0.02, 0.01]))]
+)
 def test_birth_reproduces_the_detection_and_its_covariance(transmitter):
-    """The state measures what was measured, its position is the reflector's, and 2,000 noisy births scatter as it says;
-    planted bug: covariance with J instead of its inverse."""
+    """The state measures what was measured, its position is the reflector's, and 2,000 noisy births
+    scatter as it says; planted bug: covariance with J instead of its inverse."""
     t = None if transmitter is None else transmitter.mean
     z = measure(BODY, OWN, t)
     g = birth(z, STD, OWN, transmitter)
-    assert g.mean[:3] == pytest.approx(BODY[:3], abs=1e-4)  # of deviations of 0.1 m; the pull named below
-    # the rate pulls the direction a little because the transversal velocity is open: 10 m/s * 0.005 against 0.08 m/s
+    assert g.mean[:3] == pytest.approx(
+        BODY[:3], abs=1e-4
+    )  # of deviations of 0.1 m; the pull named below
+    # the rate pulls the direction a little because the transversal velocity is open: 10 m/s * 0.005
+    # against 0.08 m/s
     assert measure(g.mean, OWN, t)[0] == pytest.approx(z[0], abs=0.01)
     assert measure(g.mean, OWN, t)[1] == pytest.approx(z[1], abs=0.02)
     assert np.linalg.eigvalsh(g.covariance).min() > 0
@@ -113,7 +140,11 @@ def test_birth_reproduces_the_detection_and_its_covariance(transmitter):
         if transmitter is None:
             at = None
         else:
-            at = Gaussian(transmitter.mean + np.sqrt(np.diag(transmitter.covariance)) * rng.standard_normal(6), transmitter.covariance)
+            at = Gaussian(
+                transmitter.mean
+                + np.sqrt(np.diag(transmitter.covariance)) * rng.standard_normal(6),
+                transmitter.covariance,
+            )
         position.append(birth(z + STD * rng.standard_normal(4), STD, OWN, at).mean[:3] - BODY[:3])
     spread = np.cov(np.array(position).T)
     ratio = np.linalg.solve(g.covariance[:3, :3], spread)
@@ -129,8 +160,9 @@ def test_birth_refuses_what_fixes_no_position():
 
 
 def test_filter_against_the_joint_posterior():
-    """A body so far away that the measurement is affine: filter against the batch posterior over all states and
-    measurements, from the full precision matrix; planted bugs: Q without the position block, Joseph term K R K^T left out."""
+    """A body so far away that the measurement is affine: filter against the batch posterior over
+    all states and measurements, from the full precision matrix; planted bugs: Q without the
+    position block, Joseph term K R K^T left out."""
     own = Pose(np.zeros(3), np.array([1.3, 0.7, 0.2]), np.zeros(3), OWN.rotation)
     far = 3e6 * own.to_world(np.array([0.31, np.sqrt(1 - 0.31**2 - 0.17**2), -0.17]))
     origin = np.concatenate([far, [3.3, -4.1, 1.2]])
@@ -141,7 +173,11 @@ def test_filter_against_the_joint_posterior():
     intervals, sigma = [0.11, 0.07, 0.19, 0.13], 3.7
     h0, scale = measure(origin, own), np.array([0.5, 0.5, 0.5, 5.0, 5.0, 5.0])
     H = np.stack(
-        [(measure(origin + s * d, own) - measure(origin - s * d, own)) / (2 * s) for s, d in zip(scale, np.eye(6), strict=True)], 1
+        [
+            (measure(origin + s * d, own) - measure(origin - s * d, own)) / (2 * s)
+            for s, d in zip(scale, np.eye(6), strict=True)
+        ],
+        1,
     )
 
     x = prior.mean + np.linalg.cholesky(prior.covariance) @ rng.standard_normal(6)
@@ -166,7 +202,9 @@ def test_filter_against_the_joint_posterior():
             C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = blocks[i][j]
             C[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = blocks[i][j].T
     A = np.kron(np.eye(n + 1)[1:], H)
-    innovation = np.concatenate([z - h0 - H @ (m - origin) for z, m in zip(zs, mean[1:], strict=True)])
+    innovation = np.concatenate(
+        [z - h0 - H @ (m - origin) for z, m in zip(zs, mean[1:], strict=True)]
+    )
     gain = C @ A.T @ np.linalg.inv(A @ C @ A.T + np.kron(np.eye(n), R))
     batch_mean = np.concatenate(mean) + gain @ innovation
     batch_covariance = C - gain @ A @ C
@@ -174,17 +212,21 @@ def test_filter_against_the_joint_posterior():
     affine = 1e-3
     scale = np.sqrt(np.diag(batch_covariance)[-6:])
     assert (g.mean - batch_mean[-6:]) / scale == pytest.approx(np.zeros(6), abs=affine)
-    assert g.covariance / np.outer(scale, scale) == pytest.approx(batch_covariance[-6:, -6:] / np.outer(scale, scale), abs=affine)
+    assert g.covariance / np.outer(scale, scale) == pytest.approx(
+        batch_covariance[-6:, -6:] / np.outer(scale, scale), abs=affine
+    )
 
 
 @pytest.mark.parametrize(("transmitter", "interval"), [(None, 0.0078), (None, 0.156), (AT, 0.05)])
 def test_consistency_in_monte_carlo(transmitter, interval):
-    """NEES of the last state and NIS of the last innovations over independent runs, born from one detection, against
-    chi-square; planted bug: R doubled in `update` (NIS falls to a half)."""
+    """NEES of the last state and NIS of the last innovations over independent runs, born from one
+    detection, against chi-square; planted bug: R doubled in `update` (NIS falls to a half)."""
     rng, runs, steps, sigma = np.random.default_rng(17), 90, 20, 1.7
     nees, nis = [], []
     for _ in range(runs):
-        x = np.concatenate([BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)])
+        x = np.concatenate(
+            [BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)]
+        )
         own, at = OWN, None if transmitter is None else transmitter.copy()
 
         def see(x, own, at):
@@ -194,8 +236,12 @@ def test_consistency_in_monte_carlo(transmitter, interval):
         g = birth(see(x, own, at), STD, own, exact)
         for _ in range(steps):
             a = sigma * rng.standard_normal(3)
-            x = np.concatenate([x[:3] + interval * x[3:] + interval**2 / 2 * a, x[3:] + interval * a])
-            own = Pose(own.position + interval * own.velocity, own.velocity, own.acceleration, own.rotation)
+            x = np.concatenate(
+                [x[:3] + interval * x[3:] + interval**2 / 2 * a, x[3:] + interval * a]
+            )
+            own = Pose(
+                own.position + interval * own.velocity, own.velocity, own.acceleration, own.rotation
+            )
             if at is not None:
                 at = np.concatenate([at[:3] + interval * at[3:], at[3:]])
             exact = None if at is None else Gaussian(at, np.zeros((6, 6)))
@@ -216,7 +262,8 @@ def test_consistency_in_monte_carlo(transmitter, interval):
 
 
 def test_missing_direction_reduces_the_measurement():
-    """Without direction the update equals one with infinite direction deviations; planted bug: NaN taken as zero."""
+    """Without direction the update equals one with infinite direction deviations; planted bug: NaN
+    taken as zero."""
     g = predict(birth(measure(BODY, OWN) + STD, STD, OWN), 0.02, 1.0)
     z = measure(BODY, OWN) + 0.7 * STD
     partial = update(g, np.array([z[0], z[1], np.nan, np.nan]), np.diag(STD**2), OWN)
@@ -226,13 +273,18 @@ def test_missing_direction_reduces_the_measurement():
 
 
 def test_velocity_is_taken_modulo_its_period():
-    """A measured velocity beyond the unambiguous span pulls the track by the folded difference only."""
+    """A measured velocity beyond the unambiguous span pulls the track by the folded difference
+    only."""
     g = predict(birth(measure(BODY, OWN), STD, OWN), 0.02, 1.0)
     z = measure(BODY, OWN)
     folded = z - np.array([0.0, PERIOD, 0.0, 0.0])
     R = np.diag(STD**2)
-    assert update(g, folded, R, OWN, velocity_period=PERIOD).mean == pytest.approx(update(g, z, R, OWN).mean, abs=1e-9)
-    assert wrapped(np.array([1.0, 0.6 * PERIOD, 0.1, 0.2]), PERIOD)[1] == pytest.approx(-0.4 * PERIOD)
+    assert update(g, folded, R, OWN, velocity_period=PERIOD).mean == pytest.approx(
+        update(g, z, R, OWN).mean, abs=1e-9
+    )
+    assert wrapped(np.array([1.0, 0.6 * PERIOD, 0.1, 0.2]), PERIOD)[1] == pytest.approx(
+        -0.4 * PERIOD
+    )
 
 
 def test_std_floor_holds():
@@ -241,20 +293,26 @@ def test_std_floor_holds():
 
 
 def test_assign_takes_as_many_pairs_as_it_can():
-    """The greedy choice (0, 0) would leave row 1 alone; planted bug: refused pairs cost too little."""
+    """The greedy choice (0, 0) would leave row 1 alone; planted bug: refused pairs cost too
+    little."""
     cost = np.array([[0.1, 9.0], [0.2, np.inf]])
     assert assign(cost) == [(0, 1), (1, 0)]
     assert assign(np.full((2, 3), np.inf)) == []
 
 
-def fly(tracker: Tracker, frames: int, bodies: list[np.ndarray], interval: float, seed: int, hidden=()):
-    """Frames of noisy detections in a shuffled order; yields the frame, the true states and the snapshot."""
+def fly(
+    tracker: Tracker, frames: int, bodies: list[np.ndarray], interval: float, seed: int, hidden=()
+):
+    """Frames of noisy detections in a shuffled order; yields the frame, the true states and the
+    snapshot."""
     rng = np.random.default_rng(seed)
     for k in range(frames):
         t = k * interval
         states = [np.concatenate([b[:3] + t * b[3:], b[3:]]) for b in bodies]
         own = Pose(OWN.position + t * OWN.velocity, OWN.velocity, OWN.acceleration, OWN.rotation)
-        z = np.array([measure(x, own) for x in states if k not in hidden] or np.zeros((0, 4))).reshape(-1, 4)
+        z = np.array(
+            [measure(x, own) for x in states if k not in hidden] or np.zeros((0, 4))
+        ).reshape(-1, 4)
         z = z + STD * rng.standard_normal(z.shape)
         tracker.predict(t)
         tracker.update(detections(rng.permutation(z)), own)
@@ -283,12 +341,15 @@ def test_crossing_targets_keep_their_tracks():
 
 
 def test_birth_confirmation_and_death():
-    """Confirmed at the third hit, dropped after eight misses, a new id afterwards; a single false alarm lives
-    until it can no longer reach 3 of 5. Planted bug: misses not reset by a hit."""
+    """Confirmed at the third hit, dropped after eight misses, a new id afterwards; a single false
+    alarm lives until it can no longer reach 3 of 5. Planted bug: misses not reset by a hit."""
     settings = Tracking()
     tracker = Tracker(settings, PERIOD)
     hidden = {6, 7, 8} | set(range(12, 20))
-    seen = {k: (tracks.ids.tolist(), tracks.confirmed.tolist()) for k, _, tracks in fly(tracker, 24, [BODY], 0.02, 2, hidden)}
+    seen = {
+        k: (tracks.ids.tolist(), tracks.confirmed.tolist())
+        for k, _, tracks in fly(tracker, 24, [BODY], 0.02, 2, hidden)
+    }
     assert seen[0] == ([0], [False]) and seen[1] == ([0], [False]) and seen[2] == ([0], [True])
     assert seen[8] == ([0], [True]) and seen[18] == ([0], [True])
     assert seen[19] == ([], [])
@@ -320,7 +381,8 @@ def test_prediction_lists_reference_then_confirmed_reflectors():
 
 
 def test_a_bistatic_track_finds_the_reflector():
-    """Fifty frames with a moving AT and receiver: position within three of its own deviations, and these below 0.5 m."""
+    """Fifty frames with a moving AT and receiver: position within three of its own deviations, and
+    these below 0.5 m."""
     rng, tracker = np.random.default_rng(4), Tracker(Tracking(), 2 * PERIOD)
     for k in range(50):
         t = 0.0078 * k
@@ -340,6 +402,11 @@ def test_ids_are_deterministic():
     runs = []
     for _ in range(2):
         tracker = Tracker(Tracking(), PERIOD)
-        runs.append([tracks.ids.tolist() for _, _, tracks in fly(tracker, 15, [BODY, BODY + 2.5], 0.02, 6, {4, 5})])
+        runs.append(
+            [
+                tracks.ids.tolist()
+                for _, _, tracks in fly(tracker, 15, [BODY, BODY + 2.5], 0.02, 6, {4, 5})
+            ]
+        )
     assert runs[0] == runs[1]
     assert all(a <= b for ids in runs[0] for a, b in pairwise(ids))

@@ -1,4 +1,5 @@
-"""Runs that are stopped and go on: the same bits as in one go, whatever was carried over; files that are torn, another's or no one's."""
+"""Runs that are stopped and go on: the same bits as in one go, whatever was carried over; files
+that are torn, another's or no one's."""
 
 from __future__ import annotations
 
@@ -40,26 +41,39 @@ def stopping_at(frame):
 
 def assert_equal_results(found, expected):
     for name, variable in expected.dataset.variables.items():
-        assert np.array_equal(found.dataset[name].values, variable.values, equal_nan=variable.dtype.kind == "f"), name
+        assert np.array_equal(
+            found.dataset[name].values, variable.values, equal_nan=variable.dtype.kind == "f"
+        ), name
     assert found.dataset.attrs == expected.dataset.attrs
-    assert {k: v for k, v in found.summary.items() if k != "timing_s"} == {k: v for k, v in expected.summary.items() if k != "timing_s"}
+    assert {k: v for k, v in found.summary.items() if k != "timing_s"} == {
+        k: v for k, v in expected.summary.items() if k != "timing_s"
+    }
 
 
 def scenarios():
-    """Tracks, acquisition, data and fall-back; feedback, clocks and slips; ray tracing, shadows and clutter in a city."""
+    """Tracks, acquisition, data and fall-back; feedback, clocks and slips; ray tracing, shadows and
+    clutter in a city."""
     access = ["frames=9", "access.feedback=true"]
     return {
         "dense": lambda: dense_scenario(frames=7),
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
-        "canyon": lambda: load(SCENES / "street_canyon.yaml", ["modulation.acquisition_frames=1"], frames=3),
+        "canyon": lambda: load(
+            SCENES / "street_canyon.yaml", ["modulation.acquisition_frames=1"], frames=3
+        ),
     }
 
 
 @pytest.mark.parametrize(
-    "name", ["dense", pytest.param("access", marks=pytest.mark.slow), pytest.param("canyon", marks=pytest.mark.sionna)]
+    "name",
+    [
+        "dense",
+        pytest.param("access", marks=pytest.mark.slow),
+        pytest.param("canyon", marks=pytest.mark.sionna),
+    ],
 )
 def test_a_stopped_run_goes_on_to_the_same_bits(name, tmp_path):
-    """Stopped after two frames, and once more before the last one. Planted bugs: the terminals, the scores or the advice not taken up."""
+    """Stopped after two frames, and once more before the last one. Planted bugs: the terminals, the
+    scores or the advice not taken up."""
     scenario = scenarios()[name]()
     whole = simulate.run(scenario, snapshots=2)
     parts, stops = 0, sorted({2, scenario.frames - 1})
@@ -67,7 +81,9 @@ def test_a_stopped_run_goes_on_to_the_same_bits(name, tmp_path):
         unfinished = Unfinished(tmp_path, run_content(scenario, 2), every=0.0)
         assert unfinished.begun == (parts > 0)
         try:
-            again = simulate.run(scenario, snapshots=2, unfinished=unfinished, progress=stopping_at(stop))
+            again = simulate.run(
+                scenario, snapshots=2, unfinished=unfinished, progress=stopping_at(stop)
+            )
         except Stopped:
             parts += 1
     assert parts == len(stops)
@@ -82,7 +98,11 @@ def test_a_run_with_all_but_its_last_frame_kept_hears_that_one_alone(tmp_path, m
     whole = simulate.run(scenario, snapshots=1, unfinished=unfinished)
     heard = []
     hear = simulate._Observer.hear
-    monkeypatch.setattr(simulate._Observer, "hear", lambda self, frame, clock: heard.append(frame.number) or hear(self, frame, clock))
+    monkeypatch.setattr(
+        simulate._Observer,
+        "hear",
+        lambda self, frame, clock: heard.append(frame.number) or hear(self, frame, clock),
+    )
     again = simulate.run(scenario, snapshots=1, unfinished=unfinished)
     assert set(heard) == {3}
     assert_equal_results(again, whole)
@@ -115,7 +135,9 @@ def test_a_torn_end_is_cut_off_and_the_rest_goes_on(tmp_path, cut):
     file = tmp_path / FILE
     whole = file.read_bytes()
     file.write_bytes(whole[:-cut])
-    assert unfinished.entries() == (["one"] if cut <= 12 + len(pickle.dumps("two" * 10, protocol=5)) else [])
+    assert unfinished.entries() == (
+        ["one"] if cut <= 12 + len(pickle.dumps("two" * 10, protocol=5)) else []
+    )
     unfinished.append("three")
     assert unfinished.entries()[-1] == "three"
     assert "two" * 10 not in unfinished.entries()
@@ -164,7 +186,8 @@ def test_entries_are_some_time_apart(tmp_path):
 
 
 def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsys):
-    """Ctrl-C after three frames: exit 130 and where they are; the next call says that it goes on, and leaves no such file behind."""
+    """Ctrl-C after three frames: exit 130 and where they are; the next call says that it goes on,
+    and leaves no such file behind."""
     (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
     monkeypatch.setattr(Unfinished.__init__, "__defaults__", (0.0,))
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
@@ -181,7 +204,11 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
         once.setattr("isac_rt.cli.cli._with_progress", stopped)
         assert main(command) == 130
     said = capsys.readouterr().err
-    assert f"{tmp_path / 'out' / FILE} keeps the frames so far" in said and "interrupted" in said and "going on" not in said
+    assert (
+        f"{tmp_path / 'out' / FILE} keeps the frames so far" in said
+        and "interrupted" in said
+        and "going on" not in said
+    )
     assert main(command) == 0
     assert "going on after the frames" in capsys.readouterr().err
     assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
@@ -190,7 +217,8 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_the_command_goes_on_after_it_was_stopped(tmp_path, how):
-    """From outside, once an entry is written: the message, the frames taken up, the same results, and no file left behind."""
+    """From outside, once an entry is written: the message, the frames taken up, the same results,
+    and no file left behind."""
     scenario = tmp_path / "scene.yaml"
     scenario.write_text(to_yaml(dense_scenario(frames=8)))
     out = tmp_path / "out"
@@ -201,8 +229,12 @@ from isac_rt.cli import main
 sys.exit(main(["run", {str(scenario)!r}, "--out", {str(out)!r}]))
 """
     command = [sys.executable, "-c", program]
-    child = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT)
-    while child.poll() is None and not ((out / FILE).exists() and (out / FILE).stat().st_size > 1000):
+    child = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT
+    )
+    while child.poll() is None and not (
+        (out / FILE).exists() and (out / FILE).stat().st_size > 1000
+    ):
         pass
     os.kill(child.pid, how)
     _, said = child.communicate(timeout=60)

@@ -1,4 +1,5 @@
-"""The validation: its cases are well formed, its truths independent, its tables and its command honest."""
+"""The validation: its cases are well formed, its truths independent, its tables and its command
+honest."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ def test_truths_take_nothing_from_the_program():
 
 def test_nothing_is_taken_from_the_tests():
     for file in PACKAGE.glob("*.py"):
-        assert "tests" not in {n.module for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.ImportFrom)}, file.name
+        assert "tests" not in {
+            n.module for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.ImportFrom)
+        }, file.name
         assert "oracles" not in file.read_text(), file.name
 
 
@@ -77,7 +80,10 @@ def test_what_cannot_be_run_is_left_out_with_the_reason():
 
 
 def test_tables():
-    others = replace(a_case, name="worse", bound=0.1), replace(a_case, name="other", package="no-such")
+    others = (
+        replace(a_case, name="worse", bound=0.1),
+        replace(a_case, name="other", package="no-such"),
+    )
     verdicts = [run_case(one) for one in (a_case, *others)]
     data = as_data(verdicts)
     assert (data["passed"], data["failed"], data["left_out"]) == (1, 1, 1)
@@ -87,18 +93,40 @@ def test_tables():
 
 
 def test_the_command_writes_its_tables_and_fails_with_a_case(tmp_path, capsys, monkeypatch):
-    assert main(["validate", "--only", "binomial intervals", "--out", str(tmp_path), "--json", str(tmp_path / "x" / "t.json")]) == 0
+    assert (
+        main(
+            [
+                "validate",
+                "--only",
+                "binomial intervals",
+                "--out",
+                str(tmp_path),
+                "--json",
+                str(tmp_path / "x" / "t.json"),
+            ]
+        )
+        == 0
+    )
     assert "1 cases pass" in capsys.readouterr().out
     assert json.loads((tmp_path / "validation.json").read_text())["passed"] == 1
-    assert json.loads((tmp_path / "x" / "t.json").read_text())["cases"][0]["name"] == "binomial intervals"
+    assert (
+        json.loads((tmp_path / "x" / "t.json").read_text())["cases"][0]["name"]
+        == "binomial intervals"
+    )
     assert "binomial intervals" in (tmp_path / "validation.md").read_text()
-    monkeypatch.setattr(isac_rt.studies.validation, "all_cases", lambda quick: [replace(a_case, bound=0.1)])
+    monkeypatch.setattr(
+        isac_rt.studies.validation, "all_cases", lambda quick: [replace(a_case, bound=0.1)]
+    )
     assert main(["validate"]) == 1
     assert main(["validate", "--only", "nonsense"]) == 2
     assert "nonsense" in capsys.readouterr().err
 
 
-GROUPS_WITHOUT_RAYS = [c for c in all_cases(quick=True) if not c.tracer and not c.package and c.group in ("geometry", "noise", "tracking")]
+GROUPS_WITHOUT_RAYS = [
+    c
+    for c in all_cases(quick=True)
+    if not c.tracer and not c.package and c.group in ("geometry", "noise", "tracking")
+]
 
 
 @pytest.mark.parametrize("one", GROUPS_WITHOUT_RAYS, ids=lambda c: c.name.replace(" ", "-"))
@@ -110,6 +138,10 @@ def test_quick_cases_without_rays_pass(one):
 
 def test_planted_bugs_fit_the_source():
     """Each stands in its file as it is written, once, so that tests/mutation.py can plant it."""
-    stale = [c.name for c in CASES if (PACKAGE.parent / c.planted.file).read_text().count(c.planted.old) != 1]
+    stale = [
+        c.name
+        for c in CASES
+        if (PACKAGE.parent / c.planted.file).read_text().count(c.planted.old) != 1
+    ]
     assert stale == []
     assert Planted("a", "b", "c").old == "b"

@@ -21,13 +21,21 @@ def test_settings_of_the_paper():
 
 
 def test_beat_of_the_largest_delay_is_the_sampling_rate():
-    w = Waveform(bandwidth=523e6, sampling_rate=17.3e6, num_samples=900, num_chirps=44, num_tx=4, num_groups=2)
+    w = Waveform(
+        bandwidth=523e6,
+        sampling_rate=17.3e6,
+        num_samples=900,
+        num_chirps=44,
+        num_tx=4,
+        num_groups=2,
+    )
     assert w.slope * w.max_delay == pytest.approx(w.sampling_rate, rel=1e-12)
     assert w.delay_step * w.num_samples == pytest.approx(w.max_delay, rel=1e-12)
 
 
 def test_resource_blocks_are_counted_in_integers():
-    """floor() of the float quotient is one too low for some settings; planted bug: int(T-/(2 T_d))."""
+    """floor() of the float quotient is one too low for some settings; planted bug: int(T-/(2
+    T_d))."""
     for ratio in range(3, 200):
         w = Waveform(bandwidth=ratio * 13.7e6, sampling_rate=13.7e6)
         assert w.num_resource_blocks == (ratio - 2 + 2 + 2 * 3) // 2
@@ -43,8 +51,12 @@ def test_resolutions():
     assert w.range_cell(2) == pytest.approx(0.24983, rel=PRINTED)
     assert w.range_cell(1) == pytest.approx(0.49965, rel=PRINTED)
     # the table uses f_c; the Doppler scale is the effective carrier, 0.44 % above
-    assert w.velocity_cell(2) * w.effective_carrier / w.carrier_frequency == pytest.approx(0.25014, rel=PRINTED)
-    assert w.max_velocity(1) * w.effective_carrier / w.carrier_frequency == pytest.approx(30.017, rel=PRINTED)
+    assert w.velocity_cell(2) * w.effective_carrier / w.carrier_frequency == pytest.approx(
+        0.25014, rel=PRINTED
+    )
+    assert w.max_velocity(1) * w.effective_carrier / w.carrier_frequency == pytest.approx(
+        30.017, rel=PRINTED
+    )
     assert w.effective_carrier == pytest.approx(77.34e9, rel=PRINTED)
 
 

@@ -1,4 +1,5 @@
-"""Writes docs/generated/licences.md from the lock and what the installed packages say of themselves."""
+"""Writes docs/generated/licences.md from the lock and what the installed packages say of
+themselves."""
 
 from __future__ import annotations
 
@@ -17,14 +18,19 @@ isac_rt is under Apache-2.0. The packages of the lock, with the licences that th
 
 
 def licence(name: str) -> str | None:
-    """A package's licence in its own words; None where it is not installed (packages of other systems)."""
+    """A package's licence in its own words; None where it is not installed (packages of other
+    systems)."""
     try:
         data = importlib.metadata.metadata(name)
     except importlib.metadata.PackageNotFoundError:
         return None
     if data.get("License-Expression"):
         return str(data["License-Expression"])
-    classes = [c.rsplit("::", 1)[-1].strip() for c in data.get_all("Classifier") or [] if c.startswith("License")]
+    classes = [
+        c.rsplit("::", 1)[-1].strip()
+        for c in data.get_all("Classifier") or []
+        if c.startswith("License")
+    ]
     stated = [c for c in classes if c != "OSI Approved"]
     return "; ".join(stated) or str(data.get("License") or "not stated").splitlines()[0][:60]
 

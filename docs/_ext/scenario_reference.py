@@ -8,7 +8,8 @@ from typing import Any
 
 HEAD = """# Scenario reference
 
-Every key of a scenario, as `isac-rt schema` has it. Units stand in the names; a key without a default must be given.
+Every key of a scenario, as `isac-rt schema` has it. Units stand in the names;
+a key without a default must be given.
 """
 
 

@@ -1,4 +1,5 @@
-"""How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, the stages before the data, and feedback."""
+"""How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, the stages
+before the data, and feedback."""
 
 from isac_rt.access.connect import Connections, connect
 from isac_rt.access.dma import Isolation, isolation

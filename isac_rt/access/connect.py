@@ -1,4 +1,5 @@
-"""A run's stages before the data: from a scenario to blocks, links and clocks that its frames then use."""
+"""A run's stages before the data: from a scenario to blocks, links and clocks that its frames then
+use."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ class Connections:
     Attributes
     ----------
     clocks : of every terminal against true time; empty where an external source keeps them equal
-    establishment : outcome of the stages before the data; None when they were left out, and everything is as stated
+    establishment : outcome of the stages before the data; None when they were left out, and
+        everything is as stated
     """
 
     clocks: Mapping[str, Clock] = field(default_factory=dict)
@@ -31,7 +33,9 @@ class Connections:
         """First block of each active terminal that found one; None when the scenario's own hold."""
         if self.establishment is None:
             return None
-        return {name: block for name, block in self.establishment.blocks.items() if block is not None}
+        return {
+            name: block for name, block in self.establishment.blocks.items() if block is not None
+        }
 
     def refused(self) -> frozenset[Link]:
         """Links that carry no data: those that were not acknowledged."""
@@ -39,18 +43,22 @@ class Connections:
         return frozenset(link for link, state in links.items() if not state.acknowledged)
 
     def apart(self, sender: str, link: Link, time: float) -> Clock:
-        """Clock of a sender against that of a link's receiver, corrected by what the receiver learnt of the link's transmitter.
+        """Clock of a sender against that of a link's receiver, corrected by what the receiver
+        learnt of the link's transmitter.
 
         Returns
         -------
-        Clock at `time` [s]: `offset` adds to every delay from the sender, `drift` to every delay rate
+        Clock at `time` [s]: `offset` adds to every delay from the sender, `drift` to every delay
+        rate
         """
         tx, rx = link
         if sender == rx:
             return Clock()
         one, other = self.clocks.get(sender, Clock()), self.clocks.get(rx, Clock())
         offset, drift = one.late(time) - other.late(time), one.drift - other.drift
-        known = None if self.establishment is None or tx == rx else self.establishment.links[link].clock
+        known = (
+            None if self.establishment is None or tx == rx else self.establishment.links[link].clock
+        )
         if known is not None:
             offset, drift = offset - known.offset_at(time), drift - known.drift
         return Clock(offset, drift)
@@ -61,7 +69,8 @@ class Connections:
         return 0.0 if state is None else state.offset_std_at(time)
 
     def summary(self, time: float) -> dict[str, Any] | None:
-        """For `summary.json`: what was decided, what was decided wrongly, clock errors left at `time`; None without the stages."""
+        """For `summary.json`: what was decided, what was decided wrongly, clock errors left at
+        `time`; None without the stages."""
         e = self.establishment
         if e is None:
             return None
@@ -98,7 +107,8 @@ def connect(
     scene: Scene,
     noise_power: Callable[[Link], float],
 ) -> Connections:
-    """Go through the stages before the data if the scenario asks for them; the last of their frames ends by the first of the run's.
+    """Go through the stages before the data if the scenario asks for them; the last of their frames
+    ends by the first of the run's.
 
     Parameters
     ----------
@@ -109,10 +119,20 @@ def connect(
     active = [name for name, uav in swarm.items() if uav.role == "active"]
     passive = [name for name, uav in swarm.items() if uav.role == "passive"]
     external = scenario.access.synchronisation == "external"
-    clocks = {} if external else {name: Clock(swarm[name].clock_offset_s, swarm[name].clock_drift_ppm * 1e-6) for name in active + passive}
+    clocks = (
+        {}
+        if external
+        else {
+            name: Clock(swarm[name].clock_offset_s, swarm[name].clock_drift_ppm * 1e-6)
+            for name in active + passive
+        }
+    )
     if not scenario.access.establish:
         return Connections(clocks)
-    sweeps, answers = len(scan(waveform.num_resource_blocks, waveform.num_groups)), -(-len(passive) // waveform.num_groups)
+    sweeps, answers = (
+        len(scan(waveform.num_resource_blocks, waveform.num_groups)),
+        -(-len(passive) // waveform.num_groups),
+    )
     longest = len(active) * (2 * sweeps + 1 + 2 * answers) * waveform.frame_duration
     network = Network(
         waveform=waveform,
@@ -122,7 +142,8 @@ def connect(
         scene=scene,
         wishes=scenario.first_blocks(),
         listeners={name: tuple(passive) for name in active},
-        noise_power={name: noise_power((name, name)) for name in active} | {name: noise_power((active[0], name)) for name in passive},
+        noise_power={name: noise_power((name, name)) for name in active}
+        | {name: noise_power((active[0], name)) for name in passive},
         filter_transition=scenario.radio.filter_transition_hz,
         seed=scenario.seed,
         clocks=clocks,

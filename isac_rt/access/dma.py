@@ -1,20 +1,26 @@
-r"""Chirp-DMA as it is in hardware: chirps mixed at a rate that holds the neighbours' beats, then low-pass filtered and decimated.
+r"""Chirp-DMA as it is in hardware: chirps mixed at a rate that holds the neighbours' beats, then
+low-pass filtered and decimated.
 
-Resource blocks start 2 T_d apart, so that a neighbour of `spacing` blocks beats at 2 `spacing` f_s and up to f_s above that, and the
-IF filter of [0, f_s] keeps it out. `ifsignal` has the filter as a gain on every chirp's beat, which is exact for tones that
-last. Here the oscillators themselves are multiplied: chirps begin and end inside the window, the filter rings, and what is left of a
-neighbour in the band is what its edges leave. `tests/test_access_dma.py` asserts the following, for the paper's numbers with a skirt
-of 0.4 MHz and data on every chirp:
+Resource blocks start 2 T_d apart, so that a neighbour of `spacing` blocks beats at 2 `spacing` f_s
+and up to f_s above that, and the IF filter of [0, f_s] keeps it out. `ifsignal` has the filter as a
+gain on every chirp's beat, which is exact for tones that last. Here the oscillators themselves are
+multiplied: chirps begin and end inside the window, the filter rings, and what is left of a
+neighbour in the band is what its edges leave. `tests/test_access_dma.py` asserts the following, for
+the paper's numbers with a skirt of 0.4 MHz and data on every chirp:
 
-- the neighbours' power over the window is at least 47 dB down at 1, 53 dB at 2 and 56 dB at 3 blocks, on both sides; it lies at the
-  edges of chirps, so that in Hann-windowed range spectra the strongest cell is 85 dB down;
-- the spacing of 2 T_d tolerates T_d of timing error towards each other, and any error away from each other until the next occupied
-  block comes near: a chirp of the next block enters the band when it is early by T_d plus its delay, one of the block before when it is
-  late by 2 T_d less its delay, and data and path together may fill T_d. The whole 2 T_d is tolerated only of the late chirp without delay.
+- the neighbours' power over the window is at least 47 dB down at 1, 53 dB at 2 and 56 dB at 3
+  blocks, on both sides; it lies at the edges of chirps, so that in Hann-windowed range spectra the
+  strongest cell is 85 dB down;
+- the spacing of 2 T_d tolerates T_d of timing error towards each other, and any error away from
+  each other until the next occupied block comes near: a chirp of the next block enters the band
+  when it is early by T_d plus its delay, one of the block before when it is late by 2 T_d less its
+  delay, and data and path together may fill T_d. The whole 2 T_d is tolerated only of the late
+  chirp without delay.
 
-Two active terminals in the same blocks are not separated by anything. A passive terminal decides the stronger tone in every chirp: with the
-other 3 dB down its delay SER is 0, with the other 3 dB up it is 1 (the frame is erased, because the other one does not move as
-predicted). In a frame without data the other one is one more detection, a ghost.
+Two active terminals in the same blocks are not separated by anything. A passive terminal decides
+the stronger tone in every chirp: with the other 3 dB down its delay SER is 0, with the other 3 dB
+up it is 1 (the frame is erased, because the other one does not move as predicted). In a frame
+without data the other one is one more detection, a ghost.
 """
 
 from __future__ import annotations
@@ -27,7 +33,8 @@ import scipy.fft
 from isac_rt.frame.waveform import Waveform
 
 OVERSAMPLING = 32
-"""Samples of the mixer's output per IF sample: beats within +-16 f_s, seven blocks to either side."""
+"""Samples of the mixer's output per IF sample: beats within +-16 f_s, seven blocks to either
+side."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,8 @@ class Isolation:
     spacing : blocks by which the neighbour's chirps start later than the reference
     timing_error : by which they are late besides [s]
     power_db : power over the window, same block and no error over this neighbour
-    peak_db : the strongest cell of its Hann-windowed range spectra against that of the same chirps in the same block
+    peak_db : the strongest cell of its Hann-windowed range spectra against that of the same chirps
+        in the same block
     """
 
     spacing: int
@@ -49,15 +57,19 @@ class Isolation:
 
 
 def raised_cosine(time: np.ndarray, sampling_rate: float, transition: float) -> np.ndarray:
-    """Impulse response [1/s] of the IF filter: gain 1 on [0, f_s], raised-cosine skirts of width `transition` outside.
+    """Impulse response [1/s] of the IF filter: gain 1 on [0, f_s], raised-cosine skirts of width
+    `transition` outside.
 
-    Linear phase; its constant delay is taken out. Closed form of the Fourier integral, written with two sincs so that it has no pole.
+    Linear phase; its constant delay is taken out. Closed form of the Fourier integral, written with
+    two sincs so that it has no pole.
     """
     x = 2 * transition * time
     # cos(pi x/2)/(1 - x^2) = (pi/4) (sinc((x+1)/2) + sinc((x-1)/2))
     roll = np.pi / 4 * (np.sinc((x + 1) / 2) + np.sinc((x - 1) / 2))
     width = sampling_rate + transition
-    return width * np.sinc(width * time) * roll * np.exp(1j * np.pi * ((sampling_rate * time) % 2.0))
+    return (
+        width * np.sinc(width * time) * roll * np.exp(1j * np.pi * ((sampling_rate * time) % 2.0))
+    )
 
 
 def mix(
@@ -69,14 +81,16 @@ def mix(
     transition: float,
     oversampling: int = OVERSAMPLING,
 ) -> np.ndarray:
-    r"""IF samples of C reference chirps with the chirps that arrive, by multiplying oscillators and filtering.
+    r"""IF samples of C reference chirps with the chirps that arrive, by multiplying oscillators and
+    filtering.
 
-    .. math:: x(u) = \sum_k a_k\, e^{j2\pi[\varphi(u) - \varphi(u - \tau_k)]},\quad \varphi(s) = f_c s + \alpha s^2/2,\ 0 \le s < \tilde T
+    .. math:: x(u) = \sum_k a_k\, e^{j2\pi[\varphi(u) - \varphi(u - \tau_k)]},\quad \varphi(s) = f_c
+    s + \alpha s^2/2,\ 0 \le s < \tilde T
 
     Parameters
     ----------
-    delay : (K, C) from the start of the reference to that of an arriving chirp, as seen at its start: data, path, clock and
-        2 T_d per block together, of either sign [s]
+    delay : (K, C) from the start of the reference to that of an arriving chirp, as seen at its
+        start: data, path, clock and 2 T_d per block together, of either sign [s]
     amplitude : (K, C) complex, as it is in the IF (conjugate of what arrives)
     rate : of the delays
     transition : width of the filter's skirts [Hz]
@@ -89,7 +103,10 @@ def mix(
     w = waveform
     lead = int(np.ceil(w.window_start / w.sample_interval))
     step = w.sample_interval / oversampling
-    u = w.window_start + (np.arange((lead + w.num_samples) * oversampling) - lead * oversampling) * step
+    u = (
+        w.window_start
+        + (np.arange((lead + w.num_samples) * oversampling) - lead * oversampling) * step
+    )
     taps = np.arange(-u.size, u.size + 1) * step
     size = scipy.fft.next_fast_len(3 * u.size + 1)
     response = scipy.fft.fft(raised_cosine(taps, w.sampling_rate, transition) * step, size)
@@ -99,9 +116,16 @@ def mix(
         for tau, a in zip(delay[:, c], amplitude[:, c], strict=True):
             since = u - tau - rate * u
             cycles = (_oscillator(w, u) - _oscillator(w, since)) % 1.0
-            product += a * _open(u, w.chirp_duration, step) * _open(since, w.chirp_duration, step) * np.exp(2j * np.pi * cycles)
+            product += (
+                a
+                * _open(u, w.chirp_duration, step)
+                * _open(since, w.chirp_duration, step)
+                * np.exp(2j * np.pi * cycles)
+            )
         filtered = scipy.fft.ifft(scipy.fft.fft(product, size) * response)[u.size :]
-        out[c] = filtered[lead * oversampling : (lead + w.num_samples) * oversampling : oversampling]
+        out[c] = filtered[
+            lead * oversampling : (lead + w.num_samples) * oversampling : oversampling
+        ]
     return out
 
 
@@ -111,7 +135,8 @@ def _oscillator(waveform: Waveform, since: np.ndarray) -> np.ndarray:
 
 
 def _open(since: np.ndarray, duration: float, step: float) -> np.ndarray:
-    """Share of the sample interval around `since` in which a chirp of this duration is on: its edges lie between samples."""
+    """Share of the sample interval around `since` in which a chirp of this duration is on: its
+    edges lie between samples."""
     return np.clip(np.minimum(since, duration - since) / step + 0.5, 0.0, 1.0)
 
 
@@ -132,11 +157,16 @@ def isolation(
     Parameters
     ----------
     timing_error : of the neighbour, positive when late [s]
-    path_cells : its path delay in range cells; None: uniform over the first half of the range, which data and path share
+    path_cells : its path delay in range cells; None: uniform over the first half of the range,
+        which data and path share
     modulated : whether uniform data are on its chirps
     """
     w = waveform
-    path = rng.uniform(0, w.num_delay_symbols, chirps) if path_cells is None else np.full(chirps, path_cells)
+    path = (
+        rng.uniform(0, w.num_delay_symbols, chirps)
+        if path_cells is None
+        else np.full(chirps, path_cells)
+    )
     symbol = rng.integers(0, w.num_delay_symbols, chirps) if modulated else np.zeros(chirps)
     delay = (path + symbol) * w.delay_step
     amplitude = np.exp(2j * np.pi * rng.random((1, chirps)))

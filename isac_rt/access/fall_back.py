@@ -1,8 +1,10 @@
-"""The paper's fall-back from a pseudo-random antenna schedule to a conventional one, frame by frame, on the receivers' advice.
+"""The paper's fall-back from a pseudo-random antenna schedule to a conventional one, frame by
+frame, on the receivers' advice.
 
-A random schedule of fewer groups than transmit antennas rests on sparsity. Receivers of such frames say whether they found the
-scene sparse (`Reception.sparse`); the last word of each counts. A transmitter sends the conventional schedule as long as one of its
-receivers advises it, from the next frame on, and the random one otherwise. How the advice of a passive terminal reaches it is not
+A random schedule of fewer groups than transmit antennas rests on sparsity. Receivers of such frames
+say whether they found the scene sparse (`Reception.sparse`); the last word of each counts. A
+transmitter sends the conventional schedule as long as one of its receivers advises it, from the
+next frame on, and the random one otherwise. How the advice of a passive terminal reaches it is not
 modelled: it is one bit a frame.
 """
 
@@ -19,7 +21,8 @@ from isac_rt.scenario.tree import Scenario
 
 @dataclass
 class Schedules:
-    """Which schedule each active terminal sends in the next frame; without `array.fall_back` always the scenario's."""
+    """Which schedule each active terminal sends in the next frame; without `array.fall_back` always
+    the scenario's."""
 
     scenario: Scenario
     usual: Schedule
@@ -33,6 +36,9 @@ class Schedules:
         return conventional_schedule(groups, chirps, self.scenario.num_tx) if dense else self.usual
 
     def heed(self, receptions: Mapping[Link, Reception]) -> None:
-        """Note what the receivers of a frame advise. One that could not tell keeps its last advice."""
+        """Note what the receivers of a frame advise. One that could not tell keeps its last
+        advice."""
         if self.scenario.array.fall_back:
-            self.advice |= {link: r.sparse for link, r in receptions.items() if r.sparse is not None}
+            self.advice |= {
+                link: r.sparse for link, r in receptions.items() if r.sparse is not None
+            }

@@ -1,9 +1,11 @@
-"""Stage 4's feedback: what a passive terminal reports now and then, and how the active one tells it of a whole-cell slip.
+"""Stage 4's feedback: what a passive terminal reports now and then, and how the active one tells it
+of a whole-cell slip.
 
-A passive terminal that takes its range for s cells too long reads every symbol s too low, and the same frame tells nobody which is
-right. Two things do: data fill their alphabet, so that symbols outside it bound the slip; and the active terminal has the same
-distance from its own echo, without the passive one's integer. It weighs all slips that the alphabet allows by the difference of
-the ranges.
+A passive terminal that takes its range for s cells too long reads every symbol s too low, and the
+same frame tells nobody which is right. Two things do: data fill their alphabet, so that symbols
+outside it bound the slip; and the active terminal has the same distance from its own echo, without
+the passive one's integer. It weighs all slips that the alphabet allows by the difference of the
+ranges.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ CONFIDENT_RATE = 1e-3
 SUFFICIENT = 0.999
 """Probability of a slip from which it is corrected."""
 SAME_DIRECTION = np.radians(4.0)
-"""Half of the 16-element beam: an echo farther off the direction that the passive terminal reports is another's."""
+"""Half of the 16-element beam: an echo farther off the direction that the passive terminal reports
+is another's."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class Feedback:
     Attributes
     ----------
     range, range_std : of the line of sight as it uses it, at an agreed time [m]
-    lowest, highest : second lowest and second highest sure symbol of the last frame, so that one wrong decision does no harm;
-        None when fewer than two were sure
+    lowest, highest : second lowest and second highest sure symbol of the last frame, so that one
+        wrong decision does no harm; None when fewer than two were sure
     decided : sure symbols
     """
 
@@ -62,8 +65,11 @@ class Correction:
     sure: bool
 
 
-def summarise(reception: Reception, range_: float, range_std: float, num_rx: int, waveform: Waveform) -> Feedback:
-    """Feedback from the last frame: earlier ones may have been read before the slip, and their bounds would contradict its.
+def summarise(
+    reception: Reception, range_: float, range_std: float, num_rx: int, waveform: Waveform
+) -> Feedback:
+    """Feedback from the last frame: earlier ones may have been read before the slip, and their
+    bounds would contradict its.
 
     Parameters
     ----------
@@ -81,7 +87,8 @@ def summarise(reception: Reception, range_: float, range_std: float, num_rx: int
 
 
 def echo_of(reported: TrackSet, own: TrackSet) -> int | None:
-    """The active terminal's track of a passive one: the nearest in direction to the line of sight that this one reports.
+    """The active terminal's track of a passive one: the nearest in direction to the line of sight
+    that this one reports.
 
     Parameters
     ----------
@@ -99,9 +106,15 @@ def echo_of(reported: TrackSet, own: TrackSet) -> int | None:
 
 
 def exchange(
-    reception: Reception, reported: TrackSet, own: TrackSet, num_rx: int, clock_std: float, waveform: Waveform
+    reception: Reception,
+    reported: TrackSet,
+    own: TrackSet,
+    num_rx: int,
+    clock_std: float,
+    waveform: Waveform,
 ) -> Correction | None:
-    """One passive terminal's feedback after a frame and the active one's answer; None where either has nothing to go by.
+    """One passive terminal's feedback after a frame and the active one's answer; None where either
+    has nothing to go by.
 
     Parameters
     ----------
@@ -114,7 +127,9 @@ def exchange(
     if echo is None or not reception.decoded:
         return None
     q = int(np.flatnonzero(reported.is_reference)[0])
-    said = summarise(reception, float(reported.range[q]), float(reported.std[q, 0]), num_rx, waveform)
+    said = summarise(
+        reception, float(reported.range[q]), float(reported.std[q, 0]), num_rx, waveform
+    )
     return correct(said, float(own.range[echo]), float(own.std[echo, 0]), clock_std, waveform)
 
 
@@ -125,21 +140,26 @@ def _of_decided(reception: Reception) -> np.ndarray:
     return reception.delay_confidence[(reception.delay_symbols >= 0).any(axis=1)]
 
 
-def correct(feedback: Feedback, echo_range: float, echo_std: float, clock_std: float, waveform: Waveform) -> Correction:
+def correct(
+    feedback: Feedback, echo_range: float, echo_std: float, clock_std: float, waveform: Waveform
+) -> Correction:
     r"""The whole cells by which a passive terminal is off, as the active terminal sees it.
 
-    .. math:: P(s) \propto \exp\left[-\frac{(r_{PT} - r_{AT} - s\,c/\alpha T)^2}{2\sigma^2}\right],\quad
+    .. math:: P(s) \propto \exp\left[-\frac{(r_{PT} - r_{AT} - s\,c/\alpha
+    T)^2}{2\sigma^2}\right],\quad
         -D_{\min} \le s \le N/2 - 1 - D_{\max}
 
     Parameters
     ----------
     feedback : from the passive terminal
-    echo_range, echo_std : its distance from the active terminal's own echo at the agreed time (half of the way there and back) [m]
+    echo_range, echo_std : its distance from the active terminal's own echo at the agreed time (half
+        of the way there and back) [m]
     clock_std : of what is left of the clocks' offset [s]
 
     Notes
     -----
-    Uniform symbols are as likely under every slip that keeps them in the alphabet, so that they bound s and weigh nothing else.
+    Uniform symbols are as likely under every slip that keeps them in the alphabet, so that they
+    bound s and weigh nothing else.
     """
     cell = waveform.range_cell(1)
     least, most = -LARGEST_SLIP, LARGEST_SLIP
@@ -160,12 +180,14 @@ def correct(feedback: Feedback, echo_range: float, echo_std: float, clock_std: f
 
 
 def frames_to_repair(first_wrong: int, period: int, travel: int = 1) -> int:
-    """Frames that are read with a slip: until the next feedback, after every `period`-th frame, and while the answer travels.
+    """Frames that are read with a slip: until the next feedback, after every `period`-th frame, and
+    while the answer travels.
 
     Parameters
     ----------
     first_wrong : number of the first frame with the slip, from 0
-    period : frames from one feedback to the next; it leaves after frames period - 1, 2 period - 1, ...
+    period : frames from one feedback to the next; it leaves after frames period - 1, 2 period - 1,
+        ...
     travel : frames that go by before the correction is in force
     """
     return period - first_wrong % period + travel

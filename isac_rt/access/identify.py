@@ -1,7 +1,8 @@
 """Which resource blocks are taken: listening at the slot grid, and the choice of a free run.
 
-Data move a sender's beat from chirp to chirp, so energies cannot be added over chirps cell by cell. A chirp is *hot* when its
-strongest cell, added over antennas, stands out of its other cells; a block is taken when more chirps are hot than noise explains.
+Data move a sender's beat from chirp to chirp, so energies cannot be added over chirps cell by cell.
+A chirp is *hot* when its strongest cell, added over antennas, stands out of its other cells; a
+block is taken when more chirps are hot than noise explains.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ HOT_RATE = 0.01
 
 
 def hot_threshold(num_rx: int, num_cells: int, rate: float = HOT_RATE) -> float:
-    """Strongest cell over the mean of the others that noise exceeds in this share of chirps: the largest of `num_cells` F-distributed
-    ratios with 2 L_rx and 2 L_rx (num_cells - 1) degrees of freedom."""
+    """Strongest cell over the mean of the others that noise exceeds in this share of chirps: the
+    largest of `num_cells` F-distributed ratios with 2 L_rx and 2 L_rx (num_cells - 1) degrees of
+    freedom."""
     law = stats.f(2 * num_rx, 2 * num_rx * (num_cells - 1))
     return float(law.isf(-np.expm1(np.log1p(-rate) / num_cells)))
 
@@ -43,13 +45,15 @@ def hot_chirps(samples: np.ndarray) -> np.ndarray:
 
 
 def needed_chirps(num_chirps: int, false_rate: float) -> int:
-    """Hot chirps from which a block counts as taken: noise reaches them with at most `false_rate`."""
+    """Hot chirps from which a block counts as taken: noise reaches them with at most
+    `false_rate`."""
     tail = stats.binom.sf(np.arange(-1, num_chirps), num_chirps, HOT_RATE)
     return int(np.flatnonzero(tail <= false_rate)[0])
 
 
 def choose_run(taken: np.ndarray, length: int, wished: int | None = None) -> int | None:
-    """First block of a free run: the wished one, else the free start nearest to it (the lower of two); without a wish the lowest.
+    """First block of a free run: the wished one, else the free start nearest to it (the lower of
+    two); without a wish the lowest.
 
     Parameters
     ----------

@@ -1,8 +1,10 @@
 """On-off keyed messages: a chirp is sent or not, and the receiver compares energies without phases.
 
-A frame begins with a stretch of chirps that are all on (it tells the range cell) and one that are all off (it tells the noise); each
-bit is then repeated on as many consecutive chirps. Energies are added over repeats, antennas and groups. Without a window, and with the
-fraction of a cell taken out, the cells of noise are independent, so that thresholds and error rates follow from F distributions.
+A frame begins with a stretch of chirps that are all on (it tells the range cell) and one that are
+all off (it tells the noise); each bit is then repeated on as many consecutive chirps. Energies are
+added over repeats, antennas and groups. Without a window, and with the fraction of a cell taken
+out, the cells of noise are independent, so that thresholds and error rates follow from F
+distributions.
 """
 
 from __future__ import annotations
@@ -30,14 +32,17 @@ class Message:
 
 @dataclass(frozen=True)
 class Codebook:
-    """Fields of a message: sender, block, and a parity bit that makes the number of ones odd, so that silence is no message."""
+    """Fields of a message: sender, block, and a parity bit that makes the number of ones odd, so
+    that silence is no message."""
 
     num_senders: int
     num_blocks: int
 
     @property
     def widths(self) -> tuple[int, int]:
-        return max((self.num_senders - 1).bit_length(), 1), max((self.num_blocks - 1).bit_length(), 1)
+        return max((self.num_senders - 1).bit_length(), 1), max(
+            (self.num_blocks - 1).bit_length(), 1
+        )
 
     @property
     def num_bits(self) -> int:
@@ -52,9 +57,13 @@ class Codebook:
         """
         fields = ((message.sender, self.num_senders), (message.block, self.num_blocks))
         if any(not 0 <= value < count for value, count in fields):
-            raise ValueError(f"{message} does not fit {self.num_senders} senders and {self.num_blocks} blocks")
+            raise ValueError(
+                f"{message} does not fit {self.num_senders} senders and {self.num_blocks} blocks"
+            )
         bits = [
-            (value >> place) & 1 for (value, _), width in zip(fields, self.widths, strict=True) for place in range(width - 1, -1, -1)
+            (value >> place) & 1
+            for (value, _), width in zip(fields, self.widths, strict=True)
+            for place in range(width - 1, -1, -1)
         ]
         return np.array([*bits, (sum(bits) + 1) % 2], np.uint8)
 
@@ -65,7 +74,11 @@ class Codebook:
         first = self.widths[0]
         sender = int("".join(map(str, bits[:first])), 2)
         block = int("".join(map(str, bits[first:-1])), 2)
-        return Message(sender, block) if sender < self.num_senders and block < self.num_blocks else None
+        return (
+            Message(sender, block)
+            if sender < self.num_senders and block < self.num_blocks
+            else None
+        )
 
 
 def repeats(num_chirps: int, num_bits: int) -> int:
@@ -77,7 +90,10 @@ def repeats(num_chirps: int, num_bits: int) -> int:
     """
     count = num_chirps // (num_bits + PREAMBLE)
     if count < 1:
-        raise ValueError(f"{num_bits} bits need {num_bits + PREAMBLE} chirps in a frame, it has {num_chirps}; lengthen the frame")
+        raise ValueError(
+            f"{num_bits} bits need {num_bits + PREAMBLE} chirps in a frame, it has {num_chirps}; "
+            "lengthen the frame"
+        )
     return count
 
 
@@ -110,37 +126,48 @@ class Reading:
 
 
 def threshold(rate: float, looks: int, num_cells: int) -> float:
-    """Energy over the mean noise of `num_cells` cells that noise alone exceeds with this rate: both are means of `looks` exponentials
-    per cell, their ratio is F distributed with 2 `looks` and 2 `looks` `num_cells` degrees of freedom."""
+    """Energy over the mean noise of `num_cells` cells that noise alone exceeds with this rate: both
+    are means of `looks` exponentials per cell, their ratio is F distributed with 2 `looks` and 2
+    `looks` `num_cells` degrees of freedom."""
     return float(stats.f(2 * looks, 2 * looks * num_cells).isf(rate))
 
 
-def read(samples: np.ndarray, num_bits: int, *, find_rate: float = 1e-4, on_rate: float = 1e-4) -> Reading:
+def read(
+    samples: np.ndarray, num_bits: int, *, find_rate: float = 1e-4, on_rate: float = 1e-4
+) -> Reading:
     """Find a sender and decide the bits of its message.
 
     Parameters
     ----------
     samples : (G, L_rx, P, N), the groups in which the same message is sent
     num_bits : of the message
-    find_rate : chance that a frame of noise is taken for a sender (union bound over cells and fractions)
+    find_rate : chance that a frame of noise is taken for a sender (union bound over cells and
+        fractions)
     on_rate : chance that noise alone turns a bit on
     """
     groups, num_rx, num_chirps, num_samples = samples.shape
     each = repeats(num_chirps, num_bits)
     looks = groups * num_rx * each
-    energy = np.stack([_stretches(samples, f / FRACTIONS, each, num_bits + PREAMBLE) for f in range(FRACTIONS)])
+    energy = np.stack(
+        [_stretches(samples, f / FRACTIONS, each, num_bits + PREAMBLE) for f in range(FRACTIONS)]
+    )
     noise = energy[0, 1].mean()  # the stretch that is off
     fraction, cell = np.unravel_index(energy[:, 0].argmax(), energy[:, 0].shape)
-    found = energy[fraction, 0, cell] > noise * threshold(find_rate / (FRACTIONS * num_samples), looks, num_samples)
+    found = energy[fraction, 0, cell] > noise * threshold(
+        find_rate / (FRACTIONS * num_samples), looks, num_samples
+    )
     level = energy[fraction, PREAMBLE:, cell] / noise
     bits = (level > threshold(on_rate, looks, num_samples)).astype(np.uint8)
     return Reading(bool(found), float(cell + fraction / FRACTIONS), bits, level)
 
 
 def _stretches(samples: np.ndarray, fraction: float, each: int, count: int) -> np.ndarray:
-    """(count, N) mean energy of the cells k + fraction over the groups, antennas and chirps of each stretch."""
+    """(count, N) mean energy of the cells k + fraction over the groups, antennas and chirps of each
+    stretch."""
     num_samples = samples.shape[-1]
-    turn = np.exp(-2j * np.pi * fraction * np.arange(num_samples) / num_samples).astype(np.complex64)
+    turn = np.exp(-2j * np.pi * fraction * np.arange(num_samples) / num_samples).astype(
+        np.complex64
+    )
     total = np.zeros((count, num_samples))
     for one in samples.reshape(-1, *samples.shape[2:]):
         spectra = scipy.fft.fft(one[: count * each] * turn, axis=1, workers=1, overwrite_x=True)

@@ -1,16 +1,22 @@
-"""The stages before the data, on the exact signal: blocks found and announced, clocks measured, links acknowledged.
+"""The stages before the data, on the exact signal: blocks found and announced, clocks measured,
+links acknowledged.
 
-Active terminals join one after the other; those that have joined send data all the while, so that the next ones hear them (or collide
-with them, if they cannot). One terminal's stages, each frame right after the last:
+Active terminals join one after the other; those that have joined send data all the while, so that
+the next ones hear them (or collide with them, if they cannot). One terminal's stages, each frame
+right after the last:
 
-1. It listens to M blocks per frame until it has heard all of them, takes the free run nearest to its wish, and announces its first block
+1. It listens to M blocks per frame until it has heard all of them, takes the free run nearest to
+its wish, and announces its first block
    by on-off keying in all M blocks while the passive terminals scan the blocks as it did.
-2. Round 1: it sends an unmodulated frame to all. Round 2: its passive terminals answer unmodulated, up to M in one frame, each in one
+2. Round 1: it sends an unmodulated frame to all. Round 2: its passive terminals answer unmodulated,
+up to M in one frame, each in one
    block of the run. With an external clock this stage is left out.
-3. Those that understood the announcement and heard round 1 acknowledge by on-off keying in their block.
+3. Those that understood the announcement and heard round 1 acknowledge by on-off keying in their
+block.
 
-Whoever sends here sends `hold` later than its clock says, so that a clock that is ahead by more than the path's delay is heard all
-the same; receivers know it. Not modelled: the passage of round 1's estimate from one end to the other, taken as free of errors.
+Whoever sends here sends `hold` later than its clock says, so that a clock that is ahead by more
+than the path's delay is heard all the same; receivers know it. Not modelled: the passage of round
+1's estimate from one end to the other, taken as free of errors.
 """
 
 from __future__ import annotations
@@ -41,14 +47,16 @@ Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, Pa
 """Poses of all terminals at a time, and the paths of these links with this time as their epoch."""
 
 HOLD_SHARE = 0.125
-"""Agreed lateness of every sender here, as a share of T_d (213 ns, 64 m with the paper's numbers)."""
+"""Agreed lateness of every sender here, as a share of T_d (213 ns, 64 m with the paper's
+numbers)."""
 BLOCK_FALSE_RATE = 1e-4
 """Chance that noise makes a free block look taken."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """A terminal's clock against true time: it shows t + offset + drift t, and what it sends is late by that [s, 1]."""
+    """A terminal's clock against true time: it shows t + offset + drift t, and what it sends is
+    late by that [s, 1]."""
 
     offset: float = 0.0
     drift: float = 0.0
@@ -66,7 +74,8 @@ class Network:
     waveform, antennas, schedule : public
     receivers : settings of the passive receiver
     scene : poses and paths at any time
-    wishes : first block that each active terminal would like, in the order in which they join; None for no wish
+    wishes : first block that each active terminal would like, in the order in which they join; None
+        for no wish
     listeners : passive terminals of each active one
     clocks : of every terminal; those left out are right
     noise_power : E|n|^2 per IF sample of every receiver [W]
@@ -97,7 +106,10 @@ class Network:
     @property
     def names(self) -> list[str]:
         """Active terminals in their order, then the passive ones."""
-        return [*self.wishes, *dict.fromkeys(name for pts in self.listeners.values() for name in pts)]
+        return [
+            *self.wishes,
+            *dict.fromkeys(name for pts in self.listeners.values() for name in pts),
+        ]
 
     @property
     def codebook(self) -> Codebook:
@@ -114,7 +126,8 @@ class LinkState:
 
     Attributes
     ----------
-    heard_block : first block on the passive terminal's own grid, None when no announcement was understood
+    heard_block : first block on the passive terminal's own grid, None when no announcement was
+        understood
     message : what it understood
     identified : whether that is what was announced
     clock : estimate, `EXTERNAL` with an external clock, None when a round was missed
@@ -137,8 +150,10 @@ class Establishment:
     ----------
     blocks : first block of each active terminal, None where no run was free
     links : state of every (active, passive) link
-    missed_blocks, false_blocks : taken blocks that each active terminal did not hear, free ones that it thought taken
-    missed_announcements, wrong_announcements : links whose passive terminal understood nothing, or something else
+    missed_blocks, false_blocks : taken blocks that each active terminal did not hear, free ones
+        that it thought taken
+    missed_announcements, wrong_announcements : links whose passive terminal understood nothing, or
+        something else
     missed_acknowledgments, false_acknowledgments : sent and not read; read and not sent
     num_frames, duration : of all of it [1, s]
     """
@@ -168,8 +183,11 @@ class _Air:
         """Middle of the present frame [s]."""
         return self.n.start + (self.frame + 0.5) * self.n.waveform.frame_duration
 
-    def sender(self, name: str, block: int, *, data: bool = False, **change: object) -> Transmission:
-        """A transmission of a terminal on its own grid: held, and unmodulated unless it has joined."""
+    def sender(
+        self, name: str, block: int, *, data: bool = False, **change: object
+    ) -> Transmission:
+        """A transmission of a terminal on its own grid: held, and unmodulated unless it has
+        joined."""
         w, n = self.n.waveform, self.n
         rng = generator(n.seed, "access", "payload", name, self.frame)
         payload = random_payload(w, n.schedule, n.dpsk_order, rng) if data else unmodulated(w)
@@ -186,10 +204,15 @@ class _Air:
         return replace(made, **change)  # type: ignore[arg-type]
 
     def hear(self, name: str, first_block: int, sent: Sequence[Transmission] = ()) -> IFCube:
-        """Samples of a terminal with its references in M blocks from `first_block` of its own grid, those that have joined included."""
+        """Samples of a terminal with its references in M blocks from `first_block` of its own grid,
+        those that have joined included."""
         n, w = self.n, self.n.waveform
         busy = {t.name for t in sent} | {name}
-        joined = [self.sender(at, b, data=True) for at, b in self.blocks.items() if b is not None and at not in busy]
+        joined = [
+            self.sender(at, b, data=True)
+            for at, b in self.blocks.items()
+            if b is not None and at not in busy
+        ]
         every = [*sent, *joined]
         poses, paths = n.scene(self.time, [(t.name, name) for t in every])
         own = n.clocks.get(name, Clock())
@@ -197,7 +220,9 @@ class _Air:
         for t in every:
             clock = n.clocks.get(t.name, Clock())
             apart = clock.late(self.time) - own.late(self.time)
-            shifted = replace(t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift)
+            shifted = replace(
+                t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift
+            )
             links.append((shifted, paths[t.name, name]))
         cube = if_signal(
             w,
@@ -219,8 +244,8 @@ def establish(network: Network) -> Establishment:
 
     Returns
     -------
-    Establishment; wrong decisions are among its counts and have their consequences: a terminal that misses the announcement hears no round,
-    one whose clock is unknown is not acknowledged.
+    Establishment; wrong decisions are among its counts and have their consequences: a terminal that
+    misses the announcement hears no round, one whose clock is unknown is not acknowledged.
     """
     air = _Air(network)
     links: dict[Link, LinkState] = {}
@@ -232,7 +257,10 @@ def establish(network: Network) -> Establishment:
         missed[at], false[at] = int((truth & ~taken).sum()), int((taken & ~truth).sum())
         block = choose_run(taken, network.waveform.num_groups, wish)
         if block is None:
-            links |= {(at, pt): LinkState(None, None, False, None, False, False) for pt in network.listeners[at]}
+            links |= {
+                (at, pt): LinkState(None, None, False, None, False, False)
+                for pt in network.listeners[at]
+            }
         else:
             links |= _join(air, at, block)
         air.blocks[at] = block
@@ -252,7 +280,8 @@ def establish(network: Network) -> Establishment:
 
 
 def scan(num_blocks: int, width: int) -> list[int]:
-    """First blocks of the stretches of `width` blocks in which all blocks are heard; the last stretch may overlap."""
+    """First blocks of the stretches of `width` blocks in which all blocks are heard; the last
+    stretch may overlap."""
     return [min(first, num_blocks - width) for first in range(0, num_blocks, width)]
 
 
@@ -306,8 +335,11 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     return out
 
 
-def _announce(air: _Air, said: Message, pts: Sequence[str]) -> dict[str, tuple[int, Message] | None]:
-    """What each passive terminal made of the announcement: (first block on its own grid, message)."""
+def _announce(
+    air: _Air, said: Message, pts: Sequence[str]
+) -> dict[str, tuple[int, Message] | None]:
+    """What each passive terminal made of the announcement: (first block on its own grid,
+    message)."""
     n, w = air.n, air.n.waveform
     mask = keyed(w, n.codebook.encode(said))
     votes: dict[str, list[tuple[int, Message]]] = {pt: [] for pt in pts}
@@ -329,23 +361,38 @@ def _announce(air: _Air, said: Message, pts: Sequence[str]) -> dict[str, tuple[i
 
 
 def _first_heard(votes: Sequence[tuple[int, Message]], width: int) -> tuple[int, Message] | None:
-    """The message that most blocks carry, in at least half of a run, and the first of these blocks: another's data may look like one."""
+    """The message that most blocks carry, in at least half of a run, and the first of these blocks:
+    another's data may look like one."""
     agreed = consensus([message for _, message in votes])
     blocks = [block for block, message in votes if message == agreed]
     return None if agreed is None or 2 * len(blocks) < width else (min(blocks), agreed)
 
 
 def _sight(air: _Air, cube: IFCube) -> Detections:
-    return receive_passive(cube, air.n.antennas, air.n.receivers, air.n.dpsk_order, None, False).detections
+    return receive_passive(
+        cube, air.n.antennas, air.n.receivers, air.n.dpsk_order, None, False
+    ).detections
 
 
-def _first_round(air: _Air, at: str, block: int, understood: Mapping[str, int], rounds: dict[str, list[Round | None]]) -> None:
+def _first_round(
+    air: _Air,
+    at: str,
+    block: int,
+    understood: Mapping[str, int],
+    rounds: dict[str, list[Round | None]],
+) -> None:
     """The active terminal's unmodulated frame at every passive one that knows where to listen."""
     sent = air.sender(at, block)
     for pt, first in understood.items():
         found = _sight(air, air.hear(pt, first, [sent]))
-        whole = (first - block) * air.n.waveform.group_spacing  # blocks by which the two grids differ
-        rounds[pt].append(round_of(found, air.time, True, cell=air.n.waveform.range_cell(1), held=air.n.hold - whole))
+        whole = (
+            first - block
+        ) * air.n.waveform.group_spacing  # blocks by which the two grids differ
+        rounds[pt].append(
+            round_of(
+                found, air.time, True, cell=air.n.waveform.range_cell(1), held=air.n.hold - whole
+            )
+        )
     air.frame += 1
 
 
@@ -355,7 +402,10 @@ def _turns(pts: Sequence[str], width: int) -> list[list[tuple[int, str]]]:
 
 
 def _answers(
-    air: _Air, turn: Sequence[tuple[int, str]], understood: Mapping[str, int], bits: Mapping[str, np.ndarray]
+    air: _Air,
+    turn: Sequence[tuple[int, str]],
+    understood: Mapping[str, int],
+    bits: Mapping[str, np.ndarray],
 ) -> list[Transmission]:
     """Transmissions of those of a turn that have something to answer, each in its group alone."""
     w, out = air.n.waveform, []
@@ -369,7 +419,12 @@ def _answers(
 
 
 def _second_round(
-    air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int], rounds: dict[str, list[Round | None]]
+    air: _Air,
+    at: str,
+    block: int,
+    pts: Sequence[str],
+    understood: Mapping[str, int],
+    rounds: dict[str, list[Round | None]],
 ) -> None:
     """The passive terminals' unmodulated answers at the active one."""
     w = air.n.waveform
@@ -378,13 +433,18 @@ def _second_round(
         for group, pt in turn:
             if pt in understood:
                 found = _sight(air, cube.of_groups([group]))
-                # it answers on its own grid, `whole` blocks late by the other one's: both ends know this
+                # it answers on its own grid, `whole` blocks late by the other one's: both ends know
+                # this
                 whole = (understood[pt] - block) * w.group_spacing
-                rounds[pt].append(round_of(found, air.time, False, cell=w.range_cell(1), held=air.n.hold + whole))
+                rounds[pt].append(
+                    round_of(found, air.time, False, cell=w.range_cell(1), held=air.n.hold + whole)
+                )
         air.frame += 1
 
 
-def _acknowledge(air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int]) -> set[str]:
+def _acknowledge(
+    air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int]
+) -> set[str]:
     """Passive terminals whose acknowledgment the active one reads: their own name and its block."""
     n = air.n
     words = {pt: n.codebook.encode(Message(n.names.index(pt), block)) for pt in pts}

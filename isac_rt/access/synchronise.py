@@ -1,13 +1,16 @@
-r"""Two-round synchronisation: what a link measures in both directions tells its clock from its range.
+r"""Two-round synchronisation: what a link measures in both directions tells its clock from its
+range.
 
-The transmitter's clock of round 1 (the active terminal's) is ahead or behind by delta(t) against the passive terminal's and adds to
-the delay; in round 2 the same clocks add with the opposite sign (signs of `Transmission.clock_offset`). With the path's delay
-tau(t), t counted from round 1,
+The transmitter's clock of round 1 (the active terminal's) is ahead or behind by delta(t) against
+the passive terminal's and adds to the delay; in round 2 the same clocks add with the opposite sign
+(signs of `Transmission.clock_offset`). With the path's delay tau(t), t counted from round 1,
 
-.. math:: y_1 = \tau + \delta,\ \dot y_1 = \dot\tau + \dot\delta,\qquad y_2 = \tau(t) - \delta(t),\ \dot y_2 = \dot\tau(t) - \dot\delta
+.. math:: y_1 = \tau + \delta,\ \dot y_1 = \dot\tau + \dot\delta,\qquad y_2 = \tau(t) - \delta(t),\
+\dot y_2 = \dot\tau(t) - \dot\delta
 
-A drift of 0.01 ppm is 3 m/s of apparent velocity, and a motion of 10 m/s between rounds 8 ms apart is 0.08 m of apparent
-offset: both are solved for, with the path's acceleration as an unknown of known spread, so that the rounds may be apart.
+A drift of 0.01 ppm is 3 m/s of apparent velocity, and a motion of 10 m/s between rounds 8 ms apart
+is 0.08 m of apparent offset: both are solved for, with the path's acceleration as an unknown of
+known spread, so that the rounds may be apart.
 """
 
 from __future__ import annotations
@@ -82,15 +85,20 @@ class ClockEstimate:
         return float(np.sqrt(row @ self.covariance[:2, :2] @ row))
 
 
-EXTERNAL = ClockEstimate(time=0.0, offset=0.0, drift=0.0, range=np.nan, velocity=np.nan, covariance=np.zeros((4, 4)))
+EXTERNAL = ClockEstimate(
+    time=0.0, offset=0.0, drift=0.0, range=np.nan, velocity=np.nan, covariance=np.zeros((4, 4))
+)
 """Clocks that an external source keeps equal: nothing to estimate, stage 2 is left out."""
 
 
-def round_of(detections: Detections, time: float, forward: bool, *, cell: float, held: float = 0.0) -> Round | None:
-    """The reference of a reception as a round: the strongest detection within a range cell of the earliest sure one.
+def round_of(
+    detections: Detections, time: float, forward: bool, *, cell: float, held: float = 0.0
+) -> Round | None:
+    """The reference of a reception as a round: the strongest detection within a range cell of the
+    earliest sure one.
 
-    One group alone samples an antenna's chirps so sparsely that a strong path leaves Doppler sidelobes at its own range, and one of
-    these may seem earlier by less than a cell.
+    One group alone samples an antenna's chirps so sparsely that a strong path leaves Doppler
+    sidelobes at its own range, and one of these may seem earlier by less than a cell.
 
     Parameters
     ----------
@@ -115,8 +123,11 @@ def round_of(detections: Detections, time: float, forward: bool, *, cell: float,
     )
 
 
-def estimate_clock(rounds: Sequence[Round], acceleration_std: float = ACCELERATION_STD) -> ClockEstimate:
-    """Clock and path from rounds of both directions by least squares with the measurements' covariance.
+def estimate_clock(
+    rounds: Sequence[Round], acceleration_std: float = ACCELERATION_STD
+) -> ClockEstimate:
+    """Clock and path from rounds of both directions by least squares with the measurements'
+    covariance.
 
     Parameters
     ----------
@@ -132,7 +143,9 @@ def estimate_clock(rounds: Sequence[Round], acceleration_std: float = ACCELERATI
     With one round each way: drift = (v1 - v2)/2c, offset = (r1 - r2 + v2 dt)/2c.
     """
     if len({r.forward for r in rounds}) < 2:
-        raise ValueError("the rounds are all of one direction; a clock needs one from each end of the link")
+        raise ValueError(
+            "the rounds are all of one direction; a clock needs one from each end of the link"
+        )
     start = min(r.time for r in rounds)
     rows, values, stds = [], [], []
     for r in rounds:
@@ -153,4 +166,6 @@ def estimate_clock(rounds: Sequence[Round], acceleration_std: float = ACCELERATI
     offset, drift, distance, velocity = solution[:4] * unit
     covariance = covariance * np.outer(unit, unit)
     covariance.setflags(write=False)
-    return ClockEstimate(start, float(offset), float(drift), float(distance), float(velocity), covariance)
+    return ClockEstimate(
+        start, float(offset), float(drift), float(distance), float(velocity), covariance
+    )

@@ -23,9 +23,23 @@ def err() -> Console:
 
 def with_progress(work: Any, what: str, steps: int | None = None) -> Any:
     """Do `work(report)` with a bar on stderr; `report(done, total)` moves it."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=err()) as bar:
         task = bar.add_task(what, total=steps)
         return work(lambda done, total: bar.update(task, completed=done, total=total))

@@ -1,4 +1,5 @@
-"""Ctrl-C and SIGTERM: the process ends soon, whatever it is doing, and says what of its work is kept."""
+"""Ctrl-C and SIGTERM: the process ends soon, whatever it is doing, and says what of its work is
+kept."""
 
 from __future__ import annotations
 
@@ -24,10 +25,11 @@ class Terminated(BaseException):
 
 @contextmanager
 def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM end the process within `_GRACE` even inside a long native call, leaving no half-written file in `folder`.
+    """Make Ctrl-C and SIGTERM end the process within `_GRACE` even inside a long native call,
+    leaving no half-written file in `folder`.
 
-    Python runs its own handler only between byte codes; the wake-up pipe is written by the C handler at once, and a thread
-    waits for it.
+    Python runs its own handler only between byte codes; the wake-up pipe is written by the C
+    handler at once, and a thread waits for it.
     """
     receive, send = os.pipe()
     os.set_blocking(send, False)
@@ -71,4 +73,6 @@ def say_interrupted() -> None:
 
 def _say_kept(folder: Path) -> None:
     if (folder / FILE).exists():
-        sys.stderr.write(f"\n{folder / FILE} keeps the frames so far; the same command goes on after them\n")
+        sys.stderr.write(
+            f"\n{folder / FILE} keeps the frames so far; the same command goes on after them\n"
+        )

@@ -15,7 +15,7 @@ from isac_rt.world.city import load_city
 
 SCHEMA = "scenario.schema.json"
 _CANYON = """\
-  source: canyon                  # a street between two rows of houses; others: builtin, mitsuba, mesh, footprints, blocks
+  source: canyon                  # others: builtin, mitsuba, mesh, footprints, blocks
   street_width_m: 24
   building_height_m: 18
   street_length_m: 120"""
@@ -32,12 +32,18 @@ def schema_text() -> str:
     return json.dumps(json_schema(), indent=1) + "\n"
 
 
-def starter_text(name: str, footprints: str | None = None, centre: tuple[float, float] = (0.0, 0.0), height: float = 12.0) -> str:
+def starter_text(
+    name: str,
+    footprints: str | None = None,
+    centre: tuple[float, float] = (0.0, 0.0),
+    height: float = 12.0,
+) -> str:
     """The scenario as YAML.
 
     Parameters
     ----------
-    footprints : a GeoJSON or CityJSON file of buildings, relative to the scenario's folder; None for a street canyon
+    footprints : a GeoJSON or CityJSON file of buildings, relative to the scenario's folder; None
+        for a street canyon
     centre : where the swarm flies, in the city's coordinates [m]
     height : of the swarm [m]
     """
@@ -51,8 +57,11 @@ def starter_text(name: str, footprints: str | None = None, centre: tuple[float, 
     return text
 
 
-def write_starter(file: str | Path, footprints: str | Path | None = None) -> tuple[list[Path], tuple[str, ...]]:
-    """Write the scenario, and beside it the schema that it names; neither replaces a scenario that is there.
+def write_starter(
+    file: str | Path, footprints: str | Path | None = None
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Write the scenario, and beside it the schema that it names; neither replaces a scenario that
+    is there.
 
     Returns
     -------
@@ -70,7 +79,9 @@ def write_starter(file: str | Path, footprints: str | Path | None = None) -> tup
     if footprints is None:
         text = starter_text(file.stem)
     elif not Path(footprints).is_file():
-        raise ResultsError(f"--footprints {footprints}: there is no such file; give a GeoJSON or CityJSON file")
+        raise ResultsError(
+            f"--footprints {footprints}: there is no such file; give a GeoJSON or CityJSON file"
+        )
     else:
         named = os.path.relpath(footprints, file.parent)
         centre, height, notes = _above(named, file.parent)
@@ -81,8 +92,18 @@ def write_starter(file: str | Path, footprints: str | Path | None = None) -> tup
 
 
 def _above(footprints: str, folder: Path) -> tuple[tuple[float, float], float, tuple[str, ...]]:
-    """The middle of the buildings, a height ten metres over the highest, in the city's coordinates [m], and what was assumed of them."""
-    city = load_city(City(source="footprints", file=footprints, ground_margin_m=0.0), folder, Radio().carrier_hz, (0.0, 0.0, 0.0))
+    """The middle of the buildings, a height ten metres over the highest, in the city's coordinates
+    [m], and what was assumed of them."""
+    city = load_city(
+        City(source="footprints", file=footprints, ground_margin_m=0.0),
+        folder,
+        Radio().carrier_hz,
+        (0.0, 0.0, 0.0),
+    )
     corners = city.corners + city.origin
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    return (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2), float(high[2]) + 10.0, city.notes
+    return (
+        (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2),
+        float(high[2]) + 10.0,
+        city.notes,
+    )

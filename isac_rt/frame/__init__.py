@@ -1,1 +1,2 @@
-"""What is sent when and by which antenna: the waveform, the payload, the timetable, and the samples of a frame."""
+"""What is sent when and by which antenna: the waveform, the payload, the timetable, and the samples
+of a frame."""

@@ -1,7 +1,7 @@
 """L-shaped arrays in the body frame, element patterns, and the antenna schedules of TDM-MIMO.
 
-Body frame: X to the right, Y along the boresight, Z up. Each of the two arrays is given about its own
-centroid, which is the body's position.
+Body frame: X to the right, Y along the boresight, Z up. Each of the two arrays is given about its
+own centroid, which is the body's position.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Antennas:
         of these apart, so that an echo sees a gapless virtual L
     gain : power gain of an element on boresight (linear); with ``isotropic`` everywhere
     pattern : "isotropic"; "sector": `gain` inside the field of view, nothing outside;
-        "cosine": gain * cos(angle)^q in the front hemisphere, q = gain/2 - 1 so that it radiates its own
-        power, and at least 0
-    half_view : half of the field of view per axis [rad]; what lies outside has no place in the estimates
-        (for "sector" nothing is sent or received there)
+        "cosine": gain * cos(angle)^q in the front hemisphere, q = gain/2 - 1 so that it radiates
+        its own power, and at least 0
+    half_view : half of the field of view per axis [rad]; what lies outside has no place in the
+        estimates (for "sector" nothing is sent or received there)
     """
 
     tx_x: int
@@ -96,14 +96,6 @@ class Antennas:
         return self.gain * np.where(forward > 0, forward**exponent, 0.0)
 
 
-
-
-
-
-
-
-
-
 def antennas_of(scenario: Scenario, waveform: Waveform) -> Antennas:
     """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
     a = scenario.array
@@ -117,7 +109,3 @@ def antennas_of(scenario: Scenario, waveform: Waveform) -> Antennas:
         pattern=a.element_pattern,
         half_view=np.deg2rad(a.field_of_view_deg) / 2,
     )
-
-
-
-

@@ -26,7 +26,8 @@ class Transmission:
     schedule : (M, P) transmit antenna of each group and chirp
     payload : what it modulates
     amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
-    clock_offset, clock_drift : of the transmitter's clock against the receiver's [s, 1]; they add to every delay
+    clock_offset, clock_drift : of the transmitter's clock against the receiver's [s, 1]; they add
+        to every delay
     active : (M, P) bool, False where nothing is sent (on-off keying)
     first_block : resource block of its group 0; block b starts 2 b T_d into every slot
     """
@@ -82,7 +83,8 @@ class RangeProfiles:
 
     Attributes
     ----------
-    spectra : (M, L_rx, cells, P) complex64, the data taken out, under Hann's window: see `isac_rt.receive.spectrum.clean_spectrum`
+    spectra : (M, L_rx, cells, P) complex64, the data taken out, under Hann's window: see
+        `isac_rt.receive.spectrum.clean_spectrum`
     waveform, schedule, start_time : as of an `IFCube`
     """
 

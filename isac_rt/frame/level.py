@@ -14,7 +14,12 @@ from isac_rt.scenario.tree import Clutter
 
 def thermal_noise_power(noise: Noise, waveform: Waveform) -> float:
     """k T f_s F [W]: E|n|^2 of a complex IF sample; the filter's noise bandwidth is f_s."""
-    return BOLTZMANN * noise.temperature_k * waveform.sampling_rate * 10 ** (noise.noise_figure_db / 10)
+    return (
+        BOLTZMANN
+        * noise.temperature_k
+        * waveform.sampling_rate
+        * 10 ** (noise.noise_figure_db / 10)
+    )
 
 
 def transmit_amplitude(noise: Noise) -> float:
@@ -30,7 +35,8 @@ def noise_power(noise: Noise, waveform: Waveform, reference_amplitude: float) ->
 
 
 def noise_rise(clutter: Clutter) -> float:
-    """Power of thermal noise and Gaussian clutter together over the thermal noise's: the sum of two white Gaussian processes is one."""
+    """Power of thermal noise and Gaussian clutter together over the thermal noise's: the sum of two
+    white Gaussian processes is one."""
     return 1 + 10 ** (clutter.clutter_to_noise_db / 10) if clutter.model == "gaussian" else 1.0
 
 
@@ -70,14 +76,19 @@ def link_budget(
 ) -> LinkBudget:
     """Budget of a link from its reference path's amplitude (elements on boresight).
 
-    The gain counts N samples and P chirps coherently, less 1.76 dB for each of the two Hann windows, and the virtual channels
-    as sqrt(L_tx L_rx), which is what adding powers gives near the threshold.
+    The gain counts N samples and P chirps coherently, less 1.76 dB for each of the two Hann
+    windows, and the virtual channels as sqrt(L_tx L_rx), which is what adding powers gives near the
+    threshold.
     """
     w = waveform
     received = (transmit_amplitude(noise) * amplitude) ** 2
     level = noise_power(noise, w, amplitude)
     channels = antennas.num_tx * antennas.num_rx
-    gain = 10 * np.log10(w.num_samples * w.num_chirps) - 2 * 10 * np.log10(1.5) + 5 * np.log10(channels)
+    gain = (
+        10 * np.log10(w.num_samples * w.num_chirps)
+        - 2 * 10 * np.log10(1.5)
+        + 5 * np.log10(channels)
+    )
     snr = 10 * np.log10(received / level)
     return LinkBudget(
         "->".join(link),

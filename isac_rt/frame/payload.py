@@ -19,11 +19,12 @@ class Payload:
 
     Attributes
     ----------
-    bits : (bits_per_frame,) uint8; the delay bits first, (group, chirp)-major, then the DPSK bits in the order
-        (group, antenna, transition); empty when the frame is unmodulated
+    bits : (bits_per_frame,) uint8; the delay bits first, (group, chirp)-major, then the DPSK bits
+        in the order (group, antenna, transition); empty when the frame is unmodulated
     delay_symbols : (M, P) int in [0, N/2)
     transitions : (M, L_tx, P/L_tx - 1) int in [0, D): the independent DPSK symbols
-    phases : (M, P) complex128, beta^(D) of every chirp: the running product of its antenna's transitions
+    phases : (M, P) complex128, beta^(D) of every chirp: the running product of its antenna's
+        transitions
     num_delay_bits : how many of the bits are on the delay symbols
     """
 
@@ -42,11 +43,14 @@ class Payload:
         return self.bits.size > 0
 
     def bits_of(self, groups: Sequence[int]) -> np.ndarray:
-        """The bits that some groups carry, in the order of `bits` with the other groups left out."""
+        """The bits that some groups carry, in the order of `bits` with the other groups left
+        out."""
         if not self.modulated:
             return self.bits
         parts = np.split(self.bits, [self.num_delay_bits])
-        return np.concatenate([part.reshape(len(self.delay_symbols), -1)[list(groups)].ravel() for part in parts])
+        return np.concatenate(
+            [part.reshape(len(self.delay_symbols), -1)[list(groups)].ravel() for part in parts]
+        )
 
 
 def unmodulated(waveform: Waveform) -> Payload:
@@ -61,9 +65,16 @@ def unmodulated(waveform: Waveform) -> Payload:
     )
 
 
-def random_payload(waveform: Waveform, schedule: Schedule, dpsk_order: int, rng: np.random.Generator) -> Payload:
+def random_payload(
+    waveform: Waveform, schedule: Schedule, dpsk_order: int, rng: np.random.Generator
+) -> Payload:
     """Independent fair bits, modulated."""
-    return modulate(rng.integers(0, 2, waveform.bits_per_frame(dpsk_order), dtype=np.uint8), waveform, schedule, dpsk_order)
+    return modulate(
+        rng.integers(0, 2, waveform.bits_per_frame(dpsk_order), dtype=np.uint8),
+        waveform,
+        schedule,
+        dpsk_order,
+    )
 
 
 def modulate(bits: np.ndarray, waveform: Waveform, schedule: Schedule, dpsk_order: int) -> Payload:
@@ -75,16 +86,25 @@ def modulate(bits: np.ndarray, waveform: Waveform, schedule: Schedule, dpsk_orde
     """
     w = waveform
     if bits.size != w.bits_per_frame(dpsk_order):
-        raise ValueError(f"{bits.size} bits given, a frame with D = {dpsk_order} holds {w.bits_per_frame(dpsk_order)}")
+        raise ValueError(
+            f"{bits.size} bits given, a frame with D = {dpsk_order} holds "
+            f"{w.bits_per_frame(dpsk_order)}"
+        )
     split = w.num_groups * w.num_chirps * w.bits_per_delay_symbol
-    delay = _gray_decode(_pack(bits[:split], w.bits_per_delay_symbol)).reshape(w.num_groups, w.num_chirps)
+    delay = _gray_decode(_pack(bits[:split], w.bits_per_delay_symbol)).reshape(
+        w.num_groups, w.num_chirps
+    )
     transitions = _gray_decode(_pack(bits[split:], dpsk_order.bit_length() - 1)).reshape(
         w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1
     )
-    return Payload(bits.copy(), delay, transitions, running_phases(transitions, schedule, dpsk_order), split)
+    return Payload(
+        bits.copy(), delay, transitions, running_phases(transitions, schedule, dpsk_order), split
+    )
 
 
-def demodulate_bits(delay_symbols: np.ndarray, transitions: np.ndarray, waveform: Waveform, dpsk_order: int) -> np.ndarray:
+def demodulate_bits(
+    delay_symbols: np.ndarray, transitions: np.ndarray, waveform: Waveform, dpsk_order: int
+) -> np.ndarray:
     """Bits of decided symbols, in the order of `Payload.bits`."""
     w = waveform
     return np.concatenate(
@@ -97,16 +117,24 @@ def demodulate_bits(delay_symbols: np.ndarray, transitions: np.ndarray, waveform
 
 def gray_bits(count: int) -> np.ndarray:
     """(count, log2 count) bits of the symbols 0 .. count - 1, most significant first."""
-    return _unpack(_gray_encode(np.arange(count)), count.bit_length() - 1).reshape(count, -1).astype(float)
+    return (
+        _unpack(_gray_encode(np.arange(count)), count.bit_length() - 1)
+        .reshape(count, -1)
+        .astype(float)
+    )
 
 
 def running_phases(transitions: np.ndarray, schedule: Schedule, dpsk_order: int) -> np.ndarray:
-    """beta_p' = prod_{i<p'} S_i of each antenna, put back at the chirps that it sends. (M, P) complex128.
+    """beta_p' = prod_{i<p'} S_i of each antenna, put back at the chirps that it sends. (M, P)
+    complex128.
 
-    The paper's recursion is circular (it defines S by beta and beta by S); S is the independent symbol.
+    The paper's recursion is circular (it defines S by beta and beta by S); S is the independent
+    symbol.
     """
     num_groups, num_tx, _ = transitions.shape
-    steps = np.concatenate([np.zeros((num_groups, num_tx, 1), np.int64), np.cumsum(transitions, axis=2)], axis=2)
+    steps = np.concatenate(
+        [np.zeros((num_groups, num_tx, 1), np.int64), np.cumsum(transitions, axis=2)], axis=2
+    )
     beta = np.exp(2j * np.pi / dpsk_order * (steps % dpsk_order))
     out = np.empty(schedule.shape, np.complex128)
     for m in range(num_groups):
@@ -116,9 +144,13 @@ def running_phases(transitions: np.ndarray, schedule: Schedule, dpsk_order: int)
 
 
 def by_antenna(values: np.ndarray, schedule: Schedule, num_tx: int) -> np.ndarray:
-    """Regroup (M, ..., P) into (M, L_tx, ..., P/L_tx): the chirps of each antenna in order of time."""
+    """Regroup (M, ..., P) into (M, L_tx, ..., P/L_tx): the chirps of each antenna in order of
+    time."""
     return np.stack(
-        [np.stack([values[m][..., schedule[m] == tx] for tx in range(num_tx)]) for m in range(len(schedule))]
+        [
+            np.stack([values[m][..., schedule[m] == tx] for tx in range(num_tx)])
+            for m in range(len(schedule))
+        ]
     )
 
 

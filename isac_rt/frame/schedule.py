@@ -17,9 +17,12 @@ def conventional_schedule(num_groups: int, num_chirps: int, num_tx: int) -> Sche
     return _frozen((p + m) % num_tx)
 
 
-def pseudo_random_schedule(num_groups: int, num_chirps: int, num_tx: int, rng: np.random.Generator) -> Schedule:
-    """In each cycle of num_tx slots every group uses every antenna once, in random order, and no two
-    groups use one antenna in the same slot: a random Latin rectangle (schemes (b) and (d) of Fig. 5)."""
+def pseudo_random_schedule(
+    num_groups: int, num_chirps: int, num_tx: int, rng: np.random.Generator
+) -> Schedule:
+    """In each cycle of num_tx slots every group uses every antenna once, in random order, and no
+    two groups use one antenna in the same slot: a random Latin rectangle (schemes (b) and (d) of
+    Fig. 5)."""
     cycles = num_chirps // num_tx
     out = np.empty((num_groups, cycles, num_tx), dtype=np.int64)
     base = (np.arange(num_tx)[:, None] + np.arange(num_tx)[None, :]) % num_tx
@@ -30,8 +33,8 @@ def pseudo_random_schedule(num_groups: int, num_chirps: int, num_tx: int, rng: n
 
 
 def is_latin(schedule: Schedule, num_tx: int) -> bool:
-    """Whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups samples every
-    antenna in every slot)."""
+    """Whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups samples
+    every antenna in every slot)."""
     return all(len(set(column)) == len(column) for column in schedule.T) and schedule.max() < num_tx
 
 

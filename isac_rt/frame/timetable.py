@@ -1,4 +1,5 @@
-"""Who sends what to whom in every frame: roles and their changes, resource blocks, pilots, streams. All of it public."""
+"""Who sends what to whom in every frame: roles and their changes, resource blocks, pilots, streams.
+All of it public."""
 
 from __future__ import annotations
 
@@ -26,13 +27,14 @@ class Timetable:
     waveform: Waveform
     schedule: Schedule
     blocks: Mapping[str, int] | None = None
-    """First resource blocks where the stages before the data chose them, without those that found none and stay silent;
-    None: as the scenario has them."""
+    """First resource blocks where the stages before the data chose them, without those that found
+    none and stay silent; None: as the scenario has them."""
     refused: frozenset[Link] = frozenset()
     """Links that these stages did not establish."""
 
     def start_time(self, frame: int, active: str | None = None) -> float:
-        """Of a frame's first slot [s]; of the first chirp of an active terminal, whose block may start later in the slot."""
+        """Of a frame's first slot [s]; of the first chirp of an active terminal, whose block may
+        start later in the slot."""
         interval = self.scenario.frame_interval_s or self.waveform.frame_duration
         block = 0 if active is None else self.first_block(active, frame)
         return frame * interval + block * self.waveform.group_spacing
@@ -42,10 +44,13 @@ class Timetable:
         return self.start_time(frame, active) + self.waveform.frame_duration / 2
 
     def modulated(self, frame: int) -> bool:
-        """Whether a frame carries data: all but the periodic pilots and the acquisition frames at the start and after a change of roles."""
+        """Whether a frame carries data: all but the periodic pilots and the acquisition frames at
+        the start and after a change of roles."""
         m = self.scenario.modulation
         pilot = m.pilot_every_frames is not None and frame % m.pilot_every_frames == 0
-        since = frame - max((c.frame for c in self.scenario.role_changes if c.frame <= frame), default=0)
+        since = frame - max(
+            (c.frame for c in self.scenario.role_changes if c.frame <= frame), default=0
+        )
         return since >= m.acquisition_frames and not pilot
 
     @cached_property
@@ -63,9 +68,18 @@ class Timetable:
         return [roles for first, roles in self._roles if first <= frame][-1]
 
     def with_role(self, role: str, frame: int) -> list[str]:
-        """Names of the UAVs of one role in a frame, in the scenario's order; active ones that send."""
-        silent = () if self.blocks is None or role != "active" else set(self.scenario.first_blocks()) - set(self.blocks)
-        return [name for name, is_now in self.roles(frame).items() if is_now == role and name not in silent]
+        """Names of the UAVs of one role in a frame, in the scenario's order; active ones that
+        send."""
+        silent = (
+            ()
+            if self.blocks is None or role != "active"
+            else set(self.scenario.first_blocks()) - set(self.blocks)
+        )
+        return [
+            name
+            for name, is_now in self.roles(frame).items()
+            if is_now == role and name not in silent
+        ]
 
     def roles_taken(self, name: str) -> list[str]:
         """The roles of a UAV over the run, in order."""
@@ -73,7 +87,8 @@ class Timetable:
         return [role for i, role in enumerate(every) if i == 0 or role != every[i - 1]]
 
     def first_block(self, active: str, frame: int) -> int:
-        """First resource block of an active terminal: its own, or that of the terminal whose role it took over."""
+        """First resource block of an active terminal: its own, or that of the terminal whose role
+        it took over."""
         blocks = dict(self.scenario.first_blocks() if self.blocks is None else self.blocks)
         for change in self.scenario.role_changes:
             if change.frame <= frame:
@@ -81,11 +96,13 @@ class Timetable:
         return blocks[active]
 
     def links(self, frame: int) -> list[Link]:
-        """Links that are received in a frame: every active terminal's own (when it processes the frame), and from each active
-        terminal to every passive one."""
+        """Links that are received in a frame: every active terminal's own (when it processes the
+        frame), and from each active terminal to every passive one."""
         active, passive = self.with_role("active", frame), self.with_role("passive", frame)
         own = frame % self.scenario.receivers.active_every_frames == 0
-        return [(a, a) for a in active if own] + [(a, p) for a in active for p in passive if (a, p) not in self.refused]
+        return [(a, a) for a in active if own] + [
+            (a, p) for a in active for p in passive if (a, p) not in self.refused
+        ]
 
     @cached_property
     def all_links(self) -> list[Link]:
@@ -94,12 +111,18 @@ class Timetable:
         for first, roles in self._roles:
             active = self.with_role("active", first)
             found |= dict.fromkeys((a, a) for a in active)
-            found |= dict.fromkeys((a, p) for a in active for p, role in roles.items() if role == "passive" and (a, p) not in self.refused)
+            found |= dict.fromkeys(
+                (a, p)
+                for a in active
+                for p, role in roles.items()
+                if role == "passive" and (a, p) not in self.refused
+            )
         return list(found)
 
     @cached_property
     def labels(self) -> dict[Link, str]:
-        """A name for each of `all_links`: the receiver's where it has one transmitter in the whole run, else "TX->RX"."""
+        """A name for each of `all_links`: the receiver's where it has one transmitter in the whole
+        run, else "TX->RX"."""
         receivers = [rx for _, rx in self.all_links]
         alone = len({tx for tx, _ in self.all_links}) == 1 and len(set(receivers)) == len(receivers)
         return {(tx, rx): rx if alone else f"{tx}->{rx}" for tx, rx in self.all_links}
@@ -110,15 +133,26 @@ class Timetable:
         return None if chosen is None or link[0] == link[1] else tuple(sorted(chosen))
 
     def payload(self, active: str, frame: int, schedule: Schedule | None = None) -> Payload:
-        """What an active terminal's chirps carry in a frame; `schedule`: if it is another than the usual one. The bits are the same."""
+        """What an active terminal's chirps carry in a frame; `schedule`: if it is another than the
+        usual one. The bits are the same."""
         if not self.modulated(frame):
             return unmodulated(self.waveform)
         rng = generator(self.scenario.seed, "payload", active, frame)
-        return random_payload(self.waveform, self.schedule if schedule is None else schedule, self.scenario.modulation.dpsk_order, rng)
+        return random_payload(
+            self.waveform,
+            self.schedule if schedule is None else schedule,
+            self.scenario.modulation.dpsk_order,
+            rng,
+        )
 
 
 def snapshot_frames(scenario: Scenario, count: int) -> set[int]:
-    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those that the active terminal processes."""
+    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those
+    that the active terminal processes."""
     step = scenario.receivers.active_every_frames
-    heard = [f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames] or [0]
-    return {heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)}
+    heard = [
+        f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames
+    ] or [0]
+    return {
+        heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)
+    }

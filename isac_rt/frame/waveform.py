@@ -1,4 +1,5 @@
-"""Numbers of the chirp, the frame and the resource blocks, and all that derives from them (Table I)."""
+"""Numbers of the chirp, the frame and the resource blocks, and all that derives from them (Table
+I)."""
 
 from __future__ import annotations
 
@@ -32,8 +33,8 @@ class Waveform:
     num_chirps : P, slots per frame
     num_groups : M, resource blocks that are used at once
     num_tx : L_tx, transmit antennas that share the slots
-    blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A receiver that reads some of
-        the groups only sees a waveform of these (`of_groups`)
+    blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A
+        receiver that reads some of the groups only sees a waveform of these (`of_groups`)
     """
 
     carrier_frequency: float = 77e9
@@ -53,12 +54,14 @@ class Waveform:
             )
         if self.num_chirps % self.num_tx:
             raise ValueError(
-                f"{self.num_chirps} chirps per frame are not a multiple of the {self.num_tx} transmit "
+                f"{self.num_chirps} chirps per frame are not a multiple of the {self.num_tx} "
+                "transmit "
                 "antennas; every antenna needs the same number of slots"
             )
         if not 1 <= self.num_groups <= self.num_tx:
             raise ValueError(
-                f"{self.num_groups} groups: the Latin schedule needs 1 to {self.num_tx} (the transmit antennas)"
+                f"{self.num_groups} groups: the Latin schedule needs 1 to {self.num_tx} (the "
+                "transmit antennas)"
             )
 
     @cached_property
@@ -127,7 +130,8 @@ class Waveform:
 
     @property
     def effective_carrier(self) -> float:
-        """Frequency at the middle of the sampled window [Hz]: what Doppler and steering scale with."""
+        """Frequency at the middle of the sampled window [Hz]: what Doppler and steering scale
+        with."""
         return self.carrier_frequency + self.slope * (self.window_start + self.sampled_duration / 2)
 
     @property
@@ -152,7 +156,8 @@ class Waveform:
         )
 
     def range_cell(self, passes: int) -> float:
-        """Range of one cell [m]: c T~ / (B T) for one pass (PT), half of it for an echo (passes = 2, AT)."""
+        """Range of one cell [m]: c T~ / (B T) for one pass (PT), half of it for an echo (passes =
+        2, AT)."""
         return SPEED_OF_LIGHT * self.delay_step / passes
 
     def velocity_cell(self, passes: int) -> float:
@@ -177,7 +182,8 @@ class Waveform:
 
     @cached_property
     def chirp_time(self) -> np.ndarray:
-        """Start of each reference chirp [s] (num_groups, num_chirps) since the start of the first block's first."""
+        """Start of each reference chirp [s] (num_groups, num_chirps) since the start of the first
+        block's first."""
         blocks = range(self.num_groups) if self.blocks is None else self.blocks
         m, p = np.array(blocks)[:, None], np.arange(self.num_chirps)[None, :]
         t = p * self.slot_duration + m * self.group_spacing

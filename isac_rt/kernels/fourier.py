@@ -1,8 +1,9 @@
-"""Inverse Fourier transform down the rows of a table whose columns are 16 channels, in place, all channels at once.
+"""Inverse Fourier transform down the rows of a table whose columns are 16 channels, in place, all
+channels at once.
 
-A row is 16 real and 16 imaginary parts. The channels are the lanes, so no butterfly needs a shuffle, and a table of 1280 rows
-(160 KB) stays in the second-level cache. Decimation in frequency; the result is left in digit-reversed order (`order`): who
-reads it picks its rows.
+A row is 16 real and 16 imaginary parts. The channels are the lanes, so no butterfly needs a
+shuffle, and a table of 1280 rows (160 KB) stays in the second-level cache. Decimation in frequency;
+the result is left in digit-reversed order (`order`): who reads it picks its rows.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns
     -------
     radices : (S,) int64, first stage first
-    twiddles : float32, for each stage of length L and radix r: exp(+j 2 pi i k/L), i < L/r, k = 1 .. r-1 (real, imaginary)
+    twiddles : float32, for each stage of length L and radix r: exp(+j 2 pi i k/L), i < L/r, k = 1
+        .. r-1 (real, imaginary)
     order : (size,) int64, the row that holds output k
     """
     left, radices = size, []
@@ -38,7 +40,12 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             left //= r
     if left != 1:
         raise ValueError(f"a lane transform of {size} rows: only factors 2, 3 and 5 can be done")
-    parts, order, length, rest = [np.zeros(0, np.complex64)], np.zeros(size, np.int64), size, np.arange(size)
+    parts, order, length, rest = (
+        [np.zeros(0, np.complex64)],
+        np.zeros(size, np.int64),
+        size,
+        np.arange(size),
+    )
     for r in radices:
         i, k = np.arange(length // r)[:, None], np.arange(1, r)[None, :]
         parts.append(np.exp(2j * np.pi * i * k / length).astype(np.complex64).ravel())
@@ -57,7 +64,12 @@ def _put(table, at, re, im, twiddles, t):
 
 @njit(nogil=True, error_model="numpy")
 def _two(table, at, step, twiddles, t):
-    ar, ai, br, bi = load(table, at), load(table, at + 16), load(table, at + step), load(table, at + step + 16)
+    ar, ai, br, bi = (
+        load(table, at),
+        load(table, at + 16),
+        load(table, at + step),
+        load(table, at + step + 16),
+    )
     store(table, at, ar + br)
     store(table, at + 16, ai + bi)
     _put(table, at + step, ar - br, ai - bi, twiddles, t)
@@ -113,7 +125,8 @@ def _five(table, at, step, twiddles, t):
 
 @njit(nogil=True, error_model="numpy")
 def transform(table, first, size, radices, twiddles):
-    """sum_g x_g exp(+j 2 pi g k/size) of the rows from float `first` of the flat `table`, in place, in the order of `plan`."""
+    """sum_g x_g exp(+j 2 pi g k/size) of the rows from float `first` of the flat `table`, in place,
+    in the order of `plan`."""
     length, t = size, 0
     for r in radices:
         rows = length // r

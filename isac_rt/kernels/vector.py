@@ -1,8 +1,9 @@
 """Sixteen numbers as one value inside numba kernels.
 
-LLVM does not make vector code of loops over small slices (it cannot know that arrays do not overlap), so the kernels say it:
-`load`, `splat`, + - *, `store`, for float32 and float64. On AVX-512 sixteen float32 are one register; elsewhere LLVM splits them, so the
-kernels run, slower, on any processor. A product that feeds a sum becomes one fused instruction where there is one.
+LLVM does not make vector code of loops over small slices (it cannot know that arrays do not
+overlap), so the kernels say it: `load`, `splat`, + - *, `store`, for float32 and float64. On
+AVX-512 sixteen float32 are one register; elsewhere LLVM splits them, so the kernels run, slower, on
+any processor. A product that feeds a sum becomes one fused instruction where there is one.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ class _Vector(types.Type):
 
     def __init__(self, element: types.Float) -> None:
         self.element = element
-        self.form = ir.VectorType({types.float32: ir.FloatType(), types.float64: ir.DoubleType()}[element], LANES)
+        self.form = ir.VectorType(
+            {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}[element], LANES
+        )
         super().__init__(name=f"{element}x{LANES}")
 
 
@@ -73,7 +76,9 @@ def store(typingctx, array, index, value):
 
     def codegen(context, builder, signature, args):
         kind = signature.args[0]
-        builder.store(args[2], _address(context, builder, kind, args[0], args[1]), align=_size(kind))
+        builder.store(
+            args[2], _address(context, builder, kind, args[0], args[1]), align=_size(kind)
+        )
         return context.get_dummy_value()
 
     return types.void(array, types.intp, _of(array.dtype)), codegen
@@ -84,8 +89,12 @@ def stream(typingctx, array, index, value):
     """`store` past the caches, to an address that is a multiple of 64."""
 
     def codegen(context, builder, signature, args):
-        written = builder.store(args[2], _address(context, builder, signature.args[0], args[0], args[1]), align=64)
-        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)]))
+        written = builder.store(
+            args[2], _address(context, builder, signature.args[0], args[0], args[1]), align=64
+        )
+        written.set_metadata(
+            "nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)])
+        )
         return context.get_dummy_value()
 
     return types.void(array, types.intp, _of(array.dtype)), codegen
@@ -121,7 +130,9 @@ def floor(typingctx, value):
         kind = signature.args[0]
         name = f"llvm.floor.v{LANES}f{kind.element.bitwidth}"
         module = builder.module
-        function = module.globals.get(name) or ir.Function(module, ir.FunctionType(kind.form, [kind.form]), name)
+        function = module.globals.get(name) or ir.Function(
+            module, ir.FunctionType(kind.form, [kind.form]), name
+        )
         return builder.call(function, args)
 
     return value(value), codegen
@@ -143,8 +154,16 @@ def _two(method):
 _add = _two(lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
 _sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
 _mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
-zip_low = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))))
-zip_high = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(LANES // 2 + i // 2 + LANES * (i % 2) for i in range(LANES))))
+zip_low = _two(
+    lambda builder, a, b: builder.shuffle_vector(
+        a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))
+    )
+)
+zip_high = _two(
+    lambda builder, a, b: builder.shuffle_vector(
+        a, b, _mask(LANES // 2 + i // 2 + LANES * (i % 2) for i in range(LANES))
+    )
+)
 
 
 @overload(operator.add)
@@ -170,7 +189,8 @@ def _times(a, b):
 
 @intrinsic
 def transpose(typingctx, array, index):
-    """Transpose in place the 16 x 16 float32 that lie from `index`: four rounds of exchanges between rows i and i + s."""
+    """Transpose in place the 16 x 16 float32 that lie from `index`: four rounds of exchanges
+    between rows i and i + s."""
 
     def codegen(context, builder, signature, args):
         places = [builder.add(args[1], ir.Constant(args[1].type, LANES * i)) for i in range(LANES)]
@@ -182,7 +202,10 @@ def transpose(typingctx, array, index):
             for i in range(LANES):
                 if not i & s:
                     a, b = rows[i], rows[i + s]
-                    rows[i], rows[i + s] = builder.shuffle_vector(a, b, upper), builder.shuffle_vector(a, b, lower)
+                    rows[i], rows[i + s] = (
+                        builder.shuffle_vector(a, b, upper),
+                        builder.shuffle_vector(a, b, lower),
+                    )
         for at, row in zip(places, rows, strict=True):
             builder.store(row, at, align=4)
         return context.get_dummy_value()
@@ -194,12 +217,15 @@ _HALF_TURN = np.float32(np.pi)
 _TWO = np.float32(2)
 # Taylor series about 0 up to where the next term is below an ulp at a quarter turn
 _SIN = tuple(np.float32(c) for c in (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800))
-_COS = tuple(np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600))
+_COS = tuple(
+    np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
+)
 
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def cos_sin(cycles):
-    """Cosine and sine of 2 pi `cycles` (float32, within [-0.55, 0.55]) by the series of half the angle; errors below 1.3e-6."""
+    """Cosine and sine of 2 pi `cycles` (float32, within [-0.55, 0.55]) by the series of half the
+    angle; errors below 1.3e-6."""
     h = cycles * splat(_HALF_TURN)
     q = h * h
     s = splat(_SIN[4]) + q * splat(_SIN[5])
@@ -246,7 +272,8 @@ def cos_sin_exact(cycles):
 
 
 def aligned(size: int) -> np.ndarray:
-    """Zeros (size,) float32 from an address that is a multiple of 64: a vector that crosses a cache line costs twice."""
+    """Zeros (size,) float32 from an address that is a multiple of 64: a vector that crosses a cache
+    line costs twice."""
     room = np.zeros(4 * size + 64, np.uint8)
     start = -room.ctypes.data % 64
     return room[start : start + 4 * size].view(np.float32)
@@ -268,8 +295,9 @@ class _Lent:
 
 
 def cube_memory(shape: tuple[int, ...]) -> np.ndarray:
-    """Complex64 of any values, in the memory of a former cube of this shape where one is no longer in use: new pages are cleared by the
-    system first, which takes as long as writing them (a fifth of a floor for a full frame)."""
+    """Complex64 of any values, in the memory of a former cube of this shape where one is no longer
+    in use: new pages are cleared by the system first, which takes as long as writing them (a fifth
+    of a floor for a full frame)."""
     try:
         memory = _SPARE.pop()
     except IndexError:

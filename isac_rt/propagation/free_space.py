@@ -29,13 +29,17 @@ def radar_amplitude(wavelength: float, cross_section: Any, there: Any, on: Any) 
 class FreeSpace:
     """Paths between terminals and by way of the other UAVs, with nothing in between."""
 
-    def __init__(self, uavs: dict[str, Uav], antennas: Antennas, wavelength: float, seed: int) -> None:
+    def __init__(
+        self, uavs: dict[str, Uav], antennas: Antennas, wavelength: float, seed: int
+    ) -> None:
         self._uavs, self._antennas, self._wavelength = uavs, antennas, wavelength
         self._names = tuple(uavs)
         self._sections = {name: CrossSection(uav.rcs, name, seed) for name, uav in uavs.items()}
         self.dropped = 0
 
-    def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
+    def paths(
+        self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]
+    ) -> dict[tuple[str, str], PathSet]:
         """Paths of every link; those that no element sends or hears are left out."""
         return {link: self._link(poses, epoch, *link) for link in links}
 
@@ -48,8 +52,12 @@ class FreeSpace:
 
     def line_of_sight(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
         """The straight path of a link, by Friis."""
-        leg = straight(poses[tx], poses[rx].position[None], poses[rx].velocity, poses[rx].acceleration)
-        elements = element_amplitude(self._antennas, poses[tx], poses[rx], leg.departure, leg.arrival)
+        leg = straight(
+            poses[tx], poses[rx].position[None], poses[rx].velocity, poses[rx].acceleration
+        )
+        elements = element_amplitude(
+            self._antennas, poses[tx], poses[rx], leg.departure, leg.arrival
+        )
         return make_paths(
             gain=friis_amplitude(self._wavelength, leg.length) * elements,
             delay=leg.length / SPEED_OF_LIGHT,
@@ -72,18 +80,27 @@ class FreeSpace:
         there, on = ([self._leg(poses, end, name) for name in others] for end in (tx, rx))
 
         def stack(legs: list, name: str) -> np.ndarray:
-            return np.concatenate([getattr(leg, name) for leg in legs]) if legs else np.zeros((0, 3))
+            return (
+                np.concatenate([getattr(leg, name) for leg in legs]) if legs else np.zeros((0, 3))
+            )
 
         dep, arr = stack(there, "departure"), stack(on, "departure")
         d1, d2 = (np.array([leg.length[0] for leg in legs]) for legs in (there, on))
-        amplitude = np.array([self.echo_amplitude(poses, tx, rx, name, a, b) for name, a, b in zip(others, there, on, strict=True)])
+        amplitude = np.array(
+            [
+                self.echo_amplitude(poses, tx, rx, name, a, b)
+                for name, a, b in zip(others, there, on, strict=True)
+            ]
+        )
         elements = element_amplitude(self._antennas, poses[tx], poses[rx], dep, arr)
         relative = np.array([self._uavs[name].rcs.model == "relative" for name in others], bool)
         return make_paths(
             gain=np.where(relative, amplitude * (elements > 0), amplitude * elements),
             delay=(d1 + d2) / SPEED_OF_LIGHT,
-            delay_rate=np.array([a.rate[0] + b.rate[0] for a, b in zip(there, on, strict=True)]) / SPEED_OF_LIGHT,
-            delay_accel=np.array([a.accel[0] + b.accel[0] for a, b in zip(there, on, strict=True)]) / SPEED_OF_LIGHT,
+            delay_rate=np.array([a.rate[0] + b.rate[0] for a, b in zip(there, on, strict=True)])
+            / SPEED_OF_LIGHT,
+            delay_accel=np.array([a.accel[0] + b.accel[0] for a, b in zip(there, on, strict=True)])
+            / SPEED_OF_LIGHT,
             departure=dep,
             arrival=arr,
             tx_radius=d1,
@@ -99,23 +116,29 @@ class FreeSpace:
         )
 
     def _leg(self, poses: dict[str, Pose], end: str, name: str):
-        return straight(poses[end], poses[name].position[None], poses[name].velocity, poses[name].acceleration)
+        return straight(
+            poses[end], poses[name].position[None], poses[name].velocity, poses[name].acceleration
+        )
 
-    def echo_amplitude(self, poses: dict[str, Pose], tx: str, rx: str, name: str, there, on) -> float:
-        """Amplitude of one UAV's echo: by the radar equation without the elements, or, with a relative cross-section, a
-        fixed level under the link's reference path, elements included."""
+    def echo_amplitude(
+        self, poses: dict[str, Pose], tx: str, rx: str, name: str, there, on
+    ) -> float:
+        """Amplitude of one UAV's echo: by the radar equation without the elements, or, with a
+        relative cross-section, a fixed level under the link's reference path, elements included."""
         rcs = self._uavs[name].rcs
         if rcs.model == "relative":
             return self.reference_amplitude(poses, tx, rx) * 10 ** (rcs.level_db / 20)
         body = poses[name]
-        section = self._sections[name].square_metres(body.to_body(there.arrival), body.to_body(on.arrival))
+        section = self._sections[name].square_metres(
+            body.to_body(there.arrival), body.to_body(on.arrival)
+        )
         return float(radar_amplitude(self._wavelength, section, there.length, on.length)[0])
 
     def reference_amplitude(self, poses: dict[str, Pose], tx: str, rx: str) -> float:
         """Amplitude of a link's reference path as if unshadowed and on boresight at both ends.
 
-        The line of sight of a link between two terminals; for a terminal's own echoes the strongest by the radar equation
-        among the UAVs whose cross-section is not itself relative.
+        The line of sight of a link between two terminals; for a terminal's own echoes the strongest
+        by the radar equation among the UAVs whose cross-section is not itself relative.
 
         Raises
         ------
@@ -134,7 +157,10 @@ class FreeSpace:
         """The UAV whose echo is the reference of a terminal's own link."""
         echoes = self._own_echoes(poses, tx)
         if not echoes:
-            raise ValueError(f"no UAV with a cross-section of its own to which {tx}'s SNR could refer; give one in swarm.*.rcs")
+            raise ValueError(
+                f"no UAV with a cross-section of its own to which {tx}'s SNR could refer; give one "
+                "in swarm.*.rcs"
+            )
         return max(echoes, key=echoes.__getitem__)
 
     def _own_echoes(self, poses: dict[str, Pose], tx: str) -> dict[str, float]:

@@ -1,4 +1,5 @@
-"""The paths of one link in one frame: what propagation hands to the signal model and to the ledger."""
+"""The paths of one link in one frame: what propagation hands to the signal model and to the
+ledger."""
 
 from __future__ import annotations
 
@@ -26,22 +27,25 @@ class PathSet:
 
     Attributes
     ----------
-    gain : (K,) complex128; amplitude and reflection phase, antenna elements included, the carrier phase
-        exp(-j 2 pi f_c tau) not
-    delay, delay_rate, delay_accel : (K,) float64 [s, 1, 1/s] at `epoch`; tau(t) = delay + delay_rate*t + delay_accel*t^2/2
-        with t since the epoch; Doppler is -f_c * delay_rate (closing is positive)
-    departure, arrival : (K, 3) unit vectors in world axes; along the first segment, and from the receiver towards where the
-        wave comes from
-    tx_radius, rx_radius : (K,) radius of curvature of the wavefront at either end [m]; inf is a plane wave
+    gain : (K,) complex128; amplitude and reflection phase, antenna elements included, the carrier
+        phase exp(-j 2 pi f_c tau) not
+    delay, delay_rate, delay_accel : (K,) float64 [s, 1, 1/s] at `epoch`; tau(t) = delay +
+        delay_rate*t + delay_accel*t^2/2 with t since the epoch; Doppler is -f_c * delay_rate
+        (closing is positive)
+    departure, arrival : (K, 3) unit vectors in world axes; along the first segment, and from the
+        receiver towards where the wave comes from
+    tx_radius, rx_radius : (K,) radius of curvature of the wavefront at either end [m]; inf is a
+        plane wave
     kind : (K,) int8 PathKind
     target : (K,) int16 index into `target_names`, -1 where no UAV is involved
     bounces : (K,) int16 interactions with the city
-    begin, end : (K,) float64 [s since the epoch], when the path lives; -inf and inf for the whole frame
+    begin, end : (K,) float64 [s since the epoch], when the path lives; -inf and inf for the whole
+        frame
     epoch : time of the middle of the frame [s]
     tx, rx : names of the terminals
     target_names : names that `target` indexes
-    points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own position, and shadow edges round
-        which a path bends, included)
+    points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own
+        position, and shadow edges round which a path bends, included)
     faces : (K, B) int32 face of the city mesh at each point, -1 where there is none
     """
 
@@ -71,19 +75,35 @@ class PathSet:
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 if value.shape[0] != count:
-                    raise ValueError(f"PathSet.{field.name} has {value.shape[0]} rows, delay has {count}")
+                    raise ValueError(
+                        f"PathSet.{field.name} has {value.shape[0]} rows, delay has {count}"
+                    )
                 value.setflags(write=False)
-        finite = np.isfinite(self.delay).all() and np.isfinite(self.gain).all() and np.isfinite(self.delay_rate).all()
+        finite = (
+            np.isfinite(self.delay).all()
+            and np.isfinite(self.gain).all()
+            and np.isfinite(self.delay_rate).all()
+        )
         if not finite:
-            raise ValueError(f"paths {self.tx}->{self.rx}: a delay, delay rate or gain is not finite")
+            raise ValueError(
+                f"paths {self.tx}->{self.rx}: a delay, delay rate or gain is not finite"
+            )
 
     def __len__(self) -> int:
         return self.delay.shape[0]
 
     def __repr__(self) -> str:
-        kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items() if count)
-        spans = f", {self.delay.min() * 1e9:.1f} to {self.delay.max() * 1e9:.1f} ns" if len(self) else ""
-        return f"<PathSet {self.tx} -> {self.rx} at {self.epoch:.4f} s: {kinds or 'no paths'}{spans}>"
+        kinds = ", ".join(
+            f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items() if count
+        )
+        spans = (
+            f", {self.delay.min() * 1e9:.1f} to {self.delay.max() * 1e9:.1f} ns"
+            if len(self)
+            else ""
+        )
+        return (
+            f"<PathSet {self.tx} -> {self.rx} at {self.epoch:.4f} s: {kinds or 'no paths'}{spans}>"
+        )
 
     @property
     def power(self) -> np.ndarray:
@@ -92,14 +112,19 @@ class PathSet:
 
     @property
     def bent(self) -> np.ndarray:
-        """(K,) whether a path bends round a shadow edge: it has a point that is neither a bounce nor a UAV."""
+        """(K,) whether a path bends round a shadow edge: it has a point that is neither a bounce
+        nor a UAV."""
         return np.isfinite(self.points).all(axis=2).sum(axis=1) > self.bounces + (self.target >= 0)
 
     def select(self, which: np.ndarray) -> PathSet:
         """The paths that a mask or an index array chooses."""
         return replace(
             self,
-            **{f.name: getattr(self, f.name)[which] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)},
+            **{
+                f.name: getattr(self, f.name)[which]
+                for f in fields(self)
+                if isinstance(getattr(self, f.name), np.ndarray)
+            },
         )
 
     def counts(self) -> dict[str, int]:
@@ -159,9 +184,14 @@ def make_paths(
 
 
 def merge(parts: list[PathSet]) -> PathSet:
-    """All paths of one link in one set, in the order given; interaction lists are padded to the longest."""
+    """All paths of one link in one set, in the order given; interaction lists are padded to the
+    longest."""
     first = parts[0]
-    if any((p.tx, p.rx, p.epoch, p.target_names) != (first.tx, first.rx, first.epoch, first.target_names) for p in parts):
+    if any(
+        (p.tx, p.rx, p.epoch, p.target_names)
+        != (first.tx, first.rx, first.epoch, first.target_names)
+        for p in parts
+    ):
         raise ValueError("merge needs path sets of one link, epoch and list of targets")
     depth = max(p.faces.shape[1] for p in parts)
 

@@ -1,24 +1,27 @@
 """Ray-traced paths: Sionna RT discovers them, float64 geometry says where they are.
 
-One solve per frame, from the terminals to every UAV, gives the legs of all links: terminal to terminal, terminal back to itself, and
-terminal to target. Of each leg only the chain of faces, its visibility and its complex amplitude (which holds no carrier
-phase) come from Sionna; length, rate, acceleration, directions and points are unfolded in float64 from the planes of
-the mesh. Sionna's float32 delays are off by up to a radian and more at this carrier. Straight legs then bend round shadow edges, and
-the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
+One solve per frame, from the terminals to every UAV, gives the legs of all links: terminal to
+terminal, terminal back to itself, and terminal to target. Of each leg only the chain of faces, its
+visibility and its complex amplitude (which holds no carrier phase) come from Sionna; length, rate,
+acceleration, directions and points are unfolded in float64 from the planes of the mesh. Sionna's
+float32 delays are off by up to a radian and more at this carrier. Straight legs then bend round
+shadow edges, and the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
 
-Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point scatterer. Sionna's own
-RCS solver gives the same paths, but wants the bodies in the scene, where each shadows the terminal that carries it, and one
-solve per link; a test holds the two against each other. What is left out: a wave that one leg turns from vertical to
-horizontal polarisation and the other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of
-two bounces in a street canyon).
+Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point
+scatterer. Sionna's own RCS solver gives the same paths, but wants the bodies in the scene, where
+each shadows the terminal that carries it, and one solve per link; a test holds the two against each
+other. What is left out: a wave that one leg turns from vertical to horizontal polarisation and the
+other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of two
+bounces in a street canyon).
 
-Where walls meet at right angles (or a wall the ground), the mirror path of a terminal to itself runs through their edge, in every
-order of the walls at once: each order holds a part of the wavefront, and together they make one image. Sionna finds none of
-them from a terminal to itself, and one of them to a point that is not the terminal, so chains of two and more bounces are also
+Where walls meet at right angles (or a wall the ground), the mirror path of a terminal to itself
+runs through their edge, in every order of the walls at once: each order holds a part of the
+wavefront, and together they make one image. Sionna finds none of them from a terminal to itself,
+and one of them to a point that is not the terminal, so chains of two and more bounces are also
 sought to points beside each terminal, and unfolded to the terminal itself.
 
-Points are world coordinates outside this module and local (recentred) coordinates inside. Import only after
-`isac_rt.runtime.activate()`.
+Points are world coordinates outside this module and local (recentred) coordinates inside. Import
+only after `isac_rt.runtime.activate()`.
 """
 
 from __future__ import annotations
@@ -43,7 +46,13 @@ from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.clearance import Clearance
 from isac_rt.propagation.legs.direct import past_edges_and_bodies
 from isac_rt.propagation.legs.edges import ShadowEdges
-from isac_rt.propagation.legs.geometry import edges_in_any_order, one_of_each_chain, plane_of_each_face, straight, unfold
+from isac_rt.propagation.legs.geometry import (
+    edges_in_any_order,
+    one_of_each_chain,
+    plane_of_each_face,
+    straight,
+    unfold,
+)
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario.tree import Scenario
@@ -52,39 +61,66 @@ from isac_rt.world.city.scene import shared_scene
 from isac_rt.world.swarm import Pose, Swarm
 
 POINT_TOLERANCE = 1e-3
-"""Share of a path's length by which its points may differ from Sionna's; beyond, it is another path. Sionna's mirrors are float32
-triangles whose normals err by up to 3e-4 rad in Munich, which moves points by centimetres and lengths by micrometres."""
+"""Share of a path's length by which its points may differ from Sionna's; beyond, it is another
+path. Sionna's mirrors are float32 triangles whose normals err by up to 3e-4 rad in Munich, which
+moves points by centimetres and lengths by micrometres."""
 ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
-"""From a terminal to the points beside it to which corners are sought, local coordinates [m]. A tenth of a metre is what
-Sionna's ray offsets need (3 cm: half of the corners, 1 cm: none) and less than a Fresnel zone; two points, because one that
-lies towards the corner does not help."""
+"""From a terminal to the points beside it to which corners are sought, local coordinates [m]. A
+tenth of a metre is what Sionna's ray offsets need (3 cm: half of the corners, 1 cm: none) and less
+than a Fresnel zone; two points, because one that lies towards the corner does not help."""
 MOST_PATHS = 4_000_000
-"""Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so fewer rays get less room."""
+"""Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
+fewer rays get less room."""
 
 
 class RayTracer:
     """Paths of all links of a frame in one city."""
 
     def __init__(
-        self, scenario: Scenario, city: City, antennas: Antennas, wavelength: float, carrier: float, instants: Sequence[float] = ()
+        self,
+        scenario: Scenario,
+        city: City,
+        antennas: Antennas,
+        wavelength: float,
+        carrier: float,
+        instants: Sequence[float] = (),
     ) -> None:
-        self._scenario, self._city, self._antennas, self._wavelength = scenario, city, antennas, wavelength
+        self._scenario, self._city, self._antennas, self._wavelength = (
+            scenario,
+            city,
+            antennas,
+            wavelength,
+        )
         self._names = tuple(scenario.swarm)
         self._terminals = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
-        self._sections = {name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()}
+        self._sections = {
+            name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()
+        }
         self._handle = shared_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
         self._edges = ShadowEdges(city, Shadows(self._handle.scene.mi_scene), wavelength)
         pinned = scenario.clutter.model == "field"
-        self.field = ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength) if pinned else None
+        self.field = (
+            ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength)
+            if pinned
+            else None
+        )
         """The scatterers on the city's surfaces."""
         twice = scenario.clutter.mirrors > 0
-        self.twice = TwoBounces.plan(scenario, city, self.field, wavelength) if self.field is not None and twice else None
+        self.twice = (
+            TwoBounces.plan(scenario, city, self.field, wavelength)
+            if self.field is not None and twice
+            else None
+        )
         """The same scatterers by way of mirrors."""
         self._trajectories = Swarm.from_scenario(scenario).trajectories
         mirrors, rays = (self._normals, self._offsets), self._handle.scene.mi_scene
-        self.between = Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength) if len(instants) > 1 else None
+        self.between = (
+            Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength)
+            if len(instants) > 1
+            else None
+        )
         """Legs from those of the traced instants; None: every frame is traced."""
         self._clearance = Clearance(city)
         self.dropped = 0
@@ -92,20 +128,32 @@ class RayTracer:
         self.duplicates = 0
         """Paths left out so far because Sionna found them more than once."""
         scene = self._handle.scene
-        scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+        scene.tx_array = scene.rx_array = rt.PlanarArray(
+            num_rows=1, num_cols=1, pattern="iso", polarization="V"
+        )
 
-    def paths(self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]) -> dict[tuple[str, str], PathSet]:
+    def paths(
+        self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]
+    ) -> dict[tuple[str, str], PathSet]:
         """Paths of every link, in a fixed order.
 
         Raises
         ------
         ValueError  If a pose is not finite, which Sionna would pass over in silence.
         """
-        local = {name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()}
-        if not all(np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all() for pose in local.values()):
+        local = {
+            name: replace(pose, position=pose.position - self._city.origin)
+            for name, pose in poses.items()
+        }
+        if not all(
+            np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all()
+            for pose in local.values()
+        ):
             raise ValueError("a UAV's position or velocity is not finite")
         self._clearance.check({name: pose.position for name, pose in local.items()}, epoch)
-        legs = self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
+        legs = (
+            self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
+        )
         bodies = Bodies.of(self._scenario.swarm, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._wavelength)
         hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
@@ -114,10 +162,20 @@ class RayTracer:
     def _legs_on_the_way(self, time: float) -> dict[tuple[str, str], LegSet]:
         """Legs traced at an instant of the run."""
         poses = {name: trajectory.pose(time) for name, trajectory in self._trajectories.items()}
-        return self._specular_legs({name: replace(pose, position=pose.position - self._city.origin) for name, pose in poses.items()})
+        return self._specular_legs(
+            {
+                name: replace(pose, position=pose.position - self._city.origin)
+                for name, pose in poses.items()
+            }
+        )
 
     def _solve(
-        self, sources: dict[str, np.ndarray], sinks: dict[str, np.ndarray], max_depth: int, samples_per_src: int, **options: bool
+        self,
+        sources: dict[str, np.ndarray],
+        sinks: dict[str, np.ndarray],
+        max_depth: int,
+        samples_per_src: int,
+        **options: bool,
     ) -> rt.Paths:
         """Solve between isotropic single elements at places by name.
 
@@ -145,7 +203,10 @@ class RayTracer:
         valid = np.asarray(found.valid)  # (rx, tx, path): the array is synthetic
         most = valid.sum(axis=(0, 2)).max()
         if most >= MOST_PATHS:
-            raise ValueError(f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays or clutter.rays")
+            raise ValueError(
+                f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays or "
+                "clutter.rays"
+            )
         return found
 
     def _specular_legs(self, local: dict[str, Pose]) -> dict[tuple[str, str], LegSet]:
@@ -154,8 +215,22 @@ class RayTracer:
         depth = p.max_bounces if p.specular and self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
         sinks = {name: local[name].position for name in self._names}
-        beside = {f"{name}-{k}": place + step for name, place in sources.items() for k, step in enumerate(ASIDE)} if depth > 1 else {}
-        found = self._solve(sources, sinks | beside, max_depth=depth, samples_per_src=p.rays, specular_reflection=depth > 0)
+        beside = (
+            {
+                f"{name}-{k}": place + step
+                for name, place in sources.items()
+                for k, step in enumerate(ASIDE)
+            }
+            if depth > 1
+            else {}
+        )
+        found = self._solve(
+            sources,
+            sinks | beside,
+            max_depth=depth,
+            samples_per_src=p.rays,
+            specular_reflection=depth > 0,
+        )
         amplitude, valid, faces, points = self._read(found, max(depth, 1))
         corner = valid & ((faces >= 0).sum(axis=-1) > 1)
         slack = 4 * np.linalg.norm(ASIDE, axis=1).max()
@@ -170,35 +245,59 @@ class RayTracer:
                     rows, which = np.append(rows, first + steps), np.append(which, found_beside)
                     loose = np.append(loose, np.full(steps.size, slack))
                 at = rows, j, which
-                out[start, end] = self._leg_set(local[start], local[end], amplitude[at], faces[at], points[at], loose)
+                out[start, end] = self._leg_set(
+                    local[start], local[end], amplitude[at], faces[at], points[at], loose
+                )
         return out
 
-    def _read(self, found: rt.Paths, depth: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Amplitudes (rx, tx, path), validity, faces (rx, tx, path, depth) and points (..., depth, 3) of solved paths."""
+    def _read(
+        self, found: rt.Paths, depth: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Amplitudes (rx, tx, path), validity, faces (rx, tx, path, depth) and points (..., depth,
+        3) of solved paths."""
         real, imag = (np.asarray(part, np.float64) for part in found.a)
         shape = real.shape[0], real.shape[2], real.shape[4]
         amplitude = (real + 1j * imag).reshape(shape)
         valid = np.asarray(found.valid).reshape(shape)
         if not shape[2]:
-            return amplitude, valid, np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
+            return (
+                amplitude,
+                valid,
+                np.zeros((*shape, depth), np.int64),
+                np.zeros((*shape, depth, 3)),
+            )
         faces = self._handle.face_index(np.asarray(found.objects), np.asarray(found.primitives))
         hit = np.asarray(found.interactions) != 0
         faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)
         points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
         return amplitude, valid, faces, points
 
-    def _leg_set(self, start: Pose, end: Pose, amplitude: np.ndarray, faces: np.ndarray, points: np.ndarray, slack: np.ndarray) -> LegSet:
-        """Unfold chains depth by depth, drop what contradicts Sionna's points by more than `slack`, drop duplicates, sort."""
+    def _leg_set(
+        self,
+        start: Pose,
+        end: Pose,
+        amplitude: np.ndarray,
+        faces: np.ndarray,
+        points: np.ndarray,
+        slack: np.ndarray,
+    ) -> LegSet:
+        """Unfold chains depth by depth, drop what contradicts Sionna's points by more than `slack`,
+        drop duplicates, sort."""
         parts = []
         for count in range(faces.shape[1] + 1):
             which = np.flatnonzero((faces >= 0).sum(axis=1) == count)
             chain = faces[which][:, :count]
             if count == 0 and np.linalg.norm(end.position - start.position) < 1e-9:
-                continue  # a terminal's path to itself is its leakage, which is not the ray tracer's
+                # a terminal's path to itself is its leakage, which is not the ray tracer's
+                continue
             legs = unfold(self._normals[chain], self._offsets[chain], start, end)
-            apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(axis=1, initial=0.0)
+            apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(
+                axis=1, initial=0.0
+            )
             good = apart < POINT_TOLERANCE * legs.length + slack[which]
-            self.dropped += int((~good & (slack[which] == 0)).sum())  # what stands beside may well go astray at grazing angles
+            self.dropped += int(
+                (~good & (slack[which] == 0)).sum()
+            )  # what stands beside may well go astray at grazing angles
             planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)
             keep = one_of_each_chain(planes, chain, good)
             self.duplicates += int(good.sum()) - keep.size
@@ -206,7 +305,9 @@ class RayTracer:
             parts.append((amplitude[which][keep], pick(legs, keep), chain[keep], planes[keep]))
         return leg_set(parts, faces.shape[1])
 
-    def _link(self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies) -> PathSet:
+    def _link(
+        self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies
+    ) -> PathSet:
         common: dict[str, Any] = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
         parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
         for number, name in enumerate(self._names):
@@ -216,15 +317,28 @@ class RayTracer:
             amplitude, face, point = hits[tx, rx]
             parts.append(self._scattered(local[tx], local[rx], amplitude, face, point, common))
         if self.field is not None:
-            parts.append(self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
+            parts.append(
+                self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies)
+            )
         if self.twice is not None:
-            parts.extend(self.twice.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies))
+            parts.extend(
+                self.twice.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies)
+            )
         leakage = self._scenario.propagation.leakage
         if tx == rx and leakage.enabled:
             ahead = local[tx].rotation[:, 1][None]
             gain = np.array([10 ** (-leakage.isolation_db / 20)])
             delay = np.array([leakage.delay_s])
-            parts.append(make_paths(gain=gain, delay=delay, departure=ahead, arrival=ahead, kind=PathKind.LEAKAGE, **common))
+            parts.append(
+                make_paths(
+                    gain=gain,
+                    delay=delay,
+                    departure=ahead,
+                    arrival=ahead,
+                    kind=PathKind.LEAKAGE,
+                    **common,
+                )
+            )
         every = merge(parts)
         every = replace(every, points=every.points + self._city.origin)
         return every.select(every.gain != 0)
@@ -233,7 +347,8 @@ class RayTracer:
         """Line of sight and mirror reflections of the city."""
         legs = found.legs
         return make_paths(
-            gain=found.amplitude * element_amplitude(self._antennas, start, end, legs.departure, legs.arrival),
+            gain=found.amplitude
+            * element_amplitude(self._antennas, start, end, legs.departure, legs.arrival),
             delay=legs.length / SPEED_OF_LIGHT,
             delay_rate=legs.rate / SPEED_OF_LIGHT,
             delay_accel=legs.accel / SPEED_OF_LIGHT,
@@ -248,17 +363,26 @@ class RayTracer:
             **common,
         )
 
-    def _by_way_of(self, local: dict, tx: str, rx: str, name: str, number: int, legs: dict, common: dict) -> PathSet:
-        """Echo and ghosts of one UAV: every leg to it with every leg from it, up to the bounces allowed."""
+    def _by_way_of(
+        self, local: dict, tx: str, rx: str, name: str, number: int, legs: dict, common: dict
+    ) -> PathSet:
+        """Echo and ghosts of one UAV: every leg to it with every leg from it, up to the bounces
+        allowed."""
         there, back = legs[tx, name], legs[rx, name]
         i, j = (a.ravel() for a in np.indices((there.amplitude.size, back.amplitude.size)))
         bounces = there.bounces[i] + back.bounces[j]
-        allowed = bounces <= (self._scenario.propagation.max_bounces if self._scenario.propagation.ghosts else 0)
+        allowed = bounces <= (
+            self._scenario.propagation.max_bounces if self._scenario.propagation.ghosts else 0
+        )
         i, j, bounces = i[allowed], j[allowed], bounces[allowed]
         a, b, body = there.legs, back.legs, local[name]
-        section = self._sections[name].square_metres(body.to_body(a.arrival[i]), body.to_body(b.arrival[j]))
+        section = self._sections[name].square_metres(
+            body.to_body(a.arrival[i]), body.to_body(b.arrival[j])
+        )
         scatter = np.sqrt(4 * np.pi * section) / self._wavelength
-        elements = element_amplitude(self._antennas, local[tx], local[rx], a.departure[i], b.departure[j])
+        elements = element_amplitude(
+            self._antennas, local[tx], local[rx], a.departure[i], b.departure[j]
+        )
         middle = np.broadcast_to(body.position, (i.size, 1, 3))
         return make_paths(
             gain=there.amplitude[i] * back.amplitude[j] * scatter * elements,
@@ -273,13 +397,19 @@ class RayTracer:
             target=number,
             bounces=bounces,
             points=np.concatenate([a.points[i], middle, b.points[j][:, ::-1]], axis=1),
-            faces=np.concatenate([there.faces[i], np.full((i.size, 1), -1), back.faces[j][:, ::-1]], axis=1),
+            faces=np.concatenate(
+                [there.faces[i], np.full((i.size, 1), -1), back.faces[j][:, ::-1]], axis=1
+            ),
             **common,
         )
 
     def _diffuse_hits(self, local: dict[str, Pose], links: list[tuple[str, str]]) -> dict:
-        """Hit points and scattered amplitudes of every link, from one solve; points on the float64 mesh, in a fixed order."""
-        sources, sinks = list(dict.fromkeys(tx for tx, _ in links)), self._terminals  # as many each frame: a new number compiles anew
+        """Hit points and scattered amplitudes of every link, from one solve; points on the float64
+        mesh, in a fixed order."""
+        sources, sinks = (
+            list(dict.fromkeys(tx for tx, _ in links)),
+            self._terminals,
+        )  # as many each frame: a new number compiles anew
         found = self._solve(
             {name: local[name].position for name in sources},
             {name: local[name].position for name in sinks},
@@ -299,14 +429,27 @@ class RayTracer:
             out[tx, rx] = np.abs(amplitude[i, j, which])[order], face[order], point[order]
         return out
 
-    def _scattered(self, start: Pose, end: Pose, amplitude: np.ndarray, face: np.ndarray, point: np.ndarray, common: dict) -> PathSet:
-        """Scatterers at rest on the mesh, each with a phase of its own that belongs to its place."""
+    def _scattered(
+        self,
+        start: Pose,
+        end: Pose,
+        amplitude: np.ndarray,
+        face: np.ndarray,
+        point: np.ndarray,
+        common: dict,
+    ) -> PathSet:
+        """Scatterers at rest on the mesh, each with a phase of its own that belongs to its
+        place."""
         normal = self._city.normals[face]
-        on_plane = point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
+        on_plane = (
+            point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
+        )
         there, back = straight(start, on_plane), straight(end, on_plane)
         phase = scatterer_phase(point, self._scenario.seed)
         return make_paths(
-            gain=amplitude * np.exp(1j * phase) * element_amplitude(self._antennas, start, end, there.departure, back.departure),
+            gain=amplitude
+            * np.exp(1j * phase)
+            * element_amplitude(self._antennas, start, end, there.departure, back.departure),
             delay=(there.length + back.length) / SPEED_OF_LIGHT,
             delay_rate=(there.rate + back.rate) / SPEED_OF_LIGHT,
             delay_accel=(there.accel + back.accel) / SPEED_OF_LIGHT,

@@ -1,4 +1,5 @@
-"""Radar cross-sections of the swarm's bodies: constant, or 3GPP TR 38.901's UAVs, with a fluctuation that is smooth in aspect."""
+"""Radar cross-sections of the swarm's bodies: constant, or 3GPP TR 38.901's UAVs, with a
+fluctuation that is smooth in aspect."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from isac_rt.scenario.swarm import Rcs
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
 LARGE_BISTATIC = (6.05, 1.33)  # k_1, k_2 of eq. 7.9.2-3 for the large UAV
 LARGE_LOBES = (
-    # azimuth of the lobe (None: around the vertical), its 3 dB width, zenith angle, its width, peak [dBsm], depth [dB]
+    # azimuth of the lobe (None: around the vertical), its 3 dB width, zenith angle, its width, peak
+    # [dBsm], depth [dB]
     (0.0, 14.19, 90.0, 16.53, 1.02, 7.89),
     (90.0, 7.13, 90.0, 8.68, 7.43, 14.30),
     (180.0, 10.09, 90.0, 11.43, 3.99, 10.86),
@@ -18,7 +20,8 @@ LARGE_LOBES = (
     (None, None, 0.0, 4.93, 13.55, 20.42),
     (None, None, 180.0, 4.93, 13.55, 20.42),
 )
-"""TR 38.901 v19 table 7.9.2.1-2. Every lobe ends on the same floor, peak - depth = -6.87 dBsm, well inside its sector."""
+"""TR 38.901 v19 table 7.9.2.1-2. Every lobe ends on the same floor, peak - depth = -6.87 dBsm, well
+inside its sector."""
 
 NUM_WAVES = 24
 ASPECT_SCALE = 6.0
@@ -28,9 +31,10 @@ ASPECT_SCALE = 6.0
 class CrossSection:
     """Radar cross-section of one UAV as a function of aspect, the same for all links and frames.
 
-    The fluctuation in dB is a sum of plane waves over the bisector of the directions of incidence and observation in the
-    body's frame: a fixed, smooth random field of zero mean and the stated standard deviation, seeded by the UAV's name. It takes
-    the place of TR 38.901's random component, whose independent draws per direction would not be coherent between frames.
+    The fluctuation in dB is a sum of plane waves over the bisector of the directions of incidence
+    and observation in the body's frame: a fixed, smooth random field of zero mean and the stated
+    standard deviation, seeded by the UAV's name. It takes the place of TR 38.901's random
+    component, whose independent draws per direction would not be coherent between frames.
     """
 
     def __init__(self, rcs: Rcs, name: str, seed: int) -> None:
@@ -45,14 +49,18 @@ class CrossSection:
 
         Parameters
         ----------
-        incident, observed : (..., 3) unit vectors in the body's frame, from the body towards source and observer
+        incident, observed : (..., 3) unit vectors in the body's frame, from the body towards source
+            and observer
         """
         total = incident + observed
         norm = np.linalg.norm(total, axis=-1)  # 2 cos(beta/2)
         half_bistatic = np.arccos(np.clip(norm / 2, 0.0, 1.0))
         bisector = total / np.maximum(norm, 1e-9)[..., None]
-        field = np.cos(bisector @ self._waves.T + self._phases).sum(axis=-1) * np.sqrt(2 / NUM_WAVES)
-        # towards forward scattering the bisector turns ever faster: the field fades there, or it would not be smooth
+        field = np.cos(bisector @ self._waves.T + self._phases).sum(axis=-1) * np.sqrt(
+            2 / NUM_WAVES
+        )
+        # towards forward scattering the bisector turns ever faster: the field fades there, or it
+        # would not be smooth
         fluctuation = self._rcs.fluctuation_db * field * norm / 2
         return 10 ** ((self._mean_db(bisector, half_bistatic) + fluctuation) / 10)
 
@@ -73,9 +81,13 @@ def large_uav_db(bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
     half_bistatic : (...) half of the bistatic angle [rad]
     """
     zenith = np.degrees(np.arccos(np.clip(bisector[..., 2], -1, 1)))
-    azimuth = np.degrees(np.arctan2(-bisector[..., 0], bisector[..., 1]))  # the table's: 0 forward, 90 left
+    azimuth = np.degrees(
+        np.arctan2(-bisector[..., 0], bisector[..., 1])
+    )  # the table's: 0 forward, 90 left
     k1, k2 = LARGE_BISTATIC
-    bistatic = -k1 * np.sin(k2 * half_bistatic) + 5 * np.log10(np.maximum(np.cos(half_bistatic), 1e-12))
+    bistatic = -k1 * np.sin(k2 * half_bistatic) + 5 * np.log10(
+        np.maximum(np.cos(half_bistatic), 1e-12)
+    )
     out = np.full(half_bistatic.shape, -np.inf)
     for centre, width, zenith_centre, zenith_width, peak, depth in LARGE_LOBES:
         loss = np.minimum(12 * ((zenith - zenith_centre) / zenith_width) ** 2, depth)

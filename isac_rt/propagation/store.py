@@ -1,8 +1,9 @@
-"""Traced paths on disk, by content: runs that differ only in noise, modulation or receivers share them.
+"""Traced paths on disk, by content: runs that differ only in noise, modulation or receivers share
+them.
 
-A file holds the paths of all links of one instant. Files appear whole (written beside, then renamed) and are touched when read; when
-the folder grows beyond its limit the least recently used go. Several processes may share a folder: a file that another one
-takes away is traced again.
+A file holds the paths of all links of one instant. Files appear whole (written beside, then
+renamed) and are touched when read; when the folder grows beyond its limit the least recently used
+go. Several processes may share a folder: a file that another one takes away is traced again.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ Link = tuple[str, str]
 Paths = dict[Link, PathSet]
 SUFFIX = ".paths.npz"
 LOW_WATER = 0.8
-"""When the limit is passed the folder is brought down to this share of it, so that not every write has to look."""
+"""When the limit is passed the folder is brought down to this share of it, so that not every write
+has to look."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class PathStore:
     limit: int = 4 * 1024**3
 
     def get(self, key: str) -> tuple[Paths, int] | None:
-        """The paths of a key and how many the float64 geometry contradicted; None where they are not (or no longer) here."""
+        """The paths of a key and how many the float64 geometry contradicted; None where they are
+        not (or no longer) here."""
         file = self._file(key)
         try:
             with np.load(file) as data:
@@ -49,7 +52,8 @@ class PathStore:
         return found
 
     def put(self, key: str, paths: Paths, dropped: int) -> None:
-        """Keep the paths of a key. A folder that cannot be written is no reason to fail: nothing is kept then."""
+        """Keep the paths of a key. A folder that cannot be written is no reason to fail: nothing is
+        kept then."""
         file = self._file(key)
         temporary = file.with_name(f".{uuid.uuid4().hex}.tmp")
         try:
@@ -84,7 +88,8 @@ class PathStore:
 
 
 class CachedPropagation:
-    """A propagation model that looks into a store first, and is made only when something is missing there.
+    """A propagation model that looks into a store first, and is made only when something is missing
+    there.
 
     Parameters
     ----------
@@ -111,7 +116,13 @@ class CachedPropagation:
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
         """As the model's own, bit for bit."""
         where = {
-            name: [p.position.tolist(), p.velocity.tolist(), p.acceleration.tolist(), p.rotation.tolist()] for name, p in poses.items()
+            name: [
+                p.position.tolist(),
+                p.velocity.tolist(),
+                p.acceleration.tolist(),
+                p.rotation.tolist(),
+            ]
+            for name, p in poses.items()
         }
         text = json.dumps([self._content, epoch, links, where])
         key = hashlib.sha256(text.encode()).hexdigest()
@@ -133,7 +144,11 @@ def _pack(paths: Paths, dropped: int) -> dict[str, Any]:
     about = []
     for i, p in enumerate(paths.values()):
         about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
-        out |= {f"{i}/{f.name}": value for f in fields(p) if isinstance(value := getattr(p, f.name), np.ndarray)}
+        out |= {
+            f"{i}/{f.name}": value
+            for f in fields(p)
+            if isinstance(value := getattr(p, f.name), np.ndarray)
+        }
     return out | {"about": np.array(json.dumps({"links": about, "dropped": dropped}))}
 
 
@@ -143,5 +158,7 @@ def _unpack(data: dict[str, np.ndarray]) -> tuple[Paths, int]:
     for i, link in enumerate(about["links"]):
         arrays = {f.name: data[f"{i}/{f.name}"] for f in fields(PathSet) if f"{i}/{f.name}" in data}
         names = tuple(link["target_names"])
-        out[link["tx"], link["rx"]] = PathSet(**arrays, tx=link["tx"], rx=link["rx"], epoch=link["epoch"], target_names=names)
+        out[link["tx"], link["rx"]] = PathSet(
+            **arrays, tx=link["tx"], rx=link["rx"], epoch=link["epoch"], target_names=names
+        )
     return out, about["dropped"]

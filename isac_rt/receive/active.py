@@ -30,13 +30,16 @@ def receive_active(
 
     Parameters
     ----------
-    cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which there is no `joint` refinement
-    clutter : what the city is expected to return, for the detectors that need it (`isac_rt.receive.clutter.detectors`)
+    cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which
+        there is no `joint` refinement
+    clutter : what the city is expected to return, for the detectors that need it
+        (`isac_rt.receive.clutter.detectors`)
     maps : also return pictures
 
     Returns
     -------
-    Reception with detections only: range one way, velocity receding positive, direction cosines from the virtual L
+    Reception with detections only: range one way, velocity receding positive, direction cosines
+    from the virtual L
     """
     w = cube.waveform
     if isinstance(cube, RangeProfiles):
@@ -44,14 +47,24 @@ def receive_active(
     else:
         spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
     if settings.clutter_filter != "none":
-        remove_standing(spectra, cube.schedule, settings.clutter_run_cells if settings.clutter_filter == "runs" else None)
+        remove_standing(
+            spectra,
+            cube.schedule,
+            settings.clutter_run_cells if settings.clutter_filter == "runs" else None,
+        )
     if settings.clutter_detector == "cfar":
-        found = sense(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2)
+        found = sense(
+            spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2
+        )
     else:
-        found = sense_in_clutter(spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter)
+        found = sense_in_clutter(
+            spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter
+        )
     detections = found.detections
     if settings.refinement == "joint" and isinstance(cube, IFCube):
-        detections = separate(Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections)[0]
+        detections = separate(
+            Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections
+        )[0]
     groups, chirps = payload.delay_symbols.shape
     return Reception(
         detections=detections,

@@ -1,8 +1,9 @@
 """Constant-false-alarm-rate detection on accumulated maps, and the choice of peaks.
 
-A cell of an accumulated noise map is the mean of L exponentials, a Gamma(L) variable; a training mean of n independent cells is
-Gamma(L n). The greatest-of rule takes the larger of the means before and behind the cell in range, which holds the
-rate at clutter edges. The factor follows from these laws by quadrature, not from the large-number limit.
+A cell of an accumulated noise map is the mean of L exponentials, a Gamma(L) variable; a training
+mean of n independent cells is Gamma(L n). The greatest-of rule takes the larger of the means before
+and behind the cell in range, which holds the rate at clutter edges. The factor follows from these
+laws by quadrature, not from the large-number limit.
 """
 
 from __future__ import annotations
@@ -21,29 +22,37 @@ HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 QUADRATURE_POINTS = 4001
 
 ROUNDING = 1e-16
-"""The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a quarter and half the range away."""
+"""The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a
+quarter and half the range away."""
 
 STRONG, MAX_STRONG = 1e3, 8
-"""Peaks this far over the median cell, and at most so many, are kept out of the training of the cells around them."""
+"""Peaks this far over the median cell, and at most so many, are kept out of the training of the
+cells around them."""
 DEEPEST_LOBE = 1e-8
-"""Lobes are followed down to this share of their peak, 15 cells out; without noise they would fill the map."""
+"""Lobes are followed down to this share of their peak, 15 cells out; without noise they would fill
+the map."""
 LEAST_KEPT = 0.25
 """Share of a training block that must be left for its mean to count."""
 
 
 @lru_cache(maxsize=256)
-def greatest_of_factor(false_alarm_rate: float, looks: float, before: float, behind: float) -> float:
+def greatest_of_factor(
+    false_alarm_rate: float, looks: float, before: float, behind: float
+) -> float:
     """Factor on the greater of two training means that gives the false-alarm rate.
 
     Parameters
     ----------
     false_alarm_rate : of one cell
     looks : L, independent exponentials in a cell's mean
-    before, behind : independent training cells on each side (may be fractions); 0 where a side is missing
+    before, behind : independent training cells on each side (may be fractions); 0 where a side is
+        missing
     """
     cell = stats.gamma(looks, scale=1 / looks)
     sides = [stats.gamma(looks * n, scale=1 / (looks * n)) for n in (before, behind) if n > 0]
-    z = np.linspace(min(s.ppf(1e-12) for s in sides), max(s.isf(1e-14) for s in sides), QUADRATURE_POINTS)
+    z = np.linspace(
+        min(s.ppf(1e-12) for s in sides), max(s.isf(1e-14) for s in sides), QUADRATURE_POINTS
+    )
     cumulative = np.prod([s.cdf(z) for s in sides], axis=0)
 
     def excess(factor: float) -> float:
@@ -55,24 +64,32 @@ def greatest_of_factor(false_alarm_rate: float, looks: float, before: float, beh
 
 
 def side_rows(rows: int, guard: int, training: int) -> np.ndarray:
-    """(rows, 2) training rows before and behind each row; a side with less than half of them is not used."""
+    """(rows, 2) training rows before and behind each row; a side with less than half of them is not
+    used."""
     index = np.arange(rows)
     count = np.clip(np.stack([index - guard, rows - 1 - guard - index], axis=1), 0, training)
     return np.where(count >= max(training // 2, 1), count, 0)
 
 
-def background(power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
-    """The greater of the means over the kept cells of the training blocks before and behind each cell in range; Doppler wraps. Where
-    one holds too few cells the other, infinite where both do."""
+def background(
+    power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int]
+) -> np.ndarray:
+    """The greater of the means over the kept cells of the training blocks before and behind each
+    cell in range; Doppler wraps. Where one holds too few cells the other, infinite where both
+    do."""
     width = 2 * (guard[1] + training[1]) + 1
     total, held = _summed(np.where(keep, power, 0.0), width), _summed(keep, width)
     index, count = np.arange(len(power)), side_rows(len(power), guard[0], training[0])
     means = []
-    for rows, first in zip(count.T, (index - guard[0] - count[:, 0], index + guard[0] + 1), strict=True):
+    for rows, first in zip(
+        count.T, (index - guard[0] - count[:, 0], index + guard[0] + 1), strict=True
+    ):
         start = np.where(rows == 0, 0, first)
         cells = np.round(held[start + rows] - held[start])
         enough = (rows[:, None] > 0) & (cells >= LEAST_KEPT * rows[:, None] * width)
-        means.append(np.where(enough, (total[start + rows] - total[start]) / np.maximum(cells, 1), np.nan))
+        means.append(
+            np.where(enough, (total[start + rows] - total[start]) / np.maximum(cells, 1), np.nan)
+        )
     level = np.fmax(*means)
     return np.where(np.isnan(level), np.inf, level)
 
@@ -86,8 +103,8 @@ def _summed(values: np.ndarray, width: int) -> np.ndarray:
 def strong_lobes(power: np.ndarray) -> np.ndarray:
     """Cells that the lobes of the strongest peaks of a Hann-windowed map reach, (rows, P) bool.
 
-    A line of sight 60 dB over the noise would otherwise raise the background of every target within the training block. A row is
-    allowed for migration.
+    A line of sight 60 dB over the noise would otherwise raise the background of every target within
+    the training block. A row is allowed for migration.
     """
     noise = float(np.median(power))
     rows, bins = peaks(power, power > STRONG * noise, (8, 8))
@@ -96,7 +113,9 @@ def strong_lobes(power: np.ndarray) -> np.ndarray:
         along = np.maximum(np.abs(np.arange(power.shape[0]) - row) - 1, 0)
         across = np.abs(np.arange(power.shape[1]) - column)
         across = np.minimum(across, power.shape[1] - across)
-        reached |= np.outer(hann_envelope(along), hann_envelope(across)) > max(noise / power[row, column], DEEPEST_LOBE)
+        reached |= np.outer(hann_envelope(along), hann_envelope(across)) > max(
+            noise / power[row, column], DEEPEST_LOBE
+        )
     return reached
 
 
@@ -119,22 +138,37 @@ def detect(
     above : (rows, P) bool
     level : (rows, P) background
     """
-    level = np.maximum(background(power, ~strong_lobes(power), guard, training), ROUNDING * power.max())
-    return power > row_factors(len(power), looks, false_alarm_rate, guard, training)[:, None] * level, level
+    level = np.maximum(
+        background(power, ~strong_lobes(power), guard, training), ROUNDING * power.max()
+    )
+    return power > row_factors(len(power), looks, false_alarm_rate, guard, training)[
+        :, None
+    ] * level, level
 
 
-def row_factors(rows: int, looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> np.ndarray:
+def row_factors(
+    rows: int,
+    looks: int,
+    false_alarm_rate: float,
+    guard: tuple[int, int],
+    training: tuple[int, int],
+) -> np.ndarray:
     """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
     sides = side_rows(rows, guard[0], training[0])
-    return np.array([_factor(looks, false_alarm_rate, guard, training, *count) for count in sides.tolist()])
+    return np.array(
+        [_factor(looks, false_alarm_rate, guard, training, *count) for count in sides.tolist()]
+    )
 
 
-def detect_chirps(power: np.ndarray, looks: int, false_alarm_rate: float, guard: int, training: int) -> np.ndarray:
+def detect_chirps(
+    power: np.ndarray, looks: int, false_alarm_rate: float, guard: int, training: int
+) -> np.ndarray:
     """One-dimensional CFAR along the range cells of every chirp (the paper's first stage).
 
     Parameters
     ----------
-    power : (N, P) mean power over `looks` receivers of spectra without a window, so that their noise is independent
+    power : (N, P) mean power over `looks` receivers of spectra without a window, so that their
+        noise is independent
     guard, training : range cells on each side
 
     Returns
@@ -143,25 +177,41 @@ def detect_chirps(power: np.ndarray, looks: int, false_alarm_rate: float, guard:
     """
     every = np.ones(power.shape, bool)
     level = np.maximum(background(power, every, (guard, 0), (training, 0)), ROUNDING * power.max())
-    factor = np.array([_chirp_factor(looks, false_alarm_rate, *count) for count in side_rows(len(power), guard, training).tolist()])
+    factor = np.array(
+        [
+            _chirp_factor(looks, false_alarm_rate, *count)
+            for count in side_rows(len(power), guard, training).tolist()
+        ]
+    )
     return power > factor[:, None] * level
 
 
 def _chirp_factor(looks: int, false_alarm_rate: float, before: int, behind: int) -> float:
-    return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, float(looks), before, behind)
+    return (
+        np.inf
+        if before == behind == 0
+        else greatest_of_factor(false_alarm_rate, float(looks), before, behind)
+    )
 
 
-def threshold(looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]) -> float:
+def threshold(
+    looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]
+) -> float:
     """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
     return _factor(looks, false_alarm_rate, guard, training, training[0], training[0])
 
 
 @lru_cache(maxsize=4096)
 def _factor(
-    looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int], before: int, behind: int
+    looks: int,
+    false_alarm_rate: float,
+    guard: tuple[int, int],
+    training: tuple[int, int],
+    before: int,
+    behind: int,
 ) -> float:
-    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less than one each. Infinite
-    where there is no training row."""
+    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less
+    than one each. Infinite where there is no training row."""
     if before == behind == 0:
         return np.inf
     across = independent_cells(2 * (guard[1] + training[1]) + 1)
@@ -170,13 +220,17 @@ def _factor(
 
 
 def independent_cells(count: int) -> float:
-    """Independent cells whose mean scatters like that of `count` neighbours along a Hann-windowed axis."""
+    """Independent cells whose mean scatters like that of `count` neighbours along a Hann-windowed
+    axis."""
     pairs = sum(max(count - d, 0) * c for d, c in enumerate(HANN_CORRELATION, start=1))
     return count**2 / (count + 2 * pairs) if count else 0.0
 
 
-def peaks(power: np.ndarray, above: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Cells above the threshold that are the largest within `reach` (range, Doppler); Doppler wraps. Strongest first."""
+def peaks(
+    power: np.ndarray, above: np.ndarray, reach: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells above the threshold that are the largest within `reach` (range, Doppler); Doppler
+    wraps. Strongest first."""
     rows, bins = np.nonzero(above)
     keep = _largest(power, rows, bins, *reach)
     rows, bins = rows[keep], bins[keep]
@@ -201,10 +255,15 @@ def _largest(power, rows, bins, along, across):  # pragma: no cover - compiled
     return out
 
 
-def strongest_peaks(power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    """(row, bin) of the peaks that are no sidelobes of a stronger one (`without_sidelobes`), at most `max_detections`."""
+def strongest_peaks(
+    power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(row, bin) of the peaks that are no sidelobes of a stronger one (`without_sidelobes`), at
+    most `max_detections`."""
     rows, bins = peaks(power, above, settings.cluster_cells)
-    keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[: settings.max_detections]
+    keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[
+        : settings.max_detections
+    ]
     return rows[keep], bins[keep]
 
 
@@ -214,14 +273,20 @@ def first_row(settings: Receivers, range_cell: float) -> int:
 
 
 def hann_envelope(distance: np.ndarray) -> np.ndarray:
-    """Upper bound of a Hann-windowed tone's power at a distance in cells, relative to its peak: 1 within the main lobe,
-    then 1/(pi^2 d^2 (1 - d^2)^2) for the peaks of the sidelobes (of the amplitude sinc(d)/(1 - d^2))."""
+    """Upper bound of a Hann-windowed tone's power at a distance in cells, relative to its peak: 1
+    within the main lobe, then 1/(pi^2 d^2 (1 - d^2)^2) for the peaks of the sidelobes (of the
+    amplitude sinc(d)/(1 - d^2))."""
     d = np.maximum(np.abs(distance), 2.0)
     return np.where(np.abs(distance) < 2.0, 1.0, 1.0 / (np.pi * d * (d * d - 1)) ** 2)
 
 
 def without_sidelobes(
-    rows: np.ndarray, bins: np.ndarray, power: np.ndarray, num_bins: int, floor: float, margin: float = 4.0
+    rows: np.ndarray,
+    bins: np.ndarray,
+    power: np.ndarray,
+    num_bins: int,
+    floor: float,
+    margin: float = 4.0,
 ) -> np.ndarray:
     """Which peaks (strongest first) are more than what a stronger one leaves around it.
 
@@ -236,6 +301,11 @@ def without_sidelobes(
         stronger = np.flatnonzero(keep[:i])
         across = np.abs(bins[i] - bins[stronger])
         across = np.minimum(across, num_bins - across)
-        bound = margin * values[stronger] * hann_envelope(rows[i] - rows[stronger]) * (hann_envelope(across) + floor)
+        bound = (
+            margin
+            * values[stronger]
+            * hann_envelope(rows[i] - rows[stronger])
+            * (hann_envelope(across) + floor)
+        )
         keep[i] = not np.any(values[i] <= bound)
     return keep

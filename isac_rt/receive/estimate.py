@@ -1,11 +1,15 @@
-"""Off-grid estimates of one detection: range and velocity by maximum likelihood on the cleaned spectra, then direction cosines.
+"""Off-grid estimates of one detection: range and velocity by maximum likelihood on the cleaned
+spectra, then direction cosines.
 
-Around mid-frame, with tau(t) = tau_0 + tau_dot t and x the time from the middle of a chirp's window (at u_c),
+Around mid-frame, with tau(t) = tau_0 + tau_dot t and x the time from the middle of a chirp's window
+(at u_c),
 
-    Phi = [f_c tau_c + alpha tau_c u_c - alpha tau_c^2/2]  +  x [alpha tau_c + tau_dot (f_c + alpha u_c - alpha tau_c)],
+    Phi = [f_c tau_c + alpha tau_c u_c - alpha tau_c^2/2]  +  x [alpha tau_c + tau_dot (f_c + alpha
+    u_c - alpha tau_c)],
 
-where tau_c is the delay at the chirp's middle. So the beat follows the migration and carries the range-Doppler coupling, and the
-slow-time phase follows tau_c. `Template` is this formula; nothing of it is linearised in the frame.
+where tau_c is the delay at the chirp's middle. So the beat follows the migration and carries the
+range-Doppler coupling, and the slow-time phase follows tau_c. `Template` is this formula; nothing
+of it is linearised in the frame.
 """
 
 from __future__ import annotations
@@ -22,7 +26,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.maps import slow_window
 from isac_rt.receive.spectrum import window_length
 
-HALF_WIDTH = 3  # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
+# range cells on each side of the peak that a template covers: Hann's main lobe and the migration
+HALF_WIDTH = 3
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,8 @@ class Estimate:
     Attributes
     ----------
     delay, delay_rate : at mid-frame [s, 1]
-    channels : (L_tx, L_rx) complex, response of every virtual channel at the estimate, normalised to the amplitude of a sample
+    channels : (L_tx, L_rx) complex, response of every virtual channel at the estimate, normalised
+        to the amplitude of a sample
     """
 
     delay: float
@@ -67,7 +73,8 @@ def middle_phase(waveform: Waveform, delay: float, delay_rate: float) -> np.ndar
 
 
 def hann_response(waveform: Waveform, offset: np.ndarray) -> np.ndarray:
-    """Transform of the range window, about its middle, at `offset` cells from a tone; real, (samples)."""
+    """Transform of the range window, about its middle, at `offset` cells from a tone; real,
+    (samples)."""
     length = window_length(waveform)
     d = np.asarray(offset) * length / waveform.num_samples
     near = np.abs(np.abs(d) - 1) < 1e-6
@@ -76,7 +83,8 @@ def hann_response(waveform: Waveform, offset: np.ndarray) -> np.ndarray:
 
 
 class LocalSpectra:
-    """The few range rows around a peak, ready for repeated evaluation of templates over the slow-time window."""
+    """The few range rows around a peak, ready for repeated evaluation of templates over the
+    slow-time window."""
 
     def __init__(
         self,
@@ -88,25 +96,39 @@ class LocalSpectra:
         *,
         separate: bool = False,
     ) -> None:
-        """`separate`: the groups are not added coherently, as where the velocity is known up to aliases only."""
+        """`separate`: the groups are not added coherently, as where the velocity is known up to
+        aliases only."""
         w, low = waveform, max(row - HALF_WIDTH, 0)
         self._sets = w.num_groups if separate else 1
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
-        # the window begins at sample 0 and its transform is real about its middle: the turn from row to row is taken out here
-        turn = np.exp(2j * np.pi * (low + np.arange(rows.shape[2])) * (window_length(w) / 2 / w.num_samples))
-        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(schedule.size, rows.shape[2], -1)
+        # the window begins at sample 0 and its transform is real about its middle: the turn from
+        # row to row is taken out here
+        turn = np.exp(
+            2j * np.pi * (low + np.arange(rows.shape[2])) * (window_length(w) / 2 / w.num_samples)
+        )
+        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(
+            schedule.size, rows.shape[2], -1
+        )
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         self._tx = np.ascontiguousarray((schedule + own).ravel())
         self._time = (middle_times(w) + delay_symbols * w.delay_step).ravel()
         self._numbers = np.array(
-            [w.carrier_frequency, w.slope, window_middle(w), w.sampled_duration, window_length(w), w.num_samples]
+            [
+                w.carrier_frequency,
+                w.slope,
+                window_middle(w),
+                w.sampled_duration,
+                window_length(w),
+                w.num_samples,
+            ]
         )
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
-        """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its amplitude; of separate
-        groups the mean, each antenna turned into the phase that it has in the first one."""
+        """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
+        amplitude; of separate groups the mean, each antenna turned into the phase that it has in
+        the first one."""
         sets = self._match(delay, delay_rate)[0]
         turn = np.exp(-1j * np.angle((sets * sets[0].conj()).sum(axis=2, keepdims=True)))
         return (sets * turn).mean(axis=0)
@@ -115,28 +137,46 @@ class LocalSpectra:
         """Responses (sets, L_tx, L_rx) and the templates' energies (sets, L_tx, 1)."""
         out = np.zeros((self._sets * self.waveform.num_tx, self._data.shape[2]), np.complex128)
         energy = np.zeros(len(out))
-        _match(self._data.view(np.float64), self._weight, self._tx, self._time, self._first, self._numbers, delay, delay_rate, out, energy)
+        _match(
+            self._data.view(np.float64),
+            self._weight,
+            self._tx,
+            self._time,
+            self._first,
+            self._numbers,
+            delay,
+            delay_rate,
+            out,
+            energy,
+        )
         shape = self._sets, self.waveform.num_tx, -1
         return out.reshape(shape), energy.reshape(shape)
 
     def power(self, delay: float, delay_rate: float) -> float:
-        """Energy that the template explains, summed over the virtual channels: what the estimate maximises. At the ends of the range axis
-        part of a template lies outside, so that the amplitude alone would draw the estimate out."""
+        """Energy that the template explains, summed over the virtual channels: what the estimate
+        maximises. At the ends of the range axis part of a template lies outside, so that the
+        amplitude alone would draw the estimate out."""
         out, energy = self._match(delay, delay_rate)
         return float(((out.real**2 + out.imag**2) * energy).sum())
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz"})
-def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energy):  # pragma: no cover - compiled
-    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`, `middle_phase` and
-    `hann_response` in one loop, which a test holds against them.
+def _match(
+    data, weight, tx, time, first, numbers, delay, delay_rate, out, energy
+):  # pragma: no cover - compiled
+    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`,
+    `middle_phase` and `hann_response` in one loop, which a test holds against them.
 
-    `data` alternates real and imaginary parts, and is turned so that the template's rows differ by real factors.
+    `data` alternates real and imaginary parts, and is turned so that the template's rows differ by
+    real factors.
     """
     carrier, slope, middle, duration, length, size = numbers
     chirps, rows, width = data.shape
     share = length / size
-    step_cos, step_sin = np.cos(np.pi * share * np.arange(rows)), np.sin(np.pi * share * np.arange(rows))
+    step_cos, step_sin = (
+        np.cos(np.pi * share * np.arange(rows)),
+        np.sin(np.pi * share * np.arange(rows)),
+    )
     line = np.empty(width)
     for i in range(chirps):
         tau = delay + delay_rate * time[i]
@@ -153,7 +193,12 @@ def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energ
             elif abs(d) < 1e-9:
                 shape = length / 2
             else:
-                shape = length / 2 * (sine * step_cos[k] - cosine * step_sin[k]) / (np.pi * d * (1.0 - d * d))
+                shape = (
+                    length
+                    / 2
+                    * (sine * step_cos[k] - cosine * step_sin[k])
+                    / (np.pi * d * (1.0 - d * d))
+                )
             energy[tx[i]] += weight[i] * shape * shape
             row = data[i, k]
             for c in range(width):
@@ -181,7 +226,8 @@ def start_point(
 
 
 def to_delay(cell: float, doppler_bin: float, waveform: Waveform) -> tuple[float, float]:
-    """Delay and delay rate at mid-frame of a beat (cells) and a Doppler bin (receding is positive)."""
+    """Delay and delay rate at mid-frame of a beat (cells) and a Doppler bin (receding is
+    positive)."""
     w = waveform
     rate = doppler_bin / (w.frame_duration * w.effective_carrier)
     return (cell / w.sampled_duration - rate * w.effective_carrier) / w.slope, rate
@@ -197,7 +243,8 @@ def _hann_ratio(three: np.ndarray) -> float:
 
 
 def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int = 3) -> Estimate:
-    """Maximise the summed power by fitted paraboloids on shrinking stencils (cells and Doppler bins)."""
+    """Maximise the summed power by fitted paraboloids on shrinking stencils (cells and Doppler
+    bins)."""
     w = local.waveform
     delay_unit, rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)
     # coordinates: beat at mid-frame and Doppler, which decouple; the beat holds the coupling
@@ -209,7 +256,9 @@ def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int
 
     for step in (0.2, 0.08, 0.03)[:iterations]:
         at = np.array([-step, 0.0, step])
-        grid = np.log([[max(local.power(*split(beat + i, doppler + j)), 1e-300) for j in at] for i in at])
+        grid = np.log(
+            [[max(local.power(*split(beat + i, doppler + j)), 1e-300) for j in at] for i in at]
+        )
         gx, gy = (grid[2, 1] - grid[0, 1]) / (2 * step), (grid[1, 2] - grid[1, 0]) / (2 * step)
         hxx = (grid[2, 1] - 2 * grid[1, 1] + grid[0, 1]) / step**2
         hyy = (grid[1, 2] - 2 * grid[1, 1] + grid[1, 0]) / step**2
@@ -226,9 +275,11 @@ def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int
 
 @lru_cache(maxsize=32)
 def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Channels (tx index, rx index) along X (axis 0) or Z (axis 2) of the L and their places along it [m].
+    """Channels (tx index, rx index) along X (axis 0) or Z (axis 2) of the L and their places along
+    it [m].
 
-    `virtual`: transmit and receive elements of the axis together (an echo); else the receive arm with every transmit antenna.
+    `virtual`: transmit and receive elements of the axis together (an echo); else the receive arm
+    with every transmit antenna.
     """
     rx = np.arange(antennas.rx_x) if axis == 0 else np.arange(antennas.rx_x - 1, antennas.num_rx)
     along = np.arange(antennas.tx_x) if axis == 0 else np.arange(antennas.tx_x - 1, antennas.num_tx)
@@ -241,16 +292,29 @@ def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.nd
 
 
 def direction_cosine(
-    channels: np.ndarray, antennas: Antennas, waveform: Waveform, axis: int, virtual: bool, *, on_grid: bool = False
+    channels: np.ndarray,
+    antennas: Antennas,
+    waveform: Waveform,
+    axis: int,
+    virtual: bool,
+    *,
+    on_grid: bool = False,
 ) -> float:
-    """Direction cosine along one axis of the L from the channel responses, by maximising the beamformed power.
+    """Direction cosine along one axis of the L from the channel responses, by maximising the
+    beamformed power.
 
-    An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle. Echoes (`virtual`) are combined
-    coherently over both arrays; one-way paths coherently over the receivers and in power over the transmitters, whose
-    direction of departure is another and ambiguous.
+    An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle.
+    Echoes (`virtual`) are combined coherently over both arrays; one-way paths coherently over the
+    receivers and in power over the transmitters, whose direction of departure is another and
+    ambiguous.
     """
     tx, rx, place = arm(antennas, axis, virtual)
-    scale = 2 * np.pi * (waveform.carrier_frequency + waveform.slope * window_middle(waveform)) / SPEED_OF_LIGHT
+    scale = (
+        2
+        * np.pi
+        * (waveform.carrier_frequency + waveform.slope * window_middle(waveform))
+        / SPEED_OF_LIGHT
+    )
     limit = min(1.0, np.pi / (scale * antennas.spacing))
     values = channels[tx, rx].reshape(1 if virtual else antennas.num_tx, -1).T
     apart = 1j * scale * place[: len(values)]  # the receivers stand alike for every transmitter
@@ -258,39 +322,64 @@ def direction_cosine(
     def beam(u: np.ndarray) -> np.ndarray:
         return (np.abs(np.exp(np.outer(u, apart)) @ values) ** 2).sum(axis=1)
 
-    u = np.linspace(-limit, limit, 8 * (antennas.rx_x if axis == 0 else antennas.rx_z) * (2 if virtual else 1) + 1)
+    u = np.linspace(
+        -limit,
+        limit,
+        8 * (antennas.rx_x if axis == 0 else antennas.rx_z) * (2 if virtual else 1) + 1,
+    )
     best = u[np.argmax(beam(u))]
     for step in () if on_grid else ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
         low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))
         curve = low - 2 * mid + high
-        best += np.clip(0.5 * (low - high) / curve * step if curve < 0 else step * np.sign(high - low), -2 * step, 2 * step)
+        best += np.clip(
+            0.5 * (low - high) / curve * step if curve < 0 else step * np.sign(high - low),
+            -2 * step,
+            2 * step,
+        )
     return float(best) if abs(best) <= 1 else float("nan")
 
 
 def direction_cosines(
-    estimate: Estimate, antennas: Antennas, waveform: Waveform, passes: int, *, on_grid: bool = False
+    estimate: Estimate,
+    antennas: Antennas,
+    waveform: Waveform,
+    passes: int,
+    *,
+    on_grid: bool = False,
 ) -> list[float]:
     """u_x and u_z of a detection.
 
-    A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an element at r and a source at R, which
-    would turn the estimate by 0.02 degrees at 11 m. R is the estimated range; behind a reflector on the way to a PT the true
-    radius is shorter.
+    A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an
+    element at r and a source at R, which would turn the estimate by 0.02 degrees at 11 m. R is the
+    estimated range; behind a reflector on the way to a PT the true radius is shorter.
     """
     virtual, channels = passes == 2, estimate.channels
-    u = [direction_cosine(channels, antennas, waveform, axis, virtual, on_grid=on_grid) for axis in (0, 2)]
+    u = [
+        direction_cosine(channels, antennas, waveform, axis, virtual, on_grid=on_grid)
+        for axis in (0, 2)
+    ]
     radius = estimate.delay * SPEED_OF_LIGHT / passes
     if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
         return u
     towards = np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
     scale = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
-    tx, rx = (scale * ((r**2).sum(1) - (r @ towards) ** 2) for r in (antennas.tx_positions, antennas.rx_positions))
+    tx, rx = (
+        scale * ((r**2).sum(1) - (r @ towards) ** 2)
+        for r in (antennas.tx_positions, antennas.rx_positions)
+    )
     flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
-    return [direction_cosine(flat, antennas, waveform, axis, virtual, on_grid=on_grid) for axis in (0, 2)]
+    return [
+        direction_cosine(flat, antennas, waveform, axis, virtual, on_grid=on_grid)
+        for axis in (0, 2)
+    ]
 
 
-def standard_deviations(snr: float, antennas: Antennas, waveform: Waveform, passes: int) -> np.ndarray:
-    """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao of a tone, with Hann's loss of
-    2 on the two windowed axes), and never below the floors at which other paths' sidelobes usually end the gain."""
+def standard_deviations(
+    snr: float, antennas: Antennas, waveform: Waveform, passes: int
+) -> np.ndarray:
+    """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao
+    of a tone, with Hann's loss of 2 on the two windowed axes), and never below the floors at which
+    other paths' sidelobes usually end the gain."""
     w, tone = waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
     spread = [max(tone, 2e-3) * w.range_cell(passes), max(tone, 4e-3) * w.velocity_cell(passes)]
     angles = []

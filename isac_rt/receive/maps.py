@@ -1,8 +1,10 @@
-"""Range-Doppler maps from cleaned spectra: the union of the groups, or each group's sparse sampling with OMP.
+"""Range-Doppler maps from cleaned spectra: the union of the groups, or each group's sparse sampling
+with OMP.
 
-By the Latin property every transmit antenna sends in every slot, in some group. The union of the groups is then a uniform sampling
-with the slot's full rate, up to the offsets of the groups and of the data (2 m T_d and tau_D), which `union_operator` takes out.
-Doppler bins are centred: bin 0 of the output is -P/2. Receding is positive.
+By the Latin property every transmit antenna sends in every slot, in some group. The union of the
+groups is then a uniform sampling with the slot's full rate, up to the offsets of the groups and of
+the data (2 m T_d and tau_D), which `union_operator` takes out. Doppler bins are centred: bin 0 of
+the output is -P/2. Receding is positive.
 """
 
 from __future__ import annotations
@@ -16,9 +18,8 @@ from isac_rt.frame.schedule import Schedule, is_latin
 from isac_rt.frame.waveform import Waveform
 
 UNION_FLOOR = 1e-5
-"""Share of a path's power that the resampling of the united groups may leave in any other Doppler bin; reached within 2 % of the
-unambiguous velocity."""
-
+"""Share of a path's power that the resampling of the united groups may leave in any other Doppler
+bin; reached within 2 % of the unambiguous velocity."""
 
 
 def slow_window(waveform: Waveform) -> np.ndarray:
@@ -33,12 +34,15 @@ def doppler_bins(waveform: Waveform) -> np.ndarray:
 
 
 def slow_times(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
-    """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a chirp with data lies tau_D later."""
+    """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a
+    chirp with data lies tau_D later."""
     w = waveform
     return (w.chirp_time + delay_symbols * w.delay_step) / w.slot_duration
 
 
-def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray) -> np.ndarray:
+def channel_maps(
+    spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
+) -> np.ndarray:
     """Doppler spectrum of every virtual channel over all its chirps, groups united.
 
     Parameters
@@ -48,12 +52,15 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, de
 
     Returns
     -------
-    maps : (L_tx, L_rx, rows, P) complex64, FFT order. Where the union is not the full sampling (M < L_tx) these are the
-        correlations with the Doppler atoms, with the sampling's sidelobes in them.
+    maps : (L_tx, L_rx, rows, P) complex64, FFT order. Where the union is not the full sampling (M <
+        L_tx) these are the correlations with the Doppler atoms, with the sampling's sidelobes in
+        them.
     """
     num_rx, num_rows, num_chirps = spectra.shape[1:]
     out = np.empty((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
-    for tx, (places, operator) in enumerate(_operators(spectra.shape, waveform, schedule, delay_symbols)):
+    for tx, (places, operator) in enumerate(
+        _operators(spectra.shape, waveform, schedule, delay_symbols)
+    ):
         united = np.empty((num_rx * num_rows, places.size), np.complex64)
         _unite(spectra.reshape(-1), places, num_chirps, united)
         np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
@@ -63,7 +70,8 @@ def channel_maps(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, de
 def _operators(
     shape: tuple[int, ...], waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each transmit antenna where its chirps lie in the flat spectra of a `shape`, in the first row, and the operator on them."""
+    """Of each transmit antenna where its chirps lie in the flat spectra of a `shape`, in the first
+    row, and the operator on them."""
     num_groups, num_rx, num_rows, num_chirps = shape
     full = num_groups == waveform.num_tx and is_latin(schedule, waveform.num_tx)
     times = slow_times(waveform, delay_symbols)
@@ -74,11 +82,14 @@ def _operators(
         yield (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), operator
 
 
-def power_map(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray) -> np.ndarray:
+def power_map(
+    spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
+) -> np.ndarray:
     """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, Doppler centred.
 
-    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates. With a + j b such a row and x + j y
-    the samples, both bins follow from a x, b x, a y and b y: half of the multiplications.
+    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
+    With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
+    half of the multiplications.
     """
     num_rx, num_rows, num_chirps = spectra.shape[1:]
     half = num_chirps // 2 + 1
@@ -91,7 +102,12 @@ def power_map(spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay
         united = np.empty((2, num_rows, places.size), np.float32)
         made = np.empty((2 * num_rows, 2 * half), np.float32)
         for rx in range(num_rx):
-            _unite_parts(spectra.reshape(-1), places + np.uint64(rx * num_rows * num_chirps), num_chirps, united)
+            _unite_parts(
+                spectra.reshape(-1),
+                places + np.uint64(rx * num_rows * num_chirps),
+                num_chirps,
+                united,
+            )
             np.matmul(united.reshape(2 * num_rows, -1), parts, out=made)
             _add_both_bins(made.reshape(2, num_rows, 2, half), power)
     return np.fft.fftshift(power, axes=-1) / (waveform.num_tx * num_rx)
@@ -107,7 +123,8 @@ def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
             out[0, i, s], out[1, i, s] = value.real, value.imag
 
 
-# no fused products: which of two is fused the compiler may decide anew, and bits would differ between processes
+# no fused products: which of two is fused the compiler may decide anew, and bits would differ
+# between processes
 @njit(nogil=True, cache=True)
 def _add_both_bins(made, power):  # pragma: no cover - compiled
     """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
@@ -131,18 +148,21 @@ def _unite(flat, places, num_chirps, out):  # pragma: no cover - compiled
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
-    """(P, S) complex64: from S samples at `times` [slots] to their windowed correlations with the Doppler atoms."""
+    """(P, S) complex64: from S samples at `times` [slots] to their windowed correlations with the
+    Doppler atoms."""
     bins = np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps)
     atoms = np.exp(-2j * np.pi * np.outer(bins, times) / waveform.num_chirps)
     return (atoms * slow_window(waveform)[np.floor(times).astype(int)]).astype(np.complex64)
 
 
 def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
-    """(P, P) complex64: from one antenna's samples at `times` [slots], one in each slot, to its windowed Doppler spectrum.
+    """(P, P) complex64: from one antenna's samples at `times` [slots], one in each slot, to its
+    windowed Doppler spectrum.
 
-    The times are not quite uniform. The plain DFT, or turning each bin by its own group phase, would leave sidelobes of -25 to -35 dB
-    at all other velocities. Here the samples are resampled to the uniform grid (about the mean offset) by the least-squares fit
-    of all tones up to the unambiguous velocity: the normal equations of that band have the entries sinc(t - t'). What
+    The times are not quite uniform. The plain DFT, or turning each bin by its own group phase,
+    would leave sidelobes of -25 to -35 dB at all other velocities. Here the samples are resampled
+    to the uniform grid (about the mean offset) by the least-squares fit of all tones up to the
+    unambiguous velocity: the normal equations of that band have the entries sinc(t - t'). What
     remains is below -60 dB, and below -50 dB within 2 % of the unambiguous velocity.
     """
     p = np.arange(waveform.num_chirps)
@@ -168,11 +188,12 @@ def accumulate(maps: np.ndarray) -> np.ndarray:
 
 
 def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
-    """Mean power of the DFT over each antenna's own chirps in each group: the conventional TDM-MIMO receiver, schemes (a) and (c).
+    """Mean power of the DFT over each antenna's own chirps in each group: the conventional TDM-MIMO
+    receiver, schemes (a) and (c).
 
-    An antenna's P/L_tx samples lie L_tx slots apart, so the map repeats every P/L_tx bins: velocities are known up to the
-    unambiguous velocity divided by L_tx. Groups are added in power. The few slots by which the antennas' samples start later,
-    and the data delays, only turn phases.
+    An antenna's P/L_tx samples lie L_tx slots apart, so the map repeats every P/L_tx bins:
+    velocities are known up to the unambiguous velocity divided by L_tx. Groups are added in power.
+    The few slots by which the antennas' samples start later, and the data delays, only turn phases.
 
     Returns
     -------
@@ -181,27 +202,22 @@ def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedu
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
     size = num_chirps // waveform.num_tx
     window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
-    analyse = (np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size) * window).astype(np.complex64)
+    analyse = (
+        np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size) * window
+    ).astype(np.complex64)
     power = np.zeros((num_rows, size), np.float32)
     for m in range(num_groups):
         for tx in range(waveform.num_tx):
             own = spectra[m][..., schedule[m] == tx].reshape(-1, size) @ analyse.T
             power += (own.real**2 + own.imag**2).reshape(num_rx, num_rows, size).sum(axis=0)
-    return np.fft.fftshift(np.tile(power / (num_groups * waveform.num_tx * num_rx), waveform.num_tx), axes=-1)
+    return np.fft.fftshift(
+        np.tile(power / (num_groups * waveform.num_tx * num_rx), waveform.num_tx), axes=-1
+    )
 
 
 def own_bins(waveform: Waveform) -> np.ndarray:
-    """(P,) bool: the centred bins within the unambiguous velocity of one antenna's uniform sampling."""
+    """(P,) bool: the centred bins within the unambiguous velocity of one antenna's uniform
+    sampling."""
     size = waveform.num_chirps // waveform.num_tx
     bins = doppler_bins(waveform)
     return (bins >= -(size // 2)) & (bins < size - size // 2)
-
-
-
-
-
-
-
-
-
-

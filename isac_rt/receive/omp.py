@@ -8,40 +8,63 @@ from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
 
 MOST_UNEXPLAINED = 1 / 3
-"""Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably may leave."""
+"""Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably
+may leave."""
 
 
 def recovery_limit(num_samples: int, num_chirps: int) -> int:
-    """Doppler atoms per row that OMP recovers dependably from `num_samples` chirps at random out of P: S / (2 ln P), at least 1.
+    """Doppler atoms per row that OMP recovers dependably from `num_samples` chirps at random out of
+    P: S / (2 ln P), at least 1.
 
     References
     ----------
-    .. [1] J. Tropp, A. Gilbert, "Signal recovery from random measurements via orthogonal matching pursuit", 2007: S >= 2 K ln P.
+    .. [1] J. Tropp, A. Gilbert, "Signal recovery from random measurements via orthogonal matching
+    pursuit", 2007: S >= 2 K ln P.
     """
     return max(int(num_samples / (2 * np.log(num_chirps))), 1)
 
 
-def unexplained(spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
-    """(len(rows),) share of each row's power that as many OMP atoms as the sampling's `recovery_limit` do not explain."""
+def unexplained(
+    spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule
+) -> np.ndarray:
+    """(len(rows),) share of each row's power that as many OMP atoms as the sampling's
+    `recovery_limit` do not explain."""
     total, left = np.zeros(len(rows)), np.zeros(len(rows))
     for m in range(len(schedule)):
         for tx in range(waveform.num_tx):
             chosen = np.flatnonzero(schedule[m] == tx)
             part = spectra[m][:, rows][:, :, chosen]
-            found = omp(part.reshape(-1, chosen.size), chosen, waveform.num_chirps, recovery_limit(chosen.size, waveform.num_chirps))
-            atoms = np.exp(2j * np.pi * np.outer(np.arange(waveform.num_chirps), chosen) / waveform.num_chirps) / chosen.size
+            found = omp(
+                part.reshape(-1, chosen.size),
+                chosen,
+                waveform.num_chirps,
+                recovery_limit(chosen.size, waveform.num_chirps),
+            )
+            atoms = (
+                np.exp(
+                    2j
+                    * np.pi
+                    * np.outer(np.arange(waveform.num_chirps), chosen)
+                    / waveform.num_chirps
+                )
+                / chosen.size
+            )
             rest = part - (found @ atoms).reshape(part.shape)
             total += (np.abs(part) ** 2).sum(axis=(0, 2))
             left += (np.abs(rest) ** 2).sum(axis=(0, 2))
     return left / np.maximum(total, 1e-300)
 
 
-def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, waveform: Waveform, schedule: Schedule) -> bool:
-    """Whether the occupied range rows are sparse enough in Doppler for random sampling (scheme (d)).
+def sparse_enough(
+    spectra: np.ndarray, rows: np.ndarray, noise: float, waveform: Waveform, schedule: Schedule
+) -> bool:
+    """Whether the occupied range rows are sparse enough in Doppler for random sampling (scheme
+    (d)).
 
-    The paper falls back to scheme (c) "when the scene is not sparse" and gives no rule. Here: in a majority of the occupied rows,
-    weighted by power over the noise, as many atoms as the sampling recovers dependably must explain all but `MOST_UNEXPLAINED` of what
-    is above the noise. A path half a bin off the grid needs two atoms for 81 % of its power.
+    The paper falls back to scheme (c) "when the scene is not sparse" and gives no rule. Here: in a
+    majority of the occupied rows, weighted by power over the noise, as many atoms as the sampling
+    recovers dependably must explain all but `MOST_UNEXPLAINED` of what is above the noise. A path
+    half a bin off the grid needs two atoms for 81 % of its power.
 
     Parameters
     ----------
@@ -54,7 +77,9 @@ def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, waveform:
     power = np.mean(np.abs(spectra[:, :, rows]) ** 2, axis=(0, 1, 3))
     above = np.maximum(power - noise, 1e-3 * noise)
     size = waveform.num_chirps // waveform.num_tx
-    kept = 1 - recovery_limit(size, waveform.num_chirps) / size  # of the noise: each atom takes one dimension
+    kept = (
+        1 - recovery_limit(size, waveform.num_chirps) / size
+    )  # of the noise: each atom takes one dimension
     share = (unexplained(spectra, rows, waveform, schedule) * power - kept * noise) / above
     return bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
 
@@ -71,17 +96,22 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
 
     Returns
     -------
-    coefficients : (V, P) complex64, FFT order, `sparsity` non-zeros each, scaled as S times the amplitude (so that they
-        compare with the plain correlation of an atom)
+    coefficients : (V, P) complex64, FFT order, `sparsity` non-zeros each, scaled as S times the
+        amplitude (so that they compare with the plain correlation of an atom)
 
     References
     ----------
-    .. [1] R. Rubinstein et al., "Efficient Implementation of the K-SVD Algorithm using Batch OMP", 2008 (the Gram-matrix form).
+    .. [1] R. Rubinstein et al., "Efficient Implementation of the K-SVD Algorithm using Batch OMP",
+    2008 (the Gram-matrix form).
     """
     count, size = vectors.shape
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
     gram = atoms.conj().T @ atoms
-    ridge = 1e-9 * size  # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient then
+    ridge = (
+        1e-9 * size
+        # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient
+        # then
+    )
     first = vectors @ atoms.conj()
     correlation, support = first.copy(), np.zeros((count, 0), np.int64)
     solution = np.zeros((count, 0), np.complex128)
@@ -98,12 +128,16 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     return out
 
 
-def omp_power(spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule, sparsity: int) -> np.ndarray:
-    """Accumulated OMP power on some range rows (the paper's map): mean over groups, antennas and receivers.
+def omp_power(
+    spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule, sparsity: int
+) -> np.ndarray:
+    """Accumulated OMP power on some range rows (the paper's map): mean over groups, antennas and
+    receivers.
 
     Returns
     -------
-    power : (len(rows), P) float32, Doppler centred, in units of the squared correlation of one group's antenna
+    power : (len(rows), P) float32, Doppler centred, in units of the squared correlation of one
+        group's antenna
     """
     num_groups, num_rx, _, num_chirps = spectra.shape
     power = np.zeros((len(rows), num_chirps), np.float64)
@@ -111,7 +145,9 @@ def omp_power(spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedul
         for tx in range(waveform.num_tx):
             chosen = np.flatnonzero(schedule[m] == tx)
             vectors = spectra[m][:, rows][:, :, chosen].reshape(-1, chosen.size)
-            found = omp(vectors, chosen, num_chirps, sparsity).reshape(num_rx, len(rows), num_chirps)
+            found = omp(vectors, chosen, num_chirps, sparsity).reshape(
+                num_rx, len(rows), num_chirps
+            )
             power += (np.abs(found) ** 2).sum(axis=0)
     power /= num_groups * waveform.num_tx * num_rx
     return np.fft.fftshift(power, axes=-1).astype(np.float32)

@@ -16,16 +16,33 @@ from isac_rt.receive.cfar import row_factors, threshold
 from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.receive.joint.fit import Frame, JointPath
 from isac_rt.receive.joint.separate import separate
-from isac_rt.receive.sense import Sensed, describe, estimate_at, make_maps, num_looks, sense, velocity_method
+from isac_rt.receive.sense import (
+    Sensed,
+    describe,
+    estimate_at,
+    make_maps,
+    num_looks,
+    sense,
+    velocity_method,
+)
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.beams import demodulate_beams, usable_paths
 from isac_rt.receive.symbols.phases import decide_phases
-from isac_rt.receive.symbols.powers import EXTRA_CELLS, Symbols, confidence_threshold, demodulate, moves_as_predicted
+from isac_rt.receive.symbols.powers import (
+    EXTRA_CELLS,
+    Symbols,
+    confidence_threshold,
+    demodulate,
+    moves_as_predicted,
+)
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario.receivers import Receivers
 
-REFERENCE_SPAN_DB = 20.0  # the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
-GATE_CELLS = 1  # range rows searched on each side of the predicted one: the fraction is known, the whole cell is the prediction's
+# the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
+REFERENCE_SPAN_DB = 20.0
+# range rows searched on each side of the predicted one: the fraction is known, the whole cell is
+# the prediction's
+GATE_CELLS = 1
 GATE_BINS = 4
 
 
@@ -46,30 +63,39 @@ def receive_passive(
     Parameters
     ----------
     cube : IFCube
-    prediction : row 0 is the line of sight; None when nothing is tracked. Unmodulated frames need none
+    prediction : row 0 is the line of sight; None when nothing is tracked. Unmodulated frames need
+        none
     modulated : whether the frame carries data (public)
-    groups : that carry data for this terminal, None for all. It decodes these, and senses with these alone while there are
-        data: what the others carry it does not know
-    profile : range profile with which the delay symbols are decided (`isac_rt.receive.symbols.profile`), None: by the strongest cell
+    groups : that carry data for this terminal, None for all. It decodes these, and senses with
+        these alone while there are data: what the others carry it does not know
+    profile : range profile with which the delay symbols are decided
+        (`isac_rt.receive.symbols.profile`), None: by the strongest cell
     maps : also return pictures
 
     Returns
     -------
-    Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the strongest. Without a prediction
-    a modulated frame cannot be read: nothing is detected. When the decisions look like noise or like a path that moves
-    otherwise, or nothing is found where the reference is expected, `line_of_sight` is False and all symbols are erased.
+    Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the
+    strongest. Without a prediction a modulated frame cannot be read: nothing is detected. When the
+    decisions look like noise or like a path that moves otherwise, or nothing is found where the
+    reference is expected, `line_of_sight` is False and all symbols are erased.
     """
     if groups is not None and modulated:
         part = cube.of_groups(groups)
-        mine = receive_passive(part, antennas, settings, dpsk_order, prediction, modulated, profile=profile, maps=maps)
+        mine = receive_passive(
+            part, antennas, settings, dpsk_order, prediction, modulated, profile=profile, maps=maps
+        )
         return _among_all(mine, groups, cube.waveform)
     w = cube.waveform
     if not modulated:
         pilot = unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        reception = _reception(cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps)
-        return _jointly(reception, Frame(cube, pilot.delay_symbols, pilot.phases, antennas, 1), settings)
+        reception = _reception(
+            cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps
+        )
+        return _jointly(
+            reception, Frame(cube, pilot.delay_symbols, pilot.phases, antennas, 1), settings
+        )
     if prediction is None:
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
@@ -78,23 +104,37 @@ def receive_passive(
     else:
         symbols = demodulate(cube, prediction, dpsk_order, run_cells, profile)
     cells = w.num_delay_symbols + 2 * EXTRA_CELLS
-    confident = np.median(symbols.delay_confidence) >= confidence_threshold(symbols.looks, cells, symbols.raw.size)
+    confident = np.median(symbols.delay_confidence) >= confidence_threshold(
+        symbols.looks, cells, symbols.raw.size
+    )
     if not confident or not moves_as_predicted(symbols, dpsk_order):
         return _reception(cube, settings, no_detections(), None, None, None, maps)
     frame = Frame(cube, symbols.raw, symbols.phases, antennas, 1)
     found, detections, reference = _sense_data(frame, prediction, settings)
-    if settings.refinement == "joint" and reference is not None and np.isfinite(detections.direction[0]).all():
+    if (
+        settings.refinement == "joint"
+        and reference is not None
+        and np.isfinite(detections.direction[0]).all()
+    ):
         first = detections  # row 0 is the reference
-        start = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT, first.direction[0]
+        start = (
+            first.range[0] / SPEED_OF_LIGHT,
+            first.velocity[0] / SPEED_OF_LIGHT,
+            first.direction[0],
+        )
         phases = decide_phases(frame, JointPath(*start, np.ones(1), np.zeros(4)), dpsk_order)
         if not np.allclose(phases, frame.phases):
             frame = replace(frame, phases=phases)
             found, detections, reference = _sense_data(frame, prediction, settings)
-    reception = _reception(cube, settings, detections, reference, found, symbols if reference else None, maps)
+    reception = _reception(
+        cube, settings, detections, reference, found, symbols if reference else None, maps
+    )
     return _jointly(reception, frame, settings)
 
 
-def _sense_data(frame: Frame, prediction: Prediction, settings: Receivers) -> tuple[Sensed, Detections, Estimate | None]:
+def _sense_data(
+    frame: Frame, prediction: Prediction, settings: Receivers
+) -> tuple[Sensed, Detections, Estimate | None]:
     """What a frame shows once its symbols are taken out, with the reference put first."""
     cube, raw = frame.cube, frame.delay_symbols
     spectra = clean_spectrum(cube, raw, frame.phases, frame.waveform.num_delay_symbols)
@@ -103,13 +143,18 @@ def _sense_data(frame: Frame, prediction: Prediction, settings: Receivers) -> tu
 
 
 def _jointly(reception: Reception, frame: Frame, settings: Receivers) -> Reception:
-    """With `joint` refinement all detections fitted at once, and the reference's power with them."""
+    """With `joint` refinement all detections fitted at once, and the reference's power with
+    them."""
     if settings.refinement != "joint":
         return reception
     detections, power = separate(frame, reception.detections)
     mine = power[detections.is_reference]
     known = mine.size and np.isfinite(mine[0])
-    return replace(reception, detections=detections, reference_power=float(mine[0]) if known else reception.reference_power)
+    return replace(
+        reception,
+        detections=detections,
+        reference_power=float(mine[0]) if known else reception.reference_power,
+    )
 
 
 def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Reception:
@@ -129,9 +174,12 @@ def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Re
     )
 
 
-def _earliest(found: Sensed, schedule: Schedule, antennas: Antennas, settings: Receivers) -> tuple[Detections, Estimate | None]:
-    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the false-alarm rate is asked of the
-    whole map here and not of one cell, or an empty pilot would now and then be acquired."""
+def _earliest(
+    found: Sensed, schedule: Schedule, antennas: Antennas, settings: Receivers
+) -> tuple[Detections, Estimate | None]:
+    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the
+    false-alarm rate is asked of the whole map here and not of one cell, or an empty pilot would now
+    and then be acquired."""
     d = found.detections
     looks = num_looks(settings, schedule, antennas)
     rate = settings.false_alarm_rate / found.power.size
@@ -158,7 +206,8 @@ def _at_prediction(
     antennas: Antennas,
     settings: Receivers,
 ) -> tuple[Detections, Estimate | None]:
-    """The reference within the gate, put first with its own estimate, and the other detections beside it."""
+    """The reference within the gate, put first with its own estimate, and the other detections
+    beside it."""
     w = cube.waveform
     row, column = predicted_cell(prediction, w)
     if not 0 <= row < found.power.shape[0]:
@@ -168,14 +217,22 @@ def _at_prediction(
     gate = found.power[np.ix_(rows, columns)]
     i, j = np.unravel_index(gate.argmax(), gate.shape)
     looks = num_looks(settings, cube.schedule, antennas)
-    factors = row_factors(len(found.power), looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+    factors = row_factors(
+        len(found.power),
+        looks,
+        settings.false_alarm_rate,
+        settings.guard_cells,
+        settings.training_cells,
+    )
     snr = found.power[rows[i], columns[j]] / found.level[rows[i], columns[j]]
     if not snr > factors[rows[i]]:
         return no_detections(), None
     separate = velocity_method(settings, cube.schedule, w.num_tx) == "conventional"
     local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]), separate=separate)
     estimate = estimate_at(local, found.power, int(rows[i]), int(columns[j]), settings)
-    reference = describe([estimate], np.array([snr]), antennas, w, 1, on_grid=settings.refinement == "grid")
+    reference = describe(
+        [estimate], np.array([snr]), antennas, w, 1, on_grid=settings.refinement == "grid"
+    )
     d = found.detections
     apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
     apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
@@ -219,12 +276,16 @@ def _reception(
         transitions=np.full(transitions, -1) if symbols is None else symbols.transitions,
         bits=np.zeros(0, np.uint8) if symbols is None else symbols.bits,
         delay_confidence=np.zeros(shape) if symbols is None else symbols.delay_confidence,
-        transition_confidence=np.zeros(transitions) if symbols is None else symbols.transition_confidence,
+        transition_confidence=np.zeros(transitions)
+        if symbols is None
+        else symbols.transition_confidence,
         raw_delay_symbols=np.zeros((0, shape[1]), int) if symbols is None else symbols.raw,
         line_of_sight=reference is not None,
         reference_power=float("nan") if reference is None else _power(reference),
         maps=picture,
-        soft_bits=np.zeros(0) if symbols is None or symbols.soft_bits is None else symbols.soft_bits,
+        soft_bits=np.zeros(0)
+        if symbols is None or symbols.soft_bits is None
+        else symbols.soft_bits,
         confidence_looks=0 if symbols is None else symbols.looks,
         sparse=None if found is None else found.sparse,
     )

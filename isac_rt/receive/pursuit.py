@@ -1,8 +1,10 @@
-"""Orthogonal matching pursuit off the grid: paths found one after the other, each taken out whole before the next is sought.
+"""Orthogonal matching pursuit off the grid: paths found one after the other, each taken out whole
+before the next is sought.
 
-The dictionary is not the Doppler grid but every path that the frame can hold: range, velocity and migration by maximum likelihood, an
-amplitude for each channel, and each element's delay. A strong path then takes one atom, not several, and leaves its row to the
-weaker ones; the sidelobes of sparse sampling go with it.
+The dictionary is not the Doppler grid but every path that the frame can hold: range, velocity and
+migration by maximum likelihood, an amplitude for each channel, and each element's delay. A strong
+path then takes one atom, not several, and leaves its row to the weaker ones; the sidelobes of
+sparse sampling go with it.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ REACH = 24
 CYCLES = 3
 """Times that the paths about a new one are estimated again, each with the others taken out."""
 LEFT_OVER_DB = 35.0
-"""What is this far under a path found before, within `NEAR` rows and bins of it, is what its removal left."""
+"""What is this far under a path found before, within `NEAR` rows and bins of it, is what its
+removal left."""
 NEAR = (3, 4)
 
 
@@ -47,8 +50,8 @@ def pursue(
     settings: Receivers,
     passes: int,
 ) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
-    """Paths of a frame from cleaned spectra, in the order in which they were found, their SNR on the map that was left, and the map
-    (rows, P) before anything was taken out.
+    """Paths of a frame from cleaned spectra, in the order in which they were found, their SNR on
+    the map that was left, and the map (rows, P) before anything was taken out.
 
     Parameters
     ----------
@@ -64,7 +67,9 @@ def pursue(
     found: list[Estimate] = []
     snr: list[float] = []
     while len(found) < settings.max_detections:
-        above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+        above, level = detect(
+            power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
+        )
         above[:first] = False
         above &= power > taken
         if not above.any():
@@ -93,13 +98,20 @@ def _fit_again(
     antennas: Antennas,
     passes: int,
 ) -> None:
-    """Estimate the last path and those within its rows once more, each with the others taken out: the orthogonal step. In place."""
+    """Estimate the last path and those within its rows once more, each with the others taken out:
+    the orthogonal step. In place."""
     w, place = waveform, [float(beat_cells(waveform, e.delay, e.delay_rate).mean()) for e in found]
     near = [k for k in range(len(found)) if abs(place[k] - place[-1]) < 2 * NEAR[0]]
     for _ in range(CYCLES if len(near) > 1 else 0):
         for k in near:
             _take_out(spectra, found[k], w, schedule, delay_symbols, antennas, passes, back=True)
-            local = LocalSpectra(spectra, w, schedule, delay_symbols, min(max(round(place[k]), 0), spectra.shape[2] - 1))
+            local = LocalSpectra(
+                spectra,
+                w,
+                schedule,
+                delay_symbols,
+                min(max(round(place[k]), 0), spectra.shape[2] - 1),
+            )
             found[k] = refine(local, found[k].delay, found[k].delay_rate)
             _take_out(spectra, found[k], w, schedule, delay_symbols, antennas, passes)
 
@@ -115,22 +127,28 @@ def _take_out(
     *,
     back: bool = False,
 ) -> slice:
-    """Subtract a path in place from the rows that it reaches, or put it `back`; returns the rows. The template is that of
-    `LocalSpectra` with each element's own delay."""
+    """Subtract a path in place from the rows that it reaches, or put it `back`; returns the rows.
+    The template is that of `LocalSpectra` with each element's own delay."""
     w = waveform
     time = middle_times(w) + delay_symbols * w.delay_step
     tau = estimate.delay + estimate.delay_rate * time
     carrier = w.carrier_frequency + w.slope * (window_middle(w) - tau)
     beat = (w.slope * tau + estimate.delay_rate * carrier) * w.sampled_duration
-    cycles = (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (window_middle(w) - tau / 2)) % 1.0
+    cycles = (w.carrier_frequency * tau) % 1.0 + (
+        w.slope * tau * (window_middle(w) - tau / 2)
+    ) % 1.0
     middle = round(float(beat_cells(w, estimate.delay, estimate.delay_rate).mean()))
     rows = np.arange(max(middle - REACH, 0), min(middle + REACH + 1, spectra.shape[2]))
     direction = np.nan_to_num(direction_cosines(estimate, antennas, w, passes))
     radius = max(estimate.delay * SPEED_OF_LIGHT / passes, w.range_cell(passes))
     heard = element_delays(antennas.rx_positions, direction, radius)[0] / w.delay_step
-    sent = element_delays(antennas.tx_positions, direction, radius)[0] / w.delay_step * (passes == 2)
+    sent = (
+        element_delays(antennas.tx_positions, direction, radius)[0] / w.delay_step * (passes == 2)
+    )
     for m in range(len(spectra)):
-        turn = np.exp(2j * np.pi * (cycles[m] - rows[:, None] * (window_length(w) / 2 / w.num_samples)))
+        turn = np.exp(
+            2j * np.pi * (cycles[m] - rows[:, None] * (window_length(w) / 2 / w.num_samples))
+        )
         for rx in range(spectra.shape[1]):
             shape = hann_response(w, beat[m] + sent[schedule[m]] + heard[rx] - rows[:, None])
             path = (estimate.channels[schedule[m], rx] * shape * turn).astype(np.complex64)

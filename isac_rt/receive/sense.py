@@ -13,8 +13,23 @@ from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.schedule import Schedule, is_latin
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.cfar import detect, detect_chirps, first_row, strongest_peaks
-from isac_rt.receive.estimate import Estimate, LocalSpectra, direction_cosines, refine, standard_deviations, start_point, to_delay
-from isac_rt.receive.maps import UNION_FLOOR, conventional_power, doppler_bins, own_bins, power_map, slow_window
+from isac_rt.receive.estimate import (
+    Estimate,
+    LocalSpectra,
+    direction_cosines,
+    refine,
+    standard_deviations,
+    start_point,
+    to_delay,
+)
+from isac_rt.receive.maps import (
+    UNION_FLOOR,
+    conventional_power,
+    doppler_bins,
+    own_bins,
+    power_map,
+    slow_window,
+)
 from isac_rt.receive.omp import omp_power, sparse_enough
 from isac_rt.receive.pursuit import pursue
 from isac_rt.receive.types import Detections, Maps
@@ -25,8 +40,8 @@ OMP_SPARSITY = 4
 
 @dataclass(frozen=True)
 class Sensed:
-    """Detections of a frame with their estimates, strongest first, the map that they came from and its background (`cfar.detect`).
-    `sparse`: see `Reception`."""
+    """Detections of a frame with their estimates, strongest first, the map that they came from and
+    its background (`cfar.detect`). `sparse`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
@@ -35,9 +50,11 @@ class Sensed:
     sparse: bool | None = None
 
 
-def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Literal["omp", "pursuit", "latin_union", "conventional"]:
-    """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT where its chirps are equally
-    spaced, as in a conventional schedule; OMP elsewhere."""
+def velocity_method(
+    settings: Receivers, schedule: Schedule, num_tx: int
+) -> Literal["omp", "pursuit", "latin_union", "conventional"]:
+    """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT
+    where its chirps are equally spaced, as in a conventional schedule; OMP elsewhere."""
     if settings.velocity_method != "auto":
         return settings.velocity_method
     if is_latin(schedule, num_tx) and len(schedule) == num_tx:
@@ -47,7 +64,11 @@ def velocity_method(settings: Receivers, schedule: Schedule, num_tx: int) -> Lit
 
 def num_looks(settings: Receivers, schedule: Schedule, antennas: Antennas) -> int:
     """Channels whose powers are added in the map."""
-    groups = len(schedule) if velocity_method(settings, schedule, antennas.num_tx) == "conventional" else 1
+    groups = (
+        len(schedule)
+        if velocity_method(settings, schedule, antennas.num_tx) == "conventional"
+        else 1
+    )
     return groups * antennas.num_tx * antennas.num_rx
 
 
@@ -60,12 +81,21 @@ def sense(
     settings: Receivers,
     passes: int,
 ) -> Sensed:
-    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose `delay_symbols` were removed."""
-    w, method, looks = waveform, velocity_method(settings, schedule, waveform.num_tx), num_looks(settings, schedule, antennas)
+    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose
+    `delay_symbols` were removed."""
+    w, method, looks = (
+        waveform,
+        velocity_method(settings, schedule, waveform.num_tx),
+        num_looks(settings, schedule, antennas),
+    )
     rules = looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
     if method == "pursuit":
-        paths, ratio, power = pursue(spectra, w, schedule, delay_symbols, antennas, settings, passes)
-        return Sensed(paths, describe(paths, ratio, antennas, w, passes), power, detect(power, *rules)[1])
+        paths, ratio, power = pursue(
+            spectra, w, schedule, delay_symbols, antennas, settings, passes
+        )
+        return Sensed(
+            paths, describe(paths, ratio, antennas, w, passes), power, detect(power, *rules)[1]
+        )
     conventional = method == "conventional"
     if conventional:
         power = conventional_power(spectra, w, schedule)
@@ -93,30 +123,41 @@ def sense(
 
 
 def window_gain(waveform: Waveform, schedule: Schedule) -> float:
-    """Noise power of a map's cell over that of a sample of the spectra: the squared window over an antenna's chirps."""
+    """Noise power of a map's cell over that of a sample of the spectra: the squared window over an
+    antenna's chirps."""
     return float((slow_window(waveform) ** 2).sum()) * len(schedule) / waveform.num_tx
 
 
 def _confirmed_by_omp(
-    spectra: np.ndarray, above: np.ndarray, level: np.ndarray, waveform: Waveform, schedule: Schedule
+    spectra: np.ndarray,
+    above: np.ndarray,
+    level: np.ndarray,
+    waveform: Waveform,
+    schedule: Schedule,
 ) -> np.ndarray:
-    """Cells of rows with a detection that OMP's support keeps: the sparse sampling's sidelobes fall away.
+    """Cells of rows with a detection that OMP's support keeps: the sparse sampling's sidelobes fall
+    away.
 
-    A cell stays if OMP's accumulated power there, compared with the correlation's, is above the background.
-    A path some 20 dB below another one of its row is lost: off the grid the stronger one takes several of the few atoms.
+    A cell stays if OMP's accumulated power there, compared with the correlation's, is above the
+    background. A path some 20 dB below another one of its row is lost: off the grid the stronger
+    one takes several of the few atoms.
     """
     rows = np.flatnonzero(above.any(axis=1))
     out = np.zeros_like(above)
     if rows.size:
         found = omp_power(spectra, rows, waveform, schedule, OMP_SPARSITY)
-        # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2, OMP one group's
+        # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2, OMP
+        # one group's
         gain = (len(schedule) / 2) ** 2
         out[rows] = found * gain > level[rows]
     return out
 
 
-def estimate_at(local: LocalSpectra, power: np.ndarray, row: int, column: int, settings: Receivers) -> Estimate:
-    """The estimate of a peak of the map: off the grid, or with `refinement: grid` the centre of its cell."""
+def estimate_at(
+    local: LocalSpectra, power: np.ndarray, row: int, column: int, settings: Receivers
+) -> Estimate:
+    """The estimate of a peak of the map: off the grid, or with `refinement: grid` the centre of its
+    cell."""
     w = local.waveform
     if settings.refinement == "grid":
         delay, rate = to_delay(row, column - w.num_chirps // 2, w)
@@ -133,8 +174,8 @@ def describe(
     *,
     on_grid: bool = False,
 ) -> Detections:
-    """Detections in ranges, velocities and direction cosines; what lies outside the field of view has no direction. `on_grid`: of the
-    directions too the nearest grid point, eight to a beam."""
+    """Detections in ranges, velocities and direction cosines; what lies outside the field of view
+    has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam."""
     count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
     limit = np.sin(antennas.half_view) if antennas.half_view < np.pi / 2 else 1.0
@@ -153,7 +194,8 @@ def describe(
 
 
 def equivalent_range_power(cube: IFCube) -> np.ndarray:
-    """(N, P) mean power over the receivers, over range cell and chirp of the first group, before any data are removed."""
+    """(N, P) mean power over the receivers, over range cell and chirp of the first group, before
+    any data are removed."""
     total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
     for one in cube.samples[0]:
         spectrum = scipy.fft.fft(one, axis=1, workers=1)
@@ -161,14 +203,24 @@ def equivalent_range_power(cube: IFCube) -> np.ndarray:
     return total / cube.samples.shape[1]
 
 
-def make_maps(power: np.ndarray, cube: IFCube | RangeProfiles, settings: Receivers, passes: int) -> Maps:
+def make_maps(
+    power: np.ndarray, cube: IFCube | RangeProfiles, settings: Receivers, passes: int
+) -> Maps:
     """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
     w, guard, training = cube.waveform, settings.guard_cells[0], settings.training_cells[0]
-    before, looks = (equivalent_range_power(cube), cube.samples.shape[1]) if isinstance(cube, IFCube) else (np.zeros((0, 0)), 1)
+    before, looks = (
+        (equivalent_range_power(cube), cube.samples.shape[1])
+        if isinstance(cube, IFCube)
+        else (np.zeros((0, 0)), 1)
+    )
     return Maps(
         range_doppler=power.astype(np.float32),
         range_axis=np.arange(power.shape[0]) * w.range_cell(passes),
         velocity_axis=doppler_bins(w) * w.velocity_cell(passes),
         equivalent_range=np.sqrt(before),
-        equivalent_detections=detect_chirps(before, looks, settings.false_alarm_rate, guard, training) if before.size else before > 0,
+        equivalent_detections=detect_chirps(
+            before, looks, settings.false_alarm_rate, guard, training
+        )
+        if before.size
+        else before > 0,
     )

@@ -2,13 +2,16 @@
 
 With a data delay tau_D = D / (alpha T) the tone of a path at cell f becomes (cycles, over sample n)
 
-    (f + D) n/N  -  f s_D/N  +  [f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2 / 2],      s_D = D f_s / (alpha T).
+    (f + D) n/N  -  f s_D/N  +  [f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2 / 2],      s_D = D
+    f_s / (alpha T).
 
-The bracket and the ramp D n/N do not depend on the path. The cross term does: it shifts the tone's time origin
-by s_D samples (17 for the largest symbol of the paper's settings). So the window is laid s_D samples later, over the same
-stretch of the shifted time for every symbol, and the spectrum's cell k, which was k + D before the factor exp(-j 2 pi D n/N), is turned
-by exp(+j 2 pi k s_D/N). What remains is, at fractional cells too, an unmodulated chirp that was sent tau_D later: the path's motion during
-tau_D is in it, and whoever follows the phase from chirp to chirp has to count tau_D to the chirp's time.
+The bracket and the ramp D n/N do not depend on the path. The cross term does: it shifts the tone's
+time origin by s_D samples (17 for the largest symbol of the paper's settings). So the window is
+laid s_D samples later, over the same stretch of the shifted time for every symbol, and the
+spectrum's cell k, which was k + D before the factor exp(-j 2 pi D n/N), is turned by exp(+j 2 pi k
+s_D/N). What remains is, at fractional cells too, an unmodulated chirp that was sent tau_D later:
+the path's motion during tau_D is in it, and whoever follows the phase from chirp to chirp has to
+count tau_D to the chirp's time.
 """
 
 from __future__ import annotations
@@ -27,19 +30,27 @@ def hann(position: np.ndarray, length: float) -> np.ndarray:
     return np.where(inside, np.sin(np.pi * position / length) ** 2, 0.0)
 
 
-def _factors(num_samples: int, delay_symbols: np.ndarray, starts: np.ndarray, length: float) -> np.ndarray:
-    """`hann` of sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D to k: (P, N) complex64."""
+def _factors(
+    num_samples: int, delay_symbols: np.ndarray, starts: np.ndarray, length: float
+) -> np.ndarray:
+    """`hann` of sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D to k:
+    (P, N) complex64."""
     out = np.empty((len(starts), num_samples), np.complex64)
     _fill_factors(
-        np.asarray(delay_symbols, np.int64) % num_samples, starts.astype(np.float64), length,
-        np.exp(2j * np.pi / length * np.arange(num_samples)), np.exp(-2j * np.pi / num_samples * np.arange(num_samples)), out,
-    )  # fmt: skip
+        np.asarray(delay_symbols, np.int64) % num_samples,
+        starts.astype(np.float64),
+        length,
+        np.exp(2j * np.pi / length * np.arange(num_samples)),
+        np.exp(-2j * np.pi / num_samples * np.arange(num_samples)),
+        out,
+    )
     return out
 
 
 @njit(nogil=True, cache=True)
 def _fill_factors(symbols, starts, length, places, roots, out):  # pragma: no cover - compiled
-    """Sines of sums made of few sines: `places` are those of the window, `roots` those of the transform."""
+    """Sines of sums made of few sines: `places` are those of the window, `roots` those of the
+    transform."""
     for p in range(out.shape[0]):
         begin = np.exp(-2j * np.pi * starts[p] / length)
         at = 0
@@ -52,9 +63,12 @@ def _fill_factors(symbols, starts, length, places, roots, out):  # pragma: no co
 
 
 def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
-    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, each a product of two phasors reduced in float64."""
+    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, each a
+    product of two phasors reduced in float64."""
     coarse, fine = np.arange(0, num_samples, 32), np.arange(32)
-    start, step = (np.exp(2j * np.pi * (np.asarray(frequency)[:, None] * n % 1.0)) for n in (coarse, fine))
+    start, step = (
+        np.exp(2j * np.pi * (np.asarray(frequency)[:, None] * n % 1.0)) for n in (coarse, fine)
+    )
     out = np.empty((len(start), num_samples), np.complex64)
     _fill_tones(start, step, out)
     return out
@@ -67,7 +81,9 @@ def _fill_tones(start, step, out):  # pragma: no cover - compiled
             out[p, n] = start[p, n // 32] * step[p, n % 32]
 
 
-def clean_spectrum(cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, num_rows: int) -> np.ndarray:
+def clean_spectrum(
+    cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, num_rows: int
+) -> np.ndarray:
     """Hann-windowed range spectra without the data.
 
     Parameters

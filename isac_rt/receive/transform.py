@@ -1,10 +1,12 @@
-r"""Range transforms of many chirps at once: the FFTs of a reception, with what comes before and after them in the same pass.
+r"""Range transforms of many chirps at once: the FFTs of a reception, with what comes before and
+after them in the same pass.
 
 .. math:: Y[r, i, p] = g[i, p] \sum_n h[p, n]\, s[r, p, n]\, e^{-j 2 \pi c_i n / N}
 
-Sixteen chirps lie side by side in a table that stays in the second-level cache from the first factor to the last (`isac_rt.kernels.fourier`);
-the samples are read once and only the cells that are wanted are written. `transform_plain` is the same by `scipy.fft`: the oracle, and
-what is used for an N that is no product of 8 and twos, threes and fives.
+Sixteen chirps lie side by side in a table that stays in the second-level cache from the first
+factor to the last (`isac_rt.kernels.fourier`); the samples are read once and only the cells that
+are wanted are written. `transform_plain` is the same by `scipy.fft`: the oracle, and what is used
+for an N that is no product of 8 and twos, threes and fives.
 """
 
 from __future__ import annotations
@@ -51,9 +53,15 @@ def transform(
     wanted = np.zeros((0, size), np.float32) if power is None else power
     work = [aligned(rows * ROW) for rows in (size, size, len(turns), len(wanted) and size // 2)]
     _transform(  # type: ignore[call-arg]
-        *(np.ascontiguousarray(a, np.complex64).view(np.float32) for a in (samples, factor, turns)), wanted,
-        out.view(np.float32), radices, twiddles, place, place[np.asarray(cells) % size], *work,
-    )  # fmt: skip
+        *(np.ascontiguousarray(a, np.complex64).view(np.float32) for a in (samples, factor, turns)),
+        wanted,
+        out.view(np.float32),
+        radices,
+        twiddles,
+        place,
+        place[np.asarray(cells) % size],
+        *work,
+    )
 
 
 def transform_plain(
@@ -76,18 +84,26 @@ def transform_plain(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, table, factors, turns, added):  # pragma: no cover
-    """`transform`; complex arrays as float32 with real and imaginary parts in turn. The last four are work space."""
+def _transform(
+    samples, factor, turn, power, out, radices, twiddles, place, at, table, factors, turns, added
+):  # pragma: no cover
+    """`transform`; complex arrays as float32 with real and imaginary parts in turn. The last four
+    are work space."""
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
         _fill(factor, 0, first, count, factors)
         for i in range(turns.size // ROW):
             for lane in range(count):
-                turns[i * ROW + lane], turns[i * ROW + LANES + lane] = turn[i, 2 * (first + lane)], turn[i, 2 * (first + lane) + 1]
+                turns[i * ROW + lane], turns[i * ROW + LANES + lane] = (
+                    turn[i, 2 * (first + lane)],
+                    turn[i, 2 * (first + lane) + 1],
+                )
         added[:] = 0.0
         for r in range(num_rx):
-            _fill(samples.reshape(num_rx * num_chirps, 2 * size), r * num_chirps, first, count, table)
+            _fill(
+                samples.reshape(num_rx * num_chirps, 2 * size), r * num_chirps, first, count, table
+            )
             _multiply(table, factors)
             lanefft.transform(table, 0, size, radices, twiddles)
             if added.size:
@@ -100,7 +116,8 @@ def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, 
 
 @njit(nogil=True, error_model="numpy")
 def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
-    """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16 chirps are turned over at a time."""
+    """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
+    chirps are turned over at a time."""
     lanes = lines.shape[1]
     flat = lines.reshape(-1)
     for n in range(0, lanes, LANES):
@@ -114,7 +131,12 @@ def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
 @njit(nogil=True, error_model="numpy")
 def _multiply(table, factors):  # pragma: no cover - compiled
     for i in range(0, table.size, ROW):
-        a, b, c, d = load(table, i), load(table, i + LANES), load(factors, i), load(factors, i + LANES)
+        a, b, c, d = (
+            load(table, i),
+            load(table, i + LANES),
+            load(factors, i),
+            load(factors, i + LANES),
+        )
         store(table, i, a * c - b * d)
         store(table, i + LANES, a * d + b * c)
 

@@ -1,4 +1,5 @@
-"""What a receiver is given besides the samples, and what it hands on. Nothing here comes from the truth."""
+"""What a receiver is given besides the samples, and what it hands on. Nothing here comes from the
+truth."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What tracking expects of the paths of one frame, in measurement space, at the middle of the frame.
+    """What tracking expects of the paths of one frame, in measurement space, at the middle of the
+    frame.
 
     One row per expected path; row 0 of a PT is its line of sight.
 
@@ -32,13 +34,15 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True)
 class Detections:
-    """Points that a receiver found in one frame, at the middle of the frame. Read-only arrays of Q rows.
+    """Points that a receiver found in one frame, at the middle of the frame. Read-only arrays of Q
+    rows.
 
     Attributes
     ----------
     range : (Q,) [m]; one way at the AT, whole path length at a PT
     velocity : (Q,) [m/s], rate of `range`, positive is receding
-    direction : (Q, 2) direction cosines (u_x, u_z) of arrival in the receiver's body frame; NaN where it was not found
+    direction : (Q, 2) direction cosines (u_x, u_z) of arrival in the receiver's body frame; NaN
+        where it was not found
     snr : (Q,) linear, of the range-Doppler cell after accumulation over antennas
     std : (Q, 4) standard deviations of range, velocity, u_x, u_z
     is_reference : (Q,) bool, the line of sight at a PT
@@ -64,7 +68,9 @@ class Detections:
             mark = "  line of sight" if self.is_reference[i] else ""
             u_x, u_z = self.direction[i]
             level = 10 * np.log10(max(self.snr[i], 1e-30))
-            rows.append(f"{self.range[i]:11.3f}{self.velocity[i]:16.3f}{u_x:8.3f}{u_z:8.3f}{level:10.1f}{mark}")
+            rows.append(
+                f"{self.range[i]:11.3f}{self.velocity[i]:16.3f}{u_x:8.3f}{u_z:8.3f}{level:10.1f}{mark}"
+            )
         more = [f"  and {len(self) - 20} more"] if len(self) > 20 else []
         return "\n".join([f"<{len(self)} detections", *(rows if len(self) else []), *more]) + ">"
 
@@ -86,9 +92,11 @@ class Maps:
 
     Attributes
     ----------
-    range_doppler : (rows, P) power, accumulated over antennas; rows from range 0, Doppler centred (velocity ascending)
+    range_doppler : (rows, P) power, accumulated over antennas; rows from range 0, Doppler centred
+        (velocity ascending)
     range_axis [m], velocity_axis [m/s] : of the rows and columns
-    equivalent_range : (N, P) rms magnitude over the receivers of the first group before data removal, over range cell and chirp
+    equivalent_range : (N, P) rms magnitude over the receivers of the first group before data
+        removal, over range cell and chirp
     equivalent_detections : (N, P) bool, what the one-dimensional CFAR finds in it, chirp by chirp
     """
 
@@ -109,18 +117,25 @@ class Reception:
     decoded : whether data symbols were decided (a PT in a data frame with its line of sight)
     delay_symbols : (M, P) int, -1 where nothing was decided
     transitions : (M, L_tx, P/L_tx - 1) int, -1 where nothing was decided
-    bits : (bits_per_frame,) uint8, of the groups that are read, in the order of `Payload.bits_of`; empty when not decoded
+    bits : (bits_per_frame,) uint8, of the groups that are read, in the order of `Payload.bits_of`;
+        empty when not decoded
     delay_confidence : (M, P), transition_confidence : as `transitions`; larger is surer
-    raw_delay_symbols : (groups read, P) int, decisions of a search that runs a few cells past the alphabet on both sides (so -3 and
-        N/2 + 2 can occur), for slip detection; empty when not decoded
-    line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at the AT)
-    reference_power : mean power of the reference path per sample and receive antenna [W], NaN where there is none
+    raw_delay_symbols : (groups read, P) int, decisions of a search that runs a few cells past the
+        alphabet on both sides (so -3 and N/2 + 2 can occur), for slip detection; empty when not
+        decoded
+    line_of_sight : whether the receiver sees its reference path in this frame (PT; always False at
+        the AT)
+    reference_power : mean power of the reference path per sample and receive antenna [W], NaN where
+        there is none
     maps : Maps or None
-    soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or decided from powers
-    confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many exponentials; 0 when not decoded
-    sparse : where the velocities came from sparse sampling with OMP or from a conventional schedule, whether the scene is sparse
-        enough for OMP (`isac_rt.receive.omp.sparse_enough`); False advises the transmitter to fall back from a pseudo-random
-        schedule to a conventional one (`isac_rt.access.fall_back`). None elsewhere
+    soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or
+        decided from powers
+    confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many
+        exponentials; 0 when not decoded
+    sparse : where the velocities came from sparse sampling with OMP or from a conventional
+        schedule, whether the scene is sparse enough for OMP (`isac_rt.receive.omp.sparse_enough`);
+        False advises the transmitter to fall back from a pseudo-random schedule to a conventional
+        one (`isac_rt.access.fall_back`). None elsewhere
     """
 
     detections: Detections
@@ -146,13 +161,15 @@ class Reception:
 
 @dataclass(frozen=True)
 class ExpectedClutter:
-    """K independent scatterers of known mean power, as one receiver expects them at the middle of a frame.
+    """K independent scatterers of known mean power, as one receiver expects them at the middle of a
+    frame.
 
     Attributes
     ----------
     delay, delay_rate : (K,) [s, 1]
     power : (K,) mean received power per sample and antenna pair [W], elements included
-    departure, arrival : (K, 3) unit vectors in the body frame of the transmitter and of the receiver
+    departure, arrival : (K, 3) unit vectors in the body frame of the transmitter and of the
+        receiver
     """
 
     delay: np.ndarray

@@ -1,8 +1,10 @@
-"""One self-describing file per run: what is recorded of every frame, how it is summed up, saved and loaded.
+"""One self-describing file per run: what is recorded of every frame, how it is summed up, saved and
+loaded.
 
-`Recorder` collects frames and makes one `xarray.Dataset` with named dimensions; what differs in number from frame to
-frame (detections, tracks, paths) is ragged: flat arrays beside their frame and observer. Nothing that depends on the
-clock of the machine is in the dataset, so two runs of one scenario give bit-identical variables.
+`Recorder` collects frames and makes one `xarray.Dataset` with named dimensions; what differs in
+number from frame to frame (detections, tracks, paths) is ragged: flat arrays beside their frame and
+observer. Nothing that depends on the clock of the machine is in the dataset, so two runs of one
+scenario give bit-identical variables.
 """
 
 from __future__ import annotations
@@ -24,40 +26,9 @@ class ResultsError(Exception):
     """Results cannot be written or read; the text says why and what to do."""
 
 
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
 def _atomically(file: Path, write: Callable[[Path], object]) -> None:
-    """Have `write` make a file under a temporary name beside `file`, then put it in place whole; or raise and leave nothing."""
+    """Have `write` make a file under a temporary name beside `file`, then put it in place whole; or
+    raise and leave nothing."""
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -65,7 +36,9 @@ def _atomically(file: Path, write: Callable[[Path], object]) -> None:
         os.replace(temporary, file)
     except OSError as problem:
         reason = problem.strerror or str(problem)
-        raise ResultsError(f"cannot write {file}: {reason}; choose another place with --out, or make room") from problem
+        raise ResultsError(
+            f"cannot write {file}: {reason}; choose another place with --out, or make room"
+        ) from problem
     finally:
         try:
             temporary.unlink(missing_ok=True)
@@ -90,11 +63,14 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
         for name, v in dataset.variables.items()
         if v.dtype != object and v.ndim and v.size
     }
-    _atomically(file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding))
+    _atomically(
+        file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+    )
 
 
 def save(results: Results, folder: str | Path) -> None:
-    """Write ``results.nc``, ``summary.json`` and ``scenario.yaml`` into `folder`; each appears whole or not at all.
+    """Write ``results.nc``, ``summary.json`` and ``scenario.yaml`` into `folder`; each appears
+    whole or not at all.
 
     Raises
     ------
@@ -103,7 +79,9 @@ def save(results: Results, folder: str | Path) -> None:
     folder = Path(folder)
     write_dataset(results.dataset, folder / FILE)
     write_text(folder / "scenario.yaml", to_yaml(results.scenario, folder))
-    write_text(folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n")
+    write_text(
+        folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n"
+    )
 
 
 def check_folder(folder: str | Path) -> None:
@@ -128,5 +106,7 @@ def load(folder: str | Path) -> Results:
             dataset = opened.load()
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
-        raise ResultsError(f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote") from problem
+        raise ResultsError(
+            f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote"
+        ) from problem
     return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))

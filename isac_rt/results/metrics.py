@@ -34,8 +34,9 @@ RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
 class Truth(NamedTuple):
     """One UAV as one terminal ought to see it.
 
-    range [m] and velocity [m/s, positive receding] in the terms of `Detections`; direction cosines u_x, u_z; azimuth from the
-    boresight towards +X and elevation from the horizontal of the body [rad]
+    range [m] and velocity [m/s, positive receding] in the terms of `Detections`; direction cosines
+    u_x, u_z; azimuth from the boresight towards +X and elevation from the horizontal of the body
+    [rad]
     """
 
     range: float
@@ -49,8 +50,9 @@ class Truth(NamedTuple):
 def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
     """What `observer` ought to measure of `uav`.
 
-    Without `at` the one-way range and its rate: every target of an AT, and the AT itself at a PT. With `at` the bistatic
-    path length AT - UAV - observer and its rate. The direction is that of arrival, over the whole sphere.
+    Without `at` the one-way range and its rate: every target of an AT, and the AT itself at a PT.
+    With `at` the bistatic path length AT - UAV - observer and its rate. The direction is that of
+    arrival, over the whole sphere.
     """
     offset = uav.position - observer.position
     distance = float(np.linalg.norm(offset))
@@ -68,20 +70,25 @@ def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
 def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarray:
     """Resolution of range [m], velocity [m/s], u_x and u_z (4,).
 
-    The array's is wavelength over aperture: that of the virtual array (transmit times receive elements of an arm) for
-    an echo (passes = 2), of the receive array alone for one pass.
+    The array's is wavelength over aperture: that of the virtual array (transmit times receive
+    elements of an arm) for an echo (passes = 2), of the receive array alone for one pass.
     """
     across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
     up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
     step = waveform.wavelength / antennas.spacing
-    return np.array([waveform.range_cell(passes), waveform.velocity_cell(passes), step / across, step / up])
+    return np.array(
+        [waveform.range_cell(passes), waveform.velocity_cell(passes), step / across, step / up]
+    )
 
 
-def associate(truths: Sequence[Truth], estimates: np.ndarray, resolution: np.ndarray) -> list[tuple[int, int]]:
-    """One-to-one pairs (truth, estimate) within `GATE_RESOLUTIONS` on every axis, of the least total squared distance.
+def associate(
+    truths: Sequence[Truth], estimates: np.ndarray, resolution: np.ndarray
+) -> list[tuple[int, int]]:
+    """One-to-one pairs (truth, estimate) within `GATE_RESOLUTIONS` on every axis, of the least
+    total squared distance.
 
-    `estimates` (Q, 4) range, velocity, u_x, u_z; a direction that is NaN is not compared. A velocity that aliased is a
-    wrong velocity here.
+    `estimates` (Q, 4) range, velocity, u_x, u_z; a direction that is NaN is not compared. A
+    velocity that aliased is a wrong velocity here.
     """
     if not truths or not len(estimates):
         return []
@@ -96,7 +103,8 @@ def associate(truths: Sequence[Truth], estimates: np.ndarray, resolution: np.nda
 
 
 def direct_targets(paths: PathSet, names: list[str]) -> np.ndarray:
-    """Whether each UAV is reached straight, without the city: the transmitter by the line of sight, the others by their echo."""
+    """Whether each UAV is reached straight, without the city: the transmitter by the line of sight,
+    the others by their echo."""
     straight = ~paths.bent
     echo = {paths.target_names[i] for i in paths.target[straight & (paths.kind == PathKind.TARGET)]}
     sight = bool((straight & (paths.kind == PathKind.LINE_OF_SIGHT)).any())
@@ -119,14 +127,17 @@ class Explanation(NamedTuple):
 
 
 def explain(detections: Detections, paths: PathSet, waveform: Waveform, passes: int) -> Explanation:
-    """Which path caused each detection: the strongest within one cell of it in range and in velocity.
+    """Which path caused each detection: the strongest within one cell of it in range and in
+    velocity.
 
     Paths are compared where the receiver sees them: velocity modulo the unambiguous span.
     """
     path_range = SPEED_OF_LIGHT * paths.delay / passes
     path_velocity = SPEED_OF_LIGHT * paths.delay_rate / passes
     span, power = 2 * waveform.max_velocity(passes), paths.power
-    out = Explanation(*(np.full(len(detections), -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)))
+    out = Explanation(
+        *(np.full(len(detections), -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32))
+    )
     for q in range(len(detections)):
         off = detections.velocity[q] - path_velocity
         off -= span * np.round(off / span)
@@ -136,7 +147,11 @@ def explain(detections: Detections, paths: PathSet, waveform: Waveform, passes: 
         )
         if near.size:
             strongest = near[np.argmax(power[near])]
-            out.kind[q], out.target[q], out.order[q] = paths.kind[strongest], paths.target[strongest], paths.bounces[strongest]
+            out.kind[q], out.target[q], out.order[q] = (
+                paths.kind[strongest],
+                paths.target[strongest],
+                paths.bounces[strongest],
+            )
             met = paths.faces[strongest][paths.faces[strongest] >= 0]
             out.face[q] = met[0] if met.size else -1
     return out
@@ -161,11 +176,16 @@ class SymbolCount:
     frames: int = 0
 
     def __add__(self, other: SymbolCount) -> SymbolCount:
-        return SymbolCount(*(getattr(self, f) + getattr(other, f) for f in self.__dataclass_fields__))
+        return SymbolCount(
+            *(getattr(self, f) + getattr(other, f) for f in self.__dataclass_fields__)
+        )
 
 
-def count_symbols(payload: Payload, reception: Reception, groups: Sequence[int] | None = None) -> SymbolCount:
-    """One frame: what was sent in `groups` (None: in all) against what was decided. An unmodulated frame counts nothing."""
+def count_symbols(
+    payload: Payload, reception: Reception, groups: Sequence[int] | None = None
+) -> SymbolCount:
+    """One frame: what was sent in `groups` (None: in all) against what was decided. An unmodulated
+    frame counts nothing."""
     if not payload.modulated:
         return SymbolCount()
     mine = list(range(len(payload.delay_symbols)) if groups is None else groups)
@@ -190,14 +210,21 @@ def count_symbols(payload: Payload, reception: Reception, groups: Sequence[int] 
 
 @dataclass
 class Errors:
-    """Sums of squares of associated errors in the four reported quantities; NaN directions are left out of theirs."""
+    """Sums of squares of associated errors in the four reported quantities; NaN directions are left
+    out of theirs."""
 
     square: np.ndarray = field(default_factory=lambda: np.zeros(4))
     count: np.ndarray = field(default_factory=lambda: np.zeros(4, np.int64))
 
     def add(self, truth: Truth, estimate: np.ndarray) -> None:
         """`estimate` (4,) range, velocity, u_x, u_z."""
-        error = np.array([estimate[0] - truth.range, estimate[1] - truth.velocity, *_angle_errors(truth, estimate[2:])])
+        error = np.array(
+            [
+                estimate[0] - truth.range,
+                estimate[1] - truth.velocity,
+                *_angle_errors(truth, estimate[2:]),
+            ]
+        )
         known = np.isfinite(error)
         self.square[known] += error[known] ** 2
         self.count += known
@@ -208,12 +235,14 @@ class Errors:
     def rmse(self) -> dict[str, float | None]:
         """By the fixed keys; null where nothing was associated."""
         return {
-            key: float(np.sqrt(s / n)) if n else None for key, s, n in zip(ERROR_KEYS, self.square, self.count, strict=True)
+            key: float(np.sqrt(s / n)) if n else None
+            for key, s, n in zip(ERROR_KEYS, self.square, self.count, strict=True)
         }
 
 
 def _angle_errors(truth: Truth, cosines: np.ndarray) -> tuple[float, float]:
-    """Azimuth and elevation errors [deg] of estimated direction cosines (front half-space); NaN outside the unit disc."""
+    """Azimuth and elevation errors [deg] of estimated direction cosines (front half-space); NaN
+    outside the unit disc."""
     forward = 1 - cosines[0] ** 2 - cosines[1] ** 2
     if not forward >= 0:
         return np.nan, np.nan
@@ -232,7 +261,8 @@ class SensingScore:
     frames, target_frames : frames scored; targets in view and unshadowed, summed over frames
     hits : target-frames with a detection within one resolution on all four axes
     matched, matched_tracks : target-frames with a detection (a confirmed track) within three
-    false, clutter : detections of no target: those that no path explains, and those that some path explains
+    false, clutter : detections of no target: those that no path explains, and those that some path
+        explains
     detection_errors, track_errors : of the matched ones
     """
 
@@ -248,9 +278,14 @@ class SensingScore:
     track_errors: Errors = field(default_factory=Errors)
 
     def add(
-        self, truths: Sequence[Truth], detections: Detections, tracks: TrackSet | None = None, kinds: np.ndarray | None = None
+        self,
+        truths: Sequence[Truth],
+        detections: Detections,
+        tracks: TrackSet | None = None,
+        kinds: np.ndarray | None = None,
     ) -> None:
-        """One frame: `truths` of the targets in view and unshadowed, `kinds` (Q,) from `explain` (all unexplained if None)."""
+        """One frame: `truths` of the targets in view and unshadowed, `kinds` (Q,) from `explain`
+        (all unexplained if None)."""
         found = np.column_stack([detections.range, detections.velocity, detections.direction])
         pairs = associate(truths, found, self.resolution)
         for i, j in pairs:
@@ -265,14 +300,24 @@ class SensingScore:
         self.target_frames += len(truths)
         self.frames += 1
         if tracks is not None:
-            sure = np.column_stack([tracks.range, tracks.velocity, tracks.direction])[tracks.confirmed]
+            sure = np.column_stack([tracks.range, tracks.velocity, tracks.direction])[
+                tracks.confirmed
+            ]
             for i, j in associate(truths, sure, self.resolution):
                 self.track_errors.add(truths[i], sure[j])
                 self.matched_tracks += 1
 
     def merge(self, other: SensingScore) -> None:
         """Pool another link's score into this one."""
-        for name in ("frames", "target_frames", "hits", "matched", "matched_tracks", "false", "clutter"):
+        for name in (
+            "frames",
+            "target_frames",
+            "hits",
+            "matched",
+            "matched_tracks",
+            "false",
+            "clutter",
+        ):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.detection_errors.merge(other.detection_errors)
         self.track_errors.merge(other.track_errors)
@@ -286,12 +331,16 @@ def pool(scores: Sequence[SensingScore]) -> SensingScore:
     return out
 
 
-def summary_block(role: str | list[str], sensing: SensingScore, symbols: SymbolCount | None, duration: float) -> dict[str, object]:
-    """One terminal's (or link's) figures under the fixed keys of `summary.json`; null where one does not apply.
+def summary_block(
+    role: str | list[str], sensing: SensingScore, symbols: SymbolCount | None, duration: float
+) -> dict[str, object]:
+    """One terminal's (or link's) figures under the fixed keys of `summary.json`; null where one
+    does not apply.
 
-    `bits` are the payload bits that were decoded, right or wrong; `bit_rate_bps` is these over `duration` [s], the time from
-    the first frame to the end of the last, pauses and pilots included. `ber` counts undecoded bits as errors. `counts` holds
-    numerator and denominator of the rates, for pooling and for intervals.
+    `bits` are the payload bits that were decoded, right or wrong; `bit_rate_bps` is these over
+    `duration` [s], the time from the first frame to the end of the last, pauses and pilots
+    included. `ber` counts undecoded bits as errors. `counts` holds numerator and denominator of the
+    rates, for pooling and for intervals.
     """
     c = symbols or SymbolCount()
     receives = symbols is not None
@@ -336,7 +385,8 @@ class Gospa(NamedTuple):
 def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
     r"""Generalised optimal sub-pattern assignment with p = 2, alpha = 2.
 
-    .. math:: d^2 = \min_\gamma \sum_{(i,j)\in\gamma} |x_i-y_j|^2 + \tfrac{c^2}{2}(|X|+|Y|-2|\gamma|)
+    .. math:: d^2 = \min_\gamma \sum_{(i,j)\in\gamma} |x_i-y_j|^2 +
+    \tfrac{c^2}{2}(|X|+|Y|-2|\gamma|)
 
     Parameters
     ----------
@@ -345,7 +395,8 @@ def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
 
     References
     ----------
-    .. [1] A. S. Rahmathullah et al., "Generalized optimal sub-pattern assignment metric", FUSION 2017,
+    .. [1] A. S. Rahmathullah et al., "Generalized optimal sub-pattern assignment metric", FUSION
+    2017,
        doi:10.23919/ICIF.2017.8009645
     """
     x, y = np.asarray(truths, float), np.asarray(estimates, float)
@@ -359,16 +410,22 @@ def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
     return Gospa(float(np.sqrt(square + missed + false)), square, missed, false)
 
 
-def binomial_interval(successes: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Clopper-Pearson: the proportions that would not make `successes` or fewer, or as many or more, too unlikely."""
+def binomial_interval(
+    successes: float, trials: float, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Clopper-Pearson: the proportions that would not make `successes` or fewer, or as many or
+    more, too unlikely."""
     tail = (1 - confidence) / 2
     low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
-    high = float(beta.ppf(1 - tail, successes + 1, trials - successes)) if successes < trials else 1.0
+    high = (
+        float(beta.ppf(1 - tail, successes + 1, trials - successes)) if successes < trials else 1.0
+    )
     return low, high
 
 
 def within_view(antennas: Antennas, own: Pose, active: Pose, body: Pose) -> bool:
-    """Whether a body is in the field of view of the receiver and, unless it is the transmitter itself, of the transmitter."""
+    """Whether a body is in the field of view of the receiver and, unless it is the transmitter
+    itself, of the transmitter."""
     ends = [(own, body)]
     if body is active:
         ends.append((active, own))

@@ -17,12 +17,13 @@ KINDS = tuple(kind.name.lower() for kind in PathKind)
 
 @dataclass(frozen=True, kw_only=True)
 class UavValues:
-    """One value per UAV of the scenario, in its order: truth, or estimates with NaN where a UAV was not matched.
+    """One value per UAV of the scenario, in its order: truth, or estimates with NaN where a UAV was
+    not matched.
 
     Attributes
     ----------
-    range, velocity : (U,) as in `Detections` [m], [m/s, positive receding]: one way at the AT and of the transmitter itself,
-        path length and its rate for what reflects to a PT
+    range, velocity : (U,) as in `Detections` [m], [m/s, positive receding]: one way at the AT and
+        of the transmitter itself, path length and its rate for what reflects to a PT
     azimuth, elevation : (U,) [rad] in the observer's body frame
     """
 
@@ -34,8 +35,9 @@ class UavValues:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackTable:
-    """The tracks that an observer keeps after a frame, one row each: id, range [m], velocity [m/s], direction cosines,
-    whether confirmed, and the index of the UAV that the track follows in truth (-1: none)."""
+    """The tracks that an observer keeps after a frame, one row each: id, range [m], velocity [m/s],
+    direction cosines, whether confirmed, and the index of the UAV that the track follows in truth
+    (-1: none)."""
 
     id: np.ndarray
     range: np.ndarray
@@ -59,12 +61,15 @@ class ObserverRecord:
     in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
-    detection_kind, detection_target, detection_order, detection_face : (Q,) what explains each detection, as `metrics.Explanation` says
+    detection_kind, detection_target, detection_order, detection_face : (Q,) what explains each
+        detection, as `metrics.Explanation` says
     symbols : what was sent to it and became of it
-    fell_back : whether the transmitter sent the conventional schedule in place of the scenario's (`isac_rt.access.fall_back`)
+    fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
+        (`isac_rt.access.fall_back`)
     num_false : detections that no path explains
     slips : symbols decided outside their alphabet
-    reference_snr : per sample and antenna before processing (linear); NaN where there is no reference path
+    reference_snr : per sample and antenna before processing (linear); NaN where there is no
+        reference path
     """
 
     transmitter: str
@@ -90,8 +95,9 @@ class ObserverRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
-    """One frame: its index, the time of its middle [s], all poses then, and by its label every observer that received in it.
-    Of a `snapshot` frame the whole path ledger and the maps are kept."""
+    """One frame: its index, the time of its middle [s], all poses then, and by its label every
+    observer that received in it. Of a `snapshot` frame the whole path ledger and the maps are
+    kept."""
 
     frame: int
     time: float
@@ -103,7 +109,8 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class _Slim:
-    """An `ObserverRecord` with its paths reduced to numbers and power by kind, and the ledger of a snapshot."""
+    """An `ObserverRecord` with its paths reduced to numbers and power by kind, and the ledger of a
+    snapshot."""
 
     record: ObserverRecord
     counts: np.ndarray
@@ -131,4 +138,9 @@ def _slim(o: ObserverRecord, snapshot: bool) -> _Slim:
     kind, power = o.paths.kind, o.paths.power
     counts = np.bincount(kind, minlength=len(KINDS))
     total = np.bincount(kind, weights=power, minlength=len(KINDS))
-    return _Slim(ObserverRecord(**{**vars(o), "paths": o.paths.select(np.zeros(0, int))}), counts, total, o.paths if snapshot else None)
+    return _Slim(
+        ObserverRecord(**{**vars(o), "paths": o.paths.select(np.zeros(0, int))}),
+        counts,
+        total,
+        o.paths if snapshot else None,
+    )

@@ -30,7 +30,8 @@ from isac_rt.world.swarm import Swarm
 
 @dataclass(frozen=True)
 class Heard:
-    """What a terminal made of one frame: reception, tracks and the state it is in then (`TerminalState`)."""
+    """What a terminal made of one frame: reception, tracks and the state it is in then
+    (`TerminalState`)."""
 
     reception: Reception
     tracks: TrackSet
@@ -45,7 +46,9 @@ class Scorer:
         self._passes = 2 if link[0] == link[1] else 1
         self.score = SensingScore(resolutions(timetable.waveform, antennas, self._passes))
 
-    def record(self, frame: int, paths: PathSet, sent: Transmission, heard: Heard, noise_power: float) -> ObserverRecord:
+    def record(
+        self, frame: int, paths: PathSet, sent: Transmission, heard: Heard, noise_power: float
+    ) -> ObserverRecord:
         """Score one frame and describe it.
 
         Parameters
@@ -63,7 +66,9 @@ class Scorer:
         for name in names:
             by_way = active if self._passes == 1 and name != tx else None
             truth.append(None if name == rx else truth_of(own, poses[name], by_way))
-        in_view = np.array([name != rx and within_view(self._antennas, own, active, poses[name]) for name in names])
+        in_view = np.array(
+            [name != rx and within_view(self._antennas, own, active, poses[name]) for name in names]
+        )
         direct = direct_targets(paths, names)
         seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
         targets = [t for i in seen if (t := truth[i]) is not None]
@@ -74,7 +79,9 @@ class Scorer:
         tracked = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
         sure = np.flatnonzero(tracks.confirmed | tracks.is_reference)
         to_detection = associate(targets, detected, self.score.resolution)
-        to_track = [(i, int(sure[j])) for i, j in associate(targets, tracked[sure], self.score.resolution)]
+        to_track = [
+            (i, int(sure[j])) for i, j in associate(targets, tracked[sure], self.score.resolution)
+        ]
         followed = np.full(len(tracks), -1)
         followed[[j for _, j in to_track]] = [seen[i] for i, _ in to_track]
         stray = np.ones(len(d), bool)
@@ -90,12 +97,19 @@ class Scorer:
             in_view=in_view,
             shadowed=in_view & ~direct,
             tracks=TrackTable(
-                id=tracks.ids, range=tracks.range, velocity=tracks.velocity, u_x=tracks.direction[:, 0],
-                u_z=tracks.direction[:, 1], confirmed=tracks.confirmed, uav=followed,
+                id=tracks.ids,
+                range=tracks.range,
+                velocity=tracks.velocity,
+                u_x=tracks.direction[:, 0],
+                u_z=tracks.direction[:, 1],
+                confirmed=tracks.confirmed,
+                uav=followed,
             ),
             state=heard.state,
             **{f"detection_{name}": value for name, value in explained._asdict().items()},
-            symbols=count_symbols(sent.payload, reception, timetable.groups(self.link)) if self._passes == 1 else SymbolCount(),
+            symbols=count_symbols(sent.payload, reception, timetable.groups(self.link))
+            if self._passes == 1
+            else SymbolCount(),
             fell_back=sent.schedule is not timetable.schedule,
             num_false=int((stray & (explained.kind < 0)).sum()),
             slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
@@ -104,7 +118,8 @@ class Scorer:
 
 
 def _reference_snr(paths: PathSet, amplitude: float, noise_power: float) -> float:
-    """Per-sample SNR of the line of sight, or of the strongest echo on the terminal's own link; NaN where there is none."""
+    """Per-sample SNR of the line of sight, or of the strongest echo on the terminal's own link; NaN
+    where there is none."""
     kind = PathKind.TARGET if paths.tx == paths.rx else PathKind.LINE_OF_SIGHT
     power = paths.power[paths.kind == kind]
     return float(amplitude**2 * power.max() / noise_power) if power.size else float("nan")
@@ -112,15 +127,23 @@ def _reference_snr(paths: PathSet, amplitude: float, noise_power: float) -> floa
 
 def _values(rows: list[np.ndarray | None]) -> UavValues:
     table = np.array([np.full(4, np.nan) if r is None else r for r in rows])
-    return UavValues(range=table[:, 0], velocity=table[:, 1], azimuth=table[:, 2], elevation=table[:, 3])
+    return UavValues(
+        range=table[:, 0], velocity=table[:, 1], azimuth=table[:, 2], elevation=table[:, 3]
+    )
 
 
-def _estimates(count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen: list[int]) -> UavValues:
+def _estimates(
+    count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen: list[int]
+) -> UavValues:
     """Estimates by UAV; direction cosines become azimuth and elevation of the front half-space."""
     rows: list[np.ndarray | None] = [None] * count
     for i, j in pairs:
         r, v, u_x, u_z = found[j]
         forward = 1 - u_x**2 - u_z**2
-        angles = (np.arctan2(u_x, np.sqrt(forward)), np.arcsin(u_z)) if forward >= 0 else (np.nan, np.nan)
+        angles = (
+            (np.arctan2(u_x, np.sqrt(forward)), np.arcsin(u_z))
+            if forward >= 0
+            else (np.nan, np.nan)
+        )
         rows[seen[i]] = np.array([r, v, *angles])
     return _values(rows)

@@ -13,8 +13,13 @@ UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracki
 
 
 def path_content(scenario: Scenario) -> str:
-    """All that a scenario's paths depend on, but the instant, as text; the city's file by its content."""
-    tree = {key: value for key, value in scenario.model_dump(mode="json").items() if key not in UNSEEN_BY_PATHS}
+    """All that a scenario's paths depend on, but the instant, as text; the city's file by its
+    content."""
+    tree = {
+        key: value
+        for key, value in scenario.model_dump(mode="json").items()
+        if key not in UNSEEN_BY_PATHS
+    }
     return json.dumps([tree, city_digest(scenario), program_fingerprint()], sort_keys=True)
 
 
@@ -22,4 +27,7 @@ def run_content(scenario: Scenario, snapshots: int) -> str:
     """All that the results of a run depend on, as text."""
     costs = scenario.cost_model_path()
     files = [city_digest(scenario), "" if costs is None else file_digest(costs)]
-    return json.dumps([scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots], sort_keys=True)
+    return json.dumps(
+        [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],
+        sort_keys=True,
+    )

@@ -1,18 +1,25 @@
-r"""The error budget: what a scene needs, link by link and frame by frame, with the bound of what is left out.
+r"""The error budget: what a scene needs, link by link and frame by frame, with the bound of what is
+left out.
 
-Phases. Two approximations turn the phase of a path that is kept; each may use half of ``accuracy.max_phase_error_rad``:
+Phases. Two approximations turn the phase of a path that is kept; each may use half of
+``accuracy.max_phase_error_rad``:
 
-- plane for spherical wavefronts: an element at r from its array's centroid errs by :math:`k r^2/(2R)\,(1 + r/R)` at most, at a
-  wavefront of radius R; a line of sight also by :math:`k\, r_{tx} r_{rx}/R` (the joint term);
-- straight for accelerated flight within a frame: :math:`\pi f_c |\ddot\tau| t^2`, t to the farthest chirp of the frame.
+- plane for spherical wavefronts: an element at r from its array's centroid errs by :math:`k
+  r^2/(2R)\,(1 + r/R)` at most, at a wavefront of radius R; a line of sight also by :math:`k\,
+  r_{tx} r_{rx}/R` (the joint term);
+- straight for accelerated flight within a frame: :math:`\pi f_c |\ddot\tau| t^2`, t to the farthest
+  chirp of the frame.
 
-Left out. Paths the IF filter stops in every group, chirp and symbol are left out at no error. Ghosts and paths of the city so weak that
-all that are left out of one range cell together stay ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna
-cell: powers add, whatever the phases, on average. Between traced instants chains of walls are unfolded anew without error
-(`isac_rt.propagation.legs.between`) but for those that live for less than the way between two instants. Of n chains, of which b are born
-and d die from one instant to the next, with lives that end at random, b d / (6 n) are missed in a frame in between on average.
+Left out. Paths the IF filter stops in every group, chirp and symbol are left out at no error.
+Ghosts and paths of the city so weak that all that are left out of one range cell together stay
+``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
+whatever the phases, on average. Between traced instants chains of walls are unfolded anew without
+error (`isac_rt.propagation.legs.between`) but for those that live for less than the way between two
+instants. Of n chains, of which b are born and d die from one instant to the next, with lives that
+end at random, b d / (6 n) are missed in a frame in between on average.
 
-What is not modelled whatever the budget (`standing`): directions that turn within a frame, jerk, motion during the flight of light.
+What is not modelled whatever the budget (`standing`): directions that turn within a frame, jerk,
+motion during the flight of light.
 """
 
 from __future__ import annotations
@@ -44,7 +51,8 @@ FASTEST_UNTRACED_M = 4.0
 """Flight between traced instants under the preset fastest."""
 FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
-"""Paths up to which the preset everything takes the direct synthesis, whose time grows with them; beyond, "auto"."""
+"""Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
+beyond, "auto"."""
 
 
 REACH_MARGIN_M = 1.0
@@ -94,7 +102,9 @@ class Plan:
     @property
     def phase_share(self) -> float:
         """Most that either approximation may turn a phase [rad]."""
-        return {"everything": 0.0, "fastest": np.inf}.get(self.preset, self.scenario.accuracy.max_phase_error_rad / 2)
+        return {"everything": 0.0, "fastest": np.inf}.get(
+            self.preset, self.scenario.accuracy.max_phase_error_rad / 2
+        )
 
     @property
     def weakest(self) -> float:
@@ -102,12 +112,16 @@ class Plan:
         if self.preset == "everything":
             return 0.0
         db = self.scenario.propagation.weakest_path_db
-        return float(10 ** (-(min(db, FASTEST_WEAKEST_DB) if self.preset == "fastest" else db) / 10))
+        return float(
+            10 ** (-(min(db, FASTEST_WEAKEST_DB) if self.preset == "fastest" else db) / 10)
+        )
 
     @property
     def max_untraced(self) -> float:
         """Most flight between traced instants [m]."""
-        return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(self.preset, self.scenario.accuracy.max_untraced_m)
+        return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(
+            self.preset, self.scenario.accuracy.max_untraced_m
+        )
 
     def __post_init__(self) -> None:
         _ = self.costs  # a bad file is told of before anything runs
@@ -138,18 +152,32 @@ class Plan:
 
     @cached_property
     def traced_frames(self) -> tuple[int, ...]:
-        """Frames at whose epochs the city is traced: the first, the last, and as few in between as `max_untraced` allows.
+        """Frames at whose epochs the city is traced: the first, the last, and as few in between as
+        `max_untraced` allows.
 
-        Every frame is traced where frames are farther apart than that, or where nothing is to be traced.
+        Every frame is traced where frames are farther apart than that, or where nothing is to be
+        traced.
         """
         frames = self.scenario.frames
         if self.scenario.propagation.model != "ray_traced" or self.max_untraced == 0:
             return tuple(range(frames))
-        places = np.array([[p.position for p in self.swarm.poses(self.timetable.epoch(f)).values()] for f in range(frames)])
-        flown = np.concatenate([np.zeros((1, places.shape[1])), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=2), axis=0)])
+        places = np.array(
+            [
+                [p.position for p in self.swarm.poses(self.timetable.epoch(f)).values()]
+                for f in range(frames)
+            ]
+        )
+        flown = np.concatenate(
+            [
+                np.zeros((1, places.shape[1])),
+                np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=2), axis=0),
+            ]
+        )
         out = [0]
         while out[-1] < frames - 1:
-            ahead = np.flatnonzero((flown[out[-1] + 1 :] - flown[out[-1]]).max(axis=1) <= self.max_untraced)
+            ahead = np.flatnonzero(
+                (flown[out[-1] + 1 :] - flown[out[-1]]).max(axis=1) <= self.max_untraced
+            )
             out.append(out[-1] + 1 + (int(ahead[-1]) if ahead.size else 0))
         return tuple(out)
 
@@ -162,14 +190,25 @@ class Plan:
 
     @cached_property
     def longest_delay(self) -> float:
-        """A path with more delay than this reaches no receiver: the IF filter stops it in every group [s]."""
+        """A path with more delay than this reaches no receiver: the IF filter stops it in every
+        group [s]."""
         w = self.waveform
-        chosen = self.scenario.first_blocks() if self.timetable.blocks is None else self.timetable.blocks
+        chosen = (
+            self.scenario.first_blocks() if self.timetable.blocks is None else self.timetable.blocks
+        )
         blocks = list(chosen.values()) or [0]
         apart = max(blocks) - min(blocks) + w.num_groups - 1
         last = self.timetable.epoch(self.scenario.frames)
-        clocks = 2 * max(abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last for u in self.scenario.swarm.values())
-        return w.max_delay + self.scenario.radio.filter_transition_hz / w.slope + apart * w.group_spacing + clocks
+        clocks = 2 * max(
+            abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last
+            for u in self.scenario.swarm.values()
+        )
+        return (
+            w.max_delay
+            + self.scenario.radio.filter_transition_hz / w.slope
+            + apart * w.group_spacing
+            + clocks
+        )
 
     @property
     def reach(self) -> float:
@@ -177,30 +216,53 @@ class Plan:
         return self.longest_delay * SPEED_OF_LIGHT / 2
 
     def mesh_radius(self, centre: np.ndarray) -> float:
-        """A surface farther than this from a place takes part in nothing that is heard, whole metres [m].
+        """A surface farther than this from a place takes part in nothing that is heard, whole
+        metres [m].
 
-        All points of a path of length L, what shadows it included, lie within L/2 of the middle between its ends, which is no farther from
-        the place than the farther end. What moves during a frame adds its way. The field of view cuts nothing: a second wall may stand
-        outside it. Infinite where nothing is to be left out, and where the blocks, and with them the reach, are found out in the run.
+        All points of a path of length L, what shadows it included, lie within L/2 of the middle
+        between its ends, which is no farther from the place than the farther end. What moves during
+        a frame adds its way. The field of view cuts nothing: a second wall may stand outside it.
+        Infinite where nothing is to be left out, and where the blocks, and with them the reach, are
+        found out in the run.
         """
         s = self.scenario
         if self.preset == "everything" or s.access.establish or s.propagation.model != "ray_traced":
             return float(np.inf)
         terminals = [name for name, uav in s.swarm.items() if uav.role != "target"]
         poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(s.frames)]
-        farthest = max(float(np.linalg.norm(pose[name].position - centre)) for pose in poses for name in terminals)
-        fastest = max(float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values())
-        return float(np.ceil(farthest + self.reach + 2 * fastest * frame_reach(self.waveform) + REACH_MARGIN_M))
+        farthest = max(
+            float(np.linalg.norm(pose[name].position - centre))
+            for pose in poses
+            for name in terminals
+        )
+        fastest = max(
+            float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values()
+        )
+        return float(
+            np.ceil(
+                farthest + self.reach + 2 * fastest * frame_reach(self.waveform) + REACH_MARGIN_M
+            )
+        )
 
     def cell_noise_gain(self) -> float:
-        """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell, per watt of noise in a sample."""
-        return transmit_amplitude(self.scenario.noise) ** 2 * self.waveform.num_samples * self.waveform.num_chirps
+        """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell,
+        per watt of noise in a sample."""
+        return (
+            transmit_amplitude(self.scenario.noise) ** 2
+            * self.waveform.num_samples
+            * self.waveform.num_chirps
+        )
 
     def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a range cell loses over the noise."""
+        """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a
+        range cell loses over the noise."""
         over_noise = paths.power * self.cell_noise_gain() / noise_power
         everything = self.preset == "everything"
-        heard = np.full(len(paths), True) if everything else paths.delay - motion(paths, self.waveform) <= self.longest_delay
+        heard = (
+            np.full(len(paths), True)
+            if everything
+            else paths.delay - motion(paths, self.waveform) <= self.longest_delay
+        )
         always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
         cell = np.floor(paths.delay / self.waveform.delay_step).astype(np.int64)
         weak, left_out = faintest(np.where(heard & ~always, over_noise, np.inf), cell, self.weakest)
@@ -280,22 +342,31 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
 
 def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.ndarray:
     """(K,) bound of the phase error of a plane wavefront at the farthest elements [rad]."""
-    reach = [np.linalg.norm(positions, axis=1).max() for positions in (antennas.tx_positions, antennas.rx_positions)]
+    reach = [
+        np.linalg.norm(positions, axis=1).max()
+        for positions in (antennas.tx_positions, antennas.rx_positions)
+    ]
     k = 2 * np.pi * (waveform.carrier_frequency + waveform.bandwidth) / SPEED_OF_LIGHT
     out = np.zeros(len(paths))
     for r, radius in zip(reach, (paths.tx_radius, paths.rx_radius), strict=True):
         out += k * r**2 / (2 * radius) * (1 + r / radius)
-    return out + np.where(paths.kind == PathKind.LINE_OF_SIGHT, k * reach[0] * reach[1] / paths.rx_radius, 0.0)
+    return out + np.where(
+        paths.kind == PathKind.LINE_OF_SIGHT, k * reach[0] * reach[1] / paths.rx_radius, 0.0
+    )
 
 
 def straight_bound(paths: PathSet, waveform: Waveform) -> np.ndarray:
-    """(K,) bound of the phase error of leaving the acceleration out, at the ends of the frame [rad]."""
+    """(K,) bound of the phase error of leaving the acceleration out, at the ends of the frame
+    [rad]."""
     highest = waveform.carrier_frequency + waveform.bandwidth
     return np.pi * highest * np.abs(paths.delay_accel) * frame_reach(waveform) ** 2
 
 
-def standing(paths: PathSet, antennas: Antennas, waveform: Waveform, speed: float) -> dict[str, float]:
-    """Phase errors of what is not modelled in any run, estimated [rad]: {what: largest over the paths}.
+def standing(
+    paths: PathSet, antennas: Antennas, waveform: Waveform, speed: float
+) -> dict[str, float]:
+    """Phase errors of what is not modelled in any run, estimated [rad]: {what: largest over the
+    paths}.
 
     Parameters
     ----------
@@ -303,12 +374,18 @@ def standing(paths: PathSet, antennas: Antennas, waveform: Waveform, speed: floa
     """
     k = 2 * np.pi * waveform.carrier_frequency / SPEED_OF_LIGHT
     t = frame_reach(waveform)
-    r = max(np.linalg.norm(positions, axis=1).max() for positions in (antennas.tx_positions, antennas.rx_positions))
+    r = max(
+        np.linalg.norm(positions, axis=1).max()
+        for positions in (antennas.tx_positions, antennas.rx_positions)
+    )
     nearest = np.minimum(paths.tx_radius, paths.rx_radius)
     finite = nearest[np.isfinite(nearest)]
     turning = float((k * r * speed * t / finite).max(initial=0.0))
     flight = float((k * speed * paths.delay).max(initial=0.0))
-    return {"directions that turn within the frame": turning, "motion during the flight of light": flight}
+    return {
+        "directions that turn within the frame": turning,
+        "motion during the flight of light": flight,
+    }
 
 
 def missed_chains(found: float, born: float, died: float) -> float:
@@ -328,7 +405,9 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "preset": plan.preset,
         "max_phase_error_rad": None if np.isinf(plan.phase_share) else 2 * plan.phase_share,
         "weakest_path_db": None if everything else round(float(-10 * np.log10(plan.weakest)), 6),
-        "traced_frames": len(plan.traced_frames) if plan.scenario.propagation.model == "ray_traced" else 0,
+        "traced_frames": len(plan.traced_frames)
+        if plan.scenario.propagation.model == "ray_traced"
+        else 0,
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0),
@@ -354,19 +433,21 @@ def mechanisms(scenario: Scenario) -> dict[str, Any]:
 
 
 def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
-    """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in summary.json.
+    """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in
+    summary.json.
 
     Parameters
     ----------
-    model : the propagation, whose `field` is None where there is none, or where paths came from a store and it was not made; the same holds
-        for its `twice`
+    model : the propagation, whose `field` is None where there is none, or where paths came from a
+        store and it was not made; the same holds for its `twice`
 
     Returns
     -------
-    record : area of a scatterer over its distance [m] and the error of the mean power that this brings, None without a field; faces
-        traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`); scatterers in sight of a transmitter, None
-        without a field, and cells of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and the shares of
-        its power that they and all others send on, None without mirrors
+    record : area of a scatterer over its distance [m] and the error of the mean power that this
+        brings, None without a field; faces traced; faces beyond the reach of all links and frames
+        (`Plan.mesh_radius`); scatterers in sight of a transmitter, None without a field, and cells
+        of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and
+        the shares of its power that they and all others send on, None without mirrors
     """
     field, twice = getattr(model, "field", None), getattr(model, "twice", None)
     area = Density.of(clutter).per_metre if clutter.model == "field" else None
@@ -380,14 +461,21 @@ def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
         "mirrors": None
         if twice is None
         else {
-            name: {"count": len(kept), "share": round(sum(m.share for m in kept), 6), "share_left_out": round(twice.left_out[name], 6)}
+            name: {
+                "count": len(kept),
+                "share": round(sum(m.share for m in kept), 6),
+                "share_left_out": round(twice.left_out[name], 6),
+            }
             for name, kept in twice.mirrors.items()
         },
     }
 
 
-def used(uses: Mapping[tuple[int, Link], Use], names: Mapping[Link, str]) -> dict[str, dict[str, Any]]:
-    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds of all frames."""
+def used(
+    uses: Mapping[tuple[int, Link], Use], names: Mapping[Link, str]
+) -> dict[str, dict[str, Any]]:
+    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds
+    of all frames."""
     out = {}
     for link in dict.fromkeys(link for _, link in uses):
         rows = [asdict(use) for (_, of), use in uses.items() if of == link]
@@ -399,7 +487,10 @@ def used(uses: Mapping[tuple[int, Link], Use], names: Mapping[Link, str]) -> dic
         out[names.get(link, "->".join(link))] = {
             "frames": len(rows),
             **per_frame,
-            "kept_per_frame": {kind: round(float(np.mean([row["kept"].get(kind, 0) for row in rows])), 2) for kind in kinds},
+            "kept_per_frame": {
+                kind: round(float(np.mean([row["kept"].get(kind, 0) for row in rows])), 2)
+                for kind in kinds
+            },
             "bounces": max(row["bounces"] for row in rows),
             "left_out_db": decibels(max(row["left_out"] for row in rows)),
             "plane_error_rad": max(row["plane_error"] for row in rows),

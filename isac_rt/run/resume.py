@@ -1,8 +1,10 @@
-"""The frames of a run that was stopped, in a file beside its results: the same run goes on after them, to the same bits.
+"""The frames of a run that was stopped, in a file beside its results: the same run goes on after
+them, to the same bits.
 
-The file begins with a line that says which run it is of: a digest of the scenario, the city's file, the program and the versions under
-it. Entries follow, each with its length and a checksum; one that was torn when the process was killed is cut off. Entries are
-pickled, and reading them makes nothing but arrays and classes of this package: a file from elsewhere cannot run code.
+The file begins with a line that says which run it is of: a digest of the scenario, the city's file,
+the program and the versions under it. Entries follow, each with its length and a checksum; one that
+was torn when the process was killed is cut off. Entries are pickled, and reading them makes nothing
+but arrays and classes of this package: a file from elsewhere cannot run code.
 """
 
 from __future__ import annotations
@@ -23,9 +25,13 @@ EVERY = 5.0
 """Least time between two entries: what a stop can cost, beside the frame at work. [s]"""
 _FRONT = struct.Struct("<QI")
 _ARRAYS = {
-    ("collections", "deque"), ("numpy", "dtype"), ("numpy", "ndarray"), ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"), ("numpy._core.numeric", "_frombuffer"),
-}  # fmt: skip
+    ("collections", "deque"),
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+}
 
 
 class UnfinishedError(Exception):
@@ -57,7 +63,8 @@ class Unfinished:
             return False
 
     def entries(self) -> list[Any]:
-        """What an earlier call kept, in its order; none if there is nothing or if it belongs to another run. A torn end is cut off.
+        """What an earlier call kept, in its order; none if there is nothing or if it belongs to
+        another run. A torn end is cut off.
 
         Raises
         ------
@@ -70,7 +77,9 @@ class Unfinished:
             try:
                 found = list(_whole(file))
             except pickle.UnpicklingError as problem:
-                raise UnfinishedError(f"{self.file} was not written by isac-rt: {problem}; delete it") from problem
+                raise UnfinishedError(
+                    f"{self.file} was not written by isac-rt: {problem}; delete it"
+                ) from problem
             file.truncate()
         return found
 
@@ -84,7 +93,9 @@ class Unfinished:
         try:
             ours = self.begun
             with self.file.open("ab" if ours else "wb") as file:
-                file.write((b"" if ours else self._head) + _FRONT.pack(len(text), zlib.crc32(text)) + text)
+                file.write(
+                    (b"" if ours else self._head) + _FRONT.pack(len(text), zlib.crc32(text)) + text
+                )
         except OSError:
             self._broken = True
             self.remove()
@@ -115,7 +126,11 @@ class _Reader(pickle.Unpickler):
     """Makes arrays and this package's own classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        found = super().find_class(module, name) if (module, name) in _ARRAYS or module.startswith("isac_rt.") else None
+        found = (
+            super().find_class(module, name)
+            if (module, name) in _ARRAYS or module.startswith("isac_rt.")
+            else None
+        )
         if found is None or not (isinstance(found, type) or (module, name) in _ARRAYS):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
         return found

@@ -11,7 +11,14 @@ import numpy as np
 from isac_rt.access import Connections, connect
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.cube import IFCube, RangeProfiles, Transmission
-from isac_rt.frame.level import LinkBudget, link_budget, noise_power, noise_rise, thermal_noise_power, transmit_amplitude
+from isac_rt.frame.level import (
+    LinkBudget,
+    link_budget,
+    noise_power,
+    noise_rise,
+    thermal_noise_power,
+    transmit_amplitude,
+)
 from isac_rt.frame.schedule import Schedule, schedule_of
 from isac_rt.frame.timetable import Link, Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
@@ -49,16 +56,20 @@ class Setup:
     uses: dict[tuple[int, Link], Use] = field(default_factory=dict)
     """What the plan kept of the paths of each frame and link traced so far."""
     expectation: ClutterExpectation | None = None
-    """What an active terminal's receiver predicts of its clutter from the mesh; None where its detector needs none."""
+    """What an active terminal's receiver predicts of its clutter from the mesh; None where its
+    detector needs none."""
 
     def expected_clutter(self, frame: int) -> dict[str, ExpectedClutter]:
-        """What each active terminal expects of its own link. Traces rays: from the thread that traces only."""
+        """What each active terminal expects of its own link. Traces rays: from the thread that
+        traces only."""
         if self.expectation is None:
             return {}
         amplitude, out = transmit_amplitude(self.scenario.noise), {}
         for name in self.timetable.with_role("active", frame):
             when = self.timetable.epoch(frame, name)
-            out[name] = self.expectation.clutter(name, self.swarm.trajectories[name].pose(when), when, amplitude)
+            out[name] = self.expectation.clutter(
+                name, self.swarm.trajectories[name].pose(when), when, amplitude
+            )
         return out
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
@@ -66,12 +77,17 @@ class Setup:
         rise = noise_rise(self.scenario.clutter)
         if self.scenario.noise.model == "link_budget":
             return rise * thermal_noise_power(self.scenario.noise, self.waveform)
-        return rise * noise_power(self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link))
+        return rise * noise_power(
+            self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link)
+        )
 
     def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """Poses and paths of a frame, interference between active terminals included; what the plan leaves out is not there."""
+        """Poses and paths of a frame, interference between active terminals included; what the plan
+        leaves out is not there."""
         poses, found = self.find(frame)
-        thinned = {link: self.plan.apply(p, self.noise_power(poses, link)) for link, p in found.items()}
+        thinned = {
+            link: self.plan.apply(p, self.noise_power(poses, link)) for link, p in found.items()
+        }
         self.uses.update({(frame, link): use for link, (_, use) in thinned.items()})
         return poses, {link: paths for link, (paths, _) in thinned.items()}
 
@@ -80,11 +96,19 @@ class Setup:
         epoch = self.timetable.epoch(frame)
         poses = self.swarm.poses(epoch)
         heard = self.timetable.links(frame)
-        active, receivers = self.timetable.with_role("active", frame), dict.fromkeys(rx for _, rx in heard)
-        return poses, self.propagation.paths(poses, epoch, [(tx, rx) for tx in active for rx in receivers])
+        active, receivers = (
+            self.timetable.with_role("active", frame),
+            dict.fromkeys(rx for _, rx in heard),
+        )
+        return poses, self.propagation.paths(
+            poses, epoch, [(tx, rx) for tx in active for rx in receivers]
+        )
 
-    def transmission(self, active: str, frame: int, pose: Pose, schedule: Schedule | None = None) -> Transmission:
-        """What an active terminal sends in a frame, by another `schedule` than the usual one if there is one."""
+    def transmission(
+        self, active: str, frame: int, pose: Pose, schedule: Schedule | None = None
+    ) -> Transmission:
+        """What an active terminal sends in a frame, by another `schedule` than the usual one if
+        there is one."""
         return Transmission(
             name=active,
             pose=pose,
@@ -96,41 +120,85 @@ class Setup:
         )
 
     def receive_samples(
-        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+        self,
+        frame: int,
+        link: Link,
+        sent: dict[str, Transmission],
+        paths: dict[Link, PathSet],
+        poses: dict[str, Pose],
     ) -> IFCube:
-        """IF samples of a link's receiver, dechirped in the resource blocks of the link's transmitter, with noise.
+        """IF samples of a link's receiver, dechirped in the resource blocks of the link's
+        transmitter, with noise.
 
-        `sent` holds every active terminal; what the others' chirps leave in these blocks is in the samples. They depend on
-        nothing but the frame and the link.
+        `sent` holds every active terminal; what the others' chirps leave in these blocks is in the
+        samples. They depend on nothing but the frame and the link.
         """
         arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
         method = self.plan.synthesis(sum(len(p) for _, p in arriving))
-        cube = if_signal(self.waveform, arriving, poses[link[1]], self.antennas, noise_power=level, method=method,
-                         max_error=self.plan.synthesis_error, costs=self.plan.costs, **frame_of)  # fmt: skip
+        cube = if_signal(
+            self.waveform,
+            arriving,
+            poses[link[1]],
+            self.antennas,
+            noise_power=level,
+            method=method,
+            max_error=self.plan.synthesis_error,
+            costs=self.plan.costs,
+            **frame_of,
+        )
         return add_noise(cube, level, words)
 
     def receive_input(
-        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+        self,
+        frame: int,
+        link: Link,
+        sent: dict[str, Transmission],
+        paths: dict[Link, PathSet],
+        poses: dict[str, Pose],
     ) -> IFCube | RangeProfiles:
-        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at the active terminal range profiles."""
+        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at
+        the active terminal range profiles."""
         if link[0] != link[1] or self.scenario.receivers.active_input == "samples":
             return self.receive_samples(frame, link, sent, paths, poses)
         arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
         own = sent[link[0]].payload
-        return range_profiles(self.waveform, arriving, poses[link[1]], self.antennas, own, noise_power=level, seed_words=words, **frame_of)
+        return range_profiles(
+            self.waveform,
+            arriving,
+            poses[link[1]],
+            self.antennas,
+            own,
+            noise_power=level,
+            seed_words=words,
+            **frame_of,
+        )
 
     def _arriving(
-        self, frame: int, link: Link, sent: dict[str, Transmission], paths: dict[Link, PathSet], poses: dict[str, Pose]
+        self,
+        frame: int,
+        link: Link,
+        sent: dict[str, Transmission],
+        paths: dict[Link, PathSet],
+        poses: dict[str, Pose],
     ) -> tuple[list[tuple[Transmission, PathSet]], float, np.ndarray, dict[str, Any]]:
-        """What reaches a link's receiver, its noise power and the noise's stream, and when and through what it listens."""
+        """What reaches a link's receiver, its noise power and the noise's stream, and when and
+        through what it listens."""
         tx, rx = link
         when = self.timetable.epoch(frame, tx)
         arriving = []
         for name in [tx, *(name for name in sent if name != tx)]:
             clock = self.connections.apart(name, link, when)
-            arriving.append((replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift), paths[name, rx]))
+            arriving.append(
+                (
+                    replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift),
+                    paths[name, rx],
+                )
+            )
         words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
-        frame_of = {"start_time": self.timetable.start_time(frame, tx), "filter_transition": self.scenario.radio.filter_transition_hz}
+        frame_of = {
+            "start_time": self.timetable.start_time(frame, tx),
+            "filter_transition": self.scenario.radio.filter_transition_hz,
+        }
         return arriving, self.noise_power(poses, link), words, frame_of
 
 
@@ -145,12 +213,23 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
         name = rx if tx != rx else setup.reference.strongest_target(poses, tx)
         distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
         what = "line of sight" if tx != rx else f"echo of {name}"
-        rows.append(link_budget((tx, rx), what, distance, amplitude, setup.scenario.noise, setup.waveform, setup.antennas))
+        rows.append(
+            link_budget(
+                (tx, rx),
+                what,
+                distance,
+                amplitude,
+                setup.scenario.noise,
+                setup.waveform,
+                setup.antennas,
+            )
+        )
     return rows
 
 
 def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
-    """Load and build everything that frames share. With a `store` traced paths are looked up there first and kept there."""
+    """Load and build everything that frames share. With a `store` traced paths are looked up there
+    first and kept there."""
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
     swarm = Swarm.from_scenario(scenario)
@@ -187,14 +266,26 @@ def _connected(setup: Setup) -> Setup:
 
     first = setup.swarm.poses(setup.timetable.epoch(0))
     found = connect(
-        setup.scenario, setup.waveform, setup.antennas, setup.schedule, scene, lambda link: setup.noise_power(first, link)
+        setup.scenario,
+        setup.waveform,
+        setup.antennas,
+        setup.schedule,
+        scene,
+        lambda link: setup.noise_power(first, link),
     )
     timetable = replace(setup.timetable, blocks=found.blocks(), refused=found.refused())
-    return replace(setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable))
+    return replace(
+        setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable)
+    )
 
 
 def _propagation(
-    scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City, instants: tuple[float, ...], store: PathStore | None
+    scenario: Scenario,
+    waveform: Waveform,
+    antennas: Antennas,
+    city: City,
+    instants: tuple[float, ...],
+    store: PathStore | None,
 ) -> Propagation:
     def make() -> Propagation:
         return make_propagation(scenario, waveform, antennas, city, instants)

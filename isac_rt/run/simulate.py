@@ -34,18 +34,6 @@ Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
 
 
-
-
-
-
-
-
-
-
-
-
-
-
 @dataclass
 class _Clock:
     """Seconds per stage, summed over the threads that work in it."""
@@ -59,15 +47,21 @@ class _Clock:
         self.seconds[name] += time.perf_counter() - start
 
 
-
-
 def standard_terminal(setup: Setup, link: Link) -> Terminal:
     """The receiver of a link as the scenario has it."""
     s = setup.scenario
     if link[0] == link[1]:
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
     order, amplitude = s.modulation.dpsk_order, transmit_amplitude(s.noise)
-    return PassiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, order, amplitude, groups=setup.timetable.groups(link))
+    return PassiveTerminal(
+        setup.waveform,
+        setup.antennas,
+        s.receivers,
+        s.tracking,
+        order,
+        amplitude,
+        groups=setup.timetable.groups(link),
+    )
 
 
 class _Observer:
@@ -84,7 +78,14 @@ class _Observer:
             return
         s, when = self.setup, self.setup.timetable.epoch(frame.number, self.link[0])
         clock_std = s.connections.offset_std(self.link, when)
-        answer = exchange(heard.reception, heard.tracks, at_active.tracks, s.antennas.num_rx, clock_std, s.waveform)
+        answer = exchange(
+            heard.reception,
+            heard.tracks,
+            at_active.tracks,
+            s.antennas.num_rx,
+            clock_std,
+            s.waveform,
+        )
         if answer is not None:
             self.feedback["answers"] += 1
             self.feedback["corrections"] += answer.cells != 0
@@ -92,7 +93,8 @@ class _Observer:
                 self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link[1]].pose(when))
 
     def hear(self, frame: _Frame, clock: _Clock) -> Heard:
-        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this observer's state changes."""
+        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this
+        observer's state changes."""
         number, when = frame.number, self.setup.timetable.epoch(frame.number, self.link[0])
         with clock.stage("synthesis"):
             cube = self.setup.receive_input(number, self.link, frame.sent, frame.paths, frame.poses)
@@ -101,7 +103,9 @@ class _Observer:
             own = self.setup.swarm.trajectories[rx].pose(when)
             if isinstance(self.terminal, ActiveTerminal):
                 clutter = frame.expected.get(tx)
-                reception, tracks = self.terminal.step(cube, frame.sent[tx].payload, own, when, clutter=clutter, maps=frame.snapshot)
+                reception, tracks = self.terminal.step(
+                    cube, frame.sent[tx].payload, own, when, clutter=clutter, maps=frame.snapshot
+                )
                 return Heard(reception, tracks, int(TerminalState.TRACKING))
             modulated = self.setup.timetable.modulated(number)
             assert isinstance(cube, IFCube)  # profiles are for active terminals only
@@ -111,7 +115,9 @@ class _Observer:
     def record(self, frame: _Frame, heard: Heard) -> ObserverRecord:
         """The frame held against the truth."""
         level = self.setup.noise_power(frame.poses, self.link)
-        return self.scorer.record(frame.number, frame.paths[self.link], frame.sent[self.link[0]], heard, level)
+        return self.scorer.record(
+            frame.number, frame.paths[self.link], frame.sent[self.link[0]], heard, level
+        )
 
 
 def run(
@@ -132,23 +138,39 @@ def run(
     progress : called with the frames done and the frames in all
     setup : from `prepare`, if it is there already
     threads : receivers at work at once; None: as many as the machine has cores
-    snapshots : frames, spread over those that the active terminals process, of which maps and path ledger are kept
-    terminal : makes the receiver of a link; one of one's own is a subclass of `ActiveTerminal` or `PassiveTerminal` with another `receive`
-    unfinished : where the frames are kept meanwhile and from where a run that was stopped goes on; with the terminals of this package
+    snapshots : frames, spread over those that the active terminals process, of which maps and path
+        ledger are kept
+    terminal : makes the receiver of a link; one of one's own is a subclass of `ActiveTerminal` or
+        `PassiveTerminal` with another `receive`
+    unfinished : where the frames are kept meanwhile and from where a run that was stopped goes on;
+        with the terminals of this package
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
-    flight = _fly(scenario, progress, setup, threads, snapshot_frames(scenario, snapshots), terminal, unfinished)
+    flight = _fly(
+        scenario,
+        progress,
+        setup,
+        threads,
+        snapshot_frames(scenario, snapshots),
+        terminal,
+        unfinished,
+    )
     return flight.recorder.finish(
         **flight.figures(),
-        materials={m.name: {k: v for k, v in vars(m).items() if k != "name"} for m in flight.setup.city.materials},
+        materials={
+            m.name: {k: v for k, v in vars(m).items() if k != "name"}
+            for m in flight.setup.city.materials
+        },
         link_budget=[vars(row) for row in link_budgets(flight.setup)],
     )
 
 
-def summarise(scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None) -> dict[str, Any]:
+def summarise(
+    scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None
+) -> dict[str, Any]:
     """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
     flight = _fly(scenario, None, setup, threads, set(), standard_terminal)
     return flight.recorder.summary(**flight.figures())
@@ -157,19 +179,29 @@ def summarise(scenario: Scenario, *, setup: Setup | None = None, threads: int | 
 def stage_seconds(
     setup: Setup, number: int, poses: dict[str, Pose], paths: dict[Link, PathSet], receive: bool
 ) -> dict[Link, dict[str, float]]:
-    """Seconds of synthesis and, if asked for, reception of one frame on each link, by terminals that hear it as their first."""
+    """Seconds of synthesis and, if asked for, reception of one frame on each link, by terminals
+    that hear it as their first."""
     out = {}
-    sent = {name: setup.transmission(name, number, poses[name]) for name in setup.timetable.with_role("active", number)}
+    sent = {
+        name: setup.transmission(name, number, poses[name])
+        for name in setup.timetable.with_role("active", number)
+    }
     frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), False)
     links = setup.timetable.links(number)
-    for link in links[:1] + links:  # the first once more: what is compiled on first use is not a frame's cost
+    for link in (
+        links[:1] + links
+    ):  # the first once more: what is compiled on first use is not a frame's cost
         clock = _Clock()
         if receive:
             _Observer(setup, link, standard_terminal(setup, link)).hear(frame, clock)
         else:
             with clock.stage("synthesis"):
                 setup.receive_input(number, link, sent, paths, poses)
-        out[link] = {name: value for name, value in clock.seconds.items() if name == "synthesis" or (receive and name == "receive")}
+        out[link] = {
+            name: value
+            for name, value in clock.seconds.items()
+            if name == "synthesis" or (receive and name == "receive")
+        }
     return out
 
 
@@ -207,17 +239,23 @@ class _Flight:
         return found
 
     def kept(self) -> dict[str, Any]:
-        """What an unfinished run needs to go on after the frames so far: those since the last call, and all that receivers carry over.
+        """What an unfinished run needs to go on after the frames so far: those since the last call,
+        and all that receivers carry over.
 
-        Only while no receiver is at work. Paths and samples are functions of the frame alone and are made anew.
+        Only while no receiver is at work. Paths and samples are functions of the frame alone and
+        are made anew.
         """
         first, self._safe = self._safe, self.recorder.count
         return {
             "first": first,
             "frames": self.recorder.since(first),
-            "observers": {link: (o.terminal, o.scorer.score, o.feedback) for link, o in self.observers.items()},
+            "observers": {
+                link: (o.terminal, o.scorer.score, o.feedback) for link, o in self.observers.items()
+            },
             "advice": self.schedules.advice,
-            "uses": {key: use for key, use in self.setup.uses.items() if first <= key[0] < self._safe},
+            "uses": {
+                key: use for key, use in self.setup.uses.items() if first <= key[0] < self._safe
+            },
             "contradicted": {frame: self.contradicted[frame] for frame in range(first, self._safe)},
             "seconds": self.seconds,
         }
@@ -236,7 +274,9 @@ class _Flight:
                 o = self.observers[link]
                 o.terminal, o.scorer.score, o.feedback = terminal, score, feedback
             self.schedules.advice.update(last["advice"])
-            self.seconds.update({stage: self.seconds[stage] + seconds for stage, seconds in last["seconds"].items()})
+            self.seconds.update(
+                {stage: self.seconds[stage] + seconds for stage, seconds in last["seconds"].items()}
+            )
         self._safe = self.recorder.count
         return self._safe
 
@@ -268,13 +308,20 @@ def _fly(
 ) -> _Flight:
     """Frame after frame; while the receivers work on one the next is traced."""
     clock, begin = _Clock(), time.perf_counter()
-    with threadpool_limits(limits=1), ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool:
+    with (
+        threadpool_limits(limits=1),
+        ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
+    ):
         with clock.stage("setup"):
             setup = setup or prepare(scenario)
             timetable = setup.timetable
-            observers = {link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links}
+            observers = {
+                link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links
+            }
             schedules = Schedules(scenario, setup.schedule)
-            recorder = Recorder(scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState])
+            recorder = Recorder(
+                scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState]
+            )
         flight = _Flight(setup, recorder, observers, schedules, clock.seconds)
         first = flight.go_on(unfinished) if unfinished else 0
         begin -= clock.seconds["total"]
@@ -290,9 +337,20 @@ def _fly(
             if progress and number:
                 progress(number, scenario.frames)
             active = timetable.with_role("active", number)
-            sent = {name: setup.transmission(name, number, poses[name], schedules.of(name)) for name in active}
-            frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), number in snapshots)
-            waiting = frame, {link: pool.submit(observers[link].hear, frame, clock) for link in timetable.links(number)}
+            sent = {
+                name: setup.transmission(name, number, poses[name], schedules.of(name))
+                for name in active
+            }
+            frame = _Frame(
+                number, poses, paths, sent, setup.expected_clutter(number), number in snapshots
+            )
+            waiting = (
+                frame,
+                {
+                    link: pool.submit(observers[link].hear, frame, clock)
+                    for link in timetable.links(number)
+                },
+            )
         if waiting is not None:
             _collect(recorder, observers, *waiting, clock)
         if progress:
@@ -301,10 +359,12 @@ def _fly(
     return flight
 
 
-
-
 def _collect(
-    recorder: Recorder, observers: dict[Link, _Observer], frame: _Frame, jobs: dict[Link, Future], clock: _Clock
+    recorder: Recorder,
+    observers: dict[Link, _Observer],
+    frame: _Frame,
+    jobs: dict[Link, Future],
+    clock: _Clock,
 ) -> dict[Link, Reception]:
     """Wait for a frame's receivers, score and record it; what they received."""
     heard = {link: job.result() for link, job in jobs.items()}
@@ -320,19 +380,14 @@ def _collect(
                 time=timetable.epoch(frame.number),
                 modulated=timetable.modulated(frame.number),
                 poses=frame.poses,
-                observers={timetable.labels[link]: observers[link].record(frame, h) for link, h in heard.items()},
+                observers={
+                    timetable.labels[link]: observers[link].record(frame, h)
+                    for link, h in heard.items()
+                },
                 snapshot=frame.snapshot,
             )
         )
     return {link: h.reception for link, h in heard.items()}
-
-
-
-
-
-
-
-
 
 
 def _fidelity(setup: Setup, contradicted: int) -> dict[str, object]:

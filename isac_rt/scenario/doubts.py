@@ -1,4 +1,5 @@
-"""Values that may stand but look as if they were in another unit: by a factor of a thousand for most keys."""
+"""Values that may stand but look as if they were in another unit: by a factor of a thousand for
+most keys."""
 
 from __future__ import annotations
 
@@ -43,17 +44,38 @@ def implausible(scenario: Any) -> Iterator[Problem]:
         if isinstance(value, int | float) and not low <= value <= high:
             yield Problem((key,), f"{value:g} is outside {low:g} to {high:g}; is it in {unit}?")
     if scenario.array.fall_back and not _can_fall_back(scenario):
-        said = "never acts: it needs the pseudo_random schedule and velocities from sparse sampling, by OMP"
-        yield Problem((("array", "fall_back"), ("array", "schedule"), ("radio", "groups"), ("receivers", "velocity_method")), said)
+        said = (
+            "never acts: it needs the pseudo_random schedule and velocities from sparse "
+            "sampling, by OMP"
+        )
+        yield Problem(
+            (
+                ("array", "fall_back"),
+                ("array", "schedule"),
+                ("radio", "groups"),
+                ("receivers", "velocity_method"),
+            ),
+            said,
+        )
     low, high = PLAUSIBLE_RCS
     for name, uav in scenario.swarm.items():
         if not low <= uav.rcs.value_dbsm <= high:
-            said = f"{uav.rcs.value_dbsm:g} is outside {low:g} to {high:g}; is it in decibels over a square metre?"
+            said = (
+                f"{uav.rcs.value_dbsm:g} is outside {low:g} to {high:g}; is it in decibels over "
+                "a square metre?"
+            )
             yield Problem((("swarm", name, "rcs", "value_dbsm"),), said)
 
 
 def _can_fall_back(scenario: Any) -> bool:
-    """Whether a receiver of this scenario ever judges sparsity: some have fewer groups than there are transmit antennas."""
+    """Whether a receiver of this scenario ever judges sparsity: some have fewer groups than there
+    are transmit antennas."""
     m = scenario.modulation
-    partial = scenario.radio.groups < scenario.num_tx or any(len(groups) < scenario.num_tx for groups in m.streams.values())
-    return scenario.array.schedule == "pseudo_random" and scenario.receivers.velocity_method == "auto" and partial
+    partial = scenario.radio.groups < scenario.num_tx or any(
+        len(groups) < scenario.num_tx for groups in m.streams.values()
+    )
+    return (
+        scenario.array.schedule == "pseudo_random"
+        and scenario.receivers.velocity_method == "auto"
+        and partial
+    )

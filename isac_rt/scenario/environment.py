@@ -1,4 +1,5 @@
-"""What a scenario says about the city, the paths in it, its clutter, and how near to the full model a run has to come."""
+"""What a scenario says about the city, the paths in it, its clutter, and how near to the full model
+a run has to come."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class City(Node):
     """Where the mesh comes from. `source` decides which of the keys below it apply."""
 
     source: Literal["builtin", "mitsuba", "mesh", "footprints", "canyon", "blocks"]
-    # builtin: name of a scene that ships with Sionna RT; mitsuba, mesh, footprints: a file beside the scenario
+    # builtin: name of a scene that ships with Sionna RT; mitsuba, mesh, footprints: a file beside
+    # the scenario
     name: str | None = None
     file: str | None = None
     # mesh files
@@ -62,12 +64,19 @@ class City(Node):
                 sources = " or ".join(source for source, keys in CITY_KEYS.items() if name in keys)
                 yield Problem(
                     ((name,), ("source",)),
-                    f"has no meaning with city.source {self.source}, only with {sources}; remove the key or change the source",
+                    f"has no meaning with city.source {self.source}, only with {sources}; remove "
+                    "the key or change the source",
                 )
         if self.source == "builtin" and not self.name:
-            yield Problem((("name",), ("source",)), "city.source builtin needs the name of a scene of Sionna RT, such as munich")
+            yield Problem(
+                (("name",), ("source",)),
+                "city.source builtin needs the name of a scene of Sionna RT, such as munich",
+            )
         if self.source in ("mitsuba", "mesh", "footprints") and not self.file:
-            yield Problem((("file",), ("source",)), f"city.source {self.source} needs a file, relative to the scenario's folder")
+            yield Problem(
+                (("file",), ("source",)),
+                f"city.source {self.source} needs a file, relative to the scenario's folder",
+            )
 
 
 _BUILT = frozenset({"street_width_m", "building_height_m", "height_spread_m", "block_size_m"})
@@ -80,7 +89,8 @@ CITY_KEYS: dict[str, frozenset[str]] = {
     "builtin": frozenset({"name"}),
     "mitsuba": frozenset({"file"}),
     "mesh": frozenset({"file", "up_axis", "scale", "material", "material_map"}),
-    "footprints": frozenset({"file", "coordinates", "height_property", "default_height_m"}) | _SURFACES,
+    "footprints": frozenset({"file", "coordinates", "height_property", "default_height_m"})
+    | _SURFACES,
     "canyon": _BUILT | _SURFACES | {"street_length_m"},
     "blocks": _BUILT | _SURFACES | {"blocks_x", "blocks_y"},
 }
@@ -112,10 +122,12 @@ class Propagation(Node):
 class Clutter(Node):
     """What is received beside line of sight, targets, ghosts and mirror images.
 
-    none: nothing; with noise.model snr this is the paper's "Gaussian noise environment", whose SNR counts weak clutter and thermal
-    noise as one. gaussian: white Gaussian clutter beside the thermal noise, so that the SNR that is asked for is the thermal noise's alone.
-    rayleigh: the paper's urban model, a run of range cells that stand still (`isac_rt.propagation.clutter.rayleigh`). Both go with any
-    propagation model. field: scatterers pinned to the mesh, the same in all frames and links. diffuse: Sionna's own, traced anew in
+    none: nothing; with noise.model snr this is the paper's "Gaussian noise environment", whose SNR
+    counts weak clutter and thermal noise as one. gaussian: white Gaussian clutter beside the
+    thermal noise, so that the SNR that is asked for is the thermal noise's alone. rayleigh: the
+    paper's urban model, a run of range cells that stand still
+    (`isac_rt.propagation.clutter.rayleigh`). Both go with any propagation model. field: scatterers
+    pinned to the mesh, the same in all frames and links. diffuse: Sionna's own, traced anew in
     every frame, which draws the points anew as well; to compare with.
     """
 
@@ -123,20 +135,23 @@ class Clutter(Node):
     clutter_to_noise_db: Finite = 0.0
     """gaussian: power of the clutter over that of the thermal noise."""
     level_db: Finite = 10.0
-    """rayleigh: mean level of one cell over the link's reference path (the strongest target at the AT, the line of sight at a PT) as
-    it would be unshadowed and in view."""
+    """rayleigh: mean level of one cell over the link's reference path (the strongest target at the
+    AT, the line of sight at a PT) as it would be unshadowed and in view."""
     level_of: Literal["power", "amplitude"] = "power"
-    """rayleigh: whether `level_db` is of the mean power or of the mean amplitude; the latter is 1.05 dB more of power."""
+    """rayleigh: whether `level_db` is of the mean power or of the mean amplitude; the latter is
+    1.05 dB more of power."""
     cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (40, 50)
     """rayleigh: least and most consecutive range cells, drawn in between."""
     centre: Literal["drawn", "reference"] = "drawn"
     """rayleigh: centre drawn uniformly within `centre_m`, or around the reference path."""
     centre_m: tuple[Positive, Positive] = (20.0, 30.0)
-    """rayleigh, centre drawn: its least and greatest range, twice the same to fix it; one way at the AT, path length at a PT."""
+    """rayleigh, centre drawn: its least and greatest range, twice the same to fix it; one way at
+    the AT, path length at a PT."""
     place: Literal["drawn", "grid"] = "drawn"
     """rayleigh: a scatterer anywhere in its range cell, or in the middle of it."""
     direction: Literal["field_of_view", "reference"] = "field_of_view"
-    """rayleigh: directions drawn over the field of view of either end, or all that of the reference path."""
+    """rayleigh: directions drawn over the field of view of either end, or all that of the reference
+    path."""
     cell_correlation: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """rayleigh: correlation of the complex amplitudes of neighbouring cells."""
     redraw: Literal["each_frame", "once"] = "each_frame"
@@ -144,16 +159,17 @@ class Clutter(Node):
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
     """diffuse: rays of a re-trace, per transmitter."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
-    """field: error of the mean power in a range cell of 4 m that nine of ten cells keep to, of those with a thousandth of all power and
-    more; decides how many scatterers there are (`isac_rt.propagation.clutter.cells`)."""
+    """field: error of the mean power in a range cell of 4 m that nine of ten cells keep to, of
+    those with a thousandth of all power and more; decides how many scatterers there are
+    (`isac_rt.propagation.clutter.cells`)."""
     cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
-    """field: largest area that one scatterer stands for, over its distance to the nearest terminal's flight [m^2/m], in place of what
-    max_error_db asks for."""
+    """field: largest area that one scatterer stands for, over its distance to the nearest
+    terminal's flight [m^2/m], in place of what max_error_db asks for."""
     smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
     """field: cells of this area are cut no further, however near."""
     mirrors: Annotated[int, Field(ge=0, le=64)] = 0
-    """field: walls, roofs and grounds per terminal, the strongest, by way of which each scatterer is lit and heard as well (two bounces);
-    0: one bounce."""
+    """field: walls, roofs and grounds per terminal, the strongest, by way of which each scatterer
+    is lit and heard as well (two bounces); 0: one bounce."""
 
     def applies(self, name: str) -> bool:
         if name == "centre_m" and self.centre != "drawn":
@@ -163,39 +179,57 @@ class Clutter(Node):
     def problems(self) -> Iterator[Problem]:
         for name, (low, high) in (("cells", self.cells), ("centre_m", self.centre_m)):
             if low > high:
-                yield Problem(((name,),), f"the first number must not exceed the second; write [{high:g}, {low:g}]")
+                yield Problem(
+                    ((name,),),
+                    f"the first number must not exceed the second; write [{high:g}, {low:g}]",
+                )
 
 
 CLUTTER_KEYS: dict[str, frozenset[str]] = {
     "none": frozenset(),
     "gaussian": frozenset({"clutter_to_noise_db"}),
     "rayleigh": frozenset(
-        {"level_db", "level_of", "cells", "centre", "centre_m", "place", "direction", "cell_correlation", "redraw"}
+        {
+            "level_db",
+            "level_of",
+            "cells",
+            "centre",
+            "centre_m",
+            "place",
+            "direction",
+            "cell_correlation",
+            "redraw",
+        }
     ),
     "diffuse": frozenset({"rays"}),
     "field": frozenset({"max_error_db", "cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
 }
-"""Keys that each clutter model understands, beside model; the others may stand and are not written back."""
+"""Keys that each clutter model understands, beside model; the others may stand and are not written
+back."""
 
 
 class Accuracy(Node):
-    """How near to the full model a run has to come; what the scene then needs is decided link by link and frame by frame
-    (`isac_rt.run.plan`, `isac-rt plan`).
+    """How near to the full model a run has to come; what the scene then needs is decided link by
+    link and frame by frame (`isac_rt.run.plan`, `isac-rt plan`).
 
-    budget: what the keys below and propagation.weakest_path_db allow is left out. everything: nothing is left out, every frame is
-    traced. fastest: plane wavefronts, straight flight within a frame, weak paths up to the noise of a cell left out, few traces.
+    budget: what the keys below and propagation.weakest_path_db allow is left out. everything:
+    nothing is left out, every frame is traced. fastest: plane wavefronts, straight flight within a
+    frame, weak paths up to the noise of a cell left out, few traces.
     """
 
     preset: Literal["budget", "everything", "fastest"] = "budget"
     max_phase_error_rad: Positive = 0.05
-    """budget: most by which approximations together may turn the phase of a path, at any element and chirp."""
+    """budget: most by which approximations together may turn the phase of a path, at any element
+    and chirp."""
     max_untraced_m: Annotated[float, Field(ge=0)] = 1.0
     """budget: farthest that a UAV flies between two traced instants; 0: every frame is traced."""
     synthesis_error: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-4
-    """budget, everything: relative RMS error that fast synthesis of IF samples may have; the cheapest method that keeps it is taken."""
+    """budget, everything: relative RMS error that fast synthesis of IF samples may have; the
+    cheapest method that keeps it is taken."""
     cost_model: str | None = None
-    """budget, everything: what the methods cost, a file of `isac-rt bench --fit`, relative to the scenario's folder; without one,
-    the costs that ship with the program. It decides between methods that all keep synthesis_error."""
+    """budget, everything: what the methods cost, a file of `isac-rt bench --fit`, relative to the
+    scenario's folder; without one, the costs that ship with the program. It decides between methods
+    that all keep synthesis_error."""
 
     def applies(self, name: str) -> bool:
         if name in ("synthesis_error", "cost_model"):

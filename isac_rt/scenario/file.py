@@ -1,7 +1,8 @@
 """Scenario files: YAML <-> `Scenario`. The only module that knows YAML.
 
-Every complaint says where the value stands (file and line, or the command line's option), the key, the value, what is
-wrong with it and what to do. Numbers are read as in YAML 1.2 (77e9 is a number, 010 is ten, yes is a word).
+Every complaint says where the value stands (file and line, or the command line's option), the key,
+the value, what is wrong with it and what to do. Numbers are read as in YAML 1.2 (77e9 is a number,
+010 is ten, yes is a word).
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ MAX_DEPTH = 40
 
 
 class ScenarioError(Exception):
-    """The scenario cannot be used; the text is meant for the person who wrote it, one line per problem."""
+    """The scenario cannot be used; the text is meant for the person who wrote it, one line per
+    problem."""
 
 
 class ScenarioWarning(UserWarning):
@@ -49,9 +51,15 @@ for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?[0-9]+|0x[0-9a-fA-F]+", list("-+0123456789")),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", list("-+.0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
 ):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+    _Loader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first
+    )
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
@@ -66,14 +74,24 @@ def _scalar(node: yaml.ScalarNode) -> Any:
         if kind == "int":
             return int(text, 16 if text.startswith("0x") else 10)
         if kind == "float":
-            return float(text.replace(".inf", "inf").replace(".nan", "nan") if text.lower().endswith(("inf", "nan")) else text)
+            return float(
+                text.replace(".inf", "inf").replace(".nan", "nan")
+                if text.lower().endswith(("inf", "nan"))
+                else text
+            )
     except ValueError as error:
-        raise yaml.MarkedYAMLError(problem=f"{text[:40]!r} is not a number that can be read", problem_mark=node.start_mark) from error
-    raise yaml.MarkedYAMLError(problem=f"the tag {node.tag!r} is not allowed; write a plain value", problem_mark=node.start_mark)
+        raise yaml.MarkedYAMLError(
+            problem=f"{text[:40]!r} is not a number that can be read", problem_mark=node.start_mark
+        ) from error
+    raise yaml.MarkedYAMLError(
+        problem=f"the tag {node.tag!r} is not allowed; write a plain value",
+        problem_mark=node.start_mark,
+    )
 
 
 class _Reader:
-    """Nodes to plain values, noting where each key stands. Aliases count each time they are used, so that none can explode."""
+    """Nodes to plain values, noting where each key stands. Aliases count each time they are used,
+    so that none can explode."""
 
     def __init__(self, place: str | None) -> None:
         self.places: dict[Key, str | int] = {}
@@ -84,7 +102,10 @@ class _Reader:
         self._left -= 1
         if self._left < 0 or depth > MAX_DEPTH:
             limit = f"{MAX_NODES} values" if self._left < 0 else f"{MAX_DEPTH} levels"
-            raise yaml.MarkedYAMLError(problem=f"more than {limit}; are aliases repeated or nested?", problem_mark=node.start_mark)
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {limit}; are aliases repeated or nested?",
+                problem_mark=node.start_mark,
+            )
         self.places.setdefault(key, self._place or node.start_mark.line + 1)
         if isinstance(node, yaml.ScalarNode):
             return _scalar(node)
@@ -92,16 +113,24 @@ class _Reader:
             return [self.value(item, (*key, i), depth + 1) for i, item in enumerate(node.value)]
         if isinstance(node, yaml.MappingNode) and node.tag == "tag:yaml.org,2002:map":
             return self._mapping(node, key, depth)
-        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag!r} is not allowed; write plain values", problem_mark=node.start_mark)
+        raise yaml.MarkedYAMLError(
+            problem=f"the tag {node.tag!r} is not allowed; write plain values",
+            problem_mark=node.start_mark,
+        )
 
     def _mapping(self, node: yaml.MappingNode, key: Key, depth: int) -> dict[str, Any]:
         values: dict[str, Any] = {}
         for name, item in node.value:
             if not isinstance(name, yaml.ScalarNode):
-                raise yaml.MarkedYAMLError(problem="a key must be a word", problem_mark=name.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem="a key must be a word", problem_mark=name.start_mark
+                )
             below = (*key, name.value)
             if name.value in values:
-                problem = f"the key {dotted(below)} stands here a second time (first in line {self.places[below]}); remove one"
+                problem = (
+                    f"the key {dotted(below)} stands here a second time (first in line "
+                    f"{self.places[below]}); remove one"
+                )
                 raise yaml.MarkedYAMLError(problem=problem, problem_mark=name.start_mark)
             self.places[below] = self._place or name.start_mark.line + 1
             values[name.value] = self.value(item, below, depth + 1)
@@ -109,7 +138,8 @@ class _Reader:
 
 
 def _parse(text: str, reader: _Reader, key: Key = ()) -> Any:
-    """The value of a YAML text; None if it is empty. Raises yaml.YAMLError, also for what nests too deeply."""
+    """The value of a YAML text; None if it is empty. Raises yaml.YAMLError, also for what nests too
+    deeply."""
     try:
         node = yaml.compose(text, Loader=_Loader)
     except RecursionError:
@@ -129,7 +159,10 @@ def _yaml_complaint(error: yaml.YAMLError, text: str) -> tuple[int | None, str]:
         return (mark.line + 1 if mark else None), said
     if isinstance(error, yaml.reader.ReaderError):
         line = text.count("\n", 0, error.position) + 1
-        return line, f"the character #x{ord(text[error.position]):04x} is not allowed in YAML; remove it"
+        return (
+            line,
+            f"the character #x{ord(text[error.position]):04x} is not allowed in YAML; remove it",
+        )
     return None, str(error)
 
 
@@ -138,7 +171,9 @@ def _text_of(path: Path) -> str:
     if path.is_dir():
         raise ScenarioError(f"{path}: is a folder; name the scenario file in it")
     if not path.exists():
-        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*.y*ml")], n=1)
+        near = difflib.get_close_matches(
+            path.name, [p.name for p in path.parent.glob("*.y*ml")], n=1
+        )
         hint = f"did you mean {path.parent / near[0]}?" if near else "check the path"
         raise ScenarioError(f"{path}: no such file; {hint}")
     if not path.is_file():
@@ -146,21 +181,30 @@ def _text_of(path: Path) -> str:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise ScenarioError(f"{path}: has {size} bytes, a scenario has at most {MAX_BYTES}; is it the right file?")
+            raise ScenarioError(
+                f"{path}: has {size} bytes, a scenario has at most {MAX_BYTES}; is it the right "
+                "file?"
+            )
         data = path.read_bytes()
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}; check its permissions") from None
+        raise ScenarioError(
+            f"{path}: cannot be read: {error.strerror}; check its permissions"
+        ) from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ScenarioError(f"{path}:{line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as UTF-8") from None
+        raise ScenarioError(
+            f"{path}:{line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as UTF-8"
+        ) from None
 
 
 # ---- overrides
 
 
-def _set(data: dict[str, Any], places: dict[Key, str | int], option: str, key: Key, value: Any) -> None:
+def _set(
+    data: dict[str, Any], places: dict[Key, str | int], option: str, key: Key, value: Any
+) -> None:
     """Put one value into the tree, making the mappings on its way."""
     here: Any = data
     for depth, name in enumerate(key[:-1]):
@@ -172,7 +216,10 @@ def _set(data: dict[str, Any], places: dict[Key, str | int], option: str, key: K
                 places[key[: depth + 1]] = option
             here = here[name]
         if not isinstance(here, dict | list):
-            raise ScenarioError(f"{option}: {dotted(key[: depth + 1])} is {_shown(here)}, which has no keys below it; check the key")
+            raise ScenarioError(
+                f"{option}: {dotted(key[: depth + 1])} is {_shown(here)}, which has no keys below "
+                "it; check the key"
+            )
     last: Any = _index(here, key, len(key) - 1, option) if isinstance(here, list) else key[-1]
     here[last] = value
 
@@ -181,20 +228,27 @@ def _index(items: list[Any], key: Key, depth: int, option: str) -> int:
     name = key[depth]
     if isinstance(name, int) and name < len(items):
         return name
-    raise ScenarioError(f"{option}: {dotted(key[:depth])} is a list of {len(items)}; use an index from 0 to {len(items) - 1} below it")
+    raise ScenarioError(
+        f"{option}: {dotted(key[:depth])} is a list of {len(items)}; use an index from 0 to "
+        f"{len(items) - 1} below it"
+    )
 
 
 def _apply_override(data: dict[str, Any], places: dict[Key, str | int], text: str) -> None:
     option = f"--set {text}"
     name, equals, written = text.partition("=")
     if not equals or not name.strip() or "" in name.strip().split("."):
-        raise ScenarioError(f"{option}: must be key=value, with a dotted key such as radio.groups=2")
+        raise ScenarioError(
+            f"{option}: must be key=value, with a dotted key such as radio.groups=2"
+        )
     key: Key = tuple(int(part) if part.isdecimal() else part for part in name.strip().split("."))
     reader = _Reader(option)
     try:
         value = _parse(written, reader, key)
     except yaml.YAMLError as error:
-        raise ScenarioError(f"{option}: the value cannot be read: {_yaml_complaint(error, written)[1]}") from None
+        raise ScenarioError(
+            f"{option}: the value cannot be read: {_yaml_complaint(error, written)[1]}"
+        ) from None
     # a mapping may have a key that looks like an index: a UAV named 7
     key = _as_present(data, key)
     for old in [place for place in places if place[: len(key)] == key]:
@@ -241,7 +295,8 @@ def _at(data: Any, key: Key) -> Any:
 
 
 def _models_in(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
-    """The tree's class that an annotation holds, and whether it holds it by name (dict) or index (tuple)."""
+    """The tree's class that an annotation holds, and whether it holds it by name (dict) or index
+    (tuple)."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation, False
     origin = typing.get_origin(annotation)
@@ -269,17 +324,25 @@ def _names_allowed(root: type[BaseModel], key: Key) -> list[str]:
 class _Complaints:
     """Turns what is wrong with a tree into lines that say where."""
 
-    def __init__(self, root: type[Node], path: Path, data: Any, places: dict[Key, str | int]) -> None:
+    def __init__(
+        self, root: type[Node], path: Path, data: Any, places: dict[Key, str | int]
+    ) -> None:
         self._root, self._path, self._data, self._places = root, path, data, places
 
     def line(self, keys: Sequence[Key], text: str) -> str:
-        """One complaint. The first key is named; the place is that of an option if one set any of the keys, else of the
-        first key that the file holds."""
+        """One complaint. The first key is named; the place is that of an option if one set any of
+        the keys, else of the first key that the file holds."""
         named = keys[0]
         options = [key for key in keys if isinstance(self._places.get(key), str)]
-        anchor = (options or [key for key in keys if _at(self._data, key) is not _NOWHERE] or [named])[0]
+        anchor = (
+            options or [key for key in keys if _at(self._data, key) is not _NOWHERE] or [named]
+        )[0]
         value = _at(self._data, named)
-        place = next(self._places[anchor[:n]] for n in range(len(anchor), -1, -1) if anchor[:n] in self._places)
+        place = next(
+            self._places[anchor[:n]]
+            for n in range(len(anchor), -1, -1)
+            if anchor[:n] in self._places
+        )
         shown = "" if value is _NOWHERE or isinstance(value, dict) else f" = {_shown(value)}"
         if isinstance(place, str):  # an option
             named_already = place.startswith((f"--set {dotted(named)}=", f"--{dotted(named)} "))
@@ -316,7 +379,10 @@ class _Complaints:
             return self.line([key], "missing, and it has no default; add it")
         if kind in ("model_type", "model_attributes_type", "dict_type"):
             allowed = _names_allowed(self._root, key)
-            return self.line([key], f"must be a mapping{' with keys out of ' + ', '.join(allowed) if allowed else ''}")
+            return self.line(
+                [key],
+                f"must be a mapping{' with keys out of ' + ', '.join(allowed) if allowed else ''}",
+            )
         if kind == "value_error":
             return self.line([key], str(found["ctx"]["error"]))
         return self.line([key], _plain_words(found["msg"]))
@@ -329,7 +395,11 @@ def _plain_words(message: str) -> str:
         .replace("Tuple should have", "must have")
         .replace("'", "")
     )
-    return message.replace("must be a valid ", "must be a ").replace("a integer", "an integer").replace("tuple", "list")
+    return (
+        message.replace("must be a valid ", "must be a ")
+        .replace("a integer", "an integer")
+        .replace("tuple", "list")
+    )
 
 
 def _refuse(lines: Iterable[str]) -> None:
@@ -343,12 +413,18 @@ def _refuse(lines: Iterable[str]) -> None:
 # ---- what others call
 
 
-def load(path: str | os.PathLike[str], overrides: Iterable[str] = (), frames: int | None = None, seed: int | None = None) -> Scenario:
+def load(
+    path: str | os.PathLike[str],
+    overrides: Iterable[str] = (),
+    frames: int | None = None,
+    seed: int | None = None,
+) -> Scenario:
     """Read and check a scenario.
 
     Parameters
     ----------
-    path : path of the YAML file; `city.file` and `accuracy.cost_model` in it are relative to its folder
+    path : path of the YAML file; `city.file` and `accuracy.cost_model` in it are relative to its
+        folder
     overrides : of the form "radio.groups=2", as after --set; the value is YAML
     frames, seed : replace the file's, as --frames and --seed do
 
@@ -378,7 +454,8 @@ def load(path: str | os.PathLike[str], overrides: Iterable[str] = (), frames: in
 
 
 def read_tree(path: Path, needs: str) -> tuple[dict[str, Any], dict[Key, str | int]]:
-    """The mapping that a YAML file holds, and the line of each of its keys; `needs` is what to say of an empty file.
+    """The mapping that a YAML file holds, and the line of each of its keys; `needs` is what to say
+    of an empty file.
 
     Raises
     ------
@@ -394,11 +471,15 @@ def read_tree(path: Path, needs: str) -> tuple[dict[str, Any], dict[Key, str | i
     if data is None:
         raise ScenarioError(f"{path}: is empty; {needs}")
     if not isinstance(data, dict):
-        raise ScenarioError(f"{path}:{reader.places[()]}: must be a mapping of keys ({needs}), not {_shown(data)}")
+        raise ScenarioError(
+            f"{path}:{reader.places[()]}: must be a mapping of keys ({needs}), not {_shown(data)}"
+        )
     return data, reader.places
 
 
-def check_tree(root: type[Tree], path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> Tree:
+def check_tree(
+    root: type[Tree], path: Path, data: dict[str, Any], places: dict[Key, str | int]
+) -> Tree:
     """The mapping of a file as a tree of class `root`.
 
     Raises
@@ -413,7 +494,13 @@ def check_tree(root: type[Tree], path: Path, data: dict[str, Any], places: dict[
         raise
 
 
-def complain(root: type[Node], path: Path, data: dict[str, Any], places: dict[Key, str | int], problem: Problem) -> ScenarioError:
+def complain(
+    root: type[Node],
+    path: Path,
+    data: dict[str, Any],
+    places: dict[Key, str | int],
+    problem: Problem,
+) -> ScenarioError:
     """A problem found outside the tree's own checks, with the line of its key."""
     return ScenarioError(_Complaints(root, path, data, places).problem(problem))
 
@@ -421,7 +508,11 @@ def complain(root: type[Node], path: Path, data: dict[str, Any], places: dict[Ke
 def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> Scenario:
     scenario = check_tree(Scenario, path, data, places).in_folder(path.parent)
     complaints = _Complaints(Scenario, path, data, places)
-    if scenario.city is not None and scenario.city.file is not None and not scenario.city_path().is_file():
+    if (
+        scenario.city is not None
+        and scenario.city.file is not None
+        and not scenario.city_path().is_file()
+    ):
         said = f"no such file in {path.parent}; the path is relative to the scenario's folder"
         raise ScenarioError(complaints.line([("city", "file")], said))
     costs = scenario.cost_model_path()
@@ -434,7 +525,8 @@ def _checked(path: Path, data: dict[str, Any], places: dict[Key, str | int]) -> 
 
 
 def plain_tree(value: Any) -> Any:
-    """A tree as lists, mappings and numbers, without the keys that have no meaning beside the others."""
+    """A tree as lists, mappings and numbers, without the keys that have no meaning beside the
+    others."""
     if isinstance(value, Node):
         fields = type(value).model_fields
         return {
@@ -455,7 +547,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _float_node(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
-    # repr gives the shortest digits that read back as the same float64; YAML 1.1 readers want a point and a sign in 7.7e+10
+    # repr gives the shortest digits that read back as the same float64; YAML 1.1 readers want a
+    # point and a sign in 7.7e+10
     text = repr(value)
     if "e" in text and "." not in text:
         text = text.replace("e", ".0e")
@@ -468,7 +561,8 @@ def _list_node(dumper: yaml.SafeDumper, value: list[Any]) -> yaml.Node:
 
 
 _Dumper.yaml_implicit_resolvers = {
-    first: yaml.SafeDumper.yaml_implicit_resolvers.get(first, []) + _Loader.yaml_implicit_resolvers.get(first, [])
+    first: yaml.SafeDumper.yaml_implicit_resolvers.get(first, [])
+    + _Loader.yaml_implicit_resolvers.get(first, [])
     for first in {*yaml.SafeDumper.yaml_implicit_resolvers, *_Loader.yaml_implicit_resolvers}
 }
 _Dumper.add_representer(float, _float_node)
@@ -481,7 +575,8 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     Parameters
     ----------
     scenario : Scenario
-    folder : where the text will be saved, if not beside the original: `city.file` and `accuracy.cost_model` are then written relative to it
+    folder : where the text will be saved, if not beside the original: `city.file` and
+        `accuracy.cost_model` are then written relative to it
 
     Returns
     -------

@@ -1,4 +1,5 @@
-"""What every mapping of a scenario is made of: the frozen node, its kinds of numbers, and how it complains."""
+"""What every mapping of a scenario is made of: the frozen node, its kinds of numbers, and how it
+complains."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ Key = tuple[str | int, ...]
 
 
 class Problem(NamedTuple):
-    """Something that cannot stand: the keys that take part in it, the one to name first, and what to say."""
+    """Something that cannot stand: the keys that take part in it, the one to name first, and what
+    to say."""
 
     keys: tuple[Key, ...]
     text: str
@@ -36,13 +38,17 @@ Vector = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_three_numbers
 
 
 def _holds_bool(value: Any) -> bool:
-    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_holds_bool, value)))
+    return isinstance(value, bool) or (
+        isinstance(value, list | tuple) and any(map(_holds_bool, value))
+    )
 
 
 class Node(BaseModel):
     """One mapping of the tree."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @field_validator("*", mode="before")
     @classmethod
@@ -56,7 +62,9 @@ class Node(BaseModel):
         problems = list(self.problems())
         if problems:
             text = "; ".join(f"{dotted(p.keys[0])}: {p.text}" for p in problems)
-            raise PydanticCustomError("inconsistent", "{text}", {"text": text, "problems": problems})
+            raise PydanticCustomError(
+                "inconsistent", "{text}", {"text": text, "problems": problems}
+            )
         return self
 
     def problems(self) -> Iterator[Problem]:

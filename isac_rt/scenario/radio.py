@@ -24,7 +24,9 @@ class ChirpTimes(NamedTuple):
     """T-, from one chirp of a group to its next."""
 
 
-def chirp_times(bandwidth: float, sampling_rate: float, num_samples: int, num_tx: int) -> ChirpTimes:
+def chirp_times(
+    bandwidth: float, sampling_rate: float, num_samples: int, num_tx: int
+) -> ChirpTimes:
     """Durations of a chirp; T_d = f_s T / (B - 2 f_s), see `isac_rt.frame.waveform.Waveform`."""
     sampled = num_samples / sampling_rate
     max_delay = sampling_rate * sampled / (bandwidth - 2 * sampling_rate)
@@ -33,7 +35,8 @@ def chirp_times(bandwidth: float, sampling_rate: float, num_samples: int, num_tx
 
 
 def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> int:
-    """floor(T- / (2 T_d)) in rational arithmetic; with r = B/f_s it is (r - 2)/2 + 1 + L_tx (19 for the paper's numbers)."""
+    """floor(T- / (2 T_d)) in rational arithmetic; with r = B/f_s it is (r - 2)/2 + 1 + L_tx (19 for
+    the paper's numbers)."""
     ratio = Rational(bandwidth).limit_denominator() / Rational(sampling_rate).limit_denominator()
     return int((ratio - 2) / 2 + 1 + num_tx)
 
@@ -54,11 +57,15 @@ class Radio(Node):
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
             yield Problem(
                 (("bandwidth_hz",), ("sampling_rate_hz",)),
-                f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of {self.sampling_rate_hz:g} Hz; "
+                f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of "
+                f"{self.sampling_rate_hz:g} Hz; "
                 "raise the bandwidth or lower the sampling rate",
             )
         if self.samples_per_chirp % 2:
-            yield Problem((("samples_per_chirp",),), "must be even: half of the range cells carry the data symbols")
+            yield Problem(
+                (("samples_per_chirp",),),
+                "must be even: half of the range cells carry the data symbols",
+            )
 
 
 class Array(Node):
@@ -71,7 +78,8 @@ class Array(Node):
     spacing_wavelengths: Positive = 0.5774
     schedule: Literal["pseudo_random", "conventional"] = "pseudo_random"
     fall_back: bool = False
-    """Send the conventional schedule instead of the pseudo-random one as long as a receiver finds the scene not sparse."""
+    """Send the conventional schedule instead of the pseudo-random one as long as a receiver finds
+    the scene not sparse."""
     element_pattern: Literal["isotropic", "sector", "cosine"] = "cosine"
     element_gain_dbi: Finite = 5.0
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0
@@ -86,12 +94,14 @@ class Modulation(Node):
     pilot_every_frames: Annotated[int, Field(ge=2)] | None = 25
     """One unmodulated frame in so many, for late and lost terminals; null: none after the start."""
     streams: dict[str, tuple[Annotated[int, Field(ge=0)], ...]] = Field({})
-    """Groups that carry data for a passive terminal, by its name; a terminal that is not named reads them all."""
+    """Groups that carry data for a passive terminal, by its name; a terminal that is not named
+    reads them all."""
 
 
 class Noise(Node):
-    """link_budget: thermal noise and transmit power. snr: per-sample IF SNR of the reference path (the strongest target at
-    the AT, the line of sight at a PT) as it would be unshadowed and in view."""
+    """link_budget: thermal noise and transmit power. snr: per-sample IF SNR of the reference path
+    (the strongest target at the AT, the line of sight at a PT) as it would be unshadowed and in
+    view."""
 
     model: Literal["link_budget", "snr"] = "link_budget"
     tx_power_dbm: Finite = 12.0

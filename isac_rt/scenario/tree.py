@@ -1,8 +1,8 @@
 """The whole input of a run as a frozen, typed tree, and what must hold between its values.
 
-Units stand in the key names. Unknown keys are refused. Everything inside the program is SI, radians and
-linear power; the conversions from decibels and degrees happen where a value leaves this tree. Files are read
-and written by `isac_rt.scenario.file`.
+Units stand in the key names. Unknown keys are refused. Everything inside the program is SI, radians
+and linear power; the conversions from decibels and degrees happen where a value leaves this tree.
+Files are read and written by `isac_rt.scenario.file`.
 """
 
 from __future__ import annotations
@@ -27,38 +27,6 @@ NEAREST_M = 0.05
 """Two bodies nearer than this are one to the ray tracer."""
 FASTEST_MPS = 200.0
 FARTHEST_M = 1e5
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
 
 
 class Scenario(Node):
@@ -87,8 +55,8 @@ class Scenario(Node):
 
     @property
     def folder(self) -> Path:
-        """Folder of the scenario file, to which `city.file` and `accuracy.cost_model` are relative; the working folder for a tree made in
-        Python."""
+        """Folder of the scenario file, to which `city.file` and `accuracy.cost_model` are relative;
+        the working folder for a tree made in Python."""
         return self._folder
 
     def in_folder(self, folder: Path) -> Scenario:
@@ -110,7 +78,8 @@ class Scenario(Node):
         return self.folder / self.city.file
 
     def cost_model_path(self) -> Path | None:
-        """The file of accuracy.cost_model, found from the scenario's folder; None for the costs that ship with the program."""
+        """The file of accuracy.cost_model, found from the scenario's folder; None for the costs
+        that ship with the program."""
         return None if self.accuracy.cost_model is None else self.folder / self.accuracy.cost_model
 
     @property
@@ -143,37 +112,55 @@ class Scenario(Node):
         if self.radio.chirps_per_frame % self.num_tx:
             yield Problem(
                 (("radio", "chirps_per_frame"), *sizes),
-                f"{self.radio.chirps_per_frame} chirps are not a multiple of {antennas}; every antenna needs the same number of slots",
+                f"{self.radio.chirps_per_frame} chirps are not a multiple of {antennas}; every "
+                "antenna needs the same number of slots",
             )
         if self.radio.groups > self.num_tx:
-            said = f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more transmit antennas"
+            said = (
+                f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more "
+                "transmit antennas"
+            )
             yield Problem((("radio", "groups"), *sizes), said)
-        if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (1 - 1e-12):
+        if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (
+            1 - 1e-12
+        ):
             yield Problem(
-                (("frame_interval_s",), ("radio", "chirps_per_frame"), ("radio", "samples_per_chirp")),
-                f"is shorter than a frame, which lasts {self.frame_duration_s:.7g} s; lengthen it, or leave it out for contiguous frames",
+                (
+                    ("frame_interval_s",),
+                    ("radio", "chirps_per_frame"),
+                    ("radio", "samples_per_chirp"),
+                ),
+                f"is shorter than a frame, which lasts {self.frame_duration_s:.7g} s; lengthen it, "
+                "or leave it out for contiguous frames",
             )
         if self.modulation.acquisition_frames >= self.frames:
             yield Problem(
                 (("modulation", "acquisition_frames"), ("frames",)),
-                f"{self.modulation.acquisition_frames} acquisition frames leave none of the {self.frames} frames for data; "
+                f"{self.modulation.acquisition_frames} acquisition frames leave none of the "
+                f"{self.frames} frames for data; "
                 "run more frames or set modulation.acquisition_frames lower",
             )
 
     def _swarm_problems(self) -> Iterator[Problem]:
         for name in self.swarm:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-                yield Problem((("swarm", name),), "a UAV's name may hold letters, digits, _ and - only; rename it")
+                yield Problem(
+                    (("swarm", name),),
+                    "a UAV's name may hold letters, digits, _ and - only; rename it",
+                )
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
         if not active:
-            yield Problem((("swarm",),), "no UAV has the role active; give it to the one that transmits")
+            yield Problem(
+                (("swarm",),), "no UAV has the role active; give it to the one that transmits"
+            )
         for (a, first), (b, second) in itertools.combinations(self.swarm.items(), 2):
             apart = math.dist(first.place(0.0), second.place(0.0))
             if apart < NEAREST_M:
                 key = "position_m" if second.waypoints is None else "waypoints"
                 yield Problem(
                     (("swarm", b, key), ("swarm", a)),
-                    f"{a} and {b} are {apart:.3g} m apart at the start, at least {NEAREST_M} m are needed; move one of them",
+                    f"{a} and {b} are {apart:.3g} m apart at the start, at least {NEAREST_M} m are "
+                    "needed; move one of them",
                 )
 
     def _role_problems(self) -> Iterator[Problem]:
@@ -182,30 +169,57 @@ class Scenario(Node):
         for i, change in enumerate(self.role_changes):
             key = ("role_changes", i)
             if change.frame <= last or change.frame >= self.frames:
-                said = f"must be after {last} (the change before it) and below the number of frames, {self.frames}"
+                said = (
+                    f"must be after {last} (the change before it) and below the number of "
+                    f"frames, {self.frames}"
+                )
                 yield Problem(((*key, "frame"), ("frames",)), said)
             last = max(last, change.frame)
-            for end, name, role in (("from_uav", change.from_uav, "active"), ("to_uav", change.to_uav, "passive")):
+            for end, name, role in (
+                ("from_uav", change.from_uav, "active"),
+                ("to_uav", change.to_uav, "passive"),
+            ):
                 if roles.get(name) != role:
                     now = f"is {roles[name]}" if name in roles else "is not in the swarm"
-                    yield Problem(((*key, end), ("swarm",)), f"{name} {now}; name a UAV that is {role} then")
+                    yield Problem(
+                        ((*key, end), ("swarm",)), f"{name} {now}; name a UAV that is {role} then"
+                    )
             roles |= {change.from_uav: "passive", change.to_uav: "active"}
             ever_passive.add(change.from_uav)
         if self.access.synchronisation == "two_round" and not self.access.establish:
-            said = "two_round measures clocks in the stages before the data; set access.establish: true, or take external or none"
+            said = (
+                "two_round measures clocks in the stages before the data; set access.establish: "
+                "true, or take external or none"
+            )
             yield Problem((("access", "synchronisation"), ("access", "establish")), said)
         if self.access.synchronisation == "none" and self.access.feedback:
-            said = "feedback compares ranges of two terminals, which need the same clock; leave it out, or take external or two_round"
+            said = (
+                "feedback compares ranges of two terminals, which need the same clock; leave it "
+                "out, or take external or two_round"
+            )
             yield Problem((("access", "feedback"), ("access", "synchronisation")), said)
         if self.access.establish and self.role_changes:
-            said = "the stages are gone through once, before the first frame; a change of roles needs them again; leave one of the two out"
+            said = (
+                "the stages are gone through once, before the first frame; a change of roles "
+                "needs them again; leave one of the two out"
+            )
             yield Problem((("access", "establish"), ("role_changes",)), said)
         for name, groups in self.modulation.streams.items():
             stream: Key = ("modulation", "streams", name)
             if name not in ever_passive:
-                yield Problem((stream, ("swarm",)), "is never a passive terminal of the swarm; name one that receives")
-            if not groups or len(set(groups)) < len(groups) or max(groups, default=0) >= self.radio.groups:
-                said = f"needs one group or more of 0 to {self.radio.groups - 1} (radio.groups = {self.radio.groups}), each once"
+                yield Problem(
+                    (stream, ("swarm",)),
+                    "is never a passive terminal of the swarm; name one that receives",
+                )
+            if (
+                not groups
+                or len(set(groups)) < len(groups)
+                or max(groups, default=0) >= self.radio.groups
+            ):
+                said = (
+                    f"needs one group or more of 0 to {self.radio.groups - 1} (radio.groups = "
+                    f"{self.radio.groups}), each once"
+                )
                 yield Problem((stream, ("radio", "groups")), said)
 
     def _block_problems(self) -> Iterator[Problem]:
@@ -214,15 +228,25 @@ class Scenario(Node):
         for name, first in self.first_blocks().items():
             if first + r.groups > limit:
                 yield Problem(
-                    (("swarm", name, "resource_block"), ("radio", "groups"), ("radio", "bandwidth_hz")),
-                    f"{name} would need the resource blocks {first} to {first + r.groups - 1}; a slot has {limit} (0 to {limit - 1}); "
+                    (
+                        ("swarm", name, "resource_block"),
+                        ("radio", "groups"),
+                        ("radio", "bandwidth_hz"),
+                    ),
+                    f"{name} would need the resource blocks {first} to {first + r.groups - 1}; a "
+                    f"slot has {limit} (0 to {limit - 1}); "
                     "choose a lower block, fewer groups or fewer active UAVs",
                 )
 
     def first_blocks(self) -> dict[str, int]:
-        """First resource block of every UAV that is active at the start; a successor takes over its predecessor's."""
+        """First resource block of every UAV that is active at the start; a successor takes over its
+        predecessor's."""
         active = {name: uav for name, uav in self.swarm.items() if uav.role == "active"}
-        out = {name: uav.resource_block for name, uav in active.items() if uav.resource_block is not None}
+        out = {
+            name: uav.resource_block
+            for name, uav in active.items()
+            if uav.resource_block is not None
+        }
         taken = {block + i for block in out.values() for i in range(self.radio.groups)}
         for name in active:
             if name not in out:
@@ -238,50 +262,82 @@ class Scenario(Node):
             if uav.rcs.model == "relative" and self.propagation.model != "free_space":
                 yield Problem(
                     (("swarm", name, "rcs", "model"), ("propagation", "model")),
-                    "relative goes with propagation.model free_space only: a traced echo needs a radar cross-section; "
+                    "relative goes with propagation.model free_space only: a traced echo needs a "
+                    "radar cross-section; "
                     "use constant or tr38901",
                 )
             if uav.rcs.model == "relative" and self.noise.model != "snr":
                 yield Problem(
                     (("swarm", name, "rcs", "model"), ("noise", "model")),
-                    "relative goes with noise.model snr only: a link budget needs a radar cross-section; use constant or tr38901",
+                    "relative goes with noise.model snr only: a link budget needs a radar "
+                    "cross-section; use constant or tr38901",
                 )
-        if self.clutter.model in ("diffuse", "field") and (self.propagation.model != "ray_traced" or self.city is None):
+        if self.clutter.model in ("diffuse", "field") and (
+            self.propagation.model != "ray_traced" or self.city is None
+        ):
             yield Problem(
                 (("clutter", "model"), ("propagation", "model"), ("city",)),
-                f"{self.clutter.model} needs propagation.model ray_traced and a city to scatter from; "
+                f"{self.clutter.model} needs propagation.model ray_traced and a city to scatter "
+                "from; "
                 "add them or set clutter.model to none",
             )
-        if self.receivers.clutter_detector in ("map", "angle_doppler") and (self.propagation.model != "ray_traced" or self.city is None):
+        if self.receivers.clutter_detector in ("map", "angle_doppler") and (
+            self.propagation.model != "ray_traced" or self.city is None
+        ):
             yield Problem(
                 (("receivers", "clutter_detector"), ("propagation", "model"), ("city",)),
-                f"{self.receivers.clutter_detector} predicts clutter from a city's mesh: it needs propagation.model ray_traced and a city; "
+                f"{self.receivers.clutter_detector} predicts clutter from a city's mesh: it needs "
+                "propagation.model ray_traced and a city; "
                 "add them or set receivers.clutter_detector to cfar or sample_matrix",
             )
 
     def doubts(self) -> Iterator[Problem]:
-        """What may stand but is probably not meant: values in the wrong unit, active UAVs that talk over each other."""
+        """What may stand but is probably not meant: values in the wrong unit, active UAVs that talk
+        over each other."""
         for (a, first), (b, second) in itertools.combinations(self.first_blocks().items(), 2):
             if abs(first - second) < self.radio.groups:
-                yield Problem((("swarm", b, "resource_block"),), f"{b} and {a} send in the same resource blocks; shall they collide?")
+                yield Problem(
+                    (("swarm", b, "resource_block"),),
+                    f"{b} and {a} send in the same resource blocks; shall they collide?",
+                )
         yield from implausible(self)
         for name, uav in self.swarm.items():
             if uav.waypoints is None:
-                speeds: list[tuple[Key, float]] = [(("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))]
-                places: list[tuple[Key, tuple[float, ...]]] = [(("swarm", name, "position_m"), uav.place(0.0))]
+                speeds: list[tuple[Key, float]] = [
+                    (("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))
+                ]
+                places: list[tuple[Key, tuple[float, ...]]] = [
+                    (("swarm", name, "position_m"), uav.place(0.0))
+                ]
             else:
                 legs = enumerate(itertools.pairwise(uav.waypoints), start=1)
                 key = ("swarm", name, "waypoints")
-                speeds = [((*key, i), math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s)) for i, (a, b) in legs]
-                places = [((*key, i, "position_m"), w.position_m) for i, w in enumerate(uav.waypoints)]
+                speeds = [
+                    ((*key, i), math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s))
+                    for i, (a, b) in legs
+                ]
+                places = [
+                    ((*key, i, "position_m"), w.position_m) for i, w in enumerate(uav.waypoints)
+                ]
             for where, speed in speeds:
                 if speed > FASTEST_MPS:
-                    yield Problem((where,), f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}; is it in metres and seconds?")
+                    yield Problem(
+                        (where,),
+                        f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}; is it in metres and "
+                        "seconds?",
+                    )
             for where, place in places:
                 if math.hypot(*place) > FARTHEST_M:
-                    yield Problem((where,), f"lies {math.hypot(*place):.4g} m from the origin, more than {FARTHEST_M:g}; is it in metres?")
+                    yield Problem(
+                        (where,),
+                        f"lies {math.hypot(*place):.4g} m from the origin, more than "
+                        f"{FARTHEST_M:g}; is it in metres?",
+                    )
 
 
 def json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario file, for editors; docstrings become descriptions."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Scenario.model_json_schema()}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Scenario.model_json_schema(),
+    }

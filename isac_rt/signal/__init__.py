@@ -1,1 +1,2 @@
-"""Paths and payload to IF samples, by several methods that are as exact as the scene needs, and the noise."""
+"""Paths and payload to IF samples, by several methods that are as exact as the scene needs, and the
+noise."""

@@ -1,13 +1,17 @@
-"""What a synthesis costs and how far off it may be, and from both what `auto` does with a cube's paths.
+"""What a synthesis costs and how far off it may be, and from both what `auto` does with a cube's
+paths.
 
-Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K paths, fitted by `isac-rt bench --fit FILE`:
+Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K paths, fitted by
+`isac-rt bench --fit FILE`:
 
-.. math:: C L \\frac{N}{1024} (a_d + K b_d) \\text{ (direct)}, \\qquad C \\lceil L/16 \\rceil \\left(a_s \\frac{N}{1024} + K b_s\\right)
+.. math:: C L \\frac{N}{1024} (a_d + K b_d) \\text{ (direct)}, \\qquad C \\lceil L/16 \\rceil
+\\left(a_s \\frac{N}{1024} + K b_s\\right)
     \\text{ (gridded, each setting)}
 
-Data do not enter: the delay symbols move paths over the grid. The coefficients that ship with the program stand in `cost_model.json`, with
-the machine they were measured on. Others are read only where a scenario names their file (``accuracy.cost_model``), so that a run
-depends on no machine unless its user says so.
+Data do not enter: the delay symbols move paths over the grid. The coefficients that ship with the
+program stand in `cost_model.json`, with the machine they were measured on. Others are read only
+where a scenario names their file (``accuracy.cost_model``), so that a run depends on no machine
+unless its user says so.
 """
 
 from __future__ import annotations
@@ -36,8 +40,9 @@ class Candidate:
     ----------
     name : of its coefficients
     setting : `isac_rt.signal.gridded.Setting`
-    error : coefficients of 1, v and v^2 [m/s] in a bound of the relative RMS error against the full model of a path whose delay changes
-        by 2 v/c, up to |u| = 0.87 and the paper's 640 MHz (measured: `docs/performance_synthesis.md`)
+    error : coefficients of 1, v and v^2 [m/s] in a bound of the relative RMS error against the full
+        model of a path whose delay changes by 2 v/c, up to |u| = 0.87 and the paper's 640 MHz
+        (measured: `docs/performance_synthesis.md`)
     """
 
     name: str
@@ -92,11 +97,16 @@ def read(file: Path) -> CostModel:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
         methods = {name: data["methods"][name] for name in NAMES}
-        chirp, path = ({name: float(row[key]) for name, row in methods.items()} for key in ("chirp_ns", "path_ns"))
+        chirp, path = (
+            {name: float(row[key]) for name, row in methods.items()}
+            for key in ("chirp_ns", "path_ns")
+        )
     except OSError as problem:
         raise ValueError(f"{file}: {problem.strerror or problem}; {remedy}") from None
     except (ValueError, KeyError, TypeError) as problem:
-        raise ValueError(f"{file}: is no cost model ({type(problem).__name__}: {problem}); {remedy}") from None
+        raise ValueError(
+            f"{file}: is no cost model ({type(problem).__name__}: {problem}); {remedy}"
+        ) from None
     if data.get("format") != FORMAT:
         raise ValueError(f"{file}: format {data.get('format')!r} is not {FORMAT!r}; {remedy}")
     values = np.array([*chirp.values(), *path.values()])
@@ -117,20 +127,26 @@ def choose(
     max_direct: int,
     num_paths: int | None = None,
 ) -> tuple[Setting, np.ndarray]:
-    """The cheapest way of making a cube within an error: the setting of the grid, and which paths go direct past it.
+    """The cheapest way of making a cube within an error: the setting of the grid, and which paths
+    go direct past it.
 
-    With a setting go direct: lines of sight (their joint curvature is not gridded); paths too fast for `max_error`; and of those whose
-    error, integrated coherently over the cube, could exceed the noise of a cell, the `max_direct` strongest. All direct is a way too.
+    With a setting go direct: lines of sight (their joint curvature is not gridded); paths too fast
+    for `max_error`; and of those whose error, integrated coherently over the cube, could exceed the
+    noise of a cell, the `max_direct` strongest. All direct is a way too.
 
     Parameters
     ----------
-    power, speed, sight : (K,) of each path: received power [W], c |delay rate| / 2 [m/s], whether it is a line of sight
+    power, speed, sight : (K,) of each path: received power [W], c |delay rate| / 2 [m/s], whether
+        it is a line of sight
     noise_power : per sample [W]
     max_error : relative RMS error of the samples, at least that of the direct method (1e-6)
     num_paths : whose cost decides, where those given are some of them
     """
     scale = 1.0 if num_paths is None else num_paths / max(power.size, 1)
-    best, least = (DEFAULT, np.ones(power.size, bool)), model.seconds(DIRECT, shape, scale * power.size)
+    best, least = (
+        (DEFAULT, np.ones(power.size, bool)),
+        model.seconds(DIRECT, shape, scale * power.size),
+    )
     top = np.zeros(power.size, bool)
     top[np.argsort(-power, kind="stable")[:max_direct]] = True
     for candidate in CANDIDATES:
@@ -148,5 +164,6 @@ def choose(
 
 
 def speed_of(rate: np.ndarray, accel: np.ndarray, duration: float) -> np.ndarray:
-    """c/2 times the largest rate of delay within a frame [m/s], from rate and acceleration at its middle."""
+    """c/2 times the largest rate of delay within a frame [m/s], from rate and acceleration at its
+    middle."""
     return (np.abs(rate) + np.abs(accel) * duration / 2) * (SPEED_OF_LIGHT / 2)

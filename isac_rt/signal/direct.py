@@ -4,8 +4,8 @@ Cycles of the IF of one path (reference times conjugate of the received chirp), 
 
 .. math:: \Phi = f_c\tau + \alpha\tau\,(u - \tau/2)
 
-with the delay tau counted from the reference chirp and u the time since its start. Every delay is float64 and every
-phase is reduced to one cycle in float64; f_c t is never formed.
+with the delay tau counted from the reference chirp and u the time since its start. Every delay is
+float64 and every phase is reduced to one cycle in float64; f_c t is never formed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,18 @@ import numpy as np
 from numba import njit
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.vector import LANES, aligned, cos_sin_exact, floor, load, narrow, splat, store, zip_high, zip_low
+from isac_rt.kernels.vector import (
+    LANES,
+    aligned,
+    cos_sin_exact,
+    floor,
+    load,
+    narrow,
+    splat,
+    store,
+    zip_high,
+    zip_low,
+)
 
 FAST = {"contract", "nnan", "ninf", "nsz"}
 """Freedoms of the compiler that do not depend on the vector width."""
@@ -60,18 +71,31 @@ class Tones:
 
     def select(self, which: np.ndarray) -> Tones:
         """The paths that a mask or an index array chooses."""
-        per_path = ("link", "factor", "delay", "rate", "accel", "begin", "end", "tx_delay", "rx_delay", "cross_row")
+        per_path = (
+            "link",
+            "factor",
+            "delay",
+            "rate",
+            "accel",
+            "begin",
+            "end",
+            "tx_delay",
+            "rx_delay",
+            "cross_row",
+        )
         return Tones(**{k: v[which] if k in per_path else v for k, v in vars(self).items()})
 
 
 def filter_gain(beat: np.ndarray, sampling_rate: float, transition: float) -> np.ndarray:
-    """Amplitude gain of the IF filter: 1 on [0, f_s], a raised-cosine skirt of width `transition` [Hz] on both sides."""
+    """Amplitude gain of the IF filter: 1 on [0, f_s], a raised-cosine skirt of width `transition`
+    [Hz] on both sides."""
     outside = np.clip(np.maximum(-beat, beat - sampling_rate) / transition, 0.0, 1.0)
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 
 
 def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
-    """The model itself in float64, path by path, sample by sample: the oracle of the faster methods.
+    """The model itself in float64, path by path, sample by sample: the oracle of the faster
+    methods.
 
     Returns
     -------
@@ -79,9 +103,10 @@ def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
 
     Notes
     -----
-    Temporary memory is a few (P, N) arrays. The gain of the filter follows the beat at the middle of each chirp, seen from
-    the arrays' centroids; the filter's own transient is not modelled. Nor is the end of a chirp: at the edge of the skirt
-    (a negative beat) the received chirp ends transition/slope before the window does, 0.7 samples for 0.4 MHz.
+    Temporary memory is a few (P, N) arrays. The gain of the filter follows the beat at the middle
+    of each chirp, seen from the arrays' centroids; the filter's own transient is not modelled. Nor
+    is the end of a chirp: at the edge of the skirt (a negative beat) the received chirp ends
+    transition/slope before the window does, 0.7 samples for 0.4 MHz.
     """
     w, t = waveform, tones
     out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
@@ -93,21 +118,30 @@ def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
             alive = (time >= t.begin[k]) & (time < t.end[k])
             for source in range(w.num_groups):
                 base = path + t.symbol_delay[q, source][:, None] - (m - source) * w.group_spacing
-                passed = filter_gain(w.slope * base[:, w.num_samples // 2], w.sampling_rate, transition)
+                passed = filter_gain(
+                    w.slope * base[:, w.num_samples // 2], w.sampling_rate, transition
+                )
                 weight = (t.factor[k] * t.send[q, source] * passed)[:, None] * alive
                 if not weight.any():
                     continue
                 antenna = t.antenna[q, source]
                 for rx in range(out.shape[1]):
-                    element = t.tx_delay[k, antenna] + t.rx_delay[k, rx] + t.cross[t.cross_row[k], antenna, rx]
+                    element = (
+                        t.tx_delay[k, antenna]
+                        + t.rx_delay[k, rx]
+                        + t.cross[t.cross_row[k], antenna, rx]
+                    )
                     tau = base + element[:, None]
-                    cycles = (w.carrier_frequency * tau) % 1 + (w.slope * tau * (w.fast_time - tau / 2)) % 1
+                    cycles = (w.carrier_frequency * tau) % 1 + (
+                        w.slope * tau * (w.fast_time - tau / 2)
+                    ) % 1
                     out[m, rx] += weight * np.exp(2j * np.pi * cycles)
     return out
 
 
 def sources(waveform: Waveform, tones: Tones, transition: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`, offsets. Both (C,) int64."""
+    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`,
+    offsets. Both (C,) int64."""
     w, t = waveform, tones
     half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
     motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
@@ -123,7 +157,8 @@ def sources(waveform: Waveform, tones: Tones, transition: float) -> tuple[np.nda
 
 
 def numbers(waveform: Waveform, transition: float) -> np.ndarray:
-    """The waveform as a vector for the kernels; the order is that of `chirp_terms` and its callers."""
+    """The waveform as a vector for the kernels; the order is that of `chirp_terms` and its
+    callers."""
     w = waveform
     middle = w.fast_time[w.num_samples // 2]
     return np.array(
@@ -143,9 +178,11 @@ def numbers(waveform: Waveform, transition: float) -> np.ndarray:
 
 @njit(inline="always")
 def chirp_terms(w, tau, rate, accel):
-    """Start phase [cycles], frequency [cycles/sample] and quadratic term of a path about the middle sample.
+    """Start phase [cycles], frequency [cycles/sample] and quadratic term of a path about the middle
+    sample.
 
-    `tau`, `rate`: there, elements included. What is left out is cubic, below 1e-8 cycles for 10 m/s^2.
+    `tau`, `rate`: there, elements included. What is left out is cubic, below 1e-8 cycles for 10
+    m/s^2.
     """
     f_c, slope, ts, u = w[0], w[1], w[2], w[3]
     b = rate * ts
@@ -170,7 +207,8 @@ def passed(w, tau):
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
 def _turn(out, at, cycles, amplitude):
-    """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at + 16:]."""
+    """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at
+    + 16:]."""
     c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
     re, im = splat(np.float32(amplitude.real)), splat(np.float32(amplitude.imag))
     store(out, at, re * c - im * s)
@@ -179,11 +217,12 @@ def _turn(out, at, cycles, amplitude):
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
 def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadratic):
-    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`: of each 16 samples real parts, then
-    imaginary ones.
+    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`: of
+    each 16 samples real parts, then imaginary ones.
 
-    With X the middle of 16 samples and i = x - X the tone is exp(phase + frequency X + quadratic X^2) exp(frequency i + quadratic i^2)
-    (1 + j 4 pi quadratic X i), all phases reduced in float64; what is left out is the square of the last term, 1e-8 at 15 m/s.
+    With X the middle of 16 samples and i = x - X the tone is exp(phase + frequency X + quadratic
+    X^2) exp(frequency i + quadratic i^2) (1 + j 4 pi quadratic X i), all phases reduced in float64;
+    what is left out is the square of the last term, 1e-8 at 15 m/s.
     """
     within = load(places, 0)
     _turn(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
@@ -198,7 +237,12 @@ def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadrat
         store(starts, 48, cross * load(starts, 0))
         for i in range(min(LANES, blocks - first)):
             at = 32 * (first + i)
-            pr, pi, qr, qi = splat(starts[i]), splat(starts[16 + i]), splat(starts[32 + i]), splat(starts[48 + i])
+            pr, pi, qr, qi = (
+                splat(starts[i]),
+                splat(starts[16 + i]),
+                splat(starts[32 + i]),
+                splat(starts[48 + i]),
+            )
             store(sums, at, (load(sums, at) + pr * lr - pi * li) + (qr * mr - qi * mi))
             store(sums, at + 16, (load(sums, at + 16) + pr * li + pi * lr) + (qr * mi + qi * mr))
 
@@ -212,7 +256,9 @@ def _flush(out, to, num_samples, sums, fresh):
         if at + 32 > 2 * num_samples:
             for i in range(num_samples - at // 2):
                 out[here + 2 * i] = sums[at + i] if fresh else out[here + 2 * i] + sums[at + i]
-                out[here + 2 * i + 1] = sums[at + 16 + i] if fresh else out[here + 2 * i + 1] + sums[at + 16 + i]
+                out[here + 2 * i + 1] = (
+                    sums[at + 16 + i] if fresh else out[here + 2 * i + 1] + sums[at + 16 + i]
+                )
         elif fresh:
             store(out, here, zip_low(re, im))
             store(out, here + 16, zip_high(re, im))
@@ -224,8 +270,32 @@ def _flush(out, to, num_samples, sums, fresh):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _direct(out, shape, w, path, offset, link, factor, delay, rate, accel, begin, end, tx, rx, row, cross, symbol, send, antenna,
-            fresh, sums, starts, lane, places):  # fmt: skip
+def _direct(
+    out,
+    shape,
+    w,
+    path,
+    offset,
+    link,
+    factor,
+    delay,
+    rate,
+    accel,
+    begin,
+    end,
+    tx,
+    rx,
+    row,
+    cross,
+    symbol,
+    send,
+    antenna,
+    fresh,
+    sums,
+    starts,
+    lane,
+    places,
+):
     """Add the listed (path, group offset) to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
     half = float(num_samples // 2)
@@ -241,12 +311,21 @@ def _direct(out, shape, w, path, offset, link, factor, delay, rate, accel, begin
                 if source < 0 or source >= groups or time < begin[k] or time >= end[k]:
                     continue
                 q = link[k]
-                tau = symbol[q, source, p] + delay[k] + (rate[k] + accel[k] * time / 2) * time - offset[i] * w[5]
+                tau = (
+                    symbol[q, source, p]
+                    + delay[k]
+                    + (rate[k] + accel[k] * time / 2) * time
+                    - offset[i] * w[5]
+                )
                 amplitude = factor[k] * send[q, source, p] * passed(w, tau)
                 if amplitude == 0:
                     continue
                 chosen[count], weight[count] = i, amplitude
-                terms[count, 0], terms[count, 1], terms[count, 2] = tau, rate[k] + accel[k] * time, antenna[q, source, p]
+                terms[count, 0], terms[count, 1], terms[count, 2] = (
+                    tau,
+                    rate[k] + accel[k] * time,
+                    antenna[q, source, p],
+                )
                 count += 1
             if count == 0 and not fresh:
                 continue
@@ -256,14 +335,19 @@ def _direct(out, shape, w, path, offset, link, factor, delay, rate, accel, begin
                     element = terms[i, 0] + tx[k, a] + rx[k, r] + cross[row[k], a, r]
                     phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], accel[k])
                     _tone(sums, starts, lane, places, half, weight[i], phase, frequency, quadratic)
-                _flush(out, 2 * num_samples * ((m * num_rx + r) * chirps + p), num_samples, sums, fresh)
+                _flush(
+                    out, 2 * num_samples * ((m * num_rx + r) * chirps + p), num_samples, sums, fresh
+                )
 
 
-def add_direct(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, *, fresh: bool = False) -> None:
+def add_direct(
+    samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, *, fresh: bool = False
+) -> None:
     """Add paths one by one, every element with its own delay (wideband, spherical).
 
-    Relative error against `exact` below 1e-6: roundings of float32 (`_tone`). A path lives in whole chirps (it does where the
-    middle of the window lies in its life). Runs in one thread without the interpreter's lock.
+    Relative error against `exact` below 1e-6: roundings of float32 (`_tone`). A path lives in whole
+    chirps (it does where the middle of the window lies in its life). Runs in one thread without the
+    interpreter's lock.
 
     Parameters
     ----------
@@ -276,8 +360,33 @@ def add_direct(samples: np.ndarray, waveform: Waveform, tones: Tones, transition
             samples[:] = 0
         return
     t, lanes = tones, np.arange(LANES)
-    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat([-1.0, 1.0], LANES)
+    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
+        [-1.0, 1.0], LANES
+    )
     blocks = -(-samples.shape[3] // LANES)
-    _direct(samples.reshape(-1).view(np.float32), samples.shape, numbers(waveform, transition), path, offset, t.link, t.factor, t.delay,
-            t.rate, t.accel, t.begin, t.end, t.tx_delay, t.rx_delay, t.cross_row, t.cross, t.symbol_delay, t.send, t.antenna,
-            fresh, aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)  # fmt: skip
+    _direct(
+        samples.reshape(-1).view(np.float32),
+        samples.shape,
+        numbers(waveform, transition),
+        path,
+        offset,
+        t.link,
+        t.factor,
+        t.delay,
+        t.rate,
+        t.accel,
+        t.begin,
+        t.end,
+        t.tx_delay,
+        t.rx_delay,
+        t.cross_row,
+        t.cross,
+        t.symbol_delay,
+        t.send,
+        t.antenna,
+        fresh,
+        aligned(2 * LANES * blocks),
+        aligned(4 * LANES),
+        aligned(2 * LANES),
+        places,
+    )

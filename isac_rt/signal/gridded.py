@@ -1,16 +1,20 @@
-r"""IF samples of many paths through an oversampled grid of fast-time frequency (a non-uniform FFT per chirp).
+r"""IF samples of many paths through an oversampled grid of fast-time frequency (a non-uniform FFT
+per chirp).
 
-In each chirp every path is a tone of known start phase and frequency (float64). It is spread with a few weights on a grid of
-frequencies, all receive elements at once; one FFT and one division make the samples. Further sets of weights on the same
-grid points carry x and x^2 (x: time from the middle of the chirp), so that the quadratic phase of motion and the wideband
-delay of each receive element need no second transform:
+In each chirp every path is a tone of known start phase and frequency (float64). It is spread with a
+few weights on a grid of frequencies, all receive elements at once; one FFT and one division make
+the samples. Further sets of weights on the same grid points carry x and x^2 (x: time from the
+middle of the chirp), so that the quadratic phase of motion and the wideband delay of each receive
+element need no second transform:
 
 .. math:: z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx
-    z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
+    z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) -
+    c\theta_l^2/2)
 
-with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the frequency sent tau earlier), c the
-mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa x). A cubic setting has a fourth set for x^3 - 3/5 x, of strength
-theta_l (jq - theta_l^2/6), and theta_l (1 - theta_l^2/10 + jq kappa) with x. The narrowband model has theta_l = 0.
+with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the
+frequency sent tau earlier), c the mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa
+x). A cubic setting has a fourth set for x^3 - 3/5 x, of strength theta_l (jq - theta_l^2/6), and
+theta_l (1 - theta_l^2/10 + jq kappa) with x. The narrowband model has theta_l = 0.
 """
 
 from __future__ import annotations
@@ -51,7 +55,8 @@ class Setting:
     ----------
     oversampling : grid points per sample, at least
     width : grid points per path, 2 to 16, even
-    wideband : delays of the receive elements applied to the whole chirp (to second order), not to its middle alone
+    wideband : delays of the receive elements applied to the whole chirp (to second order), not to
+        its middle alone
     cubic : the third order in x too, of a wideband setting
     """
 
@@ -64,13 +69,17 @@ class Setting:
 DEFAULT = Setting(1.5, 6, True)
 """For runs: error below `GRIDDED_ERROR`."""
 GRIDDED_ERROR = 1e-4
-"""Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see tests/test_ifsignal.py)."""
+"""Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see
+tests/test_ifsignal.py)."""
 PROFILES = Setting(1.25, 6, True)
 """For range cells made directly: error below `GRIDDED_ERROR` under the window, 3e-4 of samples."""
 ACCURATE = Setting(1.5, 8, True, True)
-"""Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square of the speed."""
+"""Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square
+of the speed."""
 ACCURATE_ERROR = 5e-6
-_MANY = 4000  # paths that no longer stay in the second-level cache beside the grid; they are read once for several chirps
+# paths that no longer stay in the second-level cache beside the grid; they are read once for
+# several chirps
+_MANY = 4000
 _TOGETHER = 6
 _MARGIN = LANES  # rows beyond the grid
 _EXTRA = 2  # degree of the weights' polynomials above the width
@@ -84,12 +93,15 @@ _BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on th
 
 
 @lru_cache(maxsize=16)
-def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.ndarray, np.ndarray]:
+def weights(
+    num_samples: int, oversampling: float, width: int
+) -> tuple[int, np.ndarray, np.ndarray]:
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
 
-    A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2, weights such that
-    D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c, j (x^3 - 3/5 x) for the four sets, x = -N/2 .. N/2
-    scaled to [-1, 1]. Least squares in turn for w and for D, from a Kaiser-Bessel start; the weights are real by symmetry.
+    A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2,
+    weights such that D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c, j (x^3
+    - 3/5 x) for the four sets, x = -N/2 .. N/2 scaled to [-1, 1]. Least squares in turn for w and
+      for D, from a Kaiser-Bessel start; the weights are real by symmetry.
 
     Returns
     -------
@@ -98,14 +110,26 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
     deconvolution : (N,) float32, D at x = n - N//2
     """
     half, degree = num_samples // 2, width + _EXTRA
-    grid = scipy.fft.next_fast_len(max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True)
+    grid = scipy.fft.next_fast_len(
+        max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True
+    )
     x = np.arange(-half, half + 1)
     nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
     steps = np.arange(width) - (width - 1) / 2
-    basis = np.exp(2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None]))
+    basis = np.exp(
+        2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None])
+    )
     scaled = x / half
     skew = scaled**3 - _MEAN_CUBE * scaled
-    goals = np.stack([np.ones_like(scaled, complex), 1j * scaled, scaled**2 - mean_square(num_samples) + 0j, 1j * skew], axis=1)
+    goals = np.stack(
+        [
+            np.ones_like(scaled, complex),
+            1j * scaled,
+            scaled**2 - mean_square(num_samples) + 0j,
+            1j * skew,
+        ],
+        axis=1,
+    )
     beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * width
     bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / width) ** 2, 0, None)))
     for _ in range(12):
@@ -113,7 +137,9 @@ def weights(num_samples: int, oversampling: float, width: int) -> tuple[int, np.
         deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
         fits = [_real_least_squares(deconvolution[:, None] * b, goals) for b in basis]
         bell = np.array([f[:, 0] for f in fits])
-    polynomials = np.array([np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(4)])
+    polynomials = np.array(
+        [np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(4)]
+    )
     return grid, polynomials.astype(np.float32), deconvolution[:num_samples].astype(np.float32)
 
 
@@ -130,11 +156,19 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
-def _prepare(work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size):
-    """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the middle of the cell, complex factor
-    (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to `work`. `view`: see `views_of`."""
+def _prepare(
+    work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size
+):
+    """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the
+    middle of the cell, complex factor (less the filter's gain), quadratic term [rad] and lambda, 16
+    floats of each, to `work`. `view`: see `views_of`."""
     f_c, slope, ts, u = w[0], w[1], w[2], w[3] + view[1] * w[2]
-    delay, rate, accel, extra = load(table, at), load(table, at + 16), load(table, at + 32), load(table, at + tx)
+    delay, rate, accel, extra = (
+        load(table, at),
+        load(table, at + 16),
+        load(table, at + 32),
+        load(table, at + tx),
+    )
     tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
     element = tau + extra
     b, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
@@ -175,7 +209,8 @@ def _gate(work, table, at, life, f, w, time, symbol):
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy")
 def _weigh(work, scratch, poly, taps, wideband, cubic):
-    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as they are."""
+    """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as
+    they are."""
     r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
     width, degree = len(taps), len(taps) + _EXTRA
     set_size = (degree + 1) * width
@@ -218,7 +253,8 @@ def _spread(grid, base, places, scratch, count, taps, steer, k):
 
 @njit(nogil=True, fastmath=FAST, error_model="numpy", inline="always")
 def _centred(steer, work, i, k):
-    """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary), theta and q."""
+    """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary),
+    theta and q."""
     ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
     c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
     pr, pi = c * ar - s * ai, c * ai + s * ar
@@ -259,12 +295,21 @@ def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, cent
         gr, gi = minus * er - q * ei, minus * ei + q * er
         third = square * splat(-_SIXTH)
         tr, ti = theta * (third * er - q * ei), theta * (third * ei + q * er)
-        bow, skew, less = minus * splat(centre), q * splat(_SKEW), splat(_ONE) - square * splat(_TENTH)
+        bow, skew, less = (
+            minus * splat(centre),
+            q * splat(_SKEW),
+            splat(_ONE) - square * splat(_TENTH),
+        )
         br, bi = theta * (less * er - skew * ei), theta * (less * ei + skew * er)
         er, ei = er + bow * er, ei + bow * ei
         for tap in range(len(taps)):
             j = i + _STEP * tap
-            u, v, w, x = splat(scratch[j]), splat(scratch[j + 16]), splat(scratch[j + 32]), splat(scratch[j + 48])
+            u, v, w, x = (
+                splat(scratch[j]),
+                splat(scratch[j + 16]),
+                splat(scratch[j + 32]),
+                splat(scratch[j + 48]),
+            )
             store(grid, at, (load(grid, at) + u * er + v * br) + (w * gr + x * tr))
             store(grid, at + 16, (load(grid, at + 16) + u * ei + v * bi) + (w * gi + x * ti))
             at += ROW
@@ -282,7 +327,8 @@ def _fold(grid, size, low, width):
 
 @njit(nogil=True)
 def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolution, tile, fresh):
-    """Write the rows of the samples, divided by the kernel's response: channel r of sample n to out[at + r stride + 2 n]."""
+    """Write the rows of the samples, divided by the kernel's response: channel r of sample n to
+    out[at + r stride + 2 n]."""
     half, size = num_samples // 2, order.shape[0]
     for start in range(0, num_samples, 16):
         count = min(16, num_samples - start)
@@ -312,7 +358,8 @@ def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolutio
 
 @njit(nogil=True)
 def _in_band(work, places, count, limit):
-    """Strike out the paths from the frequency `limit` on; the number up to the last one that stays."""
+    """Strike out the paths from the frequency `limit` on; the number up to the last one that
+    stays."""
     last = 0
     for i in range(count):
         if places[16 + i] < limit:
@@ -323,13 +370,50 @@ def _in_band(work, places, count, limit):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, centre, taps, wideband, cubic, poly, deconvolution,
-            radices, twiddles, rows, table, factor, life, blocks, bounds, steer, symbol, send, antenna, fresh, band, grid, work, scratch,
-            tile):  # fmt: skip
-    """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit, one chirp after the other."""
+def _chirps(
+    out,
+    shape,
+    first_channel,
+    chirps,
+    together,
+    w,
+    views,
+    turns,
+    half,
+    centre,
+    taps,
+    wideband,
+    cubic,
+    poly,
+    deconvolution,
+    radices,
+    twiddles,
+    rows,
+    table,
+    factor,
+    life,
+    blocks,
+    bounds,
+    steer,
+    symbol,
+    send,
+    antenna,
+    fresh,
+    band,
+    grid,
+    work,
+    scratch,
+    tile,
+):
+    """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit,
+    one chirp after the other."""
     _, num_rx, num_chirps, num_samples = shape
     groups, size, low = send.shape[1], rows.shape[0], len(taps) // 2 - 1
-    channels, per_block, cells = min(16, num_rx - first_channel), table.shape[0] // max(blocks.shape[0], 1), band.turn.shape[0]
+    channels, per_block, cells = (
+        min(16, num_rx - first_channel),
+        table.shape[0] // max(blocks.shape[0], 1),
+        band.turn.shape[0],
+    )
     top, skirt, per_delay = w[7] / w[1], w[8] / w[1], w[1] * w[2]
     cut = top + skirt
     stride, places = (size + _MARGIN) * ROW, np.zeros(32)
@@ -352,15 +436,53 @@ def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, 
                 if low_end > view[4] + _DOPPLER and high_end < 1 - view[3] - _DOPPLER:
                     continue
                 sent = send[q, source, p] * turns[now[g]]
-                _prepare(work, places, table, at, tx, factor, 32 * b, w, view, time, delay, sent, half, centre, size)
+                _prepare(
+                    work,
+                    places,
+                    table,
+                    at,
+                    tx,
+                    factor,
+                    32 * b,
+                    w,
+                    view,
+                    time,
+                    delay,
+                    sent,
+                    half,
+                    centre,
+                    size,
+                )
                 if blocks[b, 3] or least < 0 or most > top:
                     _gate(work, table, at, life, 32 * b, w, time, delay)
                 used = _in_band(work, places, count, view[4]) if cells else count
                 _weigh(work, scratch, poly, taps, wideband, cubic)
                 if cubic:
-                    _spread_cubic(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_cubic(
+                        grid,
+                        g * stride,
+                        places,
+                        scratch,
+                        used,
+                        taps,
+                        steer,
+                        b * 16 * 48,
+                        work,
+                        np.float32(centre),
+                    )
                 elif wideband:
-                    _spread_wideband(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 48, work, np.float32(centre))
+                    _spread_wideband(
+                        grid,
+                        g * stride,
+                        places,
+                        scratch,
+                        used,
+                        taps,
+                        steer,
+                        b * 16 * 48,
+                        work,
+                        np.float32(centre),
+                    )
                 else:
                     _spread(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 32)
         for g in range(now.shape[0]):
@@ -370,18 +492,49 @@ def _chirps(out, shape, first_channel, chirps, together, w, views, turns, half, 
             transform(table_g, low * ROW, size, radices, twiddles)
             if cells == 0:
                 to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
-                _emit(out, to, 2 * num_samples * num_chirps, channels, num_samples, table_g, low, rows, deconvolution, tile, fresh)
+                _emit(
+                    out,
+                    to,
+                    2 * num_samples * num_chirps,
+                    channels,
+                    num_samples,
+                    table_g,
+                    low,
+                    rows,
+                    deconvolution,
+                    tile,
+                    fresh,
+                )
                 continue
             block = (first_channel // 16 * shape[0] + m) * num_chirps + p
-            to_cells(table_g, low, rows, deconvolution, band, block * deconvolution.shape[0] * LANES, p % CHIRPS)
+            to_cells(
+                table_g,
+                low,
+                rows,
+                deconvolution,
+                band,
+                block * deconvolution.shape[0] * LANES,
+                p % CHIRPS,
+            )
             if p % CHIRPS == CHIRPS - 1 or p == num_chirps - 1:
                 to = 2 * ((m * num_rx + first_channel) * cells * num_chirps + p - p % CHIRPS)
-                write_cells(out, to, 2 * cells * num_chirps, channels, p % CHIRPS + 1, num_chirps, cells, band.stage, tile)
+                write_cells(
+                    out,
+                    to,
+                    2 * cells * num_chirps,
+                    channels,
+                    p % CHIRPS + 1,
+                    num_chirps,
+                    cells,
+                    band.stage,
+                    tile,
+                )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
-    """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from the last element on."""
+    """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from
+    the last element on."""
     count = min(LANES, rx_delay.shape[1] - first)
     for i in range(path.shape[0]):
         for r in range(count):
@@ -395,9 +548,12 @@ def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
             store(out, at + 2 * LANES, narrow(late * splat(turn)))
 
 
-def _steering(waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first: int, wideband: bool) -> np.ndarray:
-    """Of each listed path the phasors of the up to 16 receive elements from `first` on at mid-window (real, imaginary) and, `wideband`,
-    their turn over half a chirp [rad]: (32 or 48 n,) float32."""
+def _steering(
+    waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first: int, wideband: bool
+) -> np.ndarray:
+    """Of each listed path the phasors of the up to 16 receive elements from `first` on at
+    mid-window (real, imaginary) and, `wideband`, their turn over half a chirp [rad]: (32 or 48 n,)
+    float32."""
     w, planes = waveform, 3 if wideband else 2
     out = aligned(len(path) * planes * LANES)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
@@ -408,12 +564,14 @@ def _steering(waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one offset.
+    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one
+    offset.
 
     Attributes
     ----------
     path : (16 B,) index into the tones, the last repeated where a block is not full
-    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit element
+    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit
+        element
     factor : float32, of each block 16 real and 16 imaginary parts
     life : float64, of each block 16 begins and 16 ends
     blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
@@ -433,10 +591,16 @@ def _blocks(waveform: Waveform, t: Tones, transition: float) -> _Blocks:
     path, offset = sources(w, t, transition)
     order = np.lexsort((t.delay[path], offset, t.link[path]))
     path, offset = path[order], offset[order]
-    segment = np.cumsum(np.r_[True, np.diff(t.link[path] * (2 * w.num_groups) + offset) != 0]) - 1 if path.size else path
+    segment = (
+        np.cumsum(np.r_[True, np.diff(t.link[path] * (2 * w.num_groups) + offset) != 0]) - 1
+        if path.size
+        else path
+    )
     _, starts, counts = np.unique(segment, return_index=True, return_counts=True)
     full = -(-counts // LANES)
-    first = np.concatenate([s + LANES * np.arange(f) for s, f in zip(starts, full, strict=True)] or [starts])
+    first = np.concatenate(
+        [s + LANES * np.arange(f) for s, f in zip(starts, full, strict=True)] or [starts]
+    )
     last = np.repeat(starts + counts, full) - 1
     index = np.minimum(first[:, None] + np.arange(LANES), last[:, None])
     k, lag = path[index], offset[index]
@@ -447,25 +611,50 @@ def _blocks(waveform: Waveform, t: Tones, transition: float) -> _Blocks:
     motion = np.abs(t.rate[k]) * reach + np.abs(t.accel[k]) * reach**2 / 2
     bounds = np.stack([(delay - motion).min(axis=1), (delay + motion).max(axis=1)], axis=1)
     mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
-    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], np.minimum(last - first + 1, LANES), mortal], axis=1)
+    blocks = np.stack(
+        [t.link[k[:, 0]], lag[:, 0], np.minimum(last - first + 1, LANES), mortal], axis=1
+    )
     factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
-    return _Blocks(k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds)
+    return _Blocks(
+        k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds
+    )
 
 
 def add_gridded(
-    samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT, *, fresh: bool = False
+    samples: np.ndarray,
+    waveform: Waveform,
+    tones: Tones,
+    transition: float,
+    setting: Setting = DEFAULT,
+    *,
+    fresh: bool = False,
 ) -> None:
-    """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and 15 elements of the L).
+    """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and
+    15 elements of the L).
 
-    Left out: the joint curvature `Tones.cross`; with `DEFAULT` the third order of the wideband term. A path lives in whole chirps. Runs
-    in one thread without the interpreter's lock; the result depends on nothing but the arguments.
+    Left out: the joint curvature `Tones.cross`; with `DEFAULT` the third order of the wideband
+    term. A path lives in whole chirps. Runs in one thread without the interpreter's lock; the
+    result depends on nothing but the arguments.
 
     Parameters
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
     """
-    if not _synthesise(samples, samples.shape, waveform, tones, transition, setting, fresh, no_band(), *_as_it_is(waveform)) and fresh:
+    if (
+        not _synthesise(
+            samples,
+            samples.shape,
+            waveform,
+            tones,
+            transition,
+            setting,
+            fresh,
+            no_band(),
+            *_as_it_is(waveform),
+        )
+        and fresh
+    ):
         samples[:] = 0
 
 
@@ -475,12 +664,22 @@ def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
     return np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (count, 1)), np.ones(count, complex)
 
 
-def range_cells(waveform: Waveform, tones: Tones, transition: float, delay_symbols: np.ndarray, phases: np.ndarray, num_cells: int,
-                setting: Setting = PROFILES, power: float = 0.0, key: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
-    """Range cells under Hann's window, made directly (`isac_rt.signal.profiles`): what a transform of the windowed samples gives.
+def range_cells(
+    waveform: Waveform,
+    tones: Tones,
+    transition: float,
+    delay_symbols: np.ndarray,
+    phases: np.ndarray,
+    num_cells: int,
+    setting: Setting = PROFILES,
+    power: float = 0.0,
+    key: np.ndarray | None = None,
+) -> np.ndarray:
+    """Range cells under Hann's window, made directly (`isac_rt.signal.profiles`): what a transform
+    of the windowed samples gives.
 
-    The window of a chirp with delay symbol D starts D / (alpha T) (the delay) after its first sample, and cell k is read at k + D, its
-    phase counted from the start of the window.
+    The window of a chirp with delay symbol D starts D / (alpha T) (the delay) after its first
+    sample, and cell k is read at k + D, its phase counted from the start of the window.
 
     Parameters
     ----------
@@ -495,34 +694,64 @@ def range_cells(waveform: Waveform, tones: Tones, transition: float, delay_symbo
     """
     w = waveform
     if 4 * num_cells > 3 * w.num_samples:
-        raise ValueError(f"{num_cells} range cells of {w.num_samples} samples: at most three quarters can be made directly; take samples")
+        raise ValueError(
+            f"{num_cells} range cells of {w.num_samples} samples: at most three quarters can be "
+            "made directly; take samples"
+        )
     length = window_length(w)
-    band = make_band(w.num_samples, num_cells, length, 0.0 if key is None else power, np.zeros(2) if key is None else key)
+    band = make_band(
+        w.num_samples,
+        num_cells,
+        length,
+        0.0 if key is None else power,
+        np.zeros(2) if key is None else key,
+    )
     start = np.ravel(shift_of(w, delay_symbols))
     size = len(band.window)
     pad = (size - num_cells) // 2 / w.num_samples
     limit = num_cells / w.num_samples + pad if size < w.num_samples else 1.0
     middle = start + length / 2 - w.num_samples // 2
     one = np.ones(start.size)
-    views = np.stack([delay_symbols.ravel() / w.num_samples, middle, w.num_samples / size * one, pad * one, limit * one], axis=1)
+    views = np.stack(
+        [
+            delay_symbols.ravel() / w.num_samples,
+            middle,
+            w.num_samples / size * one,
+            pad * one,
+            limit * one,
+        ],
+        axis=1,
+    )
     shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
     out = cube_memory((*shape[:2], num_cells, w.num_chirps))
-    cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(data_phase(w, delay_symbols))
+    cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(
+        data_phase(w, delay_symbols)
+    )
     turns = np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0))
     _synthesise(out, shape, w, tones, transition, setting, True, band, views, turns)
     return out
 
 
 def _synthesise(
-    out: np.ndarray, shape: tuple[int, ...], w: Waveform, t: Tones, transition: float, setting: Setting, fresh: bool, band: Band,
-    views: np.ndarray, turns: np.ndarray,
-) -> bool:  # fmt: skip
-    """Run the kernel over all elements; False, and nothing done, where no path can be heard and there is no band.
+    out: np.ndarray,
+    shape: tuple[int, ...],
+    w: Waveform,
+    t: Tones,
+    transition: float,
+    setting: Setting,
+    fresh: bool,
+    band: Band,
+    views: np.ndarray,
+    turns: np.ndarray,
+) -> bool:
+    """Run the kernel over all elements; False, and nothing done, where no path can be heard and
+    there is no band.
 
     Parameters
     ----------
-    views : (M P, 5) what of a chirp is wanted: cycles per sample taken off every frequency; samples from the middle one to the
-        origin; samples of the chirp to one of the grid's; frequencies below zero that are kept; first frequency left out
+    views : (M P, 5) what of a chirp is wanted: cycles per sample taken off every frequency; samples
+        from the middle one to the origin; samples of the chirp to one of the grid's; frequencies
+        below zero that are kept; first frequency left out
     turns : (M P,) complex, factors of the chirps' paths
     """
     b = _blocks(w, t, transition)
@@ -532,24 +761,71 @@ def _synthesise(
     size, poly, deconvolution = weights(num_samples, setting.oversampling, setting.width)
     radices, twiddles, rows = plan(size)
     together = _TOGETHER if b.path.size > _MANY else 1
-    buffers = aligned(together * (size + _MARGIN) * ROW), aligned(80), aligned(_STEP * setting.width), aligned(512)
+    buffers = (
+        aligned(together * (size + _MARGIN) * ROW),
+        aligned(80),
+        aligned(_STEP * setting.width),
+        aligned(512),
+    )
     chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(num_samples)
     for first in range(0, shape[1], LANES):
         steer = _steering(w, t.rx_delay, b.path, first, setting.wideband)
-        _chirps(out.reshape(-1).view(np.float32), shape, first, chirps, together, numbers(w, transition), views, turns,
-                float(w.num_samples // 2), centre, (0,) * setting.width, setting.wideband, setting.wideband and setting.cubic, poly.ravel(),
-                deconvolution, radices, twiddles, rows, b.table, b.factor, b.life, b.blocks, b.bounds, steer, t.symbol_delay,
-                t.send, t.antenna, fresh, band, *buffers)  # fmt: skip
+        _chirps(
+            out.reshape(-1).view(np.float32),
+            shape,
+            first,
+            chirps,
+            together,
+            numbers(w, transition),
+            views,
+            turns,
+            float(w.num_samples // 2),
+            centre,
+            (0,) * setting.width,
+            setting.wideband,
+            setting.wideband and setting.cubic,
+            poly.ravel(),
+            deconvolution,
+            radices,
+            twiddles,
+            rows,
+            b.table,
+            b.factor,
+            b.life,
+            b.blocks,
+            b.bounds,
+            steer,
+            t.symbol_delay,
+            t.send,
+            t.antenna,
+            fresh,
+            band,
+            *buffers,
+        )
     return True
 
 
-def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, setting: Setting = DEFAULT) -> None:
+def add_plain(
+    samples: np.ndarray,
+    waveform: Waveform,
+    tones: Tones,
+    transition: float,
+    setting: Setting = DEFAULT,
+) -> None:
     """What `add_gridded` does, path by path in numpy float64: its oracle, slow."""
     w, t, half = waveform, tones, waveform.num_samples // 2
     size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
-    values, centre, steps = numbers(w, transition), mean_square(w.num_samples), np.arange(setting.width) - setting.width // 2 + 1
+    values, centre, steps = (
+        numbers(w, transition),
+        mean_square(w.num_samples),
+        np.arange(setting.width) - setting.width // 2 + 1,
+    )
     e = t.rx_delay
-    steer = np.exp(2j * np.pi * (((w.carrier_frequency + w.slope * w.fast_time[half]) * e - w.slope * e**2 / 2) % 1))
+    steer = np.exp(
+        2j
+        * np.pi
+        * (((w.carrier_frequency + w.slope * w.fast_time[half]) * e - w.slope * e**2 / 2) % 1)
+    )
     theta = 2 * np.pi * w.slope * w.sample_interval * half * e
     for m, p in np.ndindex(w.num_groups, w.num_chirps):
         grid = np.zeros((size, samples.shape[1]), complex)
@@ -558,20 +834,36 @@ def add_plain(samples: np.ndarray, waveform: Waveform, tones: Tones, transition:
             q, source = t.link[k], m - offset
             if not (0 <= source < w.num_groups and t.begin[k] <= time < t.end[k]):
                 continue
-            tau = t.symbol_delay[q, source, p] + t.delay[k] + (t.rate[k] + t.accel[k] * time / 2) * time - offset * w.group_spacing
+            tau = (
+                t.symbol_delay[q, source, p]
+                + t.delay[k]
+                + (t.rate[k] + t.accel[k] * time / 2) * time
+                - offset * w.group_spacing
+            )
             gain = filter_gain(np.array(w.slope * tau), w.sampling_rate, transition)
             sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
-            phase, frequency, bend = chirp_terms(values, sent, t.rate[k] + t.accel[k] * time, t.accel[k])
-            z = gain * t.factor[k] * t.send[q, source, p] * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
+            phase, frequency, bend = chirp_terms(
+                values, sent, t.rate[k] + t.accel[k] * time, t.accel[k]
+            )
+            z = (
+                gain
+                * t.factor[k]
+                * t.send[q, source, p]
+                * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
+            )
             turn, lag = 2 * np.pi * bend * half**2, tau / (w.sample_interval * half)
             cell, r = divmod(frequency % 1 * size, 1)
             one, x, square, cube = (np.polyval(poly[i], r - 0.5) for i in range(4))
             slant = theta[k] if setting.wideband else np.zeros_like(theta[k])
             third = slant if setting.cubic else np.zeros_like(slant)
-            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(x, slant * (1 - third**2 / 10 + 4j / 15 * turn))
+            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(
+                x, slant * (1 - third**2 / 10 + 4j / 15 * turn)
+            )
             strengths += np.outer(cube, third * (1j * turn - third**2 / 6))
             strengths += np.outer(square, 1j * turn - slant**2 / 2)
             strengths = strengths * steer[k] * np.exp(-1j * lag * slant)
             np.add.at(grid, (int(cell) + steps) % size, z * strengths)
         modes = (np.arange(w.num_samples) - half) % size
-        samples[m, :, p] += (np.fft.ifft(grid, axis=0, norm="forward")[modes] * deconvolution[:, None]).T
+        samples[m, :, p] += (
+            np.fft.ifft(grid, axis=0, norm="forward")[modes] * deconvolution[:, None]
+        ).T

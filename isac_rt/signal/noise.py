@@ -1,11 +1,14 @@
-"""White Gaussian noise of a receiver, drawn from a counter so that no sample depends on the order of work.
+"""White Gaussian noise of a receiver, drawn from a counter so that no sample depends on the order
+of work.
 
-Sample i of a stream is a pure function of (key, i): Threefry-2x32 with 20 rounds [1]_ makes two 32-bit words of the
-counter i, Box-Muller makes one complex Gaussian of them. Threads and partitions can therefore not change a value.
+Sample i of a stream is a pure function of (key, i): Threefry-2x32 with 20 rounds [1]_ makes two
+32-bit words of the counter i, Box-Muller makes one complex Gaussian of them. Threads and partitions
+can therefore not change a value.
 
 References
 ----------
-.. [1] J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC'11, doi:10.1145/2063384.2063405
+.. [1] J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC'11,
+doi:10.1145/2063384.2063405
 """
 
 from __future__ import annotations
@@ -14,12 +17,18 @@ import numpy as np
 from numba import njit, uint32
 
 _PARITY = np.uint32(0x1BD11BDA)  # Threefish key-schedule constant, 32-bit variant
-_FAST = {"contract", "nnan", "ninf", "nsz"}  # no reassociation: the result does not depend on the vector width
+_FAST = {
+    "contract",
+    "nnan",
+    "ninf",
+    "nsz",
+}  # no reassociation: the result does not depend on the vector width
 _LN2 = np.float32(np.log(2.0))
 _TURN = np.float32(2 * np.pi)
 _UNIT = np.float32(2.0**-32)
 _ONE, _HALF, _QUARTER, _FOUR = np.float32(1), np.float32(0.5), np.float32(0.25), np.float32(4)
-# Taylor coefficients: of 2 atanh(s) for |s| <= 0.172, and of sine and cosine for |x| <= pi/4; what is cut is below 1 ulp
+# Taylor coefficients: of 2 atanh(s) for |s| <= 0.172, and of sine and cosine for |x| <= pi/4; what
+# is cut is below 1 ulp
 _LOG = tuple(np.float32(2 / n) for n in (1, 3, 5, 7, 9))
 _SIN = tuple(np.float32(c) for c in (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
 _COS = tuple(np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
@@ -35,7 +44,8 @@ def _mix(a, b, r):
 
 @njit(inline="always")
 def _four_rounds(a, b, even):
-    """Rounds with the rotations 13, 15, 26, 6 (even groups of four) or 17, 29, 16, 24 (odd groups)."""
+    """Rounds with the rotations 13, 15, 26, 6 (even groups of four) or 17, 29, 16, 24 (odd
+    groups)."""
     if even:
         a, b = _mix(a, b, 13)
         a, b = _mix(a, b, 15)
@@ -122,7 +132,8 @@ def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: i
 
     Parameters
     ----------
-    samples : complex64, contiguous; its element i (in memory order) gets sample ``first + i`` of the stream
+    samples : complex64, contiguous; its element i (in memory order) gets sample ``first + i`` of
+        the stream
     power : E|n|^2 [W]; real and imaginary part have half of it each
     key : (2,) uint32, the stream; streams of different keys are independent
     first : index of the first sample, so that parts of a cube can be filled one by one

@@ -1,4 +1,5 @@
-"""What a sweep is: a base scenario, axes, repetitions; its points and the key under which each is kept."""
+"""What a sweep is: a base scenario, axes, repetitions; its points and the key under which each is
+kept."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ class _Free(Node):
 
 
 class Axis(_Free):
-    """One axis: `key` and its `values`; or `zip`, several keys that change together; or `list`, named sets of keys."""
+    """One axis: `key` and its `values`; or `zip`, several keys that change together; or `list`,
+    named sets of keys."""
 
     key: str | None = None
     values: tuple[Any, ...] | None = None
@@ -49,14 +51,25 @@ class Axis(_Free):
     list: dict[str, dict[str, Any]] | None = None
 
     def problems(self) -> Iterator[Problem]:
-        given = [n for n, v in (("key", self.key), ("zip", self.zip), ("list", self.list)) if v is not None]
+        given = [
+            n
+            for n, v in (("key", self.key), ("zip", self.zip), ("list", self.list))
+            if v is not None
+        ]
         if len(given) != 1 or (self.values is not None) != (given == ["key"]):
-            yield Problem(((given[0] if given else "key",),), "an axis has either key and values, or zip, or list; keep one of these")
+            yield Problem(
+                ((given[0] if given else "key",),),
+                "an axis has either key and values, or zip, or list; keep one of these",
+            )
         elif not self.size:
             yield Problem(((given[0],),), "has no entry; give it one value or more")
         elif self.zip is not None and len({len(v) for v in self.zip.values()}) > 1:
             lengths = ", ".join(f"{k}: {len(v)}" for k, v in self.zip.items())
-            yield Problem((("zip",),), f"the keys that change together have different numbers of values ({lengths}); make them alike")
+            yield Problem(
+                (("zip",),),
+                f"the keys that change together have different numbers of values ({lengths}); make "
+                "them alike",
+            )
 
     @property
     def size(self) -> int:
@@ -82,7 +95,8 @@ class Axis(_Free):
         return {str(self.key): self.values[index]}
 
     def labels(self) -> Sequence[float] | Sequence[str]:
-        """The coordinate along the axis: the numbers of its key (the first of a zip), else words."""
+        """The coordinate along the axis: the numbers of its key (the first of a zip), else
+        words."""
         if self.list is not None:
             return [*self.list]
         values = self.values if self.values is not None else next(iter((self.zip or {}).values()))
@@ -110,7 +124,8 @@ class Sweep(_Free):
     axes: dict[str, Axis]
     """By name; every combination of their entries is a point."""
     repetitions: Annotated[int, Field(ge=1)] = 1
-    """Runs of each point, with seeds spawned from `seed`; all points of one repetition have the same seed."""
+    """Runs of each point, with seeds spawned from `seed`; all points of one repetition have the
+    same seed."""
     seed: Annotated[int, Field(ge=0)] = 1
     keep: tuple[str, ...] = ("*",)
     """Names of the quantities in the dataset, with wildcards, such as ser_* or rmse_range_m."""
@@ -121,25 +136,40 @@ class Sweep(_Free):
             yield Problem((("axes",),), "has no axis; for a single scenario use isac-rt run")
         for name in self.axes:
             if name in OWN_DIMENSIONS or not name.isidentifier():
-                said = f"an axis's name must be a word other than {', '.join(OWN_DIMENSIONS)}; rename it"
+                said = (
+                    f"an axis's name must be a word other than {', '.join(OWN_DIMENSIONS)}; "
+                    "rename it"
+                )
                 yield Problem((("axes", name),), said)
         every: list[tuple[Key, str]] = [(("set", key), key) for key in self.set]
-        every += [(("axes", name), key) for name, axis in self.axes.items() for key in sorted(axis.keys)]
+        every += [
+            (("axes", name), key) for name, axis in self.axes.items() for key in sorted(axis.keys)
+        ]
         every += [(("seed",), "seed")]
         for (here, a), (there, b) in itertools.combinations(every, 2):
             if here != there and (a == b or a.startswith(f"{b}.") or b.startswith(f"{a}.")):
-                first = "repetitions set it" if there == ("seed",) else f"{dotted(there)} sets {b} too"
+                first = (
+                    "repetitions set it" if there == ("seed",) else f"{dotted(there)} sets {b} too"
+                )
                 yield Problem((here, there), f"sets {a}, but {first}; set each key in one place")
         for i, pattern in enumerate(self.keep):
             if not fnmatch.filter(quantities(), pattern):
-                yield Problem((("keep", i),), f"fits no quantity; there are {', '.join(quantities())}")
+                yield Problem(
+                    (("keep", i),), f"fits no quantity; there are {', '.join(quantities())}"
+                )
         for i, figure in enumerate(self.figures):
             if figure.quantity not in quantities() or figure.quantity == "paths":
-                yield Problem((("figures", i, "quantity"),), f"is no quantity of a link; there are {', '.join(quantities()[:-1])}")
+                yield Problem(
+                    (("figures", i, "quantity"),),
+                    f"is no quantity of a link; there are {', '.join(quantities()[:-1])}",
+                )
             for end in ("against", "by"):
                 axis = getattr(figure, end)
                 if axis is not None and axis not in self.axes:
-                    yield Problem((("figures", i, end), ("axes",)), f"is no axis of this sweep; the axes are {', '.join(self.axes)}")
+                    yield Problem(
+                        (("figures", i, end), ("axes",)),
+                        f"is no axis of this sweep; the axes are {', '.join(self.axes)}",
+                    )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -160,7 +190,8 @@ class Point:
     index : along every axis and the repetitions
     tree : its scenario as plain values, without the name
     key : digest of the tree, the city's file and the program; under it the outcome is kept
-    paths_key : digest of what its paths depend on, None where they are not traced: points with the same one share them
+    paths_key : digest of what its paths depend on, None where they are not traced: points with the
+        same one share them
     """
 
     index: tuple[int, ...]
@@ -194,14 +225,22 @@ class Plan:
 
     def key_of(self, tree: dict[str, Any]) -> str:
         """Under which a point is kept."""
-        files = self._named_file(tree, "city", "file"), self._named_file(tree, "accuracy", "cost_model")
+        files = (
+            self._named_file(tree, "city", "file"),
+            self._named_file(tree, "accuracy", "cost_model"),
+        )
         return _digest([tree, *files, program_fingerprint()])
 
     def _paths_key(self, tree: dict[str, Any]) -> str | None:
         if (tree.get("propagation") or {}).get("model") != "ray_traced":
             return None
         unseen = ("modulation", "noise", "receivers", "tracking")
-        return _digest([{k: v for k, v in tree.items() if k not in unseen}, self._named_file(tree, "city", "file")])
+        return _digest(
+            [
+                {k: v for k, v in tree.items() if k not in unseen},
+                self._named_file(tree, "city", "file"),
+            ]
+        )
 
     def _named_file(self, tree: dict[str, Any], part: str, key: str) -> str:
         """Digest of the file that a key names, "" without one."""
@@ -211,7 +250,8 @@ class Plan:
 
 
 def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Numbers of a nested mapping by their names joined with _; null is NaN; words and lists are left out."""
+    """Numbers of a nested mapping by their names joined with _; null is NaN; words and lists are
+    left out."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from flat_numbers(value, f"{prefix}{key}_")
@@ -221,10 +261,15 @@ def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 @lru_cache(maxsize=1)
 def quantities() -> tuple[str, ...]:
-    """Names of what a link's outcome holds (see `isac_rt.results.metrics.summary_block`), the pooled rates included."""
+    """Names of what a link's outcome holds (see `isac_rt.results.metrics.summary_block`), the
+    pooled rates included."""
     block = summary_block("passive", SensingScore(np.ones(4)), SymbolCount(), 1.0)
     names = [name for name, _ in flat_numbers(block)]
-    return (*names, *(f"{name}_{end}" for name in RATES for end in ("pooled", "low", "high")), "paths")
+    return (
+        *names,
+        *(f"{name}_{end}" for name in RATES for end in ("pooled", "low", "high")),
+        "paths",
+    )
 
 
 def put(tree: dict[str, Any], key: str, value: Any) -> None:
@@ -257,7 +302,8 @@ def _file_digest(file: Path) -> str:
 
 
 def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
-    """Read and check a sweep: every entry of every axis is tried on the base scenario before anything runs.
+    """Read and check a sweep: every entry of every axis is tried on the base scenario before
+    anything runs.
 
     Parameters
     ----------
@@ -277,19 +323,31 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
         return complain(Sweep, path, data, places, Problem((key,), text))
 
     if sweep.num_points > max_points:
-        factors = " x ".join(f"{n} {name}" for name, n in zip([*sweep.axes, "repetitions"], sweep.shape, strict=True))
-        said = f"{factors} are {sweep.num_points:,} points, more than {max_points:,}; shorten the axes or raise --max-points"
+        factors = " x ".join(
+            f"{n} {name}" for name, n in zip([*sweep.axes, "repetitions"], sweep.shape, strict=True)
+        )
+        said = (
+            f"{factors} are {sweep.num_points:,} points, more than {max_points:,}; shorten the "
+            "axes or raise --max-points"
+        )
         raise refuse(("axes",), said)
     file = path.parent / sweep.scenario
     try:
         base = load(file, _options(sweep.set))
     except ScenarioError as error:
-        raise refuse(("set",) if sweep.set and file.is_file() else ("scenario",), f"the base scenario cannot be used: {error}") from None
+        raise refuse(
+            ("set",) if sweep.set and file.is_file() else ("scenario",),
+            f"the base scenario cannot be used: {error}",
+        ) from None
     base = base.in_folder(file.parent.resolve())
     tree = plain_tree(base)
     for name, axis in sweep.axes.items():
         for i in range(axis.size):
-            _try(tree, axis.entry(i), lambda text, n=name, j=i: refuse(("axes", n), f"entry {j} of {n} {text}"))
+            _try(
+                tree,
+                axis.entry(i),
+                lambda text, n=name, j=i: refuse(("axes", n), f"entry {j} of {n} {text}"),
+            )
     return Plan(sweep, base)
 
 
@@ -300,7 +358,8 @@ def _options(values: dict[str, Any]) -> list[str]:
 def _try(tree: dict[str, Any], entry: dict[str, Any], refuse: Any) -> None:
     """Check one entry of an axis alone on the base scenario.
 
-    What depends on the other axes too is left to the points: a combination that cannot be is recorded as a failed point.
+    What depends on the other axes too is left to the points: a combination that cannot be is
+    recorded as a failed point.
     """
     here = copy.deepcopy(tree)
     shown = ", ".join(f"{key} = {json.dumps(value)}" for key, value in entry.items())
@@ -315,5 +374,9 @@ def _try(tree: dict[str, Any], entry: dict[str, Any], refuse: Any) -> None:
         if first["type"] == "inconsistent":
             return
         where = dotted(first["loc"])
-        words = "unknown key" if first["type"] == "extra_forbidden" else first["msg"].replace("Input should be", "must be")
+        words = (
+            "unknown key"
+            if first["type"] == "extra_forbidden"
+            else first["msg"].replace("Input should be", "must be")
+        )
         raise refuse(f"({shown}): {where}: {words}") from None

@@ -1,7 +1,8 @@
 """Running the points of a sweep on Dask: an embedded cluster, or a scheduler that is already there.
 
-The scheduler sees a window of small tasks and gets back a few words for each; outcomes go straight from the worker to the
-disk. So neither client nor scheduler grows with the sweep, and whoever is killed takes nothing with it that was finished.
+The scheduler sees a window of small tasks and gets back a few words for each; outcomes go straight
+from the worker to the disk. So neither client nor scheduler grows with the sweep, and whoever is
+killed takes nothing with it that was finished.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from isac_rt.sweep.outcomes import Outcomes, pending
 WINDOW = 4
 """Tasks that the scheduler is given ahead, for each thread of a worker."""
 WORKER_BYTES = 1.5e9
-"""Memory that a worker is reckoned with when their number is chosen: a ray-traced city, three receivers at work."""
+"""Memory that a worker is reckoned with when their number is chosen: a ray-traced city, three
+receivers at work."""
 LOST_AFTER = 5
-"""Workers that a point may take with it before it counts as failed: one that is killed from outside must not condemn its points."""
+"""Workers that a point may take with it before it counts as failed: one that is killed from outside
+must not condemn its points."""
 CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
 
@@ -54,10 +57,12 @@ class Job:
 
 
 def run_job(job: Job) -> tuple[str, bool]:
-    """Simulate a point and write its outcome; in a worker. Returns its key and whether it succeeded.
+    """Simulate a point and write its outcome; in a worker. Returns its key and whether it
+    succeeded.
 
-    An outcome that cannot be written (a full disk) raises: then nothing is recorded, and the point is run again next time. Dask
-    repeats a task whose worker dies before its word reached the client; a point whose outcome is there is not repeated.
+    An outcome that cannot be written (a full disk) raises: then nothing is recorded, and the point
+    is run again next time. Dask repeats a task whose worker dies before its word reached the
+    client; a point whose outcome is there is not repeated.
     """
     outcomes = Outcomes(Path(job.folder))
     if outcomes.done(job.key, job.retry_failed):
@@ -70,8 +75,17 @@ def run_job(job: Job) -> tuple[str, bool]:
         text = f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
         outcome = {"status": "failed", "error": text, "where": "".join(where)}
     else:
-        outcome = {"status": "done", **{key: summary[key] for key in ("links", "terminals", "paths", "fidelity", "timing_s", "versions")}}
-    outcomes.write(job.key, {"key": job.key, "scenario": job.tree, "seconds": time.perf_counter() - begin, **outcome})
+        outcome = {
+            "status": "done",
+            **{
+                key: summary[key]
+                for key in ("links", "terminals", "paths", "fidelity", "timing_s", "versions")
+            },
+        }
+    outcomes.write(
+        job.key,
+        {"key": job.key, "scenario": job.tree, "seconds": time.perf_counter() - begin, **outcome},
+    )
     return job.key, outcome["status"] == "done"
 
 
@@ -91,7 +105,8 @@ def _simulate(job: Job) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _limit_tracer(threads: int) -> None:
-    """Tell Dr.Jit, once in a process, how many threads it may use: several workers share the machine."""
+    """Tell Dr.Jit, once in a process, how many threads it may use: several workers share the
+    machine."""
     from isac_rt import runtime
 
     runtime.activate()
@@ -109,18 +124,26 @@ def default_workers() -> int:
 
 @contextmanager
 def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a cluster of our own with one thread a worker."""
+    """A client of the scheduler at an address, or of a cluster of our own with one thread a
+    worker."""
     import dask
     from distributed import Client, LocalCluster
 
-    quiet = {"distributed.scheduler.allowed-failures": LOST_AFTER, "distributed.worker.daemon": True,
-             "distributed.comm.timeouts.connect": f"{CONNECT_S}s", "distributed.logging.distributed": "critical"}  # fmt: skip
+    quiet = {
+        "distributed.scheduler.allowed-failures": LOST_AFTER,
+        "distributed.worker.daemon": True,
+        "distributed.comm.timeouts.connect": f"{CONNECT_S}s",
+        "distributed.logging.distributed": "critical",
+    }
     with dask.config.set(quiet):
         if scheduler is not None:
             try:
                 client = Client(scheduler, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as problem:
-                said = f"no scheduler answers at {scheduler}: {problem}; start one with `dask scheduler`, or leave --scheduler out"
+                said = (
+                    f"no scheduler answers at {scheduler}: {problem}; start one with `dask "
+                    "scheduler`, or leave --scheduler out"
+                )
                 raise SweepError(said) from problem
             try:
                 yield client
@@ -128,8 +151,13 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                 with suppress(Exception):
                     client.close(timeout=2)
             return
-        cluster = LocalCluster(n_workers=workers or default_workers(), threads_per_worker=1, processes=True, dashboard_address=None,
-                               silence_logs=50)  # fmt: skip
+        cluster = LocalCluster(
+            n_workers=workers or default_workers(),
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=50,
+        )
         client = Client(cluster)
         try:
             yield client
@@ -174,17 +202,26 @@ def run_sweep(
     if not todo:
         return
     with _client(workers, scheduler) as client:
-        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run(pending(plan, outcomes, retry_failed))
+        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run(
+            pending(plan, outcomes, retry_failed)
+        )
 
 
 class _Runner:
     """Feeds the scheduler from a window and counts what comes back.
 
-    Of the points that share their paths one goes first; the others follow when its paths are on the disk.
+    Of the points that share their paths one goes first; the others follow when its paths are on the
+    disk.
     """
 
     def __init__(
-        self, plan: Plan, outcomes: Outcomes, client: Any, done: int, retry_failed: bool, progress: Progress | None
+        self,
+        plan: Plan,
+        outcomes: Outcomes,
+        client: Any,
+        done: int,
+        retry_failed: bool,
+        progress: Progress | None,
     ) -> None:
         self._retry_failed = retry_failed
         self._plan, self._outcomes, self._client, self._progress = plan, outcomes, client, progress
@@ -215,11 +252,15 @@ class _Runner:
 
     def _lost(self, problem: BaseException | None) -> SchedulerLost:
         why = f" ({problem})" if problem is not None and str(problem) else ""
-        return SchedulerLost(f"the scheduler was lost{why}; {self._done} of {self._plan.sweep.num_points} points are done and kept: "
-                          "start the same command again to go on")  # fmt: skip
+        return SchedulerLost(
+            f"the scheduler was lost{why}; {self._done} of {self._plan.sweep.num_points} points "
+            "are done and kept: "
+            "start the same command again to go on"
+        )
 
     def _fill(self, points: Iterator[Point], queue: Any) -> None:
-        """Give the scheduler points up to the window; followers of a running leader wait, at most a window of them."""
+        """Give the scheduler points up to the window; followers of a running leader wait, at most a
+        window of them."""
         while len(self._active) < self._window and self._waiting < 64 * self._window:
             point = next(points, None)
             if point is None:
@@ -235,7 +276,14 @@ class _Runner:
             self._submit(point, queue)
 
     def _submit(self, point: Point, queue: Any) -> None:
-        job = Job(point.key, point.tree, str(self._plan.base.folder), str(self._outcomes.folder), self._threads, self._retry_failed)
+        job = Job(
+            point.key,
+            point.tree,
+            str(self._plan.base.folder),
+            str(self._outcomes.folder),
+            self._threads,
+            self._retry_failed,
+        )
         self._active[point.key] = point
         queue.add(self._client.submit(run_job, job, key=f"point-{point.key}", pure=False))
 
@@ -248,7 +296,16 @@ class _Runner:
             self._active[key] = point
             raise CancelledError("its tasks are gone")
         if future.status == "error":
-            self._outcomes.write(key, {"key": key, "scenario": point.tree, "status": "failed", "error": _of_worker(future), "where": ""})
+            self._outcomes.write(
+                key,
+                {
+                    "key": key,
+                    "scenario": point.tree,
+                    "status": "failed",
+                    "error": _of_worker(future),
+                    "where": "",
+                },
+            )
             good = False
         else:
             good = future.result()[1]
@@ -268,5 +325,8 @@ def _of_worker(future: Any) -> str:
     problem = future.exception()
     name = type(problem).__name__
     if name == "KilledWorker":
-        return f"KilledWorker: {LOST_AFTER} workers in turn died while they ran this point (out of memory?)"
+        return (
+            f"KilledWorker: {LOST_AFTER} workers in turn died while they ran this point (out of "
+            "memory?)"
+        )
     return f"{name}: {problem}"

@@ -1,7 +1,8 @@
 """Outcomes of a sweep's points on disk, and the labelled dataset that is made of them.
 
-A point's file holds the summary of its run, or its error. It appears whole or not at all, under the digest of the point's content;
-so the files are the only state of a sweep: what is there is done, whoever did it.
+A point's file holds the summary of its run, or its error. It appears whole or not at all, under the
+digest of the point's content; so the files are the only state of a sweep: what is there is done,
+whoever did it.
 """
 
 from __future__ import annotations
@@ -54,8 +55,13 @@ class Outcomes:
         return not retry_failed or (self.read(key) or {}).get("status") == "done"
 
     def save_definition(self, plan: Plan) -> None:
-        """Keep the sweep and its base scenario beside the outcomes, so that the folder can be read alone."""
-        tree = {"sweep": plan.sweep.model_dump(mode="json"), "base": plain_tree(plan.base), "folder": str(plan.base.folder)}
+        """Keep the sweep and its base scenario beside the outcomes, so that the folder can be read
+        alone."""
+        tree = {
+            "sweep": plan.sweep.model_dump(mode="json"),
+            "base": plain_tree(plan.base),
+            "folder": str(plan.base.folder),
+        }
         write_text(self.folder / DEFINITION, json.dumps(tree, indent=1) + "\n")
 
     def definition(self) -> Plan:
@@ -67,14 +73,21 @@ class Outcomes:
         """
         try:
             tree = json.loads((self.folder / DEFINITION).read_text(encoding="utf-8"))
-            return Plan(Sweep.model_validate(tree["sweep"]), Scenario.model_validate(tree["base"]).in_folder(Path(tree["folder"])))
+            return Plan(
+                Sweep.model_validate(tree["sweep"]),
+                Scenario.model_validate(tree["base"]).in_folder(Path(tree["folder"])),
+            )
         except (OSError, ValueError, KeyError) as problem:
-            raise ResultsError(f"{self.folder} holds no sweep ({problem}); give the folder that `isac-rt sweep` wrote") from problem
+            raise ResultsError(
+                f"{self.folder} holds no sweep ({problem}); give the folder that `isac-rt sweep` "
+                "wrote"
+            ) from problem
 
 
 @dataclass(frozen=True)
 class Status:
-    """How far a sweep is: counts of points, and the errors of those that failed (index along the axes, message)."""
+    """How far a sweep is: counts of points, and the errors of those that failed (index along the
+    axes, message)."""
 
     total: int
     done: int
@@ -121,10 +134,12 @@ def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
 
     Returns
     -------
-    dataset : over the axes, ``repetition`` and ``link``: the kept quantities of each link, NaN where a point is not done or does not
-        apply; without ``repetition`` the rates pooled over the repetitions (``NAME_pooled``) with the 95 % Clopper-Pearson bounds
-        ``NAME_low`` and ``NAME_high``, which take symbols for independent; ``state``: 1 done, 0 not yet, -1 failed; ``paths`` by
-        ``kind``. Coordinates are the axes' values. Nothing in it depends on who computed what when.
+    dataset : over the axes, ``repetition`` and ``link``: the kept quantities of each link, NaN
+        where a point is not done or does not apply; without ``repetition`` the rates pooled over
+        the repetitions (``NAME_pooled``) with the 95 % Clopper-Pearson bounds ``NAME_low`` and
+        ``NAME_high``, which take symbols for independent; ``state``: 1 done, 0 not yet, -1 failed;
+        ``paths`` by ``kind``. Coordinates are the axes' values. Nothing in it depends on who
+        computed what when.
     """
     sweep = plan.sweep
     table, paths = _Table(sweep.shape), _Table(sweep.shape)
@@ -147,39 +162,71 @@ def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
     return _dataset(plan, table, paths, counts, state)
 
 
-def _dataset(plan: Plan, table: _Table, paths: _Table, counts: dict[str, dict[str, np.ndarray]], state: np.ndarray) -> xr.Dataset:
+def _dataset(
+    plan: Plan,
+    table: _Table,
+    paths: _Table,
+    counts: dict[str, dict[str, np.ndarray]],
+    state: np.ndarray,
+) -> xr.Dataset:
     sweep, dims = plan.sweep, [*plan.sweep.axes, "repetition"]
     links = list(dict.fromkeys(link for columns in table.values.values() for link in columns))
-    out: dict[str, xr.Variable] = {"state": xr.Variable(dims, state, {"long_name": "1 done, 0 not yet, -1 failed"})}
+    out: dict[str, xr.Variable] = {
+        "state": xr.Variable(dims, state, {"long_name": "1 done, 0 not yet, -1 failed"})
+    }
 
-    def stacked(columns: dict[str, np.ndarray], names: list[str], missing: np.ndarray) -> np.ndarray:
+    def stacked(
+        columns: dict[str, np.ndarray], names: list[str], missing: np.ndarray
+    ) -> np.ndarray:
         return np.stack([columns.get(name, missing) for name in names], axis=-1)
 
     for name, columns in table.values.items():
-        out[name] = xr.Variable([*dims, "link"], stacked(columns, links, np.full(table.shape, np.nan)))
+        out[name] = xr.Variable(
+            [*dims, "link"], stacked(columns, links, np.full(table.shape, np.nan))
+        )
     for name, columns in counts.items():
         pair = stacked(columns, links, np.zeros((*sweep.shape[:-1], 2), np.int64))  # ..., 2, link
         errors, trials = pair[..., 0, :], pair[..., 1, :]
-        bounds = np.array([binomial_interval(int(e), int(n), CONFIDENCE) if n else (np.nan, np.nan)
-                           for e, n in zip(errors.ravel(), trials.ravel(), strict=True)]).reshape(*errors.shape, 2)  # fmt: skip
+        bounds = np.array(
+            [
+                binomial_interval(int(e), int(n), CONFIDENCE) if n else (np.nan, np.nan)
+                for e, n in zip(errors.ravel(), trials.ravel(), strict=True)
+            ]
+        ).reshape(*errors.shape, 2)
         about = {"long_name": f"{name} over all repetitions", "confidence": CONFIDENCE}
         with np.errstate(invalid="ignore"):
-            out[f"{name}_pooled"] = xr.Variable([*dims[:-1], "link"], errors / np.where(trials, trials, np.nan), about)
+            out[f"{name}_pooled"] = xr.Variable(
+                [*dims[:-1], "link"], errors / np.where(trials, trials, np.nan), about
+            )
         for i, end in enumerate(("low", "high")):
             meaning = {**about, "long_name": f"{end} bound of {name}_pooled"}
             out[f"{name}_{end}"] = xr.Variable([*dims[:-1], "link"], bounds[..., i], meaning)
     if "paths" in paths.values:
         kinds = sorted(paths.values["paths"])
-        out["paths"] = xr.Variable([*dims, "kind"], stacked(paths.values["paths"], kinds, np.full(table.shape, np.nan)))
+        out["paths"] = xr.Variable(
+            [*dims, "kind"], stacked(paths.values["paths"], kinds, np.full(table.shape, np.nan))
+        )
         out["kind"] = xr.Variable(["kind"], np.array(kinds, object))
-    kept = {name: v for name, v in out.items() if name in ("state", "kind") or any(fnmatch.fnmatch(name, p) for p in sweep.keep)}
-    coordinates: dict[str, Any] = {name: np.array(axis.labels()) for name, axis in sweep.axes.items()}
+    kept = {
+        name: v
+        for name, v in out.items()
+        if name in ("state", "kind") or any(fnmatch.fnmatch(name, p) for p in sweep.keep)
+    }
+    coordinates: dict[str, Any] = {
+        name: np.array(axis.labels()) for name, axis in sweep.axes.items()
+    }
     for name, values in coordinates.items():
         coordinates[name] = values.astype(object) if values.dtype.kind in "US" else values
     coordinates |= {"repetition": np.arange(sweep.repetitions), "link": np.array(links, object)}
     keys = {f"axis_{name}": ", ".join(sorted(axis.keys)) for name, axis in sweep.axes.items()}
-    about = {"title": f"isac_rt sweep: {sweep.name}", "program": program_fingerprint(), "versions": json.dumps(versions()),
-             "commit": commit(), "base": json.dumps(plain_tree(plan.base)), "seed": sweep.seed}  # fmt: skip
+    about = {
+        "title": f"isac_rt sweep: {sweep.name}",
+        "program": program_fingerprint(),
+        "versions": json.dumps(versions()),
+        "commit": commit(),
+        "base": json.dumps(plain_tree(plan.base)),
+        "seed": sweep.seed,
+    }
     return xr.Dataset(kept, coordinates, {**about, **keys})
 
 

@@ -1,4 +1,5 @@
-"""The clutter that a terminal predicts from its own copy of the mesh. Import only after `isac_rt.runtime.activate()`.
+"""The clutter that a terminal predicts from its own copy of the mesh. Import only after
+`isac_rt.runtime.activate()`.
 
 Its surfaces are cut as finely as the scenario's field, its points are its own.
 """
@@ -31,7 +32,8 @@ class Mistakes:
     ----------
     velocity : (3,) added to its own velocity [m/s]
     level_db : added to all levels
-    mesh_std : of the error of each face along its normal, Gaussian, independent from face to face [m]
+    mesh_std : of the error of each face along its normal, Gaussian, independent from face to face
+        [m]
     seed : of the faces' errors
     """
 
@@ -44,16 +46,28 @@ class Mistakes:
 class MeshExpectation:
     """Expected clutter along the flights of one scenario."""
 
-    def __init__(self, scenario: Scenario, city: City, scene: mi.Scene, antennas: Antennas, wavelength: float) -> None:
-        own = scenario.model_copy(update={"seed": int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])})
+    def __init__(
+        self, scenario: Scenario, city: City, scene: mi.Scene, antennas: Antennas, wavelength: float
+    ) -> None:
+        own = scenario.model_copy(
+            update={
+                "seed": int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])
+            }
+        )
         self._field = ClutterField.plan(own, city, scene, wavelength)
-        self._twice = TwoBounces.plan(own, city, self._field, wavelength) if scenario.clutter.mirrors else None
+        self._twice = (
+            TwoBounces.plan(own, city, self._field, wavelength)
+            if scenario.clutter.mirrors
+            else None
+        )
         self._city, self._antennas = city, antennas
 
     def __len__(self) -> int:
         return len(self._field.cells)
 
-    def clutter(self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None) -> ExpectedClutter:
+    def clutter(
+        self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None
+    ) -> ExpectedClutter:
         """What the terminal's own link returns at a time, from where it believes to be.
 
         Parameters
@@ -63,9 +77,15 @@ class MeshExpectation:
         amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
         """
         wrong = mistakes or Mistakes()
-        local = replace(pose, position=pose.position - self._city.origin, velocity=pose.velocity + np.array(wrong.velocity))
+        local = replace(
+            pose,
+            position=pose.position - self._city.origin,
+            velocity=pose.velocity + np.array(wrong.velocity),
+        )
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
-        error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
+        error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(
+            self._city.num_faces
+        )
         once = self._field.seen(name, name, local, local, time)
         parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
         for part in [] if self._twice is None else self._twice.seen(name, name, local, local, time):
@@ -87,11 +107,16 @@ class MeshExpectation:
         local: Pose,
         moved: np.ndarray | float = 0.0,
     ) -> ExpectedClutter:
-        """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the scatterers, on faces that are each in error,
-        and ways made longer by `moved` as a mirror is in error [m]."""
+        """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the
+        scatterers, on faces that are each in error, and ways made longer by `moved` as a mirror is
+        in error [m]."""
         elements = element_amplitude(self._antennas, local, local, seen.departure, seen.arrival)
         face = self._field.cells.face[seen.index]
-        length = seen.length + moved + error[face] * (self._city.normals[face] * (there + back)).sum(axis=1)
+        length = (
+            seen.length
+            + moved
+            + error[face] * (self._city.normals[face] * (there + back)).sum(axis=1)
+        )
         power = (amplitude * seen.magnitude * elements) ** 2
         some = power > 0
         return ExpectedClutter(
@@ -111,11 +136,14 @@ class ClutterExpectation(Protocol):
     """What simulate needs of a terminal's copy of the mesh."""
 
     def clutter(self, name: str, pose: Pose, time: float, amplitude: float) -> ExpectedClutter:
-        """Clutter of the own link of a terminal at a pose, in world coordinates; amplitude is sqrt(transmit power) [sqrt(W)]."""
+        """Clutter of the own link of a terminal at a pose, in world coordinates; amplitude is
+        sqrt(transmit power) [sqrt(W)]."""
         ...
 
 
-def make_expectation(scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City) -> ClutterExpectation | None:
+def make_expectation(
+    scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City
+) -> ClutterExpectation | None:
     """The receivers' copy of the mesh where their detector needs one; starts the JIT back end."""
     if scenario.receivers.clutter_detector not in MESH_DETECTORS:
         return None

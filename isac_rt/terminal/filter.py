@@ -1,4 +1,5 @@
-"""The extended Kalman filter of one body: measurement model of both terminals, prediction, update and birth."""
+"""The extended Kalman filter of one body: measurement model of both terminals, prediction, update
+and birth."""
 
 from __future__ import annotations
 
@@ -9,17 +10,19 @@ import numpy as np
 from isac_rt.world.swarm import Pose
 
 STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
-"""Smallest measurement standard deviations that are believed [m, m/s, 1, 1]. At high SNR the errors are not noise but the
-interpolation between cells, alike in successive frames: about 0.002 cell in range, 0.02 in velocity, 0.002 in angle."""
+"""Smallest measurement standard deviations that are believed [m, m/s, 1, 1]. At high SNR the errors
+are not noise but the interpolation between cells, alike in successive frames: about 0.002 cell in
+range, 0.02 in velocity, 0.002 in angle."""
 
 
 BIRTH_SPEED_STD = 10.0
-"""Per axis [m/s]: before its first detection a body is taken to stand still in the world, give or take this."""
+"""Per axis [m/s]: before its first detection a body is taken to stand still in the world, give or
+take this."""
 
 
 BIRTH_POSITION_STD_LIMIT = 100.0
-"""A single detection that fixes the position worse than this [m] starts no track (near the line through both terminals
-a bistatic length says nothing about where the reflector is)."""
+"""A single detection that fixes the position worse than this [m] starts no track (near the line
+through both terminals a bistatic length says nothing about where the reflector is)."""
 
 
 _ITERATIONS = 10
@@ -36,7 +39,8 @@ class Gaussian(NamedTuple):
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Length and direction of (..., 3); written without abs so that a complex step passes through."""
+    """Length and direction of (..., 3); written without abs so that a complex step passes
+    through."""
     length = np.sqrt(np.sum(vector * vector, axis=-1))
     return length, vector / length[..., None]
 
@@ -45,7 +49,8 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
     r"""What `own` measures of a body: range, its rate and the direction cosines u_x and u_z.
 
     One-way form (an echo's range at the AT, the line of sight at a PT):
-    :math:`r = |x-p|,\ \dot r = e\cdot(v-v_p),\ u = R^T e` with :math:`e = (x-p)/r`. Bistatic form: the path length
+    :math:`r = |x-p|,\ \dot r = e\cdot(v-v_p),\ u = R^T e` with :math:`e = (x-p)/r`. Bistatic form:
+    the path length
     :math:`|x-p_t| + |x-p|` and its rate; the direction is still that of arrival.
 
     Parameters
@@ -69,8 +74,8 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
 
 
 def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of (length, rate) of one leg with respect to relative position and velocity (2, 6), and of its
-    direction with respect to the position, (I - e e^T)/r (3, 3)."""
+    """Derivative of (length, rate) of one leg with respect to relative position and velocity (2,
+    6), and of its direction with respect to the position, (I - e e^T)/r (3, 3)."""
     r, e = _unit(offset)
     turn = (np.eye(3) - np.outer(e, e)) / r
     return np.stack([np.concatenate([e, np.zeros(3)]), np.concatenate([turn @ velocity, e])]), turn
@@ -94,12 +99,14 @@ def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarr
     return out
 
 
-def measurement_covariance(std: np.ndarray, mean: np.ndarray, transmitter: Gaussian | None = None) -> np.ndarray:
-    """R (4, 4) of a detection: its own deviations (4,), not below `STD_FLOOR`, and for a bistatic one the uncertainty of
-    the transmitter's track, seen from the body's state `mean` (6,).
+def measurement_covariance(
+    std: np.ndarray, mean: np.ndarray, transmitter: Gaussian | None = None
+) -> np.ndarray:
+    """R (4, 4) of a detection: its own deviations (4,), not below `STD_FLOOR`, and for a bistatic
+    one the uncertainty of the transmitter's track, seen from the body's state `mean` (6,).
 
-    The transmitter's error is the same in successive frames, but is treated here as if it were drawn anew: a
-    reflector's covariance is too small by what they share.
+    The transmitter's error is the same in successive frames, but is treated here as if it were
+    drawn anew: a reflector's covariance is too small by what they share.
     """
     R = np.diag(np.fmax(std, STD_FLOOR) ** 2)
     if transmitter is not None:
@@ -111,7 +118,8 @@ def measurement_covariance(std: np.ndarray, mean: np.ndarray, transmitter: Gauss
 def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     r"""Constant velocity with an acceleration that is white from step to step and constant in each.
 
-    :math:`x' = F x + G a,\ a \sim N(0, \sigma^2 I)`, :math:`G = [\Delta^2/2,\ \Delta]^T \otimes I`. [interval s, m/s^2]
+    :math:`x' = F x + G a,\ a \sim N(0, \sigma^2 I)`, :math:`G = [\Delta^2/2,\ \Delta]^T \otimes I`.
+    [interval s, m/s^2]
     """
     F = np.eye(6)
     F[:3, 3:] = interval * np.eye(3)
@@ -128,11 +136,13 @@ def update(
     *,
     velocity_period: float = np.inf,
 ) -> Gaussian:
-    """Condition on one measurement (4,) with covariance R (4, 4); components that are NaN were not measured.
+    """Condition on one measurement (4,) with covariance R (4, 4); components that are NaN were not
+    measured.
 
-    Iterated EKF: the measurement is linearised again at the new mean until it stands (Gauss-Newton on the posterior),
-    because a range known to a millimetre across a direction known to a metre bends visibly. Joseph form.
-    `velocity_period` [m/s] is the span of velocities that the Doppler tells apart; differences are taken modulo it.
+    Iterated EKF: the measurement is linearised again at the new mean until it stands (Gauss-Newton
+    on the posterior), because a range known to a millimetre across a direction known to a metre
+    bends visibly. Joseph form. `velocity_period` [m/s] is the span of velocities that the Doppler
+    tells apart; differences are taken modulo it.
     """
     rows = np.flatnonzero(np.isfinite(measurement))
     R = R[np.ix_(rows, rows)]
@@ -153,10 +163,12 @@ def update(
 def expected(
     mean: np.ndarray, covariance: np.ndarray, own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (..., 4) and covariance (..., 4, 4) of what will be measured of states (..., 6), measurement noise excluded.
+    """Mean (..., 4) and covariance (..., 4, 4) of what will be measured of states (..., 6),
+    measurement noise excluded.
 
-    Unscented (12 points, equal weights): with a transversal velocity still unknown by 10 m/s and 0.15 s between frames the
-    range rate bends by more than its own deviation, and a linearised gate would lose the target.
+    Unscented (12 points, equal weights): with a transversal velocity still unknown by 10 m/s and
+    0.15 s between frames the range rate bends by more than its own deviation, and a linearised gate
+    would lose the target.
     """
     root = np.sqrt(6.0) * np.swapaxes(np.linalg.cholesky(covariance), -1, -2)
     points = mean[..., None, :] + np.concatenate([root, -root], axis=-2)
@@ -165,13 +177,16 @@ def expected(
     dz = z - z_mean[..., None, :]
     S = np.swapaxes(dz, -1, -2) @ dz / z.shape[-2]
     if transmitter is not None:
-        J = np.stack([transmitter_jacobian(x, transmitter.mean) for x in mean.reshape(-1, 6)]).reshape(*mean.shape[:-1], 4, 6)
+        J = np.stack(
+            [transmitter_jacobian(x, transmitter.mean) for x in mean.reshape(-1, 6)]
+        ).reshape(*mean.shape[:-1], 4, 6)
         S = S + J @ transmitter.covariance @ np.swapaxes(J, -1, -2)
     return z_mean, S
 
 
 def wrapped(difference: np.ndarray, velocity_period: float) -> np.ndarray:
-    """Differences of measurements (..., 4) with the velocity brought to within half a period of zero."""
+    """Differences of measurements (..., 4) with the velocity brought to within half a period of
+    zero."""
     if not np.isfinite(velocity_period):
         return difference
     out = difference.copy()
@@ -182,18 +197,23 @@ def wrapped(difference: np.ndarray, velocity_period: float) -> np.ndarray:
 def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray) -> float:
     """Distance from the receiver to a reflector, rho = (L^2 - d^2) / (2 (L - d.u)) [m].
 
-    From |rho u - d| = L - rho; `baseline` d (3,) points from the receiver to the transmitter, `direction` u (3,) unit to the
-    reflector. Not positive where the length is not longer than the baseline.
+    From |rho u - d| = L - rho; `baseline` d (3,) points from the receiver to the transmitter,
+    `direction` u (3,) unit to the reflector. Not positive where the length is not longer than the
+    baseline.
     """
     return float((length**2 - baseline @ baseline) / (2 * (length - baseline @ direction)))
 
 
-def birth(measurement: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None = None) -> Gaussian | None:
-    """State after a first detection (4,) with deviations (4,); None where it does not fix a position.
+def birth(
+    measurement: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None = None
+) -> Gaussian | None:
+    """State after a first detection (4,) with deviations (4,); None where it does not fix a
+    position.
 
-    The position from range and direction (front half-space), its covariance through the inverse Jacobian; the velocity is
-    zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the measured rate: the component along the
-    line of sight (or the bisector) is then known, the others are not.
+    The position from range and direction (front half-space), its covariance through the inverse
+    Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
+    measured rate: the component along the line of sight (or the bisector) is then known, the others
+    are not.
     """
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
@@ -221,7 +241,8 @@ def birth(measurement: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaus
 
 
 def mahalanobis(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distance and ln det S of residuals (..., 4) over their finite components, S (..., 4, 4).
+    """Squared distance and ln det S of residuals (..., 4) over their finite components, S (..., 4,
+    4).
 
     A missing component is given a unit variance of its own and a residual of zero.
     """

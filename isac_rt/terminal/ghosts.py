@@ -1,14 +1,17 @@
-"""Which tracks of a terminal are ghosts, by geometry: the terminal knows its own pose and the city's mesh, and nothing of the truth.
+"""Which tracks of a terminal are ghosts, by geometry: the terminal knows its own pose and the
+city's mesh, and nothing of the truth.
 
-A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is enough to make it suspect:
+A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is
+enough to make it suspect:
 
-- Is it one of the echoes that a nearer track must have over walls? There (straight) and back (over a wall), the reverse, or over a wall on
-  both ways: their ranges, rates and directions follow from the source's state and the wall's plane. An echo over a wall is always longer
-  than the direct one, and so weaker; being farther stands here for being weaker.
+- Is it one of the echoes that a nearer track must have over walls? There (straight) and back (over
+  a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
+  the source's state and the wall's plane. An echo over a wall is always longer than the direct one,
+  and so weaker; being farther stands here for being weaker.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
-A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active terminal, as it tracks it; and whether
-one is that terminal itself over a wall.
+A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
+terminal, as it tracks it; and whether one is that terminal itself over a wall.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ SMALLEST_WALL = 20.0
 DEVIATIONS = 3.0
 """How many standard deviations a track may be off."""
 RESOLUTION_SHARE = 0.5
-"""Share of the resolution that it may be off besides: echoes that share a cell pull each other's estimates."""
+"""Share of the resolution that it may be off besides: echoes that share a cell pull each other's
+estimates."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class Walls:
 
     @cached_property
     def mirrors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Largest face (W,), unit normal (W, 3) and offset n.x (W,) [m] of the planes of `SMALLEST_WALL` and more."""
+        """Largest face (W,), unit normal (W, 3) and offset n.x (W,) [m] of the planes of
+        `SMALLEST_WALL` and more."""
         plane, areas = self.city.plane_of_face, self.city.areas
         total = np.bincount(plane, weights=areas)
         members = [np.flatnonzero(plane == p) for p in np.flatnonzero(total >= SMALLEST_WALL)]
@@ -55,11 +60,17 @@ class Walls:
         with np.errstate(divide="ignore", invalid="ignore"):
             share = (normal * (a - start)).sum(1) / slope
             point = start + share[:, None] * span
-            inside = [(np.cross(q - p, point - p) * normal).sum(1) >= 0 for p, q in ((a, b), (b, c), (c, a))]
-        return np.flatnonzero((slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside))
+            inside = [
+                (np.cross(q - p, point - p) * normal).sum(1) >= 0
+                for p, q in ((a, b), (b, c), (c, a))
+            ]
+        return np.flatnonzero(
+            (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
+        )
 
     def reflects(self, face: int, start: np.ndarray, end: np.ndarray) -> bool:
-        """Whether the segment from a mirror image to an end (3,) goes through one of the faces in the face's plane."""
+        """Whether the segment from a mirror image to an end (3,) goes through one of the faces in
+        the face's plane."""
         plane = self.city.plane_of_face
         return bool((plane[self.blocking(start, end)] == plane[face]).any())
 
@@ -70,12 +81,13 @@ class Suspicion:
 
     Attributes
     ----------
-    mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1: none does
+    mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1:
+        none does
     source : (K,) int64 id of that nearer track, -1: none
-    order : (K,) int8 bounces: 1 off that wall on one of the two ways, 2 on both, 0: none. At a passive terminal the second wall may be
-        another; `mirrored` is the first
-    behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive one, from its transmitter, -1: it is
-        in sight
+    order : (K,) int8 bounces: 1 off that wall on one of the two ways, 2 on both, 0: none. At a
+        passive terminal the second wall may be another; `mirrored` is the first
+    behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
+        one, from its transmitter, -1: it is in sight
     """
 
     mirrored: np.ndarray
@@ -89,44 +101,70 @@ class Suspicion:
         return (self.mirrored >= 0) | (self.behind >= 0)
 
 
-def suspicion(tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, velocity_period: float) -> Suspicion:
+def suspicion(
+    tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, velocity_period: float
+) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
     Parameters
     ----------
-    tracks : TrackSet of an active terminal (its own echoes), or of a passive one with its reference, which itself is not suspected
+    tracks : TrackSet of an active terminal (its own echoes), or of a passive one with its
+        reference, which itself is not suspected
     own : its pose
     walls : the mesh
-    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `metrics.resolutions`; of one pass at a passive terminal
+    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `metrics.resolutions`; of one pass at
+        a passive terminal
     velocity_period : span of velocities that the Doppler tells apart [m/s]
     """
     count = len(tracks)
-    out = Suspicion(np.full(count, -1, np.int32), np.full(count, -1), np.zeros(count, np.int8), np.full(count, -1, np.int32))
+    out = Suspicion(
+        np.full(count, -1, np.int32),
+        np.full(count, -1),
+        np.zeros(count, np.int8),
+        np.full(count, -1, np.int32),
+    )
     measured = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
     sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
     seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
     for k in np.flatnonzero(~tracks.is_reference):
-        out.behind[k] = _hidden_by(own.position + tracks.mean[k, :3], tracks.covariance[k, :3, :3], seen_from, walls, resolution[0])
+        out.behind[k] = _hidden_by(
+            own.position + tracks.mean[k, :3],
+            tracks.covariance[k, :3, :3],
+            seen_from,
+            walls,
+            resolution[0],
+        )
     for s in np.flatnonzero(tracks.confirmed & (out.behind < 0)):
         if sender is None:
             shown = echoes(tracks.mean[s], own, walls)
         else:
-            shown = reflections(tracks.mean[s], None if tracks.is_reference[s] else sender, own, walls)
+            shown = reflections(
+                tracks.mean[s], None if tracks.is_reference[s] else sender, own, walls
+            )
         for face, order, echo in shown:
             off = measured - echo
             off[:, 1] -= velocity_period * np.round(off[:, 1] / velocity_period)
-            allowed = DEVIATIONS * np.hypot(tracks.std, tracks.std[s]) + RESOLUTION_SHARE * resolution
-            hit = (np.abs(off) <= allowed).all(axis=1) & (tracks.range > tracks.range[s]) & (out.mirrored < 0) & ~tracks.is_reference
+            allowed = (
+                DEVIATIONS * np.hypot(tracks.std, tracks.std[s]) + RESOLUTION_SHARE * resolution
+            )
+            hit = (
+                (np.abs(off) <= allowed).all(axis=1)
+                & (tracks.range > tracks.range[s])
+                & (out.mirrored < 0)
+                & ~tracks.is_reference
+            )
             out.mirrored[hit], out.source[hit], out.order[hit] = face, tracks.ids[s], order
     return out
 
 
 def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, np.ndarray]]:
-    """What a body shows of itself over each single wall: (face, order, (4,) range, range rate, u_x, u_z).
+    """What a body shows of itself over each single wall: (face, order, (4,) range, range rate, u_x,
+    u_z).
 
-    `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on both ways the echo is the image's. Over it
-    on one way two equal waves arrive, from the body and from the image, at the mean of the two ranges; where the virtual array, which adds
-    the phases of both ways, points then is left open: at the body, at the image or midway.
+    `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on
+    both ways the echo is the image's. Over it on one way two equal waves arrive, from the body and
+    from the image, at the mean of the two ranges; where the virtual array, which adds the phases of
+    both ways, points then is left open: at the body, at the image or midway.
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
@@ -134,17 +172,22 @@ def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, n
     for face, image in _images(body, here, walls):
         mirrored = _leg(image, own)
         middle = (direct + mirrored) / 2
-        out += [(face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)]
+        out += [
+            (face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)
+        ]
         out += [(face, 2, mirrored)]
     return out
 
 
-def reflections(state: np.ndarray, sender: np.ndarray | None, own: Pose, walls: Walls) -> list[tuple[int, int, np.ndarray]]:
-    """What a passive terminal hears of a body over walls, one wall on each way at most: (first face, order, (4,) path length, its rate,
-    u_x, u_z).
+def reflections(
+    state: np.ndarray, sender: np.ndarray | None, own: Pose, walls: Walls
+) -> list[tuple[int, int, np.ndarray]]:
+    """What a passive terminal hears of a body over walls, one wall on each way at most: (first
+    face, order, (4,) path length, its rate, u_x, u_z).
 
-    `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose. With `sender` None the body is the active
-    terminal itself: its line of sight over a wall. The wave comes from the body, or from its image in the last wall.
+    `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose.
+    With `sender` None the body is the active terminal itself: its line of sight over a wall. The
+    wave comes from the body, or from its image in the last wall.
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
@@ -157,17 +200,26 @@ def reflections(state: np.ndarray, sender: np.ndarray | None, own: Pose, walls: 
         for last, seen in back:
             order = (first >= 0) + (last >= 0)
             if order:
-                out.append((first if first >= 0 else last, order, _leg(seen, own) + np.array([distance, rate, 0.0, 0.0])))
+                out.append(
+                    (
+                        first if first >= 0 else last,
+                        order,
+                        _leg(seen, own) + np.array([distance, rate, 0.0, 0.0]),
+                    )
+                )
     return out
 
 
 def _images(body: np.ndarray, end: np.ndarray, walls: Walls) -> list[tuple[int, np.ndarray]]:
-    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,), world coordinates, with the walls' faces."""
+    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,), world
+    coordinates, with the walls' faces."""
     out = []
     for face, n, d in zip(*(a.tolist() if a.ndim == 1 else a for a in walls.mirrors), strict=True):
         if (n @ body[:3] - d) * (n @ end[:3] - d) <= 0:
             continue  # the wall stands between the two
-        image = np.concatenate([body[:3] - 2 * (n @ body[:3] - d) * n, body[3:] - 2 * (n @ body[3:]) * n])
+        image = np.concatenate(
+            [body[:3] - 2 * (n @ body[:3] - d) * n, body[3:] - 2 * (n @ body[3:]) * n]
+        )
         if walls.reflects(face, end[:3], image[:3]):
             out.append((face, image))
     return out
@@ -187,12 +239,22 @@ def _leg(body: np.ndarray, own: Pose) -> np.ndarray:
     return np.array([distance, rate, towards[0], towards[2]])
 
 
-def _hidden_by(place: np.ndarray, covariance: np.ndarray, seen_from: list[np.ndarray], walls: Walls, range_resolution: float) -> int:
-    """The face that a place (3,) lies behind by more than it may be off, seen from any of the points; -1: none."""
+def _hidden_by(
+    place: np.ndarray,
+    covariance: np.ndarray,
+    seen_from: list[np.ndarray],
+    walls: Walls,
+    range_resolution: float,
+) -> int:
+    """The face that a place (3,) lies behind by more than it may be off, seen from any of the
+    points; -1: none."""
     for start in seen_from:
         for face in walls.blocking(start, place):
             n = walls.city.normals[face]
             depth = abs(n @ place - walls.city.plane_offsets[face] - n @ walls.city.origin)
-            if depth > DEVIATIONS * np.sqrt(n @ covariance @ n) + RESOLUTION_SHARE * range_resolution:
+            if (
+                depth
+                > DEVIATIONS * np.sqrt(n @ covariance @ n) + RESOLUTION_SHARE * range_resolution
+            ):
                 return int(face)
     return -1

@@ -1,7 +1,9 @@
-"""One terminal from frame to frame: receive, track, predict. Samples and public knowledge in, never the truth.
+"""One terminal from frame to frame: receive, track, predict. Samples and public knowledge in, never
+the truth.
 
-A terminal knows its own pose, the waveform, the antennas and their schedule, the transmit power, which frames carry data, and, at the
-active terminal, its own payload. `python -m isac_rt.terminal.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
+A terminal knows its own pose, the waveform, the antennas and their schedule, the transmit power,
+which frames carry data, and, at the active terminal, its own payload. `python -m
+isac_rt.terminal.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
 """
 
 from __future__ import annotations
@@ -27,31 +29,44 @@ from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.receive.symbols.profile import learn_profile, reference_of
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers, Tracking
-from isac_rt.terminal.filter import Gaussian, birth, expected, measurement_covariance, predict, update, wrapped
+from isac_rt.terminal.filter import (
+    Gaussian,
+    birth,
+    expected,
+    measurement_covariance,
+    predict,
+    update,
+    wrapped,
+)
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet
 from isac_rt.world.swarm import Pose
 
 LEVEL_DROP = 10.0
-"""A reference this factor in power under what free space gives at its range is a reflection. Off boresight both ends lose
-some 4 dB at most inside the field of view; a mirror reflection off a wall loses more than the rest, scattering far more."""
+"""A reference this factor in power under what free space gives at its range is a reflection. Off
+boresight both ends lose some 4 dB at most inside the field of view; a mirror reflection off a wall
+loses more than the rest, scattering far more."""
 COAST_CELLS = 0.2
-"""A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
+"""A prediction whose range is known worse than this many cells cannot read the fraction of a
+cell."""
 EVIDENCE_FRAMES = 12
 """How long a symbol outside the alphabet is remembered."""
 SLIP_FALSE_RATE = 1e-6
-"""Chance that noise alone makes one chirp's decision confident enough to count as evidence of a slip."""
+"""Chance that noise alone makes one chirp's decision confident enough to count as evidence of a
+slip."""
 BELIEVED_CELLS = (0.15, 0.3)
-"""A reference off its prediction by more cells of range or of velocity than these, and four deviations, is not believed: a second path in
-the same cell pulls the estimate, and the track, if it followed, would soon misread the symbols. It coasts instead."""
+"""A reference off its prediction by more cells of range or of velocity than these, and four
+deviations, is not believed: a second path in the same cell pulls the estimate, and the track, if it
+followed, would soon misread the symbols. It coasts instead."""
 MOST_CELLS = 0.4
-"""However uncertain the prediction, a reference farther off in range is not believed: two equal paths a cell apart are found in
-their middle."""
+"""However uncertain the prediction, a reference farther off in range is not believed: two equal
+paths a cell apart are found in their middle."""
 ANCHOR_CELLS = 0.75
 """A pilot off by more than this has found another cell: the track starts anew from it."""
 PATIENCE = 25
 """So many frames of disbelief in a row, and the next pilot is right and the track wrong."""
 REFERENCE_STD_CELLS = 0.02
-"""Floor of the reference's range and velocity deviations in cells, for what other paths beside it leave."""
+"""Floor of the reference's range and velocity deviations in cells, for what other paths beside it
+leave."""
 
 
 class TerminalState(IntEnum):
@@ -65,27 +80,45 @@ class TerminalState(IntEnum):
 class ActiveTerminal:
     """The AT: senses with its own echoes and tracks what it finds."""
 
-    def __init__(self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking) -> None:
+    def __init__(
+        self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking
+    ) -> None:
         self._antennas, self._receivers = antennas, receivers
         self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
 
     def step(
-        self, cube: IFCube | RangeProfiles, payload: Payload, own_pose: Pose, time: float, *, clutter: ExpectedClutter | None = None,
+        self,
+        cube: IFCube | RangeProfiles,
+        payload: Payload,
+        own_pose: Pose,
+        time: float,
+        *,
+        clutter: ExpectedClutter | None = None,
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
-        """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal expects of its mesh there."""
+        """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal
+        expects of its mesh there."""
         reception = self.receive(cube, payload, clutter, maps)
         self.tracker.predict(time)
         self.tracker.update(reception.detections, own_pose)
         return reception, self.tracker.snapshot(own_pose)
 
-    def receive(self, cube: IFCube | RangeProfiles, payload: Payload, clutter: ExpectedClutter | None, maps: bool) -> Reception:
+    def receive(
+        self,
+        cube: IFCube | RangeProfiles,
+        payload: Payload,
+        clutter: ExpectedClutter | None,
+        maps: bool,
+    ) -> Reception:
         """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
-        return receive_active(cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps)
+        return receive_active(
+            cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps
+        )
 
 
 class PassiveTerminal:
-    """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of sight, and comes back.
+    """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of
+    sight, and comes back.
 
     `groups` carry data for it, None for all (see `receive_passive`).
 
@@ -93,7 +126,8 @@ class PassiveTerminal:
     ----------
     state : TerminalState
     reference : the track of the active terminal, None before acquisition
-    slips_repaired : times that the range of the reference was moved by whole cells while data flowed
+    slips_repaired : times that the range of the reference was moved by whole cells while data
+        flowed
     """
 
     def __init__(
@@ -107,7 +141,12 @@ class PassiveTerminal:
         groups: Sequence[int] | None = None,
     ) -> None:
         self._groups = groups
-        self._waveform, self._antennas, self._receivers, self._order = waveform, antennas, receivers, dpsk_order
+        self._waveform, self._antennas, self._receivers, self._order = (
+            waveform,
+            antennas,
+            receivers,
+            dpsk_order,
+        )
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
@@ -125,16 +164,24 @@ class PassiveTerminal:
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `modulated` is public."""
         if self.reference is not None:
-            self.reference.state = predict(self.reference.state, time - self._time, self._acceleration)
+            self.reference.state = predict(
+                self.reference.state, time - self._time, self._acceleration
+            )
             self.reference.age += 1
         self._time = time
         self.tracker.predict(time)
-        reception = self.receive(cube, self._expect(own_pose) if modulated else None, modulated, maps)
+        reception = self.receive(
+            cube, self._expect(own_pose) if modulated else None, modulated, maps
+        )
         if reception.decoded:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
             reception = _without_reference(reception)
-        if self._receivers.symbol_decision == "profile" and not modulated and reception.line_of_sight:
+        if (
+            self._receivers.symbol_decision == "profile"
+            and not modulated
+            and reception.line_of_sight
+        ):
             found = learn_profile(cube, reference_of(reception.detections))
             self._profile = found if found.any() else None
         self._follow(reception, own_pose, modulated)
@@ -143,26 +190,39 @@ class PassiveTerminal:
         return reception, self.tracker.snapshot(own_pose, self.reference)
 
     def shorten(self, cells: int, own_pose: Pose) -> None:
-        """Take whole cells off the reference's range, as the active terminal's answer to feedback says."""
+        """Take whole cells off the reference's range, as the active terminal's answer to feedback
+        says."""
         if self.reference is not None:
             self.reference.state = _moved(self.reference.state, own_pose, -cells * self._cells[0])
             self._ends.clear()
 
-    def receive(self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool) -> Reception:
+    def receive(
+        self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
+    ) -> Reception:
         """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
         return receive_passive(
-            cube, self._antennas, self._receivers, self._order, prediction, modulated, groups=self._groups, profile=self._profile, maps=maps
+            cube,
+            self._antennas,
+            self._receivers,
+            self._order,
+            prediction,
+            modulated,
+            groups=self._groups,
+            profile=self._profile,
+            maps=maps,
         )
 
     def _expect(self, own: Pose) -> Prediction | None:
-        """Prediction for a data frame; None when the range is no longer known well enough to read a fraction of a cell."""
+        """Prediction for a data frame; None when the range is no longer known well enough to read a
+        fraction of a cell."""
         if self.reference is None:
             return None
         prediction = self.tracker.to_prediction(own, self.reference)
         return prediction if prediction.range_std[0] < COAST_CELLS * self._cells[0] else None
 
     def _plausible(self, reception: Reception) -> bool:
-        """Whether the reference is as strong as a line of sight of its length: transmit power and antennas are public."""
+        """Whether the reference is as strong as a line of sight of its length: transmit power and
+        antennas are public."""
         d = reception.detections
         scaled = reception.reference_power * d.range[d.is_reference][0] ** 2
         return bool(scaled >= self._level / LEVEL_DROP)
@@ -179,13 +239,17 @@ class PassiveTerminal:
         z = np.array([d.range[q], d.velocity[q], *d.direction[q]])
         std = np.maximum(d.std[q], REFERENCE_STD_CELLS * np.array([*self._cells, 0.0, 0.0]))
         off = self._disbelief(z, own)
-        if self.reference is None or (not modulated and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)):
+        if self.reference is None or (
+            not modulated and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)
+        ):
             self._restart(z, std, float(d.snr[q]), own)
         elif off > 0:
             self.reference.missed += 1
         else:
             R = measurement_covariance(std, self.reference.state.mean)
-            self.reference.state = update(self.reference.state, z, R, own, velocity_period=self._period)
+            self.reference.state = update(
+                self.reference.state, z, R, own, velocity_period=self._period
+            )
             self.reference.snr, self.reference.missed = float(d.snr[q]), 0
         if self.reference is not None:
             self.state = TerminalState.TRACKING
@@ -199,7 +263,8 @@ class PassiveTerminal:
             self._ends.clear()
 
     def _disbelief(self, z: np.ndarray, own: Pose) -> float:
-        """0 where a reference lies where the track has it; else how many cells of range it is off."""
+        """0 where a reference lies where the track has it; else how many cells of range it is
+        off."""
         if self.reference is None:
             return 0.0
         mean, S = expected(*self.reference.state, own)
@@ -209,12 +274,14 @@ class PassiveTerminal:
         return float(residual[0] / self._cells[0]) if (residual > allowed).any() else 0.0
 
     def _repair_slip(self, cube: IFCube, reception: Reception, own: Pose, maps: bool) -> Reception:
-        """Move the reference by whole cells when symbols outside the alphabet show a slip, and read the frame again.
+        """Move the reference by whole cells when symbols outside the alphabet show a slip, and read
+        the frame again.
 
-        With the range k cells too long every symbol is read k too low: the symbols 0..k-1 fall below the alphabet, and none is read
-        in its last k places. A frame of M P chirps holds k M P / (N/2) of the former on average (0.7 k for the paper's
-        numbers); two are asked for, over at most `EVIDENCE_FRAMES` frames, and none of the latter, which a second
-        path in the cell would leave there.
+        With the range k cells too long every symbol is read k too low: the symbols 0..k-1 fall
+        below the alphabet, and none is read in its last k places. A frame of M P chirps holds k M P
+        / (N/2) of the former on average (0.7 k for the paper's numbers); two are asked for, over at
+        most `EVIDENCE_FRAMES` frames, and none of the latter, which a second path in the cell would
+        leave there.
         """
         self._ends.append(_end_symbols(reception, self._groups, self._waveform))
         cells = slip_cells(np.concatenate(self._ends), self._waveform.num_delay_symbols)
@@ -232,9 +299,13 @@ class PassiveTerminal:
         return again
 
 
-def _end_symbols(reception: Reception, groups: Sequence[int] | None, waveform: Waveform) -> np.ndarray:
+def _end_symbols(
+    reception: Reception, groups: Sequence[int] | None, waveform: Waveform
+) -> np.ndarray:
     """Confident raw symbols of a frame near and beyond either end of the alphabet."""
-    confidence = reception.delay_confidence if groups is None else reception.delay_confidence[list(groups)]
+    confidence = (
+        reception.delay_confidence if groups is None else reception.delay_confidence[list(groups)]
+    )
     raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
     looks = reception.confidence_looks
@@ -243,7 +314,8 @@ def _end_symbols(reception: Reception, groups: Sequence[int] | None, waveform: W
 
 
 def slip_cells(ends: np.ndarray, num_symbols: int) -> int:
-    """Whole cells by which the true range exceeds the predicted one, from confident raw symbols at the alphabet's ends.
+    """Whole cells by which the true range exceeds the predicted one, from confident raw symbols at
+    the alphabet's ends.
 
     0 without two symbols outside at one end, or with one where such a slip leaves none.
     """
@@ -265,7 +337,8 @@ def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
 
 
 def _without_reference(reception: Reception) -> Reception:
-    """The same frame with its reference taken for something else: nothing decoded, no line of sight."""
+    """The same frame with its reference taken for something else: nothing decoded, no line of
+    sight."""
     d = reception.detections
     return replace(
         reception,
@@ -306,8 +379,15 @@ def save_capture(
         "transmit_amplitude": transmit_amplitude,
         "active": payloads is not None,
     }
-    arrays: dict[str, Any] = {"samples": np.stack([c.samples for c in cubes]), "schedule": cubes[0].schedule}
-    arrays |= {"start": np.array([c.start_time for c in cubes]), "time": np.array(times), "modulated": np.array(modulated)}
+    arrays: dict[str, Any] = {
+        "samples": np.stack([c.samples for c in cubes]),
+        "schedule": cubes[0].schedule,
+    }
+    arrays |= {
+        "start": np.array([c.start_time for c in cubes]),
+        "time": np.array(times),
+        "modulated": np.array(modulated),
+    }
     for name in ("position", "velocity", "acceleration", "rotation"):
         arrays[f"own_{name}"] = np.stack([getattr(p, name) for p in own_poses])
     for i, p in enumerate(payloads or []):
@@ -316,18 +396,34 @@ def save_capture(
 
 
 def replay(path: Path | str) -> dict[str, Any]:
-    """Run a terminal on a capture alone: detections, symbols, bits and tracks of every frame, as flat named arrays."""
+    """Run a terminal on a capture alone: detections, symbols, bits and tracks of every frame, as
+    flat named arrays."""
     with np.load(path) as file:
         data = {name: file[name] for name in file.files}
     public = json.loads(str(data["public"]))
     w, antennas = Waveform(**public["waveform"]), Antennas(**public["antennas"])
-    receivers, tracking = Receivers.model_validate(public["receivers"]), Tracking.model_validate(public["tracking"])
+    receivers, tracking = (
+        Receivers.model_validate(public["receivers"]),
+        Tracking.model_validate(public["tracking"]),
+    )
     active = ActiveTerminal(w, antennas, receivers, tracking)
-    passive = PassiveTerminal(w, antennas, receivers, tracking, public["dpsk_order"], public["transmit_amplitude"])
+    passive = PassiveTerminal(
+        w, antennas, receivers, tracking, public["dpsk_order"], public["transmit_amplitude"]
+    )
     out: dict[str, np.ndarray] = {}
     for i, time in enumerate(data["time"].tolist()):
-        cube = IFCube(samples=data["samples"][i], waveform=w, schedule=data["schedule"], start_time=float(data["start"][i]))
-        own = Pose(*(data[f"own_{name}"][i] for name in ("position", "velocity", "acceleration", "rotation")))
+        cube = IFCube(
+            samples=data["samples"][i],
+            waveform=w,
+            schedule=data["schedule"],
+            start_time=float(data["start"][i]),
+        )
+        own = Pose(
+            *(
+                data[f"own_{name}"][i]
+                for name in ("position", "velocity", "acceleration", "rotation")
+            )
+        )
         if public["active"]:
             names = ("bits", "delay_symbols", "transitions", "phases")
             payload = Payload(*(data[f"payload{i}_{name}"] for name in names))
@@ -343,7 +439,9 @@ def flat(frame: int, reception: Reception, tracks: TrackSet) -> dict[str, np.nda
     d, names = reception.detections, ("delay_symbols", "transitions", "bits", "delay_confidence")
     out = {f"{frame}/{name}": np.asarray(getattr(reception, name)) for name in names}
     out |= {f"{frame}/det_{name}": np.asarray(value) for name, value in vars(d).items()}
-    return out | {f"{frame}/track_{name}": np.asarray(value) for name, value in vars(tracks).items()}
+    return out | {
+        f"{frame}/track_{name}": np.asarray(value) for name, value in vars(tracks).items()
+    }
 
 
 def main() -> None:

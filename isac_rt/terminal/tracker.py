@@ -1,7 +1,8 @@
 """Extended Kalman filter, association and the life of tracks.
 
-A track is the world position and velocity of one body. The terminal that keeps it knows its own pose, so what is
-reported is relative to it. Names outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
+A track is the world position and velocity of one body. The terminal that keeps it knows its own
+pose, so what is reported is relative to it. Names outside, symbols inside: x, P mean and
+covariance; F, Q, H, R the model.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from isac_rt.world.swarm import Pose
 
 
 def assign(cost: np.ndarray) -> list[tuple[int, int]]:
-    """Global nearest neighbour: as many pairs (row, column) as the finite costs allow, of the least total."""
+    """Global nearest neighbour: as many pairs (row, column) as the finite costs allow, of the least
+    total."""
     if not np.isfinite(cost).any():
         return []
     finite = np.isfinite(cost)
@@ -53,7 +55,8 @@ class Track:
     state : Gaussian, world
     snr : of the last detection (linear)
     age : frames since the first detection
-    recent : whether each of the latest frames held a detection, newest last, the first detection included
+    recent : whether each of the latest frames held a detection, newest last, the first detection
+        included
     missed : frames since the last detection
     confirmed : M hits in N frames were reached
     """
@@ -69,14 +72,16 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSet:
-    """What a terminal knows after a frame, relative to its own known pose, at the middle of the frame.
+    """What a terminal knows after a frame, relative to its own known pose, at the middle of the
+    frame.
 
     Attributes
     ----------
     ids : (K,) int
     mean : (K, 6) position and velocity relative to the terminal, world axes [m, m/s]
     covariance : (K, 6, 6)
-    range, velocity : (K,) as in `Detections` (path length and its rate for a PT's reflectors) [m, m/s]
+    range, velocity : (K,) as in `Detections` (path length and its rate for a PT's reflectors) [m,
+        m/s]
     direction : (K, 2) u_x, u_z
     std : (K, 4) standard deviations of range, velocity, u_x, u_z
     age : (K,) int, frames since the first detection
@@ -99,7 +104,8 @@ class TrackSet:
 
 
 def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None) -> TrackSet:
-    """Report tracks relative to `own`; a PT's `reference` comes first and makes the others bistatic."""
+    """Report tracks relative to `own`; a PT's `reference` comes first and makes the others
+    bistatic."""
     everyone = ([] if reference is None else [reference]) + list(tracks)
     count = len(everyone)
     mean = np.array([t.state.mean for t in everyone]).reshape(count, 6)
@@ -131,7 +137,8 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
 
 
 class Tracker:
-    """All tracks of one terminal but a PT's reference: prediction, association, birth, confirmation and death.
+    """All tracks of one terminal but a PT's reference: prediction, association, birth, confirmation
+    and death.
 
     Parameters
     ----------
@@ -158,13 +165,19 @@ class Tracker:
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""
         for track in self.tracks:
-            track.state = predict(track.state, time - self.time, self.settings.acceleration_std_mps2)
+            track.state = predict(
+                track.state, time - self.time, self.settings.acceleration_std_mps2
+            )
         self.time = time
 
-    def update(self, detections: Detections, own: Pose, transmitter: Gaussian | None = None) -> None:
-        """Associate one frame's detections (confirmed tracks choose first), update, start and drop tracks.
+    def update(
+        self, detections: Detections, own: Pose, transmitter: Gaussian | None = None
+    ) -> None:
+        """Associate one frame's detections (confirmed tracks choose first), update, start and drop
+        tracks.
 
-        Detections that are a PT's reference are passed over. With a transmitter all are taken as bistatic.
+        Detections that are a PT's reference are passed over. With a transmitter all are taken as
+        bistatic.
         """
         z = np.column_stack([detections.range, detections.velocity, detections.direction])
         free = [int(q) for q in np.flatnonzero(~detections.is_reference)]
@@ -182,7 +195,9 @@ class Tracker:
             if q is not None:
                 R = measurement_covariance(detections.std[q], track.state.mean, transmitter)
                 t = None if transmitter is None else transmitter.mean
-                track.state = update(track.state, z[q], R, own, t, velocity_period=self.velocity_period)
+                track.state = update(
+                    track.state, z[q], R, own, t, velocity_period=self.velocity_period
+                )
                 track.snr = float(detections.snr[q])
         self.tracks = [t for t in self.tracks if not self._dead(t)]
         for q in free:
@@ -197,8 +212,8 @@ class Tracker:
         return track_set(self.tracks, own, reference)
 
     def to_prediction(self, own: Pose, reference: Track) -> Prediction:
-        """What a PT expects of this frame: row 0 its line of sight, then the confirmed reflectors seen in the last
-        frame, weighted by their last SNR over the strongest's."""
+        """What a PT expects of this frame: row 0 its line of sight, then the confirmed reflectors
+        seen in the last frame, weighted by their last SNR over the strongest's."""
         seen = [t for t in self.tracks if t.confirmed and t.missed == 0]
         report = track_set(seen, own, reference)
         snr = np.array([reference.snr] + [t.snr for t in seen])
@@ -211,8 +226,11 @@ class Tracker:
             weight=snr / snr.max(),
         )
 
-    def _costs(self, z: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None) -> np.ndarray:
-        """(tracks, detections) d^2 + ln det S, minus twice the log likelihood but for a constant; inf outside the gate."""
+    def _costs(
+        self, z: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None
+    ) -> np.ndarray:
+        """(tracks, detections) d^2 + ln det S, minus twice the log likelihood but for a constant;
+        inf outside the gate."""
         if not self.tracks or not len(z):
             return np.full((len(self.tracks), len(z)), np.inf)
         mean = np.stack([t.state.mean for t in self.tracks])
@@ -232,11 +250,9 @@ class Tracker:
         track.confirmed = track.confirmed or sum(track.recent) >= s.confirm_hits
 
     def _dead(self, track: Track) -> bool:
-        """A confirmed track dies of `drop_misses` misses in a row; a tentative one as soon as it can no longer be
-        confirmed within its first `confirm_window` frames."""
+        """A confirmed track dies of `drop_misses` misses in a row; a tentative one as soon as it
+        can no longer be confirmed within its first `confirm_window` frames."""
         s = self.settings
         if track.confirmed:
             return track.missed >= s.drop_misses
         return sum(track.recent) + s.confirm_window - len(track.recent) < s.confirm_hits
-
-

@@ -22,13 +22,21 @@ _LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
 
 
 def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
-    """(K, 3) where a terminal's confirmed tracks lie in the world [m], as it sees them: its own pose, a range and a direction.
+    """(K, 3) where a terminal's confirmed tracks lie in the world [m], as it sees them: its own
+    pose, a range and a direction.
 
     Of a passive terminal the line of sight alone: the other ranges are path lengths.
     """
     name = str(dataset.receiver.values[observer])
-    own, monostatic = list(dataset.uav.values).index(name), str(dataset.transmitter.values[observer]) == name
-    mine = (dataset.track_frame.values == frame) & (dataset.track_observer.values == observer) & dataset.track_confirmed.values
+    own, monostatic = (
+        list(dataset.uav.values).index(name),
+        str(dataset.transmitter.values[observer]) == name,
+    )
+    mine = (
+        (dataset.track_frame.values == frame)
+        & (dataset.track_observer.values == observer)
+        & dataset.track_confirmed.values
+    )
     if not monostatic:
         sender = list(dataset.uav.values).index(str(dataset.transmitter.values[observer]))
         mine &= dataset.track_uav.values == sender
@@ -36,20 +44,30 @@ def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndar
     forward = np.sqrt(np.maximum(1 - (u**2).sum(axis=1), 0.0))
     body = np.column_stack([u[:, 0], forward, u[:, 1]])
     rotation = dataset.uav_attitude.values[frame, own]
-    return dataset.uav_position.values[frame, own] + dataset.track_range.values[mine, None] * (body @ rotation.T)
+    return dataset.uav_position.values[frame, own] + dataset.track_range.values[mine, None] * (
+        body @ rotation.T
+    )
 
 
-def animate(results: Results, observer: int = 0, city: City | None = None) -> tuple[Figure, FuncAnimation]:
-    """A picture per frame whose maps were kept (`run(snapshots=)`): left the swarm so far with the terminal's tracks, right its map.
+def animate(
+    results: Results, observer: int = 0, city: City | None = None
+) -> tuple[Figure, FuncAnimation]:
+    """A picture per frame whose maps were kept (`run(snapshots=)`): left the swarm so far with the
+    terminal's tracks, right its map.
 
     Raises
     ------
     ResultsError  If fewer than two frames have maps of this observer.
     """
     d = results.dataset
-    shown = [k for k in range(d.sizes["snapshot"]) if np.isfinite(d.map_power.values[k, observer]).any()]
+    shown = [
+        k for k in range(d.sizes["snapshot"]) if np.isfinite(d.map_power.values[k, observer]).any()
+    ]
     if len(shown) < 2:
-        raise ResultsError(f"{len(shown)} frame(s) have maps of {d.observer.values[observer]}; run again with --snapshots 20 or more")
+        raise ResultsError(
+            f"{len(shown)} frame(s) have maps of {d.observer.values[observer]}; run again with "
+            "--snapshots 20 or more"
+        )
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11, 4.8), dpi=100)
         left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
@@ -79,8 +97,18 @@ class _Moving:
         self._d, self._ax, self._observer = dataset, ax, observer
         count = dataset.sizes["uav"]
         self._paths = [ax.plot([], [], color=uav_colour(dataset, u))[0] for u in range(count)]
-        self._here = [ax.plot([], [], "o", color=uav_colour(dataset, u), mec="white")[0] for u in range(count)]
-        (self._tracks,) = ax.plot([], [], "x", color="black", ms=9, mew=1.6, label=f"tracks of {dataset.observer.values[observer]}")
+        self._here = [
+            ax.plot([], [], "o", color=uav_colour(dataset, u), mec="white")[0] for u in range(count)
+        ]
+        (self._tracks,) = ax.plot(
+            [],
+            [],
+            "x",
+            color="black",
+            ms=9,
+            mew=1.6,
+            label=f"tracks of {dataset.observer.values[observer]}",
+        )
         ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
 
     def show(self, frame: int) -> None:
@@ -93,8 +121,15 @@ class _Moving:
         self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
 
 
-def write_animation(results: Results, file: str | Path, observer: int = 0, city: City | None = None, rate: float = 5.0) -> None:
-    """Write the moving picture as GIF or, where there is ffmpeg, MP4; it appears whole or not at all.
+def write_animation(
+    results: Results,
+    file: str | Path,
+    observer: int = 0,
+    city: City | None = None,
+    rate: float = 5.0,
+) -> None:
+    """Write the moving picture as GIF or, where there is ffmpeg, MP4; it appears whole or not at
+    all.
 
     Parameters
     ----------
@@ -102,14 +137,18 @@ def write_animation(results: Results, file: str | Path, observer: int = 0, city:
 
     Raises
     ------
-    ResultsError  If the suffix is another, ffmpeg is missing, too few frames have maps, or the file cannot be written.
+    ResultsError  If the suffix is another, ffmpeg is missing, too few frames have maps, or the file
+    cannot be written.
     """
     file = Path(file)
     writer = WRITERS.get(file.suffix)
     if writer is None:
         raise ResultsError(f"{file}: a moving picture ends in {' or '.join(WRITERS)}; name it so")
     if not writers.is_available(writer):
-        raise ResultsError(f"{file}: {file.suffix} needs {writer}, which is not on this machine; install it or write a .gif")
+        raise ResultsError(
+            f"{file}: {file.suffix} needs {writer}, which is not on this machine; install it or "
+            "write a .gif"
+        )
     _, moving = animate(results, observer, city)
     write_bytes(file, lambda temporary: _save(moving, temporary, file.suffix, writer, rate))
 

@@ -1,4 +1,5 @@
-"""Figures of a run: functions that take Axes and return them, and `make_figures`, which writes them all."""
+"""Figures of a run: functions that take Axes and return them, and `make_figures`, which writes them
+all."""
 
 from __future__ import annotations
 
@@ -22,23 +23,59 @@ from isac_rt.results.records import KINDS
 from isac_rt.world.city.mesh import City
 
 KIND_COLOURS = {
-    "line_of_sight": "#000000", "target": "#D55E00", "ghost": "#CC79A7", "specular": "#0072B2", "diffuse": "#56B4E9",
+    "line_of_sight": "#000000",
+    "target": "#D55E00",
+    "ghost": "#CC79A7",
+    "specular": "#0072B2",
+    "diffuse": "#56B4E9",
     "leakage": "#E69F00",
-}  # fmt: skip
+}
 """One colour per path kind in every figure (Okabe and Ito, Color Universal Design, 2008)."""
-KIND_MARKERS = {"line_of_sight": "s", "target": "o", "ghost": "D", "specular": "^", "diffuse": ".", "leakage": "P"}
+KIND_MARKERS = {
+    "line_of_sight": "s",
+    "target": "o",
+    "ghost": "D",
+    "specular": "^",
+    "diffuse": ".",
+    "leakage": "P",
+}
 UNEXPLAINED = "#8C8C8C"
-UAV_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+UAV_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#8C6D31",
+)
 ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
 STYLE: dict[Any, Any] = {
-    "figure.dpi": 110, "figure.constrained_layout.use": True, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False,
-    "axes.grid": True, "grid.color": "#E4E4E4", "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.titlesize": 10,
-    "axes.titlelocation": "left", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.4,
-}  # fmt: skip
+    "figure.dpi": 110,
+    "figure.constrained_layout.use": True,
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.4,
+}
 _SHOWN_DB = 60.0
 _TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 """Depth of a map's colour scale [dB]."""
-_UNITS = {"range": (1.0, "m"), "velocity": (1.0, "m/s"), "azimuth": (180 / np.pi, "deg"), "elevation": (180 / np.pi, "deg")}
+_UNITS = {
+    "range": (1.0, "m"),
+    "velocity": (1.0, "m/s"),
+    "azimuth": (180 / np.pi, "deg"),
+    "elevation": (180 / np.pi, "deg"),
+}
 
 
 def words(kind: str) -> str:
@@ -52,7 +89,8 @@ def uav_colour(dataset: xr.Dataset, index: int) -> str:
 
 
 def scene_map(ax: Axes, dataset: xr.Dataset, city: City | None = None) -> Axes:
-    """The swarm from above: tracks, final positions by role, over the city's upward faces shaded by height."""
+    """The swarm from above: tracks, final positions by role, over the city's upward faces shaded by
+    height."""
     position = dataset.uav_position.values
     low, high = position[..., :2].min((0, 1)), position[..., :2].max((0, 1))
     margin = 0.35 * max(*(high - low), 40.0)
@@ -62,14 +100,39 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: City | None = None) -> Axes:
         x, y = position[:, u, 0], position[:, u, 1]
         role, colour = str(dataset.role.values[u]), uav_colour(dataset, u)
         ax.plot(x, y, color=colour)
-        ax.plot(x[-1], y[-1], ROLE_MARKERS[role], color=colour, ms=11 if role == "active" else 6, mec="white", mew=0.8)
-        ax.annotate(f"{name}", (x[-1], y[-1]), xytext=(6, 5), textcoords="offset points", fontsize=9, fontweight="bold", color=colour,
-                    bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7})  # fmt: skip
+        ax.plot(
+            x[-1],
+            y[-1],
+            ROLE_MARKERS[role],
+            color=colour,
+            ms=11 if role == "active" else 6,
+            mec="white",
+            mew=0.8,
+        )
+        ax.annotate(
+            f"{name}",
+            (x[-1], y[-1]),
+            xytext=(6, 5),
+            textcoords="offset points",
+            fontsize=9,
+            fontweight="bold",
+            color=colour,
+            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
+        )
         facing = dataset.uav_attitude.values[-1, u, :2, 1]
         if role != "target":
-            ax.annotate("", (x[-1] + 0.25 * margin * facing[0], y[-1] + 0.25 * margin * facing[1]), (x[-1], y[-1]),
-                        arrowprops={"arrowstyle": "->", "color": colour, "lw": 1})  # fmt: skip
-    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), xlabel="east [m]", ylabel="north [m]")
+            ax.annotate(
+                "",
+                (x[-1] + 0.25 * margin * facing[0], y[-1] + 0.25 * margin * facing[1]),
+                (x[-1], y[-1]),
+                arrowprops={"arrowstyle": "->", "color": colour, "lw": 1},
+            )
+    ax.set(
+        xlim=(low[0] - margin, high[0] + margin),
+        ylim=(low[1] - margin, high[1] + margin),
+        xlabel="east [m]",
+        ylabel="north [m]",
+    )
     ax.set_aspect("equal")
     ax.grid(False)
     ax.set_title("Swarm (star: active, square: passive, circle: target; arrows: boresight)")
@@ -85,48 +148,96 @@ def _footprints(ax: Axes, city: City) -> None:
     top = max(float(np.quantile(height, 0.98) - height.min()), 1.0)
     shade = 0.96 - 0.42 * np.clip((height - height.min()) / top, 0, 1)
     colours = np.repeat(shade[:, None], 3, axis=1)
-    patches = PolyCollection(list(triangles[order][:, :, :2]), facecolors=colours[order], edgecolors="face", linewidths=0.6, zorder=0)
+    patches = PolyCollection(
+        list(triangles[order][:, :, :2]),
+        facecolors=colours[order],
+        edgecolors="face",
+        linewidths=0.6,
+        zorder=0,
+    )
     patches.set_rasterized(True)
     ax.add_collection(patches)
 
 
 def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
-    """Range-Doppler map of one terminal; detections marked by the kind of path that explains them, truth as circles."""
+    """Range-Doppler map of one terminal; detections marked by the kind of path that explains them,
+    truth as circles."""
     power = dataset.map_power.values[snapshot, observer]
     r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
     rows, columns = np.isfinite(r), np.isfinite(v)
     level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], _TINY))
-    level = level - np.median(level)  # most cells hold noise alone; the peak may be the transmitter's own leakage
-    _map(ax, v[columns], r[rows], level, (-5.0, np.clip(level.max(), 5.0, _SHOWN_DB)), "power above the median cell [dB]")
+    level = level - np.median(
+        level
+    )  # most cells hold noise alone; the peak may be the transmitter's own leakage
+    _map(
+        ax,
+        v[columns],
+        r[rows],
+        level,
+        (-5.0, np.clip(level.max(), 5.0, _SHOWN_DB)),
+        "power above the median cell [dB]",
+    )
     if not power.any():
-        ax.text(0.5, 0.5, "no map: the data's delays were not known", color="white", ha="center", transform=ax.transAxes)
+        ax.text(
+            0.5,
+            0.5,
+            "no map: the data's delays were not known",
+            color="white",
+            ha="center",
+            transform=ax.transAxes,
+        )
     frame = int(dataset.snapshot_frame.values[snapshot])
     mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
     kind = dataset.det_kind.values
     for k, name in [*enumerate(KINDS), (-1, "unexplained")]:
         at = mine & (kind == k)
         if at.any():
-            ax.plot(dataset.det_velocity.values[at], dataset.det_range.values[at], KIND_MARKERS.get(name, "x"), ms=6, mew=1.1, ls="none",
-                    mfc="none" if k >= 0 else None, color="white" if name == "line_of_sight" else KIND_COLOURS.get(name, UNEXPLAINED),
-                    label=f"{words(name)} ({at.sum()})")  # fmt: skip
+            ax.plot(
+                dataset.det_velocity.values[at],
+                dataset.det_range.values[at],
+                KIND_MARKERS.get(name, "x"),
+                ms=6,
+                mew=1.1,
+                ls="none",
+                mfc="none" if k >= 0 else None,
+                color="white" if name == "line_of_sight" else KIND_COLOURS.get(name, UNEXPLAINED),
+                label=f"{words(name)} ({at.sum()})",
+            )
     x, y = _expected(dataset, frame, observer)
-    ax.plot(x, y, "o", ms=13, mfc="none", mec="white", mew=1.2, ls="none", label="UAV in view (truth)")
+    ax.plot(
+        x, y, "o", ms=13, mfc="none", mec="white", mew=1.2, ls="none", label="UAV in view (truth)"
+    )
     far = np.concatenate([dataset.det_range.values[mine], y[np.isfinite(y)], [20.0]])
     ax.set(xlim=(v[columns].min(), v[columns].max()), ylim=(0, min(1.4 * far.max(), r[rows].max())))
-    ax.set(xlabel="radial velocity [m/s] (receding is positive)", ylabel=_range_label(dataset, observer))
+    ax.set(
+        xlabel="radial velocity [m/s] (receding is positive)",
+        ylabel=_range_label(dataset, observer),
+    )
     ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}")
     if ax.get_legend_handles_labels()[0]:
-        legend = ax.legend(loc="upper right", frameon=True, facecolor="#303030", edgecolor="none", labelcolor="white", fontsize=7)
+        legend = ax.legend(
+            loc="upper right",
+            frameon=True,
+            facecolor="#303030",
+            edgecolor="none",
+            labelcolor="white",
+            fontsize=7,
+        )
         legend.set_zorder(9)
     return ax
 
 
 def _range_label(dataset: xr.Dataset, observer: int) -> str:
-    return "range [m]" if dataset.transmitter.values[observer] == dataset.receiver.values[observer] else "path length [m]"
+    return (
+        "range [m]"
+        if dataset.transmitter.values[observer] == dataset.receiver.values[observer]
+        else "path length [m]"
+    )
 
 
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded into the map's span."""
+    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded
+    into the map's span."""
     here = {"frame": frame, "observer": observer}
     seen = dataset.in_view[here].values & ~dataset.shadowed[here].values
     r, v = dataset.truth_range[here].values[seen], dataset.truth_velocity[here].values[seen]
@@ -136,9 +247,24 @@ def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarra
     return v - span * np.floor((v - axis[0]) / span + 0.5 / len(axis)), r
 
 
-def _map(ax: Axes, x: np.ndarray, y: np.ndarray, level_db: np.ndarray, shown: tuple[float, float], label: str) -> None:
-    image = ax.imshow(level_db, origin="lower", aspect="auto", cmap="magma", vmin=shown[0], vmax=shown[1], interpolation="nearest",
-                      extent=_extent(x, y))  # fmt: skip
+def _map(
+    ax: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    level_db: np.ndarray,
+    shown: tuple[float, float],
+    label: str,
+) -> None:
+    image = ax.imshow(
+        level_db,
+        origin="lower",
+        aspect="auto",
+        cmap="magma",
+        vmin=shown[0],
+        vmax=shown[1],
+        interpolation="nearest",
+        extent=_extent(x, y),
+    )
     ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.05)
     ax.grid(False)
 
@@ -149,22 +275,34 @@ def _extent(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
-    """Range cell over chirp of the first group before the data are removed: what the delay symbols do to every echo."""
+    """Range cell over chirp of the first group before the data are removed: what the delay symbols
+    do to every echo."""
     magnitude = dataset.map_equivalent_range.values[snapshot, observer]
     magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
     level = 20 * np.log10(np.maximum(magnitude, _TINY))
     level = level - level.max()
-    _map(ax, np.arange(level.shape[1]), np.arange(level.shape[0]), level, (-_SHOWN_DB, 0.0), "magnitude [dB below the peak]")
+    _map(
+        ax,
+        np.arange(level.shape[1]),
+        np.arange(level.shape[0]),
+        level,
+        (-_SHOWN_DB, 0.0),
+        "magnitude [dB below the peak]",
+    )
     cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])
     ax.plot(chirps, cells, "o", ms=2.5, mfc="none", mec="white", mew=0.4)
     frame = int(dataset.snapshot_frame.values[snapshot])
     ax.set(xlabel="chirp", ylabel="range cell (circles: one-dimensional CFAR)")
-    ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, equivalent range before data removal")
+    ax.set_title(
+        f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, "
+        "equivalent range before data removal"
+    )
     return ax
 
 
 def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
-    """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed intervals shaded in its colour."""
+    """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed
+    intervals shaded in its colour."""
     scale, unit = _UNITS[name]
     here = _processed(dataset, observer)
     t = here.time.values
@@ -172,8 +310,16 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         if uav == dataset.receiver.values[observer] or not here.in_view.values[:, u].any():
             continue
         colour, seen = uav_colour(dataset, u), here.in_view.values[:, u]
-        ax.plot(t, np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan), color=colour, lw=0.9, label=str(uav))
-        ax.plot(t, here[f"detected_{name}"].values[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
+        ax.plot(
+            t,
+            np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan),
+            color=colour,
+            lw=0.9,
+            label=str(uav),
+        )
+        ax.plot(
+            t, here[f"detected_{name}"].values[:, u] * scale, ".", color=colour, ms=4, alpha=0.7
+        )
         ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
     ax.set(xlabel="time [s]", ylabel=f"{name} [{unit}]")
@@ -204,16 +350,27 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
             e = np.abs(errors_of(dataset, group, name)[:, o]).ravel() * scale
             e = np.sort(e[np.isfinite(e) & (dataset["truth_range"].values[:, o].ravel() > 0)])
             if e.size:
-                ax.plot(np.maximum(e, 1e-9), np.arange(1, e.size + 1) / e.size, dash, color=UAV_COLOURS[o % len(UAV_COLOURS)],
-                        label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})")  # fmt: skip
-    ax.set(xscale="log", ylim=(0, 1.02), xlabel=f"|{name} error| [{unit}]", ylabel="share of errors below")
+                ax.plot(
+                    np.maximum(e, 1e-9),
+                    np.arange(1, e.size + 1) / e.size,
+                    dash,
+                    color=UAV_COLOURS[o % len(UAV_COLOURS)],
+                    label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})",
+                )
+    ax.set(
+        xscale="log",
+        ylim=(0, 1.02),
+        xlabel=f"|{name} error| [{unit}]",
+        ylabel="share of errors below",
+    )
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best")
     return ax
 
 
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
-    """Power of every path in the ledger of the snapshot frames against its path length ("delay") or rate ("doppler")."""
+    """Power of every path in the ledger of the snapshot frames against its path length ("delay") or
+    rate ("doppler")."""
     mine = dataset.path_observer.values == observer
     x = (
         dataset.path_delay.values * SPEED_OF_LIGHT
@@ -224,9 +381,23 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
         at = mine & (dataset.path_kind.values == k)
         if at.any():
             name, many = KINDS[k], KINDS[k] == "diffuse"
-            ax.plot(x[at], dataset.path_power_db.values[at], KIND_MARKERS[name], ms=2.5 if many else 5, ls="none",
-                    color=KIND_COLOURS[name], alpha=0.5 if many else 0.9, mew=0, label=f"{words(name)} ({at.sum()})")  # fmt: skip
-    ax.set(xlabel="path length [m]" if against == "delay" else "Doppler shift [kHz] (closing is positive)", ylabel="path gain [dB]")
+            ax.plot(
+                x[at],
+                dataset.path_power_db.values[at],
+                KIND_MARKERS[name],
+                ms=2.5 if many else 5,
+                ls="none",
+                color=KIND_COLOURS[name],
+                alpha=0.5 if many else 0.9,
+                mew=0,
+                label=f"{words(name)} ({at.sum()})",
+            )
+    ax.set(
+        xlabel="path length [m]"
+        if against == "delay"
+        else "Doppler shift [kHz] (closing is positive)",
+        ylabel="path gain [dB]",
+    )
     ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
     if ax.get_legend_handles_labels()[0]:
         for handle in ax.legend(loc="best", ncols=2).legend_handles:
@@ -236,19 +407,43 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
 
 
 def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
-    """Symbol error rates of every data frame; frames without a decision and shadowed ones stand out."""
+    """Symbol error rates of every data frame; frames without a decision and shadowed ones stand
+    out."""
     d = dataset.isel(observer=observer)
     t, total = dataset.time.values, d.symbol_total.values
     for s, colour, mark in ((0, "#0072B2", "o"), (1, "#D55E00", "s")):
-        rate = np.divide(d.symbol_errors.values[:, s], total[:, s], out=np.full(len(t), np.nan), where=total[:, s] > 0)
-        ax.plot(t, rate, f"{mark}-", ms=3, lw=0.8, color=colour, label=f"{'delay' if s == 0 else 'DPSK'} symbols")
+        rate = np.divide(
+            d.symbol_errors.values[:, s],
+            total[:, s],
+            out=np.full(len(t), np.nan),
+            where=total[:, s] > 0,
+        )
+        ax.plot(
+            t,
+            rate,
+            f"{mark}-",
+            ms=3,
+            lw=0.8,
+            color=colour,
+            label=f"{'delay' if s == 0 else 'DPSK'} symbols",
+        )
     data = total[:, 0] > 0
     lost = data & ~d.decoded.values
-    ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=f"not decided ({lost.sum()} of {data.sum()} data frames)")
+    ax.plot(
+        t[lost],
+        np.full(lost.sum(), 1.06),
+        "x",
+        color="#303030",
+        ms=4,
+        label=f"not decided ({lost.sum()} of {data.sum()} data frames)",
+    )
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
     _shade(ax, t, d.shadowed.values[:, sender], "#303030")
     ax.set(ylim=(-0.04, 1.14), xlabel="time [s]", ylabel="symbol error rate")
-    ax.set_title(f"{dataset.observer.values[observer]} (shaded: the city hides {dataset.transmitter.values[observer]})")
+    ax.set_title(
+        f"{dataset.observer.values[observer]} (shaded: the city hides "
+        f"{dataset.transmitter.values[observer]})"
+    )
     ax.legend(loc="center right")
     return ax
 
@@ -260,7 +455,13 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
         with np.errstate(divide="ignore", invalid="ignore"):
             snr = 10 * np.log10(here.reference_snr.values)
         ax.plot(
-            here.time.values, np.where(np.isfinite(snr), snr, np.nan), ".-", ms=3, lw=1, color=UAV_COLOURS[o % len(UAV_COLOURS)], label=name
+            here.time.values,
+            np.where(np.isfinite(snr), snr, np.nan),
+            ".-",
+            ms=3,
+            lw=1,
+            color=UAV_COLOURS[o % len(UAV_COLOURS)],
+            label=name,
         )
     ax.set(xlabel="time [s]", ylabel="SNR of the reference path [dB]")
     ax.legend(loc="best")
@@ -275,15 +476,28 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
         shown = count[:, k] > 0
         if shown.any():
             level = np.where(shown, 10 * np.log10(np.maximum(power[:, k], 1e-300)), np.nan)
-            ax.plot(here.time.values, level, ".-", ms=3, lw=1, color=KIND_COLOURS[name], label=f"{words(name)} ({count[:, k].sum()})")
+            ax.plot(
+                here.time.values,
+                level,
+                ".-",
+                ms=3,
+                lw=1,
+                color=KIND_COLOURS[name],
+                label=f"{words(name)} ({count[:, k].sum()})",
+            )
     ax.set(xlabel="time [s]", ylabel="path gain of the kind [dB]")
-    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]} (paths over all frames)")
+    ax.set_title(
+        f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]} (paths "
+        "over all frames)"
+    )
     if ax.get_legend_handles_labels()[0]:
         ax.legend(ncols=3)
     return ax
 
 
-def _figure(rows: int, columns: int, height: float, width: float = 8.4) -> tuple[Figure, np.ndarray]:
+def _figure(
+    rows: int, columns: int, height: float, width: float = 8.4
+) -> tuple[Figure, np.ndarray]:
     """A figure of its own, outside pyplot, so that none stays open."""
     figure = Figure(figsize=(width, height))
     return figure, figure.subplots(rows, columns, squeeze=False)
@@ -302,17 +516,25 @@ def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
         for ax, o in zip(axes[:, 0], with_map, strict=True):
             range_doppler(ax, d, s, o)
         yield f"range_doppler_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
-        before = [o for o in with_map if np.isfinite(d.map_equivalent_range.values[s, o]).any()]  # none where profiles were made directly
+        before = [
+            o for o in with_map if np.isfinite(d.map_equivalent_range.values[s, o]).any()
+        ]  # none where profiles were made directly
         if before:
             figure, axes = _figure(len(before), 1, 3.2 * len(before))
             for ax, o in zip(axes[:, 0], before, strict=True):
                 equivalent_range(ax, d, s, o)
-            yield f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
+            yield (
+                f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}",
+                figure,
+            )
     for o in observers:
         figure, axes = _figure(3, 1, 7.6)
         for ax, name in zip(axes[:, 0], ("range", "velocity", "azimuth"), strict=True):
             over_time(ax, d, o, name)
-        axes[0, 0].set_title(f"{d.observer.values[o]}: truth (line), detections (dots), tracks (broad); shaded where hidden")
+        axes[0, 0].set_title(
+            f"{d.observer.values[o]}: truth (line), detections (dots), tracks (broad); shaded "
+            "where hidden"
+        )
         yield f"tracks_{str(d.observer.values[o]).replace('->', '_to_')}", figure
     figure, axes = _figure(2, 2, 6.0)
     for ax, name in zip(axes.flat, MEASURES, strict=True):
@@ -338,7 +560,8 @@ def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
 
 
 def make_figures(results: Results, folder: str | Path, city: City | None = None) -> list[Path]:
-    """Write all figures of a run as ``figures/*.png`` under `folder`; the scene shows the `city` if it is given.
+    """Write all figures of a run as ``figures/*.png`` under `folder`; the scene shows the `city` if
+    it is given.
 
     Raises
     ------
@@ -353,17 +576,25 @@ def make_figures(results: Results, folder: str | Path, city: City | None = None)
     return written
 
 
-def sweep_curves(ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by: str | None = None) -> Axes:
-    """A quantity of a sweep against one of its axes, a curve for each link and each entry of the axis `by`.
+def sweep_curves(
+    ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by: str | None = None
+) -> Axes:
+    """A quantity of a sweep against one of its axes, a curve for each link and each entry of the
+    axis `by`.
 
-    A rate (a quantity with bounds beside it) is pooled over the repetitions and drawn with its bounds, logarithmically; anything else is
-    the mean over them. Of the axes that are neither of the two the first entry is taken.
+    A rate (a quantity with bounds beside it) is pooled over the repetitions and drawn with its
+    bounds, logarithmically; anything else is the mean over them. Of the axes that are neither of
+    the two the first entry is taken.
     """
     rate = f"{quantity}_low" in dataset
     values = dataset[f"{quantity}_pooled"] if rate else dataset[quantity].mean("repetition")
     rest = {d: 0 for d in values.dims if d not in (against, by, "link")}
     values = values.isel(rest)
-    x = np.arange(values.sizes[against]) if values[against].dtype == object else values[against].values
+    x = (
+        np.arange(values.sizes[against])
+        if values[against].dtype == object
+        else values[against].values
+    )
     curve = 0
     for link in values.link.values:
         for entry in values[by].values if by else [None]:
@@ -371,10 +602,16 @@ def sweep_curves(ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by:
             y = values.sel(where).values
             if not np.isfinite(y).any():
                 continue
-            colour, label = UAV_COLOURS[curve % len(UAV_COLOURS)], f"{link}" + (f", {by} {entry}" if by else "")
+            colour, label = (
+                UAV_COLOURS[curve % len(UAV_COLOURS)],
+                f"{link}" + (f", {by} {entry}" if by else ""),
+            )
             ax.plot(x, np.maximum(y, 1e-9) if rate else y, "o-", ms=3.5, color=colour, label=label)
             if rate:
-                low, high = (dataset[f"{quantity}_{end}"].isel(rest).sel(where).values for end in ("low", "high"))
+                low, high = (
+                    dataset[f"{quantity}_{end}"].isel(rest).sel(where).values
+                    for end in ("low", "high")
+                )
                 ax.fill_between(x, np.maximum(low, 1e-9), high, color=colour, alpha=0.15, lw=0)
             curve += 1
     if rate:
@@ -383,14 +620,18 @@ def sweep_curves(ax: Axes, dataset: xr.Dataset, quantity: str, against: str, by:
     if values[against].dtype == object:
         ax.set_xticks(x, [str(v) for v in values[against].values])
     kept = ", ".join(f"{d} {values[d].values}" for d in rest)
-    ax.set(xlabel=f"{against} ({dataset.attrs[f'axis_{against}']})", ylabel=quantity.replace("_", " "))
+    ax.set(
+        xlabel=f"{against} ({dataset.attrs[f'axis_{against}']})", ylabel=quantity.replace("_", " ")
+    )
     ax.set_title(f"{quantity.replace('_', ' ')} against {against}" + (f" ({kept})" if kept else ""))
     if curve:
         ax.legend(loc="best")
     return ax
 
 
-def make_sweep_figures(dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path) -> list[Path]:
+def make_sweep_figures(
+    dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path
+) -> list[Path]:
     """Write (quantity, against, by) figures of a sweep as ``figures/*.png`` under `folder`."""
     written = []
     with matplotlib.rc_context(STYLE):

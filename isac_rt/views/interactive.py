@@ -1,4 +1,5 @@
-"""The city, the swarm and the paths of a frame as a scene to turn about: in a notebook, or as a page that needs no network.
+"""The city, the swarm and the paths of a frame as a scene to turn about: in a notebook, or as a
+page that needs no network.
 
 Plotly is in the extra ``notebooks`` (`pip install isac_rt[notebooks]`).
 """
@@ -27,7 +28,12 @@ _SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 
 
 def scene_3d(
-    city: City, swarm: Swarm, times: np.ndarray, time: float, paths: Mapping[tuple[str, str], PathSet], reach: float = 150.0
+    city: City,
+    swarm: Swarm,
+    times: np.ndarray,
+    time: float,
+    paths: Mapping[tuple[str, str], PathSet],
+    reach: float = 150.0,
 ) -> Figure:
     """The scene as a Plotly figure; kinds of path and UAVs can be switched off in its legend.
 
@@ -44,7 +50,9 @@ def scene_3d(
     try:
         import plotly.graph_objects as go
     except ModuleNotFoundError as problem:
-        raise ModuleNotFoundError("interactive scenes need the package plotly: pip install 'isac_rt[notebooks]'") from problem
+        raise ModuleNotFoundError(
+            "interactive scenes need the package plotly: pip install 'isac_rt[notebooks]'"
+        ) from problem
     figure = go.Figure()
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
     if city.num_faces:
@@ -55,25 +63,59 @@ def scene_3d(
         if count:
             colour = KIND_COLOURS[kind.name.lower()]
             figure.add_trace(
-                go.Scatter3d(x=lines[:, 0], y=lines[:, 1], z=lines[:, 2], mode="lines", line={"color": colour, "width": 3},
-                             name=f"{words(kind.name.lower())} ({count})", hoverinfo="skip",
-                             visible="legendonly" if kind == PathKind.DIFFUSE else True)
-            )  # fmt: skip
+                go.Scatter3d(
+                    x=lines[:, 0],
+                    y=lines[:, 1],
+                    z=lines[:, 2],
+                    mode="lines",
+                    line={"color": colour, "width": 3},
+                    name=f"{words(kind.name.lower())} ({count})",
+                    hoverinfo="skip",
+                    visible="legendonly" if kind == PathKind.DIFFUSE else True,
+                )
+            )
     for u, (name, uav) in enumerate(swarm.uavs.items()):
         colour = UAV_COLOURS[u % len(UAV_COLOURS)]
         x, y, z = tracks[:, u].T
-        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": colour, "width": 5}, legendgroup=name, showlegend=False,
-                                      name=name, hoverinfo="skip"))  # fmt: skip
+        figure.add_trace(
+            go.Scatter3d(
+                x=x,
+                y=y,
+                z=z,
+                mode="lines",
+                line={"color": colour, "width": 5},
+                legendgroup=name,
+                showlegend=False,
+                name=name,
+                hoverinfo="skip",
+            )
+        )
         here = poses[name].position
         figure.add_trace(
-            go.Scatter3d(x=here[:1], y=here[1:2], z=here[2:], mode="markers+text", text=[name], textposition="top center",
-                         marker={"color": colour, "size": 6, "symbol": _SYMBOLS[uav.role]}, legendgroup=name, name=f"{name}, {uav.role}")
-        )  # fmt: skip
+            go.Scatter3d(
+                x=here[:1],
+                y=here[1:2],
+                z=here[2:],
+                mode="markers+text",
+                text=[name],
+                textposition="top center",
+                marker={"color": colour, "size": 6, "symbol": _SYMBOLS[uav.role]},
+                legendgroup=name,
+                name=f"{name}, {uav.role}",
+            )
+        )
     figure.update_layout(
-        scene={"aspectmode": "data", "xaxis_title": "east [m]", "yaxis_title": "north [m]", "zaxis_title": "up [m]",
-               "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}}},
-        margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0.01, "y": 0.99}, template="plotly_white",
-    )  # fmt: skip
+        scene={
+            "aspectmode": "data",
+            "xaxis_title": "east [m]",
+            "yaxis_title": "north [m]",
+            "zaxis_title": "up [m]",
+            "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}},
+        },
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        legend={"x": 0.01, "y": 0.99},
+        template="plotly_white",
+    )
     return figure
 
 
@@ -81,25 +123,48 @@ def _mesh(city: City, tracks: np.ndarray, reach: float) -> dict[str, object]:
     """The faces near the swarm, lighter the higher."""
     corners = city.corners + city.origin
     low, high = tracks[..., :2].min((0, 1)) - reach, tracks[..., :2].max((0, 1)) + reach
-    near = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(axis=1)
+    near = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(
+        axis=1
+    )
     if not near.any():
         near[:] = True
     points, index = np.unique(corners[near].reshape(-1, 3), axis=0, return_inverse=True)
     i, j, k = index.reshape(-1, 3).T
     return {
-        "x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "i": i, "j": j, "k": k, "intensity": points[:, 2],
-        "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]], "showscale": False, "flatshading": True, "hoverinfo": "skip", "opacity": 0.75,
+        "x": points[:, 0],
+        "y": points[:, 1],
+        "z": points[:, 2],
+        "i": i,
+        "j": j,
+        "k": k,
+        "intensity": points[:, 2],
+        "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
+        "showscale": False,
+        "flatshading": True,
+        "hoverinfo": "skip",
+        "opacity": 0.75,
         "lighting": {"ambient": 0.65, "diffuse": 0.6, "specular": 0.05},
-    }  # fmt: skip
+    }
 
 
-def _lines(paths: Mapping[tuple[str, str], PathSet], kind: PathKind, swarm: Swarm, time: float) -> tuple[np.ndarray, int]:
-    """The strongest paths of a kind, over all links, as one broken line (rows of NaN between them), and how many there are in all."""
+def _lines(
+    paths: Mapping[tuple[str, str], PathSet], kind: PathKind, swarm: Swarm, time: float
+) -> tuple[np.ndarray, int]:
+    """The strongest paths of a kind, over all links, as one broken line (rows of NaN between them),
+    and how many there are in all."""
     poses = swarm.poses(time)
-    every = [(float(p.power[k]), p, int(k)) for p in paths.values() for k in np.flatnonzero(p.kind == kind)]
+    every = [
+        (float(p.power[k]), p, int(k))
+        for p in paths.values()
+        for k in np.flatnonzero(p.kind == kind)
+    ]
     drawn = sorted(every, key=lambda row: -row[0])[:MOST_LINES]
     gap = np.full((1, 3), np.nan)
-    parts = [part for _, p, k in drawn for part in (polyline(p, k, poses[p.tx].position, poses[p.rx].position, poses), gap)]
+    parts = [
+        part
+        for _, p, k in drawn
+        for part in (polyline(p, k, poses[p.tx].position, poses[p.rx].position, poses), gap)
+    ]
     return (np.vstack(parts) if parts else np.zeros((0, 3))), len(every)
 
 

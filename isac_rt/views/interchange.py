@@ -1,4 +1,5 @@
-"""Files and objects that others read: path ledgers and IF cubes as NetCDF, cubes as SigMF, Sionna's path sets, detections for Stone Soup.
+"""Files and objects that others read: path ledgers and IF cubes as NetCDF, cubes as SigMF, Sionna's
+path sets, detections for Stone Soup.
 
 SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interchange]`).
 """
@@ -33,11 +34,14 @@ EXTRA = "pip install 'isac_rt[interchange]'"
 _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
 
 
-def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario) -> None:
+def write_ledger(
+    paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario
+) -> None:
     """Write the path ledger of one frame, all links, as NetCDF.
 
-    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront radii, the transmitter and
-    receiver of each, interaction points (path, bounce, axis) [m] and faces of the city mesh (path, bounce).
+    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront
+    radii, the transmitter and receiver of each, interaction points (path, bounce, axis) [m] and
+    faces of the city mesh (path, bounce).
 
     Raises
     ------
@@ -47,54 +51,153 @@ def write_ledger(paths: Mapping[tuple[str, str], PathSet], file: str | Path, sce
     names = next((p.target_names for p in paths.values() if p.target_names), ())
     out: dict[str, xr.Variable] = {}
 
-    def put(name: str, dims: Sequence[str], parts: list[np.ndarray], empty: np.ndarray, units: str, text: str) -> None:
-        out[name] = xr.Variable(dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text})
+    def put(
+        name: str,
+        dims: Sequence[str],
+        parts: list[np.ndarray],
+        empty: np.ndarray,
+        units: str,
+        text: str,
+    ) -> None:
+        out[name] = xr.Variable(
+            dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text}
+        )
 
-    def column(name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str) -> None:
-        put(name, ["path"], [np.asarray(get(p), dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
+    def column(
+        name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str
+    ) -> None:
+        put(
+            name,
+            ["path"],
+            [np.asarray(get(p), dtype) for p in paths.values()],
+            np.zeros(0, dtype),
+            units,
+            text,
+        )
 
-    column("transmitter", lambda p: np.full(len(p), p.tx, object), object, DIMENSIONLESS, "transmitting terminal")
-    column("receiver", lambda p: np.full(len(p), p.rx, object), object, DIMENSIONLESS, "receiving terminal")
+    column(
+        "transmitter",
+        lambda p: np.full(len(p), p.tx, object),
+        object,
+        DIMENSIONLESS,
+        "transmitting terminal",
+    )
+    column(
+        "receiver",
+        lambda p: np.full(len(p), p.rx, object),
+        object,
+        DIMENSIONLESS,
+        "receiving terminal",
+    )
     for name, (dtype, units, text) in PATH_COLUMNS.items():
-        put(name, ["path"], [np.asarray(path_columns(p)[name], dtype) for p in paths.values()], np.zeros(0, dtype), units, text)
+        put(
+            name,
+            ["path"],
+            [np.asarray(path_columns(p)[name], dtype) for p in paths.values()],
+            np.zeros(0, dtype),
+            units,
+            text,
+        )
     carrier = scenario.radio.carrier_hz
-    column("doppler", lambda p: -carrier * p.delay_rate, float, "Hz", "Doppler shift at the carrier, positive closing")
-    column("tx_radius", lambda p: p.tx_radius, float, "m", "radius of curvature of the wavefront at the transmitter")
-    column("rx_radius", lambda p: p.rx_radius, float, "m", "radius of curvature of the wavefront at the receiver")
+    column(
+        "doppler",
+        lambda p: -carrier * p.delay_rate,
+        float,
+        "Hz",
+        "Doppler shift at the carrier, positive closing",
+    )
+    column(
+        "tx_radius",
+        lambda p: p.tx_radius,
+        float,
+        "m",
+        "radius of curvature of the wavefront at the transmitter",
+    )
+    column(
+        "rx_radius",
+        lambda p: p.rx_radius,
+        float,
+        "m",
+        "radius of curvature of the wavefront at the receiver",
+    )
 
     def pad(a: np.ndarray, fill: float) -> np.ndarray:
-        return np.pad(a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill)
+        return np.pad(
+            a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill
+        )
 
-    put("points", ["path", "bounce", "axis"], [pad(p.points, np.nan) for p in paths.values()], np.zeros((0, depth, 3)), "m",
-        "interaction points in world axes, NaN where there is none")  # fmt: skip
-    put("faces", ["path", "bounce"], [pad(p.faces, -1) for p in paths.values()], np.zeros((0, depth), np.int32), DIMENSIONLESS,
-        "face of the city mesh at each point, -1 where there is none")  # fmt: skip
-    out["kind_name"] = xr.Variable(["kind"], np.array(KINDS, object), {"units": DIMENSIONLESS, "long_name": "name of each kind of path"})
-    out["target_name"] = xr.Variable(["uav"], np.array(names, object), {"units": DIMENSIONLESS, "long_name": "name that target indexes"})
+    put(
+        "points",
+        ["path", "bounce", "axis"],
+        [pad(p.points, np.nan) for p in paths.values()],
+        np.zeros((0, depth, 3)),
+        "m",
+        "interaction points in world axes, NaN where there is none",
+    )
+    put(
+        "faces",
+        ["path", "bounce"],
+        [pad(p.faces, -1) for p in paths.values()],
+        np.zeros((0, depth), np.int32),
+        DIMENSIONLESS,
+        "face of the city mesh at each point, -1 where there is none",
+    )
+    out["kind_name"] = xr.Variable(
+        ["kind"],
+        np.array(KINDS, object),
+        {"units": DIMENSIONLESS, "long_name": "name of each kind of path"},
+    )
+    out["target_name"] = xr.Variable(
+        ["uav"],
+        np.array(names, object),
+        {"units": DIMENSIONLESS, "long_name": "name that target indexes"},
+    )
     epoch = next((p.epoch for p in paths.values()), np.nan)
     write_dataset(xr.Dataset(out, attrs={**provenance(scenario), "epoch_s": epoch}), Path(file))
 
 
 def cube_dataset(cube: IFCube) -> xr.Dataset:
-    """An IF cube as labelled arrays; NetCDF knows no complex numbers, so real and imaginary parts stand apart.
+    """An IF cube as labelled arrays; NetCDF knows no complex numbers, so real and imaginary parts
+    stand apart.
 
     Returns
     -------
-    Dataset with `samples_re`, `samples_im` (group, rx, chirp, sample) float32 [sqrt(W)], `schedule` (group, chirp), the start of each
-    slot `slot_time` (chirp,) and fast time `time` (sample,) [s]; the waveform is the JSON attribute `waveform`
+    Dataset with `samples_re`, `samples_im` (group, rx, chirp, sample) float32 [sqrt(W)], `schedule`
+    (group, chirp), the start of each slot `slot_time` (chirp,) and fast time `time` (sample,) [s];
+    the waveform is the JSON attribute `waveform`
     """
     w = cube.waveform
     values = {
-        "samples_re": (_SAMPLE_AXES, cube.samples.real, {"units": "W0.5", "long_name": "in-phase part of the IF samples"}),
-        "samples_im": (_SAMPLE_AXES, cube.samples.imag, {"units": "W0.5", "long_name": "quadrature part of the IF samples"}),
-        "schedule": (("group", "chirp"), np.asarray(cube.schedule), {"units": "1", "long_name": "transmit antenna of each chirp"}),
+        "samples_re": (
+            _SAMPLE_AXES,
+            cube.samples.real,
+            {"units": "W0.5", "long_name": "in-phase part of the IF samples"},
+        ),
+        "samples_im": (
+            _SAMPLE_AXES,
+            cube.samples.imag,
+            {"units": "W0.5", "long_name": "quadrature part of the IF samples"},
+        ),
+        "schedule": (
+            ("group", "chirp"),
+            np.asarray(cube.schedule),
+            {"units": "1", "long_name": "transmit antenna of each chirp"},
+        ),
     }
     slots = cube.start_time + np.arange(w.num_chirps) * w.slot_duration
     coordinates = {
         "slot_time": ("chirp", slots, {"units": "s", "long_name": "start of the reference chirp"}),
-        "time": ("sample", np.arange(w.num_samples) / w.sampling_rate, {"units": "s", "long_name": "time since that"}),
+        "time": (
+            "sample",
+            np.arange(w.num_samples) / w.sampling_rate,
+            {"units": "s", "long_name": "time since that"},
+        ),
     }
-    attributes = {"waveform": json.dumps(asdict(w)), "start_time_s": cube.start_time, "Conventions": "CF-1.11"}
+    attributes = {
+        "waveform": json.dumps(asdict(w)),
+        "start_time_s": cube.start_time,
+        "Conventions": "CF-1.11",
+    }
     return xr.Dataset(values, coordinates, attributes)
 
 
@@ -115,17 +218,25 @@ def load_cube(file: str | Path) -> IFCube:
         with xr.open_dataset(file, engine="h5netcdf") as d:
             samples = (d.samples_re.values + 1j * d.samples_im.values).astype(np.complex64)
             waveform = Waveform(**json.loads(d.attrs["waveform"]))
-            return IFCube(samples=samples, waveform=waveform, schedule=d.schedule.values, start_time=float(d.attrs["start_time_s"]))
+            return IFCube(
+                samples=samples,
+                waveform=waveform,
+                schedule=d.schedule.values,
+                start_time=float(d.attrs["start_time_s"]),
+            )
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as problem:
-        raise ResultsError(f"cannot read an IF cube from {file}: {problem}; give a file that `save_cube` wrote") from problem
+        raise ResultsError(
+            f"cannot read an IF cube from {file}: {problem}; give a file that `save_cube` wrote"
+        ) from problem
 
 
 def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[Path, Path]:
     """Write IF samples as a SigMF recording: ``FILE.sigmf-data`` and ``FILE.sigmf-meta``.
 
-    Channels are the receive antennas of group 0, then of group 1 and so on; samples run through the chirps one after the other with the
-    pauses between them left out. Each chirp is an annotation with its transmit antennas. What SigMF has no field for stands under
-    ``isac_rt:`` (waveform, schedule, start time).
+    Channels are the receive antennas of group 0, then of group 1 and so on; samples run through the
+    chirps one after the other with the pauses between them left out. Each chirp is an annotation
+    with its transmit antennas. What SigMF has no field for stands under ``isac_rt:`` (waveform,
+    schedule, start time).
 
     Raises
     ------
@@ -134,7 +245,10 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
     sigmf = _imported("sigmf")
     w, base = cube.waveform, Path(file)
     groups, antennas = cube.samples.shape[:2]
-    data, meta = base.with_name(base.name + ".sigmf-data"), base.with_name(base.name + ".sigmf-meta")
+    data, meta = (
+        base.with_name(base.name + ".sigmf-data"),
+        base.with_name(base.name + ".sigmf-meta"),
+    )
     rows = cube.samples.transpose(2, 3, 0, 1).reshape(-1, groups * antennas).astype("<c8")
     write_bytes(data, lambda temporary: rows.tofile(temporary))
     made = sigmf.SigMFFile(
@@ -155,7 +269,9 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
     for p in range(w.num_chirps):
         senders = " ".join(str(int(row[p])) for row in cube.schedule)
         made.add_annotation(
-            p * w.num_samples, w.num_samples, metadata={"core:label": f"chirp {p}", "core:comment": f"transmit antennas {senders}"}
+            p * w.num_samples,
+            w.num_samples,
+            metadata={"core:label": f"chirp {p}", "core:comment": f"transmit antennas {senders}"},
         )
     made.validate()
     write_bytes(meta, lambda temporary: temporary.write_text(made.dumps(), encoding="utf-8"))
@@ -166,20 +282,38 @@ def read_sigmf(file: str | Path) -> IFCube:
     """An IF cube from a recording that `write_sigmf` made; `file` without the suffix."""
     base = Path(file)
     try:
-        info = json.loads(base.with_name(base.name + ".sigmf-meta").read_text(encoding="utf-8"))["global"]
+        info = json.loads(base.with_name(base.name + ".sigmf-meta").read_text(encoding="utf-8"))[
+            "global"
+        ]
         w, schedule = Waveform(**info["isac_rt:waveform"]), np.array(info["isac_rt:schedule"])
         flat = np.fromfile(base.with_name(base.name + ".sigmf-data"), "<c8")
         samples = flat.reshape(w.num_chirps, w.num_samples, len(schedule), -1).transpose(2, 3, 0, 1)
     except (OSError, ValueError, KeyError, TypeError) as problem:
-        raise ResultsError(f"cannot read an IF cube from {base}: {problem}; give a recording that `write_sigmf` made") from problem
-    return IFCube(samples=np.ascontiguousarray(samples), waveform=w, schedule=schedule, start_time=info["isac_rt:start_time_s"])
+        raise ResultsError(
+            f"cannot read an IF cube from {base}: {problem}; give a recording that `write_sigmf` "
+            "made"
+        ) from problem
+    return IFCube(
+        samples=np.ascontiguousarray(samples),
+        waveform=w,
+        schedule=schedule,
+        start_time=info["isac_rt:start_time_s"],
+    )
 
 
-def from_sionna(paths: rt.Paths, carrier_frequency: float, *, transmitter: int = 0, receiver: int = 0, epoch: float = 0.0) -> PathSet:
+def from_sionna(
+    paths: rt.Paths,
+    carrier_frequency: float,
+    *,
+    transmitter: int = 0,
+    receiver: int = 0,
+    epoch: float = 0.0,
+) -> PathSet:
     """The paths of one link from a Sionna RT `Paths` object, for the signal model here.
 
-    Sionna's delays are float32: at 100 m they are good to some 10 um, 0.1 rad of phase at 77 GHz, and the phases of two paths
-    against each other no better. Doppler shifts are Sionna's; accelerations are zero, wavefronts plane.
+    Sionna's delays are float32: at 100 m they are good to some 10 um, 0.1 rad of phase at 77 GHz,
+    and the phases of two paths against each other no better. Doppler shifts are Sionna's;
+    accelerations are zero, wavefronts plane.
 
     Parameters
     ----------
@@ -202,9 +336,15 @@ def from_sionna(paths: rt.Paths, carrier_frequency: float, *, transmitter: int =
     interactions = np.asarray(paths.interactions)
     interactions = interactions[:, :, 0, :, 0] if interactions.ndim == 6 else interactions
     kinds = interactions[:, receiver, transmitter]  # depth, paths; 0 none, 2 diffuse
-    theta_t, phi_t, theta_r, phi_r = (flat(getattr(paths, name)) for name in ("theta_t", "phi_t", "theta_r", "phi_r"))
+    theta_t, phi_t, theta_r, phi_r = (
+        flat(getattr(paths, name)) for name in ("theta_t", "phi_t", "theta_r", "phi_r")
+    )
     bounces = (kinds != 0).sum(axis=0)
-    kind = np.where(bounces == 0, PathKind.LINE_OF_SIGHT, np.where((kinds == 2).any(axis=0), PathKind.DIFFUSE, PathKind.SPECULAR))
+    kind = np.where(
+        bounces == 0,
+        PathKind.LINE_OF_SIGHT,
+        np.where((kinds == 2).any(axis=0), PathKind.DIFFUSE, PathKind.SPECULAR),
+    )
     every = make_paths(
         gain=real + 1j * imag,
         delay=flat(paths.tau),
@@ -222,15 +362,21 @@ def from_sionna(paths: rt.Paths, carrier_frequency: float, *, transmitter: int =
 
 def _unit(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Zenith and azimuth angles to unit vectors (..., 3)."""
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    return np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
+    )
 
 
-def stonesoup_detections(dataset: xr.Dataset, observer: str, start: datetime.datetime) -> list[set[Detection]]:
-    """A run's detections as Stone Soup `Detection` objects, one set per frame, each with its measurement model.
+def stonesoup_detections(
+    dataset: xr.Dataset, observer: str, start: datetime.datetime
+) -> list[set[Detection]]:
+    """A run's detections as Stone Soup `Detection` objects, one set per frame, each with its
+    measurement model.
 
-    The state is (x, vx, y, vy, z, vz) in world axes [m, m/s]; a detection is (elevation, bearing, range, range rate) in world axes as seen
-    from the moving observer, with the covariance of the estimate. An active terminal's detections are all there; of a passive one
-    only the line of sight, since a bistatic range has no such model.
+    The state is (x, vx, y, vy, z, vz) in world axes [m, m/s]; a detection is (elevation, bearing,
+    range, range rate) in world axes as seen from the moving observer, with the covariance of the
+    estimate. An active terminal's detections are all there; of a passive one only the line of
+    sight, since a bistatic range has no such model.
 
     Parameters
     ----------
@@ -250,17 +396,28 @@ def stonesoup_detections(dataset: xr.Dataset, observer: str, start: datetime.dat
 
     index = {str(name): i for i, name in enumerate(dataset.observer.values)}[observer]
     name = str(dataset.receiver.values[index])
-    own, bistatic = list(dataset.uav.values).index(name), str(dataset.transmitter.values[index]) != name
-    mine = (dataset.det_observer.values == index) & (dataset.det_is_reference.values | (not bistatic))
+    own, bistatic = (
+        list(dataset.uav.values).index(name),
+        str(dataset.transmitter.values[index]) != name,
+    )
+    mine = (dataset.det_observer.values == index) & (
+        dataset.det_is_reference.values | (not bistatic)
+    )
     out: list[set[Detection]] = [set() for _ in range(dataset.sizes["frame"])]
     for k in np.flatnonzero(mine):
         frame = int(dataset.det_frame.values[k])
         rotation = dataset.uav_attitude.values[frame, own]
-        u, std = (np.array([dataset[f"det_{c}{s}"].values[k] for c in ("u_x", "u_z")]) for s in ("", "_std"))
+        u, std = (
+            np.array([dataset[f"det_{c}{s}"].values[k] for c in ("u_x", "u_z")])
+            for s in ("", "_std")
+        )
         angles, covariance = _world_angles(u, std, rotation)
         spread = np.zeros((4, 4))
         spread[:2, :2] = covariance
-        spread[2, 2], spread[3, 3] = dataset.det_range_std.values[k] ** 2, dataset.det_velocity_std.values[k] ** 2
+        spread[2, 2], spread[3, 3] = (
+            dataset.det_range_std.values[k] ** 2,
+            dataset.det_velocity_std.values[k] ** 2,
+        )
         model = CartesianToElevationBearingRangeRate(
             ndim_state=6,
             mapping=np.array([0, 2, 4]),
@@ -269,20 +426,36 @@ def stonesoup_detections(dataset: xr.Dataset, observer: str, start: datetime.dat
             translation_offset=StateVector(dataset.uav_position.values[frame, own]),
             velocity=StateVector(dataset.uav_velocity.values[frame, own]),
         )
-        measured = StateVector([*angles, dataset.det_range.values[k], dataset.det_velocity.values[k]])
+        measured = StateVector(
+            [*angles, dataset.det_range.values[k], dataset.det_velocity.values[k]]
+        )
         when = start + datetime.timedelta(seconds=float(dataset.time.values[frame]))
-        out[frame].add(Detection(measured, timestamp=when, measurement_model=model, metadata={"snr": float(dataset.det_snr.values[k])}))
+        out[frame].add(
+            Detection(
+                measured,
+                timestamp=when,
+                measurement_model=model,
+                metadata={"snr": float(dataset.det_snr.values[k])},
+            )
+        )
     return out
 
 
-def _world_angles(u: np.ndarray, std: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(elevation, bearing) in world axes [rad] of body direction cosines (u_x, u_z), and their covariance by linear propagation."""
+def _world_angles(
+    u: np.ndarray, std: np.ndarray, rotation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(elevation, bearing) in world axes [rad] of body direction cosines (u_x, u_z), and their
+    covariance by linear propagation."""
     forward = np.sqrt(max(1 - u @ u, 1e-12))
     d = rotation @ np.array([u[0], forward, u[1]])
-    turn = rotation @ np.array([[1.0, 0.0], [-u[0] / forward, -u[1] / forward], [0.0, 1.0]])  # d of direction by (u_x, u_z)
+    turn = rotation @ np.array(
+        [[1.0, 0.0], [-u[0] / forward, -u[1] / forward], [0.0, 1.0]]
+    )  # d of direction by (u_x, u_z)
     level = d[0] ** 2 + d[1] ** 2
     jacobian = np.array([turn[2] / np.sqrt(level), (d[0] * turn[1] - d[1] * turn[0]) / level])
-    return np.array([np.arcsin(d[2]), np.arctan2(d[1], d[0])]), jacobian @ np.diag(std**2) @ jacobian.T
+    return np.array([np.arcsin(d[2]), np.arctan2(d[1], d[0])]), jacobian @ np.diag(
+        std**2
+    ) @ jacobian.T
 
 
 def _imported(name: str) -> Any:

@@ -1,7 +1,8 @@
-"""A picture of a scene: the city in an oblique parallel projection with depth, sun and shadows, and over it the swarm and the paths.
+"""A picture of a scene: the city in an oblique parallel projection with depth, sun and shadows, and
+over it the swarm and the paths.
 
-The mesh is drawn with a depth buffer of its own, so that what buildings hide of the tracks and paths can be drawn faintly, and so
-that no ray tracer is needed for a look at a city.
+The mesh is drawn with a depth buffer of its own, so that what buildings hide of the tracks and
+paths can be drawn faintly, and so that no ray tracer is needed for a look at a city.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from isac_rt.world.swarm import Pose, Swarm
 ELEVATION = np.deg2rad(38.0)
 """Of the view above the horizon."""
 SUN = np.array([-0.45, -0.35, 0.82]) / np.linalg.norm([-0.45, -0.35, 0.82])
-_SKY, _GROUND, _ROOF, _WALL = (np.array(c) / 255 for c in ((236, 241, 246), (222, 220, 212), (214, 190, 170), (226, 224, 220)))
+_SKY, _GROUND, _ROOF, _WALL = (
+    np.array(c) / 255 for c in ((236, 241, 246), (222, 220, 212), (214, 190, 170), (226, 224, 220))
+)
 _SUPERSAMPLING = 2
 _LINES_PER_KIND = 40
 _HIDDEN_ALPHA = 0.18
@@ -53,9 +56,18 @@ class View:
         return (points - self.centre) @ self.axes.T
 
 
-def view_from(azimuth: float, elevation: float, centre: np.ndarray, half: tuple[float, float]) -> View:
-    """The view of somebody who stands towards `azimuth` (from north to east) at `elevation` [rad] and looks at `centre`."""
-    away = -np.array([np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)])
+def view_from(
+    azimuth: float, elevation: float, centre: np.ndarray, half: tuple[float, float]
+) -> View:
+    """The view of somebody who stands towards `azimuth` (from north to east) at `elevation` [rad]
+    and looks at `centre`."""
+    away = -np.array(
+        [
+            np.cos(elevation) * np.sin(azimuth),
+            np.cos(elevation) * np.cos(azimuth),
+            np.sin(elevation),
+        ]
+    )
     right = np.cross(away, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     return View(np.stack([right, np.cross(right, away), away]), centre, half)
@@ -63,7 +75,8 @@ def view_from(azimuth: float, elevation: float, centre: np.ndarray, half: tuple[
 
 @numba.njit(cache=True)
 def _rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
-    """Depth buffer of triangles (F, 3, 3) in pixels and metres of depth; a pixel belongs to a triangle if its middle does."""
+    """Depth buffer of triangles (F, 3, 3) in pixels and metres of depth; a pixel belongs to a
+    triangle if its middle does."""
     height, width = depth.shape
     for f in range(corners.shape[0]):
         ax, ay, az = corners[f, 0]
@@ -72,8 +85,14 @@ def _rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         if area == 0.0:
             continue
-        left, right = max(int(np.ceil(min(ax, bx, cx) - 0.5)), 0), min(int(np.floor(max(ax, bx, cx) - 0.5)), width - 1)
-        low, high = max(int(np.ceil(min(ay, by, cy) - 0.5)), 0), min(int(np.floor(max(ay, by, cy) - 0.5)), height - 1)
+        left, right = (
+            max(int(np.ceil(min(ax, bx, cx) - 0.5)), 0),
+            min(int(np.floor(max(ax, bx, cx) - 0.5)), width - 1),
+        )
+        low, high = (
+            max(int(np.ceil(min(ay, by, cy) - 0.5)), 0),
+            min(int(np.floor(max(ay, by, cy) - 0.5)), height - 1),
+        )
         for row in range(low, high + 1):
             y = row + 0.5
             for column in range(left, right + 1):
@@ -88,8 +107,11 @@ def _rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None
                     face[row, column] = f
 
 
-def depth_buffer(corners: np.ndarray, view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [m] (height, width), inf where there is nothing, and the face seen, -1 there; row 0 is the bottom.
+def depth_buffer(
+    corners: np.ndarray, view: View, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [m] (height, width), inf where there is nothing, and the face seen, -1 there; row 0 is
+    the bottom.
 
     Parameters
     ----------
@@ -104,7 +126,8 @@ def depth_buffer(corners: np.ndarray, view: View, width: int, height: int) -> tu
 
 
 def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 0.6) -> np.ndarray:
-    """Whether world points (..., 3) lie more than `slack` [m] behind what the depth buffer shows there."""
+    """Whether world points (..., 3) lie more than `slack` [m] behind what the depth buffer shows
+    there."""
     height, width = depth.shape
     p = view.project(points)
     column = np.clip(((p[..., 0] / view.half[0] + 1) * width / 2).astype(int), 0, width - 1)
@@ -113,7 +136,8 @@ def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 
 
 
 def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Picture (height, width, 3) of the city in [0, 1] and its depth buffer; row 0 is the bottom."""
+    """Picture (height, width, 3) of the city in [0, 1] and its depth buffer; row 0 is the
+    bottom."""
     corners = city.corners + city.origin
     depth, face = depth_buffer(corners, view, width, height)
     picture = np.tile(_SKY, (height, width, 1))
@@ -124,7 +148,9 @@ def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, 
     normal = normal * np.where(np.sum(normal * view.axes[2], axis=-1, keepdims=True) > 0, -1.0, 1.0)
     x = (np.arange(width) + 0.5) / width * 2 - 1
     y = (np.arange(height) + 0.5) / height * 2 - 1
-    flat = np.stack([*np.meshgrid(x * view.half[0], y * view.half[1]), np.where(seen, depth, 0.0)], axis=-1)
+    flat = np.stack(
+        [*np.meshgrid(x * view.half[0], y * view.half[1]), np.where(seen, depth, 0.0)], axis=-1
+    )
     points = flat @ view.axes + view.centre
     reach = float(np.hypot(*view.half)) * 2
     sun = view_from(np.arctan2(SUN[0], SUN[1]), np.arcsin(SUN[2]), view.centre, (reach, reach))
@@ -132,41 +158,81 @@ def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, 
     lit = ~is_hidden(points, sun, cast, slack=4 * reach / 2048 + 0.1)
     floor = float(np.quantile(corners[..., 2], 0.02)) + 1.0
     level = normal[..., 2:] > 0.9
-    base = np.where(level & (points[..., 2:] < floor), _GROUND, np.where(normal[..., 2:] > 0.25, _ROOF, _WALL))
-    light = 0.66 + 0.06 * normal[..., 2] + 0.07 * (normal @ view.axes[0]) + 0.28 * np.clip(normal @ SUN, 0, 1) * lit
+    base = np.where(
+        level & (points[..., 2:] < floor), _GROUND, np.where(normal[..., 2:] > 0.25, _ROOF, _WALL)
+    )
+    light = (
+        0.66
+        + 0.06 * normal[..., 2]
+        + 0.07 * (normal @ view.axes[0])
+        + 0.28 * np.clip(normal @ SUN, 0, 1) * lit
+    )
     step = np.abs(np.diff(np.where(seen, depth, 1e4), axis=1, prepend=1e4)) + np.abs(
         np.diff(np.where(seen, depth, 1e4), axis=0, prepend=1e4)
     )
-    turn = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(np.diff(normal, axis=0, prepend=0), axis=-1)
+    turn = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(
+        np.diff(normal, axis=0, prepend=0), axis=-1
+    )
     edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (turn > 0.5), 0.72, 1.0)
     picture[seen] = (base * (light * edge)[..., None])[seen]
     return picture, depth
 
 
 def best_view(city: City, tracks: np.ndarray, aspect: float) -> View:
-    """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3) [m]."""
+    """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3)
+    [m]."""
     low, high = tracks.reshape(-1, 3).min(axis=0), tracks.reshape(-1, 3).max(axis=0)
     centre = (low + high) / 2
     half = 0.78 * max(float(np.linalg.norm(high - low)), 65.0)
     corners = city.corners + city.origin
-    views = [view_from(a, ELEVATION, centre, (half, half / aspect)) for a in np.arange(16) * np.pi / 8 + 0.2]
-    return min(views, key=lambda v: is_hidden(tracks, v, depth_buffer(corners, v, 320, int(320 / aspect))[0]).mean())
+    views = [
+        view_from(a, ELEVATION, centre, (half, half / aspect))
+        for a in np.arange(16) * np.pi / 8 + 0.2
+    ]
+    return min(
+        views,
+        key=lambda v: is_hidden(
+            tracks, v, depth_buffer(corners, v, 320, int(320 / aspect))[0]
+        ).mean(),
+    )
 
 
-def _line(ax: Axes, corners: np.ndarray, view: View, depth: np.ndarray, colour: str, width: float, alpha: float = 1.0) -> None:
+def _line(
+    ax: Axes,
+    corners: np.ndarray,
+    view: View,
+    depth: np.ndarray,
+    colour: str,
+    width: float,
+    alpha: float = 1.0,
+) -> None:
     """A polyline (n, 3), faint where it is hidden."""
     s = np.linspace(0, len(corners) - 1, _PIECES * (len(corners) - 1) + 1)
-    points = np.stack([np.interp(s, np.arange(len(corners)), corners[:, i]) for i in range(3)], axis=1)
+    points = np.stack(
+        [np.interp(s, np.arange(len(corners)), corners[:, i]) for i in range(3)], axis=1
+    )
     flat = view.project(points)[:, :2]
     hidden = is_hidden((points[1:] + points[:-1]) / 2, view, depth)
     pieces = np.stack([flat[:-1], flat[1:]], axis=1)
-    ax.add_collection(LineCollection(list(pieces), colors=colour, linewidths=width, alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha))
+    ax.add_collection(
+        LineCollection(
+            list(pieces),
+            colors=colour,
+            linewidths=width,
+            alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha,
+        )
+    )
 
 
 def _draw_paths(
-    ax: Axes, paths: Mapping[tuple[str, str], PathSet], poses: Mapping[str, Pose], view: View, depth: np.ndarray
+    ax: Axes,
+    paths: Mapping[tuple[str, str], PathSet],
+    poses: Mapping[str, Pose],
+    view: View,
+    depth: np.ndarray,
 ) -> list[Line2D]:
-    """Every kind in its colour: the scattering points of diffuse paths, the strongest of the others as lines."""
+    """Every kind in its colour: the scattering points of diffuse paths, the strongest of the others
+    as lines."""
     count = dict.fromkeys(PathKind, 0)
     for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
         colour = KIND_COLOURS[kind.name.lower()]
@@ -182,12 +248,30 @@ def _draw_paths(
             elif kind != PathKind.LEAKAGE:
                 width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
                 for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
-                    _line(ax, polyline(p, k, poses[tx].position, poses[rx].position, poses), view, depth, colour, width, 0.85)
+                    _line(
+                        ax,
+                        polyline(p, k, poses[tx].position, poses[rx].position, poses),
+                        view,
+                        depth,
+                        colour,
+                        width,
+                        0.85,
+                    )
     drawn = [k for k in PathKind if count[k] and k != PathKind.LEAKAGE]
-    return [Line2D([], [], color=KIND_COLOURS[k.name.lower()], label=f"{words(k.name.lower())} ({count[k]})") for k in drawn]
+    return [
+        Line2D(
+            [],
+            [],
+            color=KIND_COLOURS[k.name.lower()],
+            label=f"{words(k.name.lower())} ({count[k]})",
+        )
+        for k in drawn
+    ]
 
 
-def polyline(p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapping[str, Pose]) -> np.ndarray:
+def polyline(
+    p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapping[str, Pose]
+) -> np.ndarray:
     """Corners of a path from transmitter to receiver, its UAV included."""
     inner = p.points[k][np.isfinite(p.points[k]).all(axis=1)]
     if not inner.size and p.target[k] >= 0:
@@ -195,26 +279,75 @@ def polyline(p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapp
     return np.vstack([start, inner, end])
 
 
-def _draw_swarm(ax: Axes, swarm: Swarm, times: np.ndarray, time: float, view: View, depth: np.ndarray, ground: float) -> list[Line2D]:
+def _draw_swarm(
+    ax: Axes,
+    swarm: Swarm,
+    times: np.ndarray,
+    time: float,
+    view: View,
+    depth: np.ndarray,
+    ground: float,
+) -> list[Line2D]:
     """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`."""
     poses, legend = swarm.poses(time), []
     for u, (name, uav) in enumerate(swarm.uavs.items()):
         colour, here = UAV_COLOURS[u % len(UAV_COLOURS)], poses[name].position
-        _line(ax, np.array([swarm.trajectories[name].pose(t).position for t in times]), view, depth, colour, 2.2)
+        _line(
+            ax,
+            np.array([swarm.trajectories[name].pose(t).position for t in times]),
+            view,
+            depth,
+            colour,
+            2.2,
+        )
         foot = view.project(np.stack([here, [here[0], here[1], ground]]))
         ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
         big = 15 if uav.role == "active" else 8
-        ax.plot(foot[0, 0], foot[0, 1], ROLE_MARKERS[uav.role], color=colour, ms=big, mec="white", mew=1.1, zorder=8)
-        ax.annotate(name, (foot[0, 0], foot[0, 1]), xytext=(8, 7), textcoords="offset points", color=colour, fontweight="bold",
-                    fontsize=10, zorder=9, bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8})  # fmt: skip
-        legend.append(Line2D([], [], color=colour, marker=ROLE_MARKERS[uav.role], ls="none", label=f"{name}, {uav.role}"))
+        ax.plot(
+            foot[0, 0],
+            foot[0, 1],
+            ROLE_MARKERS[uav.role],
+            color=colour,
+            ms=big,
+            mec="white",
+            mew=1.1,
+            zorder=8,
+        )
+        ax.annotate(
+            name,
+            (foot[0, 0], foot[0, 1]),
+            xytext=(8, 7),
+            textcoords="offset points",
+            color=colour,
+            fontweight="bold",
+            fontsize=10,
+            zorder=9,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+        )
+        legend.append(
+            Line2D(
+                [],
+                [],
+                color=colour,
+                marker=ROLE_MARKERS[uav.role],
+                ls="none",
+                label=f"{name}, {uav.role}",
+            )
+        )
     return legend
 
 
 def view_scene(
-    city: City, swarm: Swarm, times: np.ndarray, time: float, paths: Mapping[tuple[str, str], PathSet], width: int = 1500, height: int = 940
+    city: City,
+    swarm: Swarm,
+    times: np.ndarray,
+    time: float,
+    paths: Mapping[tuple[str, str], PathSet],
+    width: int = 1500,
+    height: int = 940,
 ) -> Figure:
-    """The city, the swarm at `time` with its tracks over `times` [s], and the `paths` of that moment."""
+    """The city, the swarm at `time` with its tracks over `times` [s], and the `paths` of that
+    moment."""
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
     view = best_view(city, tracks, width / height)
     picture, depth = shade(city, view, width * _SUPERSAMPLING, height * _SUPERSAMPLING)
@@ -224,9 +357,20 @@ def view_scene(
     extent = (-view.half[0], view.half[0], -view.half[1], view.half[1])
     ax.imshow(np.clip(picture, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
     legend = _draw_paths(ax, paths, swarm.poses(time), view, depth)
-    ground = float((city.corners + city.origin)[..., 2].min()) if city.num_faces else float(tracks[..., 2].min() - 10)
+    ground = (
+        float((city.corners + city.origin)[..., 2].min())
+        if city.num_faces
+        else float(tracks[..., 2].min() - 10)
+    )
     legend = _draw_swarm(ax, swarm, times, time, view, depth, ground) + legend
-    ax.legend(handles=legend, loc="upper left", fontsize=9, framealpha=0.85, edgecolor="none", facecolor="white")
+    ax.legend(
+        handles=legend,
+        loc="upper left",
+        fontsize=9,
+        framealpha=0.85,
+        edgecolor="none",
+        facecolor="white",
+    )
     bar = 10.0 ** np.floor(np.log10(view.half[0] * 0.6))
     left, low = -0.95 * view.half[0], -0.93 * view.half[1]
     ax.plot([left, left + bar], [low, low], color="#202020", lw=3)

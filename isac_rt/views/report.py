@@ -19,31 +19,48 @@ from isac_rt.results.recorder import Results
 
 DASH = "\u2013"
 _CAPTIONS = {
-    "scene": ("The scene", "The swarm from above. The darker a face of the city, the higher it lies."),
+    "scene": (
+        "The scene",
+        "The swarm from above. The darker a face of the city, the higher it lies.",
+    ),
     "range_doppler": (
         "Range and Doppler",
-        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. Marks are detections, by the kind of the "
+        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. "
+        "Marks are detections, by the kind of the "
         "strongest ray-traced path within one cell; "
-        "white circles are where the truth puts the UAVs in view, detected or not. A passive terminal measures path lengths: "
+        "white circles are where the truth puts the UAVs in view, detected or not. A passive "
+        "terminal measures path lengths: "
         "reflectors stand at transmitter to UAV to receiver.",
     ),
     "equivalent_range": (
         "Equivalent range",
-        "What the receiver sees before it removes the data: each chirp's delay symbol moves every path by the same number of cells.",
+        "What the receiver sees before it removes the data: each chirp's delay symbol moves every "
+        "path by the same number of cells.",
     ),
     "tracks": (
         "Tracks against truth",
-        "Seen from one terminal. Estimates are drawn at the UAV they were associated with after the fact; the receiver does not know it.",
+        "Seen from one terminal. Estimates are drawn at the UAV they were associated with after "
+        "the fact; the receiver does not know it.",
     ),
     "errors": (
         "Errors",
-        "Distribution of errors of associated estimates; the number of them in brackets. A UAV that is never found has no error here.",
+        "Distribution of errors of associated estimates; the number of them in brackets. A UAV "
+        "that is never found has no error here.",
     ),
-    "paths": ("Paths", "Every path of the snapshot frames. Gain holds antenna elements and reflections, not the transmit power."),
-    "decoding": ("Data", "Errors among the data symbols of every frame; frames without a decision count as lost in the tables."),
+    "paths": (
+        "Paths",
+        "Every path of the snapshot frames. Gain holds antenna elements and reflections, not the "
+        "transmit power.",
+    ),
+    "decoding": (
+        "Data",
+        "Errors among the data symbols of every frame; frames without a decision count as lost in "
+        "the tables.",
+    ),
     "link": (
         "Links over time",
-        "Above, the reference path: the strongest target at the active terminal, the line of sight at a passive one. Below, what arrives "
+        "Above, the reference path: the strongest target at the active terminal, the line of sight "
+        "at a passive one. Below, what arrives "
         "by each kind of path.",
     ),
 }
@@ -70,8 +87,20 @@ def number(value: Any, digits: int = 3) -> str:
 
 def per_terminal(summary: Mapping[str, Any]) -> Table:
     """Decoding and detection, one row for each link (and so for each terminal)."""
-    columns = ("Link", "Role", "SER delay", "SER DPSK", "BER", "Undecided", "Bits", "Bit rate [kbit/s]", "Hit rate", "Matched",
-               "Matched, tracked", "False per frame")  # fmt: skip
+    columns = (
+        "Link",
+        "Role",
+        "SER delay",
+        "SER DPSK",
+        "BER",
+        "Undecided",
+        "Bits",
+        "Bit rate [kbit/s]",
+        "Hit rate",
+        "Matched",
+        "Matched, tracked",
+        "False per frame",
+    )
     rows = []
     for name, s in summary["links"].items():
         rate = None if s["bit_rate_bps"] is None else s["bit_rate_bps"] / 1e3
@@ -110,7 +139,14 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         if isinstance(value, Mapping):
             out += flat(value, f"{name}: ")
         else:
-            out.append((name, ", ".join(map(number, value)) if isinstance(value, list | tuple) else number(value)))
+            out.append(
+                (
+                    name,
+                    ", ".join(map(number, value))
+                    if isinstance(value, list | tuple)
+                    else number(value),
+                )
+            )
     return out
 
 
@@ -132,23 +168,33 @@ def _title(key: str) -> str:
 
 def _html(table: Table) -> Markup:
     head = "".join(f"<th>{html.escape(c)}</th>" for c in table.columns)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in table.rows)
-    return Markup(f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')  # escaped above
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in table.rows
+    )
+    return Markup(
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )  # escaped above
 
 
 def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
     out, last = [], ""
     for picture in pictures:
-        key = next((k for k in _CAPTIONS if picture.stem == k or picture.stem.startswith(f"{k}_")), "")
+        key = next(
+            (k for k in _CAPTIONS if picture.stem == k or picture.stem.startswith(f"{k}_")), ""
+        )
         heading, caption = _CAPTIONS.get(key, (picture.stem, ""))
         data = base64.b64encode(picture.read_bytes()).decode()
-        out.append({"heading": "" if heading == last else heading, "caption": caption, "data": data})
+        out.append(
+            {"heading": "" if heading == last else heading, "caption": caption, "data": data}
+        )
         last = heading
     return out
 
 
 def write_report(results: Results, folder: str | Path, pictures: Sequence[Path]) -> Path:
-    """Write ``report.html`` into `folder` with the figures `pictures` embedded; nothing in it is fetched from elsewhere.
+    """Write ``report.html`` into `folder` with the figures `pictures` embedded; nothing in it is
+    fetched from elsewhere.
 
     Raises
     ------
@@ -156,8 +202,12 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
     """
     s, d, radio = results.summary, results.dataset, results.scenario.radio
     materials = json.loads(d.attrs["materials"])
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    template = environment.from_string((package_files("isac_rt.views") / "report.html.j2").read_text(encoding="utf-8"))
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    template = environment.from_string(
+        (package_files("isac_rt.views") / "report.html.j2").read_text(encoding="utf-8")
+    )
     roles = [str(r) for r in d.role.values]
     span = float(d.time.values[-1] - d.time.values[0]) if d.sizes["frame"] else 0.0
     page = template.render(
@@ -170,15 +220,27 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         terminals=per_terminal(s),
         rmse=rmse_table(s),
         budget=row_table(json.loads(d.attrs["link_budget"])),
-        paths=Table(("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]),
+        paths=Table(
+            ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]
+        ),
         figures=_embedded(pictures),
         access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),
-        sparsity=row_table([{"link": name.replace("->", " to "), **row} for name, row in (s.get("sparsity") or {}).items()]),
+        sparsity=row_table(
+            [
+                {"link": name.replace("->", " to "), **row}
+                for name, row in (s.get("sparsity") or {}).items()
+            ]
+        ),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
         timing=Table(("Stage", "Seconds"), [(k, number(v)) for k, v in s["timing_s"].items()]),
         versions=Table(
-            ("Package", "Version"), [*s["versions"].items(), ("commit", d.attrs["commit"] or DASH), ("platform", d.attrs["platform"])]
+            ("Package", "Version"),
+            [
+                *s["versions"].items(),
+                ("commit", d.attrs["commit"] or DASH),
+                ("platform", d.attrs["platform"]),
+            ],
         ),
         scenario_yaml=d.attrs["scenario"],
     )

@@ -18,7 +18,8 @@ from isac_rt.world.swarm import Swarm
 
 
 def city_of(scenario: Scenario, radius: float = np.inf) -> City:
-    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object again for like scenarios."""
+    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object
+    again for like scenarios."""
     centre, carrier = tuple(flight_centre(scenario).tolist()), scenario.radio.carrier_hz
     text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
     return _near_city(radius, text, scenario.folder, city_digest(scenario), carrier, centre)
@@ -35,14 +36,20 @@ def flight_centre(scenario: Scenario) -> np.ndarray:
 
 
 @lru_cache(maxsize=2)
-def _loaded_city(text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]) -> City:
+def _loaded_city(
+    text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]
+) -> City:
     tree = CityTree.model_validate(json.loads(text)) if text else None
     return load_city(tree, folder, carrier, centre)
 
 
 def city_digest(scenario: Scenario) -> str:
     """Of the city's file, "" without one."""
-    return "" if scenario.city is None or scenario.city.file is None else file_digest(scenario.city_path())
+    return (
+        ""
+        if scenario.city is None or scenario.city.file is None
+        else file_digest(scenario.city_path())
+    )
 
 
 def file_digest(file: Path) -> str:

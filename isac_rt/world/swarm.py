@@ -18,8 +18,8 @@ class Pose:
     Attributes
     ----------
     position, velocity, acceleration : (3,) float64 [m, m/s, m/s^2]
-    rotation : (3, 3) float64; columns are the body's X (right), Y (boresight) and Z (up) in world axes, so
-        world = rotation @ body and body = rotation.T @ world
+    rotation : (3, 3) float64; columns are the body's X (right), Y (boresight) and Z (up) in world
+        axes, so world = rotation @ body and body = rotation.T @ world
     """
 
     position: np.ndarray
@@ -48,23 +48,35 @@ def attitude(boresight: np.ndarray) -> np.ndarray:
 
 
 class Trajectory:
-    """Position, velocity and acceleration of one UAV at any time: a straight line, or the smooth (C2) spline
-    through its waypoints, prolonged in a straight line beyond them."""
+    """Position, velocity and acceleration of one UAV at any time: a straight line, or the smooth
+    (C2) spline through its waypoints, prolonged in a straight line beyond them."""
 
     def __init__(self, uav: Uav) -> None:
-        self._fixed_boresight = None if uav.boresight == "velocity" else np.array(uav.boresight, float)
+        self._fixed_boresight = (
+            None if uav.boresight == "velocity" else np.array(uav.boresight, float)
+        )
         if uav.waypoints is None:
             assert uav.position_m is not None  # the scenario's own check
-            self._start, self._velocity, self._spline = np.array(uav.position_m), np.array(uav.velocity_mps), None
+            self._start, self._velocity, self._spline = (
+                np.array(uav.position_m),
+                np.array(uav.velocity_mps),
+                None,
+            )
         else:
             times = np.array([w.time_s for w in uav.waypoints])
             self._span = times[0], times[-1]
-            self._spline = CubicSpline(times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural")
+            self._spline = CubicSpline(
+                times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural"
+            )
 
     def pose(self, time: float) -> Pose:
         """Pose at `time` [s]."""
         if self._spline is None:
-            position, velocity, acceleration = self._start + time * self._velocity, self._velocity.copy(), np.zeros(3)
+            position, velocity, acceleration = (
+                self._start + time * self._velocity,
+                self._velocity.copy(),
+                np.zeros(3),
+            )
         else:
             inside = float(np.clip(time, *self._span))
             velocity = self._spline(inside, 1)
@@ -85,7 +97,9 @@ class Swarm:
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Swarm:
-        return cls(dict(scenario.swarm), {name: Trajectory(uav) for name, uav in scenario.swarm.items()})
+        return cls(
+            dict(scenario.swarm), {name: Trajectory(uav) for name, uav in scenario.swarm.items()}
+        )
 
     def poses(self, time: float) -> dict[str, Pose]:
         """Every UAV's pose at `time` [s]."""
@@ -93,7 +107,10 @@ class Swarm:
 
     def middle(self, duration: float) -> np.ndarray:
         """(3,) mean position of all UAVs over nine instants of a flight [s, m]."""
-        return np.mean([pose.position for t in np.linspace(0, duration, 9) for pose in self.poses(t).values()], axis=0)
+        return np.mean(
+            [pose.position for t in np.linspace(0, duration, 9) for pose in self.poses(t).values()],
+            axis=0,
+        )
 
     def with_role(self, role: str) -> list[str]:
         """Names of the UAVs of one role."""

@@ -1,9 +1,11 @@
-"""The surfaces of a city cut into cells, one scatterer in each: functions of the mesh, the seed and the flights, and of nothing else.
+"""The surfaces of a city cut into cells, one scatterer in each: functions of the mesh, the seed and
+the flights, and of nothing else.
 
-Faces are halved at their longest edges until a cell's area is small against its distance to all that flies in the run. A cell is
-named by its face's corners (in the order of their coordinates) and by the halvings that lead to it; from the seed and this name
-its point and its amplitude are hashed. So neither the order of faces and corners, nor the process, nor what else is in the mesh
-changes a scatterer.
+Faces are halved at their longest edges until a cell's area is small against its distance to all
+that flies in the run. A cell is named by its face's corners (in the order of their coordinates) and
+by the halvings that lead to it; from the seed and this name its point and its amplitude are hashed.
+So neither the order of faces and corners, nor the process, nor what else is in the mesh changes a
+scatterer.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import City
 
 UNIT = 1e-6 * np.sqrt(2)
-"""World coordinates are hashed in whole multiples of this [m]. Irrational, so that no coordinate of a file lies where rounding
-could go either way after the city has been recentred and shifted back."""
+"""World coordinates are hashed in whole multiples of this [m]. Irrational, so that no coordinate of
+a file lies where rounding could go either way after the city has been recentred and shifted
+back."""
 ALIKE = 1e-9
 """Edges whose lengths differ by less than this share are equally long; then the first is halved."""
 MOST_CELLS = 8_000_000
@@ -41,20 +44,24 @@ class Density:
     @classmethod
     def of(cls, clutter: Clutter) -> Density:
         """As a scenario asks for it."""
-        return cls(clutter.cell_area_per_metre_m or area_for(clutter.max_error_db), clutter.smallest_cell_m2)
+        return cls(
+            clutter.cell_area_per_metre_m or area_for(clutter.max_error_db),
+            clutter.smallest_cell_m2,
+        )
 
 
 KNOWN_ERROR_DB, KNOWN_AREA = 0.2, 0.024
-"""Of the mean power in range cells of 4 m, that nine of ten keep to, at this area over distance [m]: what Munich and San Francisco
-show (0.17 and 0.18 dB, `docs/clutter.md`) and a tenth more."""
+"""Of the mean power in range cells of 4 m, that nine of ten keep to, at this area over distance
+[m]: what Munich and San Francisco show (0.17 and 0.18 dB, `docs/clutter.md`) and a tenth more."""
 
 
 def area_for(error_db: float) -> float:
     """Area over distance [m] at which nine of ten range cells keep to an error of their mean power.
 
-    Of the surface within a range cell, cells of area A that its two edges cut count on one side or the other, their whole power. There are
-    n ~ 1/A inside and m ~ 1/sqrt(A) on the edges, so the error sqrt(m)/n grows with A^(3/4). It is the same for all presets of
-    the budget, because another density is another draw of the clutter.
+    Of the surface within a range cell, cells of area A that its two edges cut count on one side or
+    the other, their whole power. There are n ~ 1/A inside and m ~ 1/sqrt(A) on the edges, so the
+    error sqrt(m)/n grows with A^(3/4). It is the same for all presets of the budget, because
+    another density is another draw of the clutter.
     """
     return float(f"{KNOWN_AREA * (error_db / KNOWN_ERROR_DB) ** (4 / 3):.6g}")
 
@@ -89,7 +96,9 @@ class Cells:
         return Cells(self.points[which], self.area[which], self.amplitude[which], self.face[which])
 
 
-def cut(city: City, scattering: np.ndarray, places: np.ndarray, density: Density, seed: int) -> Cells:
+def cut(
+    city: City, scattering: np.ndarray, places: np.ndarray, density: Density, seed: int
+) -> Cells:
     """All scatterers of a city.
 
     Parameters
@@ -124,7 +133,8 @@ def cut(city: City, scattering: np.ndarray, places: np.ndarray, density: Density
         count += int((~large).sum()) + 2 * int(large.sum())
         if count > MOST_CELLS:
             raise ValueError(
-                f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, or cell_area_per_metre_m) cuts "
+                f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, "
+                "or cell_area_per_metre_m) cuts "
                 f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
             )
         corners = _halves(corners[large])
@@ -139,8 +149,11 @@ def cut(city: City, scattering: np.ndarray, places: np.ndarray, density: Density
     return Cells(point, areas.astype(np.float32), amplitude, face[rows].astype(np.int32))
 
 
-def _too_large(corners: np.ndarray, area: np.ndarray, tree: cKDTree, density: Density) -> np.ndarray:
-    """Whether cells are larger than their distance allows; that of the nearest point that a circle about the centroid can hold."""
+def _too_large(
+    corners: np.ndarray, area: np.ndarray, tree: cKDTree, density: Density
+) -> np.ndarray:
+    """Whether cells are larger than their distance allows; that of the nearest point that a circle
+    about the centroid can hold."""
     large = area > density.smallest
     middle = corners[large].mean(axis=1)
     reach = np.linalg.norm(corners[large] - middle[:, None], axis=2).max(axis=1)
@@ -156,13 +169,16 @@ def _sorted_corners(corners: np.ndarray) -> np.ndarray:
 
 
 def _halves(corners: np.ndarray) -> np.ndarray:
-    """(2n, 3, 3) the two halves of each triangle (n, 3, 3), cut from the middle of its longest edge."""
+    """(2n, 3, 3) the two halves of each triangle (n, 3, 3), cut from the middle of its longest
+    edge."""
     edge = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)
     first = (edge >= edge.max(axis=1, keepdims=True) * (1 - ALIKE)).argmax(axis=1)
     turn = (first[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
     middle = (a + b) / 2
-    return np.stack([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)], axis=1).reshape(-1, 3, 3)
+    return np.stack(
+        [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)], axis=1
+    ).reshape(-1, 3, 3)
 
 
 def _mixed(state: np.ndarray, word: np.ndarray) -> np.ndarray:
@@ -185,8 +201,12 @@ def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _draw(state: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point, uniform in each triangle (N, 3, 3), and a complex Gaussian amplitude of unit power."""
-    uniform = [((_mixed(state, np.full_like(state, k)) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53 for k in range(4)]
+    """A point, uniform in each triangle (N, 3, 3), and a complex Gaussian amplitude of unit
+    power."""
+    uniform = [
+        ((_mixed(state, np.full_like(state, k)) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
+        for k in range(4)
+    ]
     root = np.sqrt(uniform[0])[:, None]
     share = uniform[1][:, None]
     a, b, c = np.moveaxis(triangles, 1, 0)

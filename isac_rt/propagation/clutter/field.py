@@ -1,22 +1,27 @@
 r"""Diffuse clutter pinned to the mesh: scatterers that stay where they are while the radar flies.
 
-Each scatterer stands for one cell of a surface (`cells`) and returns, from one isotropic antenna to another,
+Each scatterer stands for one cell of a surface (`cells`) and returns, from one isotropic antenna to
+another,
 
-.. math:: |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A / (r_1 r_2)^2,
+.. math:: |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A /
+(r_1 r_2)^2,
 
-times its own complex-Gaussian amplitude of unit power, so that the mean power over a surface is the effective-roughness integral
-[1]_ that Sionna RT takes by shooting rays, and its speckle is Rayleigh however few scatterers share a cell of range and Doppler.
-S is the material's scattering coefficient, Gamma the slab's reflection (ITU-R P.2040) for the vertically polarised wave as its TE and TM
-parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is kept: what comes in vertical goes
-out vertical, as with Sionna's default. Gamma belongs to the way in, so the two directions of a link differ a little.
+times its own complex-Gaussian amplitude of unit power, so that the mean power over a surface is the
+effective-roughness integral [1]_ that Sionna RT takes by shooting rays, and its speckle is Rayleigh
+however few scatterers share a cell of range and Doppler. S is the material's scattering
+coefficient, Gamma the slab's reflection (ITU-R P.2040) for the vertically polarised wave as its TE
+and TM parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is
+kept: what comes in vertical goes out vertical, as with Sionna's default. Gamma belongs to the way
+in, so the two directions of a link differ a little.
 
-One bounce; `twice` adds a mirror before or after it. Delay, rate, acceleration and directions are float64 closed forms of the
-point and the poses.
+One bounce; `twice` adds a mirror before or after it. Delay, rate, acceleration and directions are
+float64 closed forms of the point and the poses.
 Import only after `isac_rt.runtime.activate()`.
 
 References
 ----------
-.. [1] V. Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans. Antennas Propag. 55(1),
+.. [1] V. Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE
+Trans. Antennas Propag. 55(1),
    2007, doi:10.1109/TAP.2006.888422.
 """
 
@@ -43,9 +48,11 @@ from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose, Swarm
 
 TABLE = 4097
-"""Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines between them."""
+"""Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines
+between them."""
 KEPT_SPACING = 1.0
-"""Flight of the transmitters from one test of all cells to the next [m]; a cell in sight of none of these places is left out."""
+"""Flight of the transmitters from one test of all cells to the next [m]; a cell in sight of none of
+these places is left out."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,8 @@ class Surfaces:
     ----------
     normals : (F, 3) unit normals
     material : (F,) int64
-    table : (M, T, 3) TE and TM power reflectivity, and the pattern's norm 1/F, over the cosine of incidence from 0 to 1
+    table : (M, T, 3) TE and TM power reflectivity, and the pattern's norm 1/F, over the cosine of
+        incidence from 0 to 1
     coefficient : (M,) S^2
     lobe : (M,) share of the lobe about the mirror direction; -1 for Lambert's pattern
     exponent : (M,) of the lobes
@@ -74,12 +82,14 @@ class Surfaces:
 class Seen:
     """What K scatterers of the field do between two terminals at one instant, isotropic antennas.
 
-    Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link share is one array.
+    Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link
+    share is one array.
 
     Attributes
     ----------
     index : (K,) int32 into the field's cells
-    magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own amplitude not
+    magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own
+        amplitude not
     length, rate, accel : (K,) of the way over the scatterer [m, m/s, m/s^2]
     tx_radius, rx_radius : (K,) distances from either end [m]
     departure, arrival : (K, 3) unit vectors from either end to the scatterer
@@ -102,9 +112,12 @@ class Seen:
 
 
 class ClutterField:
-    """The scatterers of one run. All links and frames see the same ones; `plan` makes it from a scenario."""
+    """The scatterers of one run. All links and frames see the same ones; `plan` makes it from a
+    scenario."""
 
-    def __init__(self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int) -> None:
+    def __init__(
+        self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int
+    ) -> None:
         self._city, self.sight = city, sight
         self.cells = cells
         self.num_candidates = num_candidates
@@ -113,21 +126,35 @@ class ClutterField:
         self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
     @classmethod
-    def plan(cls, scenario: Scenario, city: City, scene: mi.Scene, wavelength: float) -> ClutterField:
-        """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any place of its flight."""
+    def plan(
+        cls, scenario: Scenario, city: City, scene: mi.Scene, wavelength: float
+    ) -> ClutterField:
+        """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
+        place of its flight."""
         duration = scenario.flight_duration_s
         trajectories = Swarm.from_scenario(scenario).trajectories
         names = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
         flights = {name: Flight(trajectories[name], duration, city.origin) for name in names}
         places = np.concatenate([flight.knots for flight in flights.values()])
         density = Density.of(scenario.clutter)
-        scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[city.face_material]
+        scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
+            city.face_material
+        ]
         candidates = cut(city, scatters, places, density, scenario.seed)
         shadows = Shadows(scene)
-        active = {n for n in names if scenario.swarm[n].role == "active"} | {change.to_uav for change in scenario.role_changes}
-        kept = _ever_seen(shadows, [flights[n] for n in names if n in active], candidates.points, city.normals[candidates.face])
+        active = {n for n in names if scenario.swarm[n].role == "active"} | {
+            change.to_uav for change in scenario.role_changes
+        }
+        kept = _ever_seen(
+            shadows,
+            [flights[n] for n in names if n in active],
+            candidates.points,
+            city.normals[candidates.face],
+        )
         cells = candidates.select(np.flatnonzero(kept))
-        sight = Sight(shadows, flights, cells.points, city.normals[cells.face], cells.area, wavelength)
+        sight = Sight(
+            shadows, flights, cells.points, city.normals[cells.face], cells.area, wavelength
+        )
         return cls(city, cells, sight, wavelength, len(candidates))
 
     @property
@@ -135,24 +162,60 @@ class ClutterField:
         """Of the scatterers and of what is remembered of their sight."""
         return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
 
-    def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None) -> Seen:
-        """What is in sight of both ends of a link, poses in local coordinates; in the shadows of `bodies`, if given."""
+    def seen(
+        self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None
+    ) -> Seen:
+        """What is in sight of both ends of a link, poses in local coordinates; in the shadows of
+        `bodies`, if given."""
         share = self.sight.share(tx, start, time)
         if tx != rx:
             share = share * self.sight.share(rx, end, time)
         index = np.flatnonzero(share).astype(np.int32)
         count, own = index.size, tx == rx
         radius, departure = np.empty(count), np.empty((count, 3))
-        out: list[np.ndarray] = [np.empty(count, np.float32), np.empty(count), np.empty(count), np.empty(count, np.float32), radius]
-        out += [radius, departure, departure] if own else [np.empty(count), departure, np.empty((count, 3))]
+        out: list[np.ndarray] = [
+            np.empty(count, np.float32),
+            np.empty(count),
+            np.empty(count),
+            np.empty(count, np.float32),
+            radius,
+        ]
+        out += (
+            [radius, departure, departure]
+            if own
+            else [np.empty(count), departure, np.empty((count, 3))]
+        )
         s, c = self.surfaces, self.cells
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
-        _advance(index, share, c.points, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
-                 self._scale, *motion, own, *out)  # type: ignore[call-arg]  # fmt: skip
+        _advance(
+            index,
+            share,
+            c.points,
+            c.face,
+            c.area,
+            s.normals,
+            s.material,
+            s.table,
+            s.coefficient,
+            s.lobe,
+            s.exponent,
+            self._scale,
+            *motion,
+            own,
+            *out,
+        )  # type: ignore[call-arg]
         found = Seen(index, *out)
         if bodies is not None:
-            there = bodies.sight(start.position, c.points[index], found.tx_radius, self._wavelength, (tx,))
-            back = there if own else bodies.sight(end.position, c.points[index], found.rx_radius, self._wavelength, (rx,))
+            there = bodies.sight(
+                start.position, c.points[index], found.tx_radius, self._wavelength, (tx,)
+            )
+            back = (
+                there
+                if own
+                else bodies.sight(
+                    end.position, c.points[index], found.rx_radius, self._wavelength, (rx,)
+                )
+            )
             found.magnitude[:] *= there * back
         lit = found.magnitude > 0
         if lit.all():
@@ -161,9 +224,17 @@ class ClutterField:
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
     def paths(
-        self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict, bodies: Bodies | None = None
+        self,
+        tx: str,
+        rx: str,
+        start: Pose,
+        end: Pose,
+        antennas: Antennas,
+        common: dict,
+        bodies: Bodies | None = None,
     ) -> PathSet:
-        """The link's paths at ``common["epoch"]``; poses, points and bodies in local coordinates."""
+        """The link's paths at ``common["epoch"]``; poses, points and bodies in local
+        coordinates."""
         seen = self.seen(tx, rx, start, end, common["epoch"], bodies)
         elements = (
             antennas.element_gain(start.to_body(seen.departure))
@@ -187,7 +258,9 @@ class ClutterField:
         )
 
 
-def _ever_seen(shadows: Shadows, flights: Sequence[Flight], points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _ever_seen(
+    shadows: Shadows, flights: Sequence[Flight], points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
     """(N,) whether points are seen from a place of the flights."""
     step = round(KEPT_SPACING / KNOT_SPACING)
     kept = np.zeros(len(points), bool)
@@ -201,7 +274,10 @@ def _ever_seen(shadows: Shadows, flights: Sequence[Flight], points: np.ndarray, 
 def surfaces(city: City, wavelength: float) -> Surfaces:
     """Tables of a city's materials."""
     cosine = np.linspace(0.0, 1.0, TABLE)
-    table = [np.stack([*slab_reflectivity(m, cosine, wavelength), 1 / lobe_norm(m, cosine)], axis=1) for m in city.materials]
+    table = [
+        np.stack([*slab_reflectivity(m, cosine, wavelength), 1 / lobe_norm(m, cosine)], axis=1)
+        for m in city.materials
+    ]
     lobes = {"lambertian": -1.0, "directive": 1.0, "backscattering": 0.5}
     return Surfaces(
         city.normals,
@@ -213,10 +289,15 @@ def surfaces(city: City, wavelength: float) -> Surfaces:
     )
 
 
-def slab_reflectivity(material: Material, cosine: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Power reflectivity of a slab for TE and TM waves over the cosine of incidence (ITU-R P.2040-3, eqs. 37, 43 and 44)."""
+def slab_reflectivity(
+    material: Material, cosine: np.ndarray, wavelength: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Power reflectivity of a slab for TE and TM waves over the cosine of incidence (ITU-R
+    P.2040-3, eqs. 37, 43 and 44)."""
     omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
-    eta = material.relative_permittivity - 1j * material.conductivity / (omega * VACUUM_PERMITTIVITY)
+    eta = material.relative_permittivity - 1j * material.conductivity / (
+        omega * VACUUM_PERMITTIVITY
+    )
     root = np.sqrt(eta - (1 - cosine**2))
     turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
     te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
@@ -225,9 +306,11 @@ def slab_reflectivity(material: Material, cosine: np.ndarray, wavelength: float)
 
 
 def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
-    """Integral over the half-space of the lobe ((1 + cos psi)/2)^alpha about a direction (Degli-Esposti [1]_, eqs. 13 and 15).
+    """Integral over the half-space of the lobe ((1 + cos psi)/2)^alpha about a direction
+    (Degli-Esposti [1]_, eqs. 13 and 15).
 
-    The lobes about the mirror direction and about the way in have one exponent, so both have this norm.
+    The lobes about the mirror direction and about the way in have one exponent, so both have this
+    norm.
     """
     alpha = material.pattern_exponent
     if material.scattering_pattern == "lambertian":
@@ -242,10 +325,33 @@ def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _advance(index, share, points, face, area, normals, material, table, coefficient, lobe, exponent, scale, start, end, own,
-             magnitude, length, rate, accel, tx_radius, rx_radius, departure, arrival):  # fmt: skip
-    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`: position, velocity, acceleration;
-    `own`: both are one body, and `arrival` is `departure`."""
+def _advance(
+    index,
+    share,
+    points,
+    face,
+    area,
+    normals,
+    material,
+    table,
+    coefficient,
+    lobe,
+    exponent,
+    scale,
+    start,
+    end,
+    own,
+    magnitude,
+    length,
+    rate,
+    accel,
+    tx_radius,
+    rx_radius,
+    departure,
+    arrival,
+):
+    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`:
+    position, velocity, acceleration; `own`: both are one body, and `arrival` is `departure`."""
     last = table.shape[1] - 2
     for row in range(index.size):
         i = index[row]
@@ -271,7 +377,8 @@ def _advance(index, share, points, face, area, normals, material, table, coeffic
         at -= k
         te = table[m, k, 0] + at * (table[m, k + 1, 0] - table[m, k, 0])
         tm = table[m, k, 1] + at * (table[m, k + 1, 1] - table[m, k, 1])
-        # the vertical field is across the horizontal u x z: its TE part is the part of n along u x z, of all of n across u
+        # the vertical field is across the horizontal u x z: its TE part is the part of n along u x
+        # z, of all of n across u
         whole = (x1 * x1 + y1 * y1) * (1 - cos_i * cos_i)
         part = min((ny * x1 - nx * y1) ** 2 / whole, 1.0) if whole > 1e-12 else 0.5
         power = coefficient[m] * (part * te + (1 - part) * tm) * cos_i * area[i]
@@ -289,7 +396,8 @@ def _advance(index, share, points, face, area, normals, material, table, coeffic
 
 @numba.njit(inline="always", error_model="numpy")
 def _leg(px, py, pz, body):
-    """Distance from a moving body to a point, its rate and acceleration, and the unit vector towards the point."""
+    """Distance from a moving body to a point, its rate and acceleration, and the unit vector
+    towards the point."""
     x, y, z = px - body[0, 0], py - body[0, 1], pz - body[0, 2]
     r = np.sqrt(x * x + y * y + z * z)
     x, y, z = x / r, y / r, z / r

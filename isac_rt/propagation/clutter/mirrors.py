@@ -1,12 +1,15 @@
-r"""Which walls a terminal sees the city in: the mirrors of two-bounce clutter, chosen once for a run, and what shows in them.
+r"""Which walls a terminal sees the city in: the mirrors of two-bounce clutter, chosen once for a
+run, and what shows in them.
 
-A mirror is all faces of one plane and one material. Of all mirrors a terminal keeps those that send on the most of what it radiates,
+A mirror is all faces of one plane and one material. Of all mirrors a terminal keeps those that send
+on the most of what it radiates,
 
 .. math:: \overline{\sum R\,(1 - S^2)\,\Omega / 4\pi},
 
-the share of an isotropic antenna's power that meets the mirror's faces in sight (solid angle Omega) and leaves them as from a
-mirror (R is the mean of the slab's TE and TM power reflectivity), averaged over places along its flight. By reciprocity it is also
-the mirror's share of what can reach the terminal. Being shares of one whole, they say what the mirrors left out could have held.
+the share of an isotropic antenna's power that meets the mirror's faces in sight (solid angle Omega)
+and leaves them as from a mirror (R is the mean of the slab's TE and TM power reflectivity),
+averaged over places along its flight. By reciprocity it is also the mirror's share of what can
+reach the terminal. Being shares of one whole, they say what the mirrors left out could have held.
 
 Local coordinates. Import only after `isac_rt.runtime.activate()`.
 """
@@ -29,9 +32,11 @@ from isac_rt.world.swarm import Pose
 PLACES = 16
 """Places along a flight from which mirrors are weighed."""
 COARSE = Density(0.3, 2.0)
-"""Cells by which solid angles are taken [m, m^2]: some 500 of them over a plane that fills half of the view."""
+"""Cells by which solid angles are taken [m, m^2]: some 500 of them over a plane that fills half of
+the view."""
 APART = 0.01
-"""A point this near to the plane of a mirror [m] does not show in it: it lies on the wall, or in its corner."""
+"""A point this near to the plane of a mirror [m] does not show in it: it lies on the wall, or in
+its corner."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +68,22 @@ class Mirror:
         return motion
 
 
-def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int) -> tuple[list[Mirror], float]:
-    """The mirrors that send on the most of what a terminal radiates on its flight, strongest first, at most `most`; and the share that
-    all others send on."""
+def strongest(
+    city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int
+) -> tuple[list[Mirror], float]:
+    """The mirrors that send on the most of what a terminal radiates on its flight, strongest first,
+    at most `most`; and the share that all others send on."""
     if not most or not city.num_faces:
         return [], 0.0
-    places = flight.knots[np.unique(np.linspace(0, len(flight.knots) - 1, PLACES).round().astype(int))]
+    places = flight.knots[
+        np.unique(np.linspace(0, len(flight.knots) - 1, PLACES).round().astype(int))
+    ]
     cells = cut(city, np.ones(city.num_faces, bool), places, COARSE, seed)
-    _, group = np.unique(np.stack([city.plane_of_face, city.face_material.astype(np.int64)], axis=1), axis=0, return_inverse=True)
+    _, group = np.unique(
+        np.stack([city.plane_of_face, city.face_material.astype(np.int64)], axis=1),
+        axis=0,
+        return_inverse=True,
+    )
     group = group.ravel()
     normals, offsets = plane_of_each_face(city)
     share = np.zeros(group.max() + 1)
@@ -96,18 +109,35 @@ def strongest(city: City, shadows: Shadows, flight: Flight, wavelength: float, s
             faces = faces[np.argsort(-city.areas[faces], kind="stable")]
             first = faces[0]
             material = city.materials[city.face_material[first]]
-            out.append(Mirror(normals[first], float(offsets[first]), faces, city.corners[faces], material, float(share[number])))
+            out.append(
+                Mirror(
+                    normals[first],
+                    float(offsets[first]),
+                    faces,
+                    city.corners[faces],
+                    material,
+                    float(share[number]),
+                )
+            )
     return out, float(share[order[most:]].sum())
 
 
 def _reflected(material: Material, wavelength: float) -> np.ndarray:
-    """Mean of the TE and TM power that a slab mirrors, over the cosine of incidence from 0 to 1, evenly."""
+    """Mean of the TE and TM power that a slab mirrors, over the cosine of incidence from 0 to 1,
+    evenly."""
     te, tm = slab_coefficients(material, np.linspace(0.0, 1.0, 257), wavelength)
     return (np.abs(te) ** 2 + np.abs(tm) ** 2) / 2
 
 
-def shown(shadows: Shadows, place: np.ndarray, mirrors: list[Mirror], points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
-    """Of points (N, 3) on surfaces with unit normals (N, 3), the indices of those that `place` sees in each mirror.
+def shown(
+    shadows: Shadows,
+    place: np.ndarray,
+    mirrors: list[Mirror],
+    points: np.ndarray,
+    normals: np.ndarray,
+) -> list[np.ndarray]:
+    """Of points (N, 3) on surfaces with unit normals (N, 3), the indices of those that `place` sees
+    in each mirror.
 
     The wave must meet the mirror on one of its faces, and both legs must be free.
     """
@@ -129,7 +159,8 @@ def shown(shadows: Shadows, place: np.ndarray, mirrors: list[Mirror], points: np
 
 @numba.njit(cache=True, nogil=True)
 def _on_the_wall(points, place, normal, offset, corners):
-    """Points on the viewer's side of a mirror whose way to it meets one of its triangles, and where."""
+    """Points on the viewer's side of a mirror whose way to it meets one of its triangles, and
+    where."""
     above = (normal * place).sum() - offset
     which, where = [0 for _ in range(0)], [0.0 for _ in range(0)]
     low, high = np.empty(3), np.empty(3)
@@ -158,12 +189,17 @@ def _on_the_wall(points, place, normal, offset, corners):
 
 @numba.njit(inline="always")
 def _inside(x, y, z, corners, normal):
-    """Whether a point of the plane is in a triangle, whichever way round its corners go; seams belong to both sides."""
+    """Whether a point of the plane is in a triangle, whichever way round its corners go; seams
+    belong to both sides."""
     least, most = np.inf, -np.inf
     for k in range(3):
         a, b = corners[k], corners[(k + 1) % 3]
         ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         px, py, pz = x - a[0], y - a[1], z - a[2]
-        turn = (ey * pz - ez * py) * normal[0] + (ez * px - ex * pz) * normal[1] + (ex * py - ey * px) * normal[2]
+        turn = (
+            (ey * pz - ez * py) * normal[0]
+            + (ez * px - ex * pz) * normal[1]
+            + (ex * py - ey * px) * normal[2]
+        )
         least, most = min(least, turn), max(most, turn)
     return least >= -1e-9 or most <= 1e-9

@@ -1,14 +1,17 @@
-r"""Where a flight carries the sight of scatterers across shadow edges, and how wide the penumbra is there.
+r"""Where a flight carries the sight of scatterers across shadow edges, and how wide the penumbra is
+there.
 
-A scatterer that is seen from one knot of a flight and not from the next has crossed a shadow edge in between. Rays bisect
-the place; the ray that just fails hits what is in the way within millimetres of its edge, so that the edge is that of the triangle
-hit which is nearest. From it come the distances d_1 (to the terminal) and d_2 (to the scatterer) and the direction
-m across the edge and the ray, and with them the flight that takes the scatterer one Fresnel unit into the shadow,
+A scatterer that is seen from one knot of a flight and not from the next has crossed a shadow edge
+in between. Rays bisect the place; the ray that just fails hits what is in the way within
+millimetres of its edge, so that the edge is that of the triangle hit which is nearest. From it come
+the distances d_1 (to the terminal) and d_2 (to the scatterer) and the direction m across the edge
+and the ray, and with them the flight that takes the scatterer one Fresnel unit into the shadow,
 
 .. math:: \sigma = \frac{d_1}{d_2\,|v \cdot m|} \sqrt{\frac{\lambda d_2 (d_1 + d_2)}{2 d_1} + w^2},
 
-v the unit vector of the flight and w half the width of the scatterer's cell across the edge: a cell is no point, and the shadow's
-edge takes that long to cross it. About the crossing the Fresnel parameter is taken linear in the flight.
+v the unit vector of the flight and w half the width of the scatterer's cell across the edge: a cell
+is no point, and the shadow's edge takes that long to cross it. About the crossing the Fresnel
+parameter is taken linear in the flight.
 
 Import only after `isac_rt.runtime.activate()`.
 """
@@ -26,9 +29,11 @@ from isac_rt.propagation.legs.diffraction import knife_edge
 HALVINGS = 6
 """Of the flight between two knots; what is left is 8 mm of half a metre."""
 REACH = 4.0
-"""Fresnel units on either side after which a scatterer is dark or lit; the ripple and the tail are 6 % there, and tapered."""
+"""Fresnel units on either side after which a scatterer is dark or lit; the ripple and the tail are
+6 % there, and tapered."""
 HALF_WIDTH = 0.7
-"""Half the width of a cell over the root of its area: half a side of a right triangle with two equal ones."""
+"""Half the width of a cell over the root of its area: half a side of a right triangle with two
+equal ones."""
 _UNITS = np.linspace(-REACH, REACH, 1025)
 
 
@@ -49,7 +54,8 @@ def penumbra(units: np.ndarray) -> np.ndarray:
 
 
 class Triangles:
-    """All triangles of a scene, and which of them a ray has hit. Asking the scene's meshes at each hit takes as long as a million rays."""
+    """All triangles of a scene, and which of them a ray has hit. Asking the scene's meshes at each
+    hit takes as long as a million rays."""
 
     def __init__(self, scene: mi.Scene) -> None:
         parts = [np.zeros((0, 3, 3), np.float32)]
@@ -119,7 +125,9 @@ def crossings(
         after = now == gained
         low, high = np.where(after, low, middle), np.where(after, middle, high)
     where = (low + high) / 2
-    width = _widths(scene, triangles, knots, np.where(gained, low, high), p, n, lift, area[index], wavelength)
+    width = _widths(
+        scene, triangles, knots, np.where(gained, low, high), p, n, lift, area[index], wavelength
+    )
     return Crossings(index, where.astype(np.float32), width.astype(np.float32), gained)
 
 
@@ -134,13 +142,17 @@ def _rays(points: np.ndarray, normals: np.ndarray, places: np.ndarray, lift: flo
     span = places - start
     length = np.linalg.norm(span, axis=1)
     span /= length[:, None]
-    ray = mi.Ray3f(mi.Point3f(*np.ascontiguousarray(start.T, np.float32)), mi.Vector3f(*np.ascontiguousarray(span.T, np.float32)))
+    ray = mi.Ray3f(
+        mi.Point3f(*np.ascontiguousarray(start.T, np.float32)),
+        mi.Vector3f(*np.ascontiguousarray(span.T, np.float32)),
+    )
     ray.maxt = mi.Float((length - lift).astype(np.float32))  # type: ignore[assignment]
     return ray
 
 
 def _widths(scene, triangles, knots, dark, points, normals, lift, area, wavelength):  # type: ignore[no-untyped-def]
-    """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way between two knots."""
+    """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way
+    between two knots."""
     if not points.shape[0]:
         return np.zeros(0)
     places = _between(knots, dark)

@@ -1,19 +1,26 @@
-"""The paper's urban clutter: a run of range cells with Rayleigh amplitudes that stand still, on top of any propagation model.
+"""The paper's urban clutter: a run of range cells with Rayleigh amplitudes that stand still, on top
+of any propagation model.
 
-The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1", on average 10 dB over the target's; 40 to 50 consecutive
-range cells; their centre drawn between 20 and 30 m; velocity 0. What it leaves open is a key of `clutter`:
+The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1", on average 10 dB
+over the target's; 40 to 50 consecutive range cells; their centre drawn between 20 and 30 m;
+velocity 0. What it leaves open is a key of `clutter`:
 
-- 10 dB of mean power or of mean amplitude (`level_of`), over the link's reference path: at a PT its line of sight, which the paper
-  calls its target;
-- where the centre is (`centre`, `centre_m`); a run that would begin before cell 1 is moved out, not cut;
-- whether all is drawn anew in every frame (`redraw`) - independent amplitudes from frame to frame, but constant, so coherent, within one;
+- 10 dB of mean power or of mean amplitude (`level_of`), over the link's reference path: at a PT its
+  line of sight, which the paper calls its target;
+- where the centre is (`centre`, `centre_m`); a run that would begin before cell 1 is moved out, not
+  cut;
+- whether all is drawn anew in every frame (`redraw`) - independent amplitudes from frame to frame,
+  but constant, so coherent, within one;
 - scatterers on the range grid, or anywhere in their cells (`place`), where their sidelobes show;
-- directions (`direction`); uniform in azimuth and elevation over the field of view. At a terminal's own link a wave leaves where it
-  comes from, between two terminals the two directions are independent;
-- "strong correlation between adjacent distance grids" (`cell_correlation`, a first-order autoregression along the cells).
+- directions (`direction`); uniform in azimuth and elevation over the field of view. At a terminal's
+  own link a wave leaves where it comes from, between two terminals the two directions are
+  independent;
+- "strong correlation between adjacent distance grids" (`cell_correlation`, a first-order
+  autoregression along the cells).
 
-Each scatterer is a path of kind DIFFUSE with a delay rate of exactly 0: clutter that stands still relative to the receiver, which a
-city does for a hovering one only. Being a path of the transmitter's chirps it carries their data, as the paper does not say.
+Each scatterer is a path of kind DIFFUSE with a delay rate of exactly 0: clutter that stands still
+relative to the receiver, which a city does for a hovering one only. Being a path of the
+transmitter's chirps it carries their data, as the paper does not say.
 """
 
 from __future__ import annotations
@@ -38,7 +45,9 @@ class _Paths(Protocol):
     @property
     def dropped(self) -> int: ...
 
-    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> dict[Link, PathSet]: ...
+    def paths(
+        self, poses: dict[str, Pose], epoch: float, links: list[Link]
+    ) -> dict[Link, PathSet]: ...
 
 
 def rayleigh_cells(
@@ -54,7 +63,8 @@ def rayleigh_cells(
     Returns
     -------
     ranges : (K,) [m], one in each of K consecutive cells from cell 1 on
-    amplitudes : (K,) complex, circular Gaussian - Rayleigh magnitude, uniform phase - relative to the reference path's amplitude
+    amplitudes : (K,) complex, circular Gaussian - Rayleigh magnitude, uniform phase - relative to
+        the reference path's amplitude
     """
     low, high = clutter.cells
     count = int(rng.integers(low, high + 1))
@@ -66,7 +76,9 @@ def rayleigh_cells(
     white = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
     rho = clutter.cell_correlation
     white[1:] *= np.sqrt(1 - rho**2)
-    mean_power = 10 ** (clutter.level_db / 10) * (4 / np.pi if clutter.level_of == "amplitude" else 1.0)
+    mean_power = 10 ** (clutter.level_db / 10) * (
+        4 / np.pi if clutter.level_of == "amplitude" else 1.0
+    )
     return ranges, np.sqrt(mean_power) * lfilter([1.0], [1.0, -rho], white)
 
 
@@ -74,7 +86,13 @@ class RayleighClutter:
     """A propagation model with the paper's clutter on every link."""
 
     def __init__(
-        self, model: _Paths, reference: FreeSpace, clutter: Clutter, waveform: Waveform, antennas: Antennas, seed: int
+        self,
+        model: _Paths,
+        reference: FreeSpace,
+        clutter: Clutter,
+        waveform: Waveform,
+        antennas: Antennas,
+        seed: int,
     ) -> None:
         self._model, self._reference, self._clutter = model, reference, clutter
         self._waveform, self._antennas, self._seed = waveform, antennas, seed
@@ -85,7 +103,8 @@ class RayleighClutter:
         return self._model.dropped
 
     def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> dict[Link, PathSet]:
-        """The model's paths and the clutter's; the draw depends on seed, link and, unless drawn once, epoch."""
+        """The model's paths and the clutter's; the draw depends on seed, link and, unless drawn
+        once, epoch."""
         found = self._model.paths(poses, epoch, links)
         return {link: merge([p, self._scatterers(p, poses, epoch)]) for link, p in found.items()}
 
@@ -97,7 +116,9 @@ class RayleighClutter:
         distance = float(np.linalg.norm(between))
         when = "run" if self._clutter.redraw == "once" else repr(float(epoch))
         rng = generator(self._seed, "rayleigh clutter", tx, rx, when)
-        ranges, amplitudes = rayleigh_cells(self._clutter, self._waveform.range_cell(passes), distance, rng)
+        ranges, amplitudes = rayleigh_cells(
+            self._clutter, self._waveform.range_cell(passes), distance, rng
+        )
         departure = arrival = np.tile(between / distance, (ranges.size, 1))
         if tx != rx:
             arrival = -departure
@@ -118,7 +139,10 @@ class RayleighClutter:
         )
 
     def _directions(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within half the field of view."""
-        azimuth, elevation = rng.uniform(-self._antennas.half_view, self._antennas.half_view, (2, count))
+        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within half the
+        field of view."""
+        azimuth, elevation = rng.uniform(
+            -self._antennas.half_view, self._antennas.half_view, (2, count)
+        )
         flat = np.cos(elevation)
         return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=1)

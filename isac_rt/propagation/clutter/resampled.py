@@ -1,4 +1,5 @@
-"""Phases of diffuse scatterers: random, but a function of the place, so that all links see one scatterer alike."""
+"""Phases of diffuse scatterers: random, but a function of the place, so that all links see one
+scatterer alike."""
 
 from __future__ import annotations
 
@@ -13,7 +14,11 @@ def scatterer_phase(points: np.ndarray, seed: int) -> np.ndarray:
     The mixing is splitmix64's finaliser, applied after each coordinate.
     """
     bits = np.ascontiguousarray(points, np.float32).view(np.uint32).astype(np.uint64)
-    state = np.full(points.shape[0], seed_sequence(seed, "scatterers").generate_state(1, np.uint64)[0], np.uint64)
+    state = np.full(
+        points.shape[0],
+        seed_sequence(seed, "scatterers").generate_state(1, np.uint64)[0],
+        np.uint64,
+    )
     with np.errstate(over="ignore"):
         for axis in range(3):
             state = state + (bits[:, axis] + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)

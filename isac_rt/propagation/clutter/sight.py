@@ -1,9 +1,10 @@
 """What is seen from where: shadow rays, and how sight of a scatterer comes and goes along a flight.
 
-Rays are tested from knots, places every half metre along a flight as it is planned. Where a scatterer is seen from one knot and not from
-the next, `penumbra` finds the shadow edge in between, and about it sight is the modulus of the knife edge's factor; several crossings
-add up as the apertures do that they bound. Sight is a function of the time alone: a frame is the same whether the frames before it were
-computed or not. Import only after `isac_rt.runtime.activate()`.
+Rays are tested from knots, places every half metre along a flight as it is planned. Where a
+scatterer is seen from one knot and not from the next, `penumbra` finds the shadow edge in between,
+and about it sight is the modulus of the knife edge's factor; several crossings add up as the
+apertures do that they bound. Sight is a function of the time alone: a frame is the same whether the
+frames before it were computed or not. Import only after `isac_rt.runtime.activate()`.
 """
 
 from __future__ import annotations
@@ -23,14 +24,17 @@ KNOT_SPACING = 0.5
 OFF_FLIGHT = 1e-3
 """A pose farther than this from the planned flight [m] has its rays tested by itself."""
 LIFT = 2e-3
-"""Rays start this far from the surface and end as far before the viewer [m]; float32 corners and rays are good to a tenth of it."""
+"""Rays start this far from the surface and end as far before the viewer [m]; float32 corners and
+rays are good to a tenth of it."""
 CHUNK = 1 << 20
 REACH = 3
-"""Knots on each side that matter to a blend, which is how sight by way of mirrors comes and goes."""
+"""Knots on each side that matter to a blend, which is how sight by way of mirrors comes and
+goes."""
 AROUND = 8
 """Knots on each side whose crossings are known."""
 WIDEST = (AROUND - 1) / PENUMBRA
-"""Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is forgotten."""
+"""Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is
+forgotten."""
 BLEND = BSpline.basis_element(np.arange(-REACH, REACH + 1))
 
 
@@ -41,7 +45,8 @@ class Shadows:
         self.scene = scene
 
     def sees(self, place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(N,) whether `place` sees points (N, 3) on surfaces with unit normals (N, 3) (of either side)."""
+        """(N,) whether `place` sees points (N, 3) on surfaces with unit normals (N, 3) (of either
+        side)."""
         out = np.empty(len(points), bool)
         for first in range(0, len(points), CHUNK):
             part = slice(first, first + CHUNK)
@@ -60,7 +65,10 @@ class Shadows:
         """(N,) whether nothing stands between points (N, 3) and points (N, 3)."""
         span = ends - starts
         length = np.linalg.norm(span, axis=1)
-        ray = mi.Ray3f(mi.Point3f(*_rows(starts)), mi.Vector3f(*_rows(span / np.maximum(length, 1e-9)[:, None])))
+        ray = mi.Ray3f(
+            mi.Point3f(*_rows(starts)),
+            mi.Vector3f(*_rows(span / np.maximum(length, 1e-9)[:, None])),
+        )
         ray.maxt = mi.Float(length.astype(np.float32))  # type: ignore[assignment]
         return ~np.asarray(self.scene.ray_test(ray))
 
@@ -84,7 +92,9 @@ class Flight:
         self._trajectory, self._origin = trajectory, origin
         self._times = np.linspace(0.0, duration, 2001)
         track = np.array([trajectory.pose(t).position for t in self._times])
-        self._way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))])
+        self._way = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))]
+        )
         self.spacing = max(self._way[-1] / max(np.ceil(self._way[-1] / KNOT_SPACING), 1.0), 1e-9)
         count = round(self._way[-1] / self.spacing) + 1
         times = np.interp(self.spacing * np.arange(count), self._way, self._times)
@@ -93,24 +103,33 @@ class Flight:
 
     def holds(self, pose: Pose, time: float) -> bool:
         """Whether a pose, local, is the planned one."""
-        return bool(np.linalg.norm(self._trajectory.pose(time).position - self._origin - pose.position) < OFF_FLIGHT)
+        return bool(
+            np.linalg.norm(self._trajectory.pose(time).position - self._origin - pose.position)
+            < OFF_FLIGHT
+        )
 
     def number(self, time: float) -> float:
         """Knots passed at a time, a fraction of the way to the next included."""
         return float(np.interp(time, self._times, self._way) / self.spacing)
 
     def blend(self, time: float) -> dict[int, float]:
-        """Knots that matter at a time, with their weights, which sum to one: a quintic B-spline over the way flown."""
+        """Knots that matter at a time, with their weights, which sum to one: a quintic B-spline
+        over the way flown."""
         q = self.number(time)
         nearby = np.arange(np.ceil(q - REACH), q + REACH)
         out: dict[int, float] = {}
-        for knot, weight in zip(np.clip(nearby, 0, len(self.knots) - 1).astype(int).tolist(), BLEND(nearby - q).tolist(), strict=True):
+        for knot, weight in zip(
+            np.clip(nearby, 0, len(self.knots) - 1).astype(int).tolist(),
+            BLEND(nearby - q).tolist(),
+            strict=True,
+        ):
             out[knot] = out.get(knot, 0.0) + weight
         return out
 
 
 class Sight:
-    """How far N points are in sight of each terminal at any time of a run: 0, 1, and the modulus of the knife edge's factor in between.
+    """How far N points are in sight of each terminal at any time of a run: 0, 1, and the modulus of
+    the knife edge's factor in between.
 
     Parameters
     ----------
@@ -122,10 +141,21 @@ class Sight:
     """
 
     def __init__(
-        self, shadows: Shadows, flights: dict[str, Flight], points: np.ndarray, normals: np.ndarray, area: np.ndarray, wavelength: float
+        self,
+        shadows: Shadows,
+        flights: dict[str, Flight],
+        points: np.ndarray,
+        normals: np.ndarray,
+        area: np.ndarray,
+        wavelength: float,
     ) -> None:
         self.shadows, self.flights = shadows, flights
-        self._points, self._normals, self._area, self._wavelength = points, normals, area, wavelength
+        self._points, self._normals, self._area, self._wavelength = (
+            points,
+            normals,
+            area,
+            wavelength,
+        )
         self._seen: dict[tuple[str, int], np.ndarray] = {}
         self._crossed: dict[tuple[str, int], Crossings] = {}
         self._nearby: dict[str, _Nearby] = {}
@@ -135,7 +165,9 @@ class Sight:
     def nbytes(self) -> int:
         """Of the tests and crossings kept."""
         kept = [vars(c).values() for c in (*self._crossed.values(), *self._nearby.values())]
-        return sum(bits.nbytes for bits in self._seen.values()) + sum(a.nbytes for c in kept for a in c if isinstance(a, np.ndarray))
+        return sum(bits.nbytes for bits in self._seen.values()) + sum(
+            a.nbytes for c in kept for a in c if isinstance(a, np.ndarray)
+        )
 
     def share(self, name: str, pose: Pose, time: float) -> np.ndarray:
         """(N,) float32 for a terminal at a pose, local coordinates."""
@@ -149,8 +181,14 @@ class Sight:
         near = self._nearby[name]
         out = self._knot(name, knot).astype(np.float32)
         if near.row.size:
-            step = np.where(near.gained, 1, -1) * (penumbra((q - near.where) / near.width) - (near.where < knot))
-            some = out[near.index] + np.bincount(near.row, step.real) + 1j * np.bincount(near.row, step.imag)
+            step = np.where(near.gained, 1, -1) * (
+                penumbra((q - near.where) / near.width) - (near.where < knot)
+            )
+            some = (
+                out[near.index]
+                + np.bincount(near.row, step.real)
+                + 1j * np.bincount(near.row, step.imag)
+            )
             out[near.index] = np.abs(some)
         return out
 
@@ -161,16 +199,29 @@ class Sight:
         parts = [self._crossings(name, number) for number in spans]
         for key in [k for k in self._crossed if k[0] == name and k[1] not in spans]:
             del self._crossed[key]
-        for key in [k for k in self._seen if k[0] == name and not knot - AROUND <= k[1] <= knot + AROUND]:
+        for key in [
+            k for k in self._seen if k[0] == name and not knot - AROUND <= k[1] <= knot + AROUND
+        ]:
             del self._seen[key]
         if not parts:
             nothing = np.zeros(0)
-            return _Nearby(knot, nothing.astype(np.int32), nothing.astype(np.int32), nothing, nothing, nothing.astype(bool))
+            return _Nearby(
+                knot,
+                nothing.astype(np.int32),
+                nothing.astype(np.int32),
+                nothing,
+                nothing,
+                nothing.astype(bool),
+            )
         index, row = np.unique(np.concatenate([c.index for c in parts]), return_inverse=True)
-        where = np.concatenate([number + c.where.astype(float) for number, c in zip(spans, parts, strict=True)])
+        where = np.concatenate(
+            [number + c.where.astype(float) for number, c in zip(spans, parts, strict=True)]
+        )
         width = np.concatenate([c.width for c in parts]) / flight.spacing
         gained = np.concatenate([c.gained for c in parts])
-        return _Nearby(knot, index, row.ravel().astype(np.int32), where, np.minimum(width, WIDEST), gained)
+        return _Nearby(
+            knot, index, row.ravel().astype(np.int32), where, np.minimum(width, WIDEST), gained
+        )
 
     def _crossings(self, name: str, number: int) -> Crossings:
         """What crosses an edge between a knot and the next."""
@@ -180,20 +231,30 @@ class Sight:
             if self._triangles is None:
                 self._triangles = Triangles(self.shadows.scene)
             self._crossed[name, number] = crossings(
-                self.shadows.scene, self._triangles, knots, seen, self._points, self._normals, LIFT, self._area, self._wavelength
+                self.shadows.scene,
+                self._triangles,
+                knots,
+                seen,
+                self._points,
+                self._normals,
+                LIFT,
+                self._area,
+                self._wavelength,
             )
         return self._crossed[name, number]
 
     def _knot(self, name: str, knot: int) -> np.ndarray:
         if (name, knot) not in self._seen:
-            self._seen[name, knot] = np.packbits(self.shadows.sees(self.flights[name].knots[knot], self._points, self._normals))
+            self._seen[name, knot] = np.packbits(
+                self.shadows.sees(self.flights[name].knots[knot], self._points, self._normals)
+            )
         return np.unpackbits(self._seen[name, knot], count=len(self._points))
 
 
 @dataclass(frozen=True)
 class _Nearby:
-    """Crossings about one knot; `index` (R,) are the scatterers, `row` (K,) says which of them each crossing is of; `where` and
-    `width` (K,) are counted in knots."""
+    """Crossings about one knot; `index` (R,) are the scatterers, `row` (K,) says which of them each
+    crossing is of; `where` and `width` (K,) are counted in knots."""
 
     knot: int
     index: np.ndarray

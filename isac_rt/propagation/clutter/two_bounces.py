@@ -1,18 +1,21 @@
 r"""Clutter of two bounces: the scatterers of the field, lit or heard by way of a mirror.
 
-Mirror then scatter, and scatter then mirror. The scatterers are those of one bounce, with the same amplitudes; the terminal at
-the mirror's side is its image, so that delay, rate, acceleration and directions are closed forms in float64. From one isotropic
-antenna to another
+Mirror then scatter, and scatter then mirror. The scatterers are those of one bounce, with the same
+amplitudes; the terminal at the mirror's side is its image, so that delay, rate, acceleration and
+directions are closed forms in float64. From one isotropic antenna to another
 
-.. math:: |a|^2 = (\lambda/4\pi)^2\, M^2\, S^2\, \Gamma^2 f_s(k_i, k_o) \cos\theta_i\, A / (r_1 r_2)^2
+.. math:: |a|^2 = (\lambda/4\pi)^2\, M^2\, S^2\, \Gamma^2 f_s(k_i, k_o) \cos\theta_i\, A / (r_1
+r_2)^2
 
-with the unfolded r_1 or r_2, and M^2 the mirror's (1 - S^2) times its slab's reflection at the angle there. The electric field
-is followed as a vector through the mirror, whose phase is in the gain; at the scatterer Gamma is that of the field which arrives,
-and what comes in vertical goes out vertical, as for one bounce.
+with the unfolded r_1 or r_2, and M^2 the mirror's (1 - S^2) times its slab's reflection at the
+angle there. The electric field is followed as a vector through the mirror, whose phase is in the
+gain; at the scatterer Gamma is that of the field which arrives, and what comes in vertical goes out
+vertical, as for one bounce.
 
-On a terminal's link to itself the two orders are one way and its reverse: equal in length, and in phase where transmitter and
-receiver share one place, as backscatter is enhanced in nature. Sight by way of a mirror is tested at the knots of the flight, both
-legs and the mirror's rim, and blended in between.
+On a terminal's link to itself the two orders are one way and its reverse: equal in length, and in
+phase where transmitter and receiver share one place, as backscatter is enhanced in nature. Sight by
+way of a mirror is tested at the knots of the flight, both legs and the mirror's rim, and blended in
+between.
 
 Import only after `isac_rt.runtime.activate()`.
 """
@@ -61,7 +64,13 @@ class SeenTwice:
 class TwoBounces:
     """Mirror images of one field for all terminals of a run; `plan` makes it from a scenario."""
 
-    def __init__(self, field: ClutterField, city: City, mirrors: dict[str, tuple[list[Mirror], float]], wavelength: float) -> None:
+    def __init__(
+        self,
+        field: ClutterField,
+        city: City,
+        mirrors: dict[str, tuple[list[Mirror], float]],
+        wavelength: float,
+    ) -> None:
         self._field, self._city, self._wavelength = field, city, wavelength
         self.mirrors = {name: kept for name, (kept, _) in mirrors.items()}
         """Of each terminal, the strongest first."""
@@ -70,31 +79,54 @@ class TwoBounces:
         self._shown: dict[tuple[str, int], list[np.ndarray]] = {}
 
     @classmethod
-    def plan(cls, scenario: Scenario, city: City, field: ClutterField, wavelength: float) -> TwoBounces:
+    def plan(
+        cls, scenario: Scenario, city: City, field: ClutterField, wavelength: float
+    ) -> TwoBounces:
         """Choose each terminal's mirrors for the whole of its flight."""
         shadows, most = field.sight.shadows, scenario.clutter.mirrors
-        mirrors = {n: strongest(city, shadows, flight, wavelength, scenario.seed, most) for n, flight in field.sight.flights.items()}
+        mirrors = {
+            n: strongest(city, shadows, flight, wavelength, scenario.seed, most)
+            for n, flight in field.sight.flights.items()
+        }
         return cls(field, city, mirrors, wavelength)
 
-    def seen(self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None) -> list[SeenTwice]:
-        """What is in sight of both ends, once for each mirror and order; poses in local coordinates."""
+    def seen(
+        self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None
+    ) -> list[SeenTwice]:
+        """What is in sight of both ends, once for each mirror and order; poses in local
+        coordinates."""
         out = []
-        for before, name, pose, other, far in ((True, tx, start, rx, end), (False, rx, end, tx, start)):
+        for before, name, pose, other, far in (
+            (True, tx, start, rx, end),
+            (False, rx, end, tx, start),
+        ):
             if not self.mirrors[name]:
                 continue
             straight = self._field.sight.share(other, far, time)
-            for mirror, (index, share) in zip(self.mirrors[name], self._share(name, pose, time), strict=True):
+            for mirror, (index, share) in zip(
+                self.mirrors[name], self._share(name, pose, time), strict=True
+            ):
                 share = share * straight[index]
                 lit = share > 0
                 if lit.any():
                     found = self._by_way_of(mirror, index[lit], share[lit], start, end, before)
-                    out.append(found if bodies is None else self._shaded(found, tx, rx, start, end, bodies))
+                    out.append(
+                        found if bodies is None else self._shaded(found, tx, rx, start, end, bodies)
+                    )
         return out
 
     def paths(
-        self, tx: str, rx: str, start: Pose, end: Pose, antennas: Antennas, common: dict, bodies: Bodies | None = None
+        self,
+        tx: str,
+        rx: str,
+        start: Pose,
+        end: Pose,
+        antennas: Antennas,
+        common: dict,
+        bodies: Bodies | None = None,
     ) -> list[PathSet]:
-        """The link's paths at ``common["epoch"]``, one set for each mirror and order; poses, points and bodies in local coordinates."""
+        """The link's paths at ``common["epoch"]``, one set for each mirror and order; poses, points
+        and bodies in local coordinates."""
         cells, out = self._field.cells, []
         for part in self.seen(tx, rx, start, end, common["epoch"], bodies):
             s = part.seen
@@ -120,7 +152,8 @@ class TwoBounces:
         return out
 
     def _chain(self, part: SeenTwice, start: Pose, end: Pose) -> tuple[np.ndarray, np.ndarray]:
-        """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of a mirror go by its largest."""
+        """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of
+        a mirror go by its largest."""
         place = self._field.cells.points[part.seen.index]
         own = self._field.cells.face[part.seen.index]
         m, body = part.mirror, (start if part.before else end).position
@@ -135,7 +168,10 @@ class TwoBounces:
         """For each mirror of a terminal: scatterers that show in it, and how far, from 0 to 1."""
         flight, mirrors = self._field.sight.flights[name], self.mirrors[name]
         if not flight.holds(pose, time):
-            return [(index, np.ones(index.size, np.float32)) for index in self._test(name, pose.position)]
+            return [
+                (index, np.ones(index.size, np.float32))
+                for index in self._test(name, pose.position)
+            ]
         knots = {knot: weight for knot, weight in flight.blend(time).items() if weight > 0}
         tests = {knot: self._knot(name, knot) for knot in knots}
         out = []
@@ -157,29 +193,73 @@ class TwoBounces:
 
     def _test(self, name: str, place: np.ndarray) -> list[np.ndarray]:
         cells = self._field.cells
-        return shown(self._field.sight.shadows, place, self.mirrors[name], cells.points, self._city.normals[cells.face])
+        return shown(
+            self._field.sight.shadows,
+            place,
+            self.mirrors[name],
+            cells.points,
+            self._city.normals[cells.face],
+        )
 
-    def _by_way_of(self, mirror: Mirror, index: np.ndarray, share: np.ndarray, start: Pose, end: Pose, before: bool) -> SeenTwice:
+    def _by_way_of(
+        self,
+        mirror: Mirror,
+        index: np.ndarray,
+        share: np.ndarray,
+        start: Pose,
+        end: Pose,
+        before: bool,
+    ) -> SeenTwice:
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
         motion[0 if before else 1] = mirror.image(start if before else end)
         count = index.size
-        out = [np.empty(count), np.empty(count), np.empty(count, np.float32), np.empty(count), np.empty(count)]
+        out = [
+            np.empty(count),
+            np.empty(count),
+            np.empty(count, np.float32),
+            np.empty(count),
+            np.empty(count),
+        ]
         out += [np.empty((count, 3)), np.empty((count, 3))]
         c, s = self._field.cells, self._field.surfaces
         _lay_out(index, c.points, mirror.normal, *motion, before, *out)  # type: ignore[call-arg]
         tx_radius, rx_radius, departure, arrival = out[3:]
         met = departure if before else arrival
-        te, tm = slab_coefficients(mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength)
+        te, tm = slab_coefficients(
+            mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength
+        )
         gain = np.empty(count, complex)
-        _weigh(index, share, c.face, c.area, s.normals, s.material, s.table, s.coefficient, s.lobe, s.exponent,
-               self._wavelength / (4 * np.pi), mirror.normal, te, tm, before, tx_radius, rx_radius, departure, arrival, gain)  # fmt: skip
+        _weigh(
+            index,
+            share,
+            c.face,
+            c.area,
+            s.normals,
+            s.material,
+            s.table,
+            s.coefficient,
+            s.lobe,
+            s.exponent,
+            self._wavelength / (4 * np.pi),
+            mirror.normal,
+            te,
+            tm,
+            before,
+            tx_radius,
+            rx_radius,
+            departure,
+            arrival,
+            gain,
+        )
         size = np.abs(gain)
         some = np.flatnonzero(size > 0)
         turn = (gain[some] / size[some]).astype(np.complex64)
         kept = [np.asarray(a)[some] for a in (index, size.astype(np.float32), *out)]
         return SeenTwice(Seen(*kept), turn, mirror, before)
 
-    def _shaded(self, part: SeenTwice, tx: str, rx: str, start: Pose, end: Pose, bodies: Bodies) -> SeenTwice:
+    def _shaded(
+        self, part: SeenTwice, tx: str, rx: str, start: Pose, end: Pose, bodies: Bodies
+    ) -> SeenTwice:
         """The same past the swarm's bodies, on both ways."""
         s = part.seen
         points, _ = self._chain(part, start, end)
@@ -187,15 +267,32 @@ class TwoBounces:
         ends = [np.broadcast_to(p.position, (len(points), 1, 3)) for p in (start, end)]
         there = np.concatenate([ends[0], points[:, :split]], axis=1)
         back = np.concatenate([points[:, split - 1 :], ends[1]], axis=1)
-        factor = np.abs(bodies.factor(there, self._wavelength, (tx,)) * bodies.factor(back, self._wavelength, (rx,)))
+        factor = np.abs(
+            bodies.factor(there, self._wavelength, (tx,))
+            * bodies.factor(back, self._wavelength, (rx,))
+        )
         s.magnitude[:] *= factor
         return part
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lay_out(index, points, normal, start, end, before, length, rate, accel, tx_radius, rx_radius, departure, arrival):
-    """Geometry of ways over scatterers from `start` to `end` (position, velocity, acceleration), one of them an image behind the mirror;
-    directions are those at the terminals themselves."""
+def _lay_out(
+    index,
+    points,
+    normal,
+    start,
+    end,
+    before,
+    length,
+    rate,
+    accel,
+    tx_radius,
+    rx_radius,
+    departure,
+    arrival,
+):
+    """Geometry of ways over scatterers from `start` to `end` (position, velocity, acceleration),
+    one of them an image behind the mirror; directions are those at the terminals themselves."""
     for row in range(index.size):
         i = index[row]
         r1, v1, a1, x1, y1, z1 = _leg(points[i, 0], points[i, 1], points[i, 2], start)
@@ -231,7 +328,8 @@ def _turned(u, n):
 
 @numba.njit(inline="always", error_model="numpy")
 def _upright(u):
-    """The spherical unit vector theta of a direction: the field of a vertically polarised isotropic element."""
+    """The spherical unit vector theta of a direction: the field of a vertically polarised isotropic
+    element."""
     flat = np.sqrt(u[0] * u[0] + u[1] * u[1])
     x, y = (u[0] / flat, u[1] / flat) if flat > 0 else (1.0, 0.0)
     return u[2] * x, u[2] * y, -flat
@@ -239,7 +337,8 @@ def _upright(u):
 
 @numba.njit(inline="always", error_model="numpy")
 def _mirrored(u, out, n, te, tm):
-    """Field (three complex parts) along `out` after a mirror of normal n, of a wave along u with the upright field."""
+    """Field (three complex parts) along `out` after a mirror of normal n, of a wave along u with
+    the upright field."""
     field, across = _upright(u), _cross(u, n)
     size = np.sqrt(_dot(across, across))
     if size < 1e-9:  # any direction will do, at normal incidence
@@ -248,12 +347,36 @@ def _mirrored(u, out, n, te, tm):
     across = across[0] / size, across[1] / size, across[2] / size
     first, second = te * _dot(field, across), tm * _dot(field, _cross(across, u))
     beyond = _cross(across, out)
-    return first * across[0] + second * beyond[0], first * across[1] + second * beyond[1], first * across[2] + second * beyond[2]
+    return (
+        first * across[0] + second * beyond[0],
+        first * across[1] + second * beyond[1],
+        first * across[2] + second * beyond[2],
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(index, share, face, area, normals, material, table, coefficient, lobe, exponent, scale, normal, te, tm, before,
-           tx_radius, rx_radius, departure, arrival, gain):  # fmt: skip
+def _weigh(
+    index,
+    share,
+    face,
+    area,
+    normals,
+    material,
+    table,
+    coefficient,
+    lobe,
+    exponent,
+    scale,
+    normal,
+    te,
+    tm,
+    before,
+    tx_radius,
+    rx_radius,
+    departure,
+    arrival,
+    gain,
+):
     """Complex gains of ways over scatterers; the scatterers' own amplitudes left out."""
     last = table.shape[1] - 2
     mirror = normal[0], normal[1], normal[2]

@@ -1,8 +1,10 @@
-"""Legs between two traced instants: the same chains of walls unfolded in float64 where the swarm is now.
+"""Legs between two traced instants: the same chains of walls unfolded in float64 where the swarm is
+now.
 
-A chain that was found at both instants around is taken to live in between. One that was found at one of them only is born or dies on the
-way: rays say whether it is there now. Delays, rates, accelerations, directions and amplitudes are exact for the chains that are
-there; what can be missed is a chain that lives for less than the way between two traced instants, or a shadow as short.
+A chain that was found at both instants around is taken to live in between. One that was found at
+one of them only is born or dies on the way: rays say whether it is there now. Delays, rates,
+accelerations, directions and amplitudes are exact for the chains that are there; what can be missed
+is a chain that lives for less than the way between two traced instants, or a shadow as short.
 
 Local coordinates. Import only after `isac_rt.runtime.activate()`.
 """
@@ -24,7 +26,8 @@ from isac_rt.world.swarm import Pose
 
 Pair = tuple[str, str]
 PROPER = 1e-9
-"""Share of its length by which a path may differ from the sum of its segments; one that differs by more runs through a mirror."""
+"""Share of its length by which a path may differ from the sum of its segments; one that differs by
+more runs through a mirror."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class LegSet:
     amplitude : (K,) complex, isotropic ends, without the carrier phase
     legs : Legs
     faces : (K, B) of the chains, -1 where a chain is shorter
-    planes : (K, B) of the chains in a fixed order where two walls meet in an edge, -1 where a chain is shorter
+    planes : (K, B) of the chains in a fixed order where two walls meet in an edge, -1 where a chain
+        is shorter
     """
 
     amplitude: np.ndarray
@@ -51,22 +55,47 @@ class LegSet:
 
 def pick(legs: Legs, which: np.ndarray) -> Legs:
     """The legs that an index array chooses."""
-    return Legs(*(getattr(legs, name)[which] for name in ("length", "rate", "accel", "departure", "arrival", "points")))
+    return Legs(
+        *(
+            getattr(legs, name)[which]
+            for name in ("length", "rate", "accel", "departure", "arrival", "points")
+        )
+    )
 
 
 def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth: int) -> LegSet:
-    """One set of (amplitude, legs, faces, planes) of chains of one length each, padded to `depth`."""
+    """One set of (amplitude, legs, faces, planes) of chains of one length each, padded to
+    `depth`."""
     if not parts:
-        nothing = Legs(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, depth, 3)))
-        return LegSet(np.zeros(0, complex), nothing, np.zeros((0, depth), np.int64), np.zeros((0, depth), np.int64))
+        nothing = Legs(
+            np.zeros(0),
+            np.zeros(0),
+            np.zeros(0),
+            np.zeros((0, 3)),
+            np.zeros((0, 3)),
+            np.zeros((0, depth, 3)),
+        )
+        return LegSet(
+            np.zeros(0, complex),
+            nothing,
+            np.zeros((0, depth), np.int64),
+            np.zeros((0, depth), np.int64),
+        )
 
     def padded(chain: np.ndarray) -> np.ndarray:
         return np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1)
 
     amplitudes, legs, faces, planes = zip(*parts, strict=True)
-    points = [np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan) for p in legs]
-    length, rate, accel = (np.concatenate([getattr(p, name) for p in legs]) for name in ("length", "rate", "accel"))
-    departure, arrival = (np.concatenate([getattr(p, name) for p in legs]) for name in ("departure", "arrival"))
+    points = [
+        np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan)
+        for p in legs
+    ]
+    length, rate, accel = (
+        np.concatenate([getattr(p, name) for p in legs]) for name in ("length", "rate", "accel")
+    )
+    departure, arrival = (
+        np.concatenate([getattr(p, name) for p in legs]) for name in ("departure", "arrival")
+    )
     joined = Legs(length, rate, accel, departure, arrival, np.concatenate(points))
     chains = [np.concatenate([padded(chain) for chain in part]) for part in (faces, planes)]
     return LegSet(np.concatenate(amplitudes), joined, chains[0], chains[1])
@@ -101,7 +130,8 @@ class Between:
         self.num_traced = 0
         """Instants traced so far."""
         self.changes: dict[int, tuple[int, int]] = {}
-        """Legs that were born and that died between a traced instant, by its number, and the next."""
+        """Legs that were born and that died between a traced instant, by its number, and the
+        next."""
         self.num_chains: dict[int, float] = {}
         """Legs there were on average at these two instants."""
 
@@ -117,9 +147,14 @@ class Between:
         if self._interval[0] != after:
             self._interval = after, _chains(first, second)
             self.changes[after - 1] = _changes(self._interval[1])
-            self.num_chains[after - 1] = sum(c.in_first.sum() + c.in_second.sum() for c in self._interval[1]) / 2
+            self.num_chains[after - 1] = (
+                sum(c.in_first.sum() + c.in_second.sum() for c in self._interval[1]) / 2
+            )
         nearest_first = time - self._instants[after - 1] <= self._instants[after] - time
-        found = [self._unfolded(chains, local, list(first), nearest_first) for chains in self._interval[1]]
+        found = [
+            self._unfolded(chains, local, list(first), nearest_first)
+            for chains in self._interval[1]
+        ]
         self._test(found)
         return self._settled(found, list(first), next(iter(first.values())).faces.shape[1])
 
@@ -131,29 +166,49 @@ class Between:
             self.num_traced += 1
         return self._kept[number]
 
-    def _unfolded(self, chains: _Chains, local: Mapping[str, Pose], pairs: list[Pair], nearest_first: bool) -> _Unfolded:
+    def _unfolded(
+        self, chains: _Chains, local: Mapping[str, Pose], pairs: list[Pair], nearest_first: bool
+    ) -> _Unfolded:
         """Where the chains run for these poses, and which of them may be there."""
-        start, end = (_stacked([local[pair[side]] for pair in pairs], chains.pair) for side in (0, 1))
+        start, end = (
+            _stacked([local[pair[side]] for pair in pairs], chains.pair) for side in (0, 1)
+        )
         normals = self._mirrors[0][chains.faces]
         legs = unfold(normals, self._mirrors[1][chains.faces], start, end)
-        stops = np.concatenate([start.position[:, None], legs.points, end.position[:, None]], axis=1)
-        proper = np.linalg.norm(np.diff(stops, axis=1), axis=2).sum(axis=1) <= legs.length * (1 + PROPER)
+        stops = np.concatenate(
+            [start.position[:, None], legs.points, end.position[:, None]], axis=1
+        )
+        proper = np.linalg.norm(np.diff(stops, axis=1), axis=2).sum(axis=1) <= legs.length * (
+            1 + PROPER
+        )
         in_edge = (np.linalg.norm(np.diff(legs.points, axis=1), axis=2) < EDGE).any(axis=1)
         both = chains.in_first & chains.in_second
         alive = proper & (both | ~in_edge | (chains.in_first == nearest_first))
-        return _Unfolded(chains, normals, legs, stops, alive, doubtful=np.flatnonzero(alive & ~both & ~in_edge))
+        return _Unfolded(
+            chains, normals, legs, stops, alive, doubtful=np.flatnonzero(alive & ~both & ~in_edge)
+        )
 
     def _test(self, found: list[_Unfolded]) -> None:
-        """Clear `alive` of doubtful chains that a wall blocks or whose wall ends before the point of reflection."""
+        """Clear `alive` of doubtful chains that a wall blocks or whose wall ends before the point
+        of reflection."""
         lifted = [_lifted(part.stops[part.doubtful], part.normals[part.doubtful]) for part in found]
-        walls = [(end[:, :-1], 2 * part.stops[part.doubtful, 1:-1] - end[:, :-1]) for part, (_, end) in zip(found, lifted, strict=True)]
-        clear = ~self._blocked(*(np.concatenate([rays[side].reshape(-1, 3) for rays in lifted]) for side in (0, 1)))
-        on_wall = self._blocked(*(np.concatenate([rays[side].reshape(-1, 3) for rays in walls]) for side in (0, 1)))
+        walls = [
+            (end[:, :-1], 2 * part.stops[part.doubtful, 1:-1] - end[:, :-1])
+            for part, (_, end) in zip(found, lifted, strict=True)
+        ]
+        clear = ~self._blocked(
+            *(np.concatenate([rays[side].reshape(-1, 3) for rays in lifted]) for side in (0, 1))
+        )
+        on_wall = self._blocked(
+            *(np.concatenate([rays[side].reshape(-1, 3) for rays in walls]) for side in (0, 1))
+        )
         a = b = 0
         for part in found:
             count, depth = part.doubtful.size, part.chains.faces.shape[1]
             seen = clear[a : a + count * (depth + 1)].reshape(count, depth + 1).all(axis=1)
-            part.alive[part.doubtful] = seen & on_wall[b : b + count * depth].reshape(count, depth).all(axis=1)
+            part.alive[part.doubtful] = seen & on_wall[b : b + count * depth].reshape(
+                count, depth
+            ).all(axis=1)
             a, b = a + count * (depth + 1), b + count * depth
 
     def _blocked(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -172,7 +227,9 @@ class Between:
         for part in found:
             keep = np.flatnonzero(part.alive)
             legs, faces = pick(part.legs, keep), part.chains.faces[keep]
-            amplitude = mirror_amplitude(self._city, part.normals[keep], faces, legs, self._wavelength)
+            amplitude = mirror_amplitude(
+                self._city, part.normals[keep], faces, legs, self._wavelength
+            )
             parts.append((amplitude, legs, faces, part.chains.planes[keep]))
             owners.append(part.chains.pair[keep])
         every, owner = leg_set(parts, depth), np.concatenate(owners)
@@ -180,7 +237,12 @@ class Between:
         edges = np.searchsorted(owner[order], np.arange(len(pairs) + 1))
         rows = [order[a:b] for a, b in itertools.pairwise(edges)]
         return {
-            pair: LegSet(every.amplitude[which], pick(every.legs, which), every.faces[which], every.planes[which])
+            pair: LegSet(
+                every.amplitude[which],
+                pick(every.legs, which),
+                every.faces[which],
+                every.planes[which],
+            )
             for pair, which in zip(pairs, rows, strict=True)
         }
 
@@ -228,7 +290,9 @@ def _chains(first: Mapping[Pair, LegSet], second: Mapping[Pair, LegSet]) -> list
                 keys.append(np.concatenate([head, part.planes[which, :count]], axis=1))
         every, key = np.concatenate(faces), np.concatenate(keys)
         late = key[:, 1] == 1
-        alike, index, back = np.unique(np.delete(key, 1, axis=1), axis=0, return_index=True, return_inverse=True)
+        alike, index, back = np.unique(
+            np.delete(key, 1, axis=1), axis=0, return_index=True, return_inverse=True
+        )
         seen = [np.zeros(len(alike), bool) for _ in range(2)]
         seen[0][back.ravel()[~late]] = True
         seen[1][back.ravel()[late]] = True
@@ -238,18 +302,23 @@ def _chains(first: Mapping[Pair, LegSet], second: Mapping[Pair, LegSet]) -> list
 
 def _changes(chains: list[_Chains]) -> tuple[int, int]:
     """How many chains were found at the second instant only, and at the first only."""
-    return sum(int((~c.in_first).sum()) for c in chains), sum(int((~c.in_second).sum()) for c in chains)
+    return sum(int((~c.in_first).sum()) for c in chains), sum(
+        int((~c.in_second).sum()) for c in chains
+    )
 
 
 def _stacked(poses: list[Pose], which: np.ndarray) -> Pose:
     """One row of position, velocity and acceleration per chain."""
     names = ("position", "velocity", "acceleration")
-    position, velocity, acceleration = (np.array([getattr(p, name) for p in poses])[which] for name in names)
+    position, velocity, acceleration = (
+        np.array([getattr(p, name) for p in poses])[which] for name in names
+    )
     return Pose(position, velocity, acceleration, np.eye(3))
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Begins and ends (K, B + 1, 3) of the paths' segments, `LIFT` off the walls on the side where the path is."""
+    """Begins and ends (K, B + 1, 3) of the paths' segments, `LIFT` off the walls on the side where
+    the path is."""
     lift = np.zeros_like(stops)
     side = np.sign(((stops[:, :-2] - stops[:, 1:-1]) * normals).sum(2))
     lift[:, 1:-1] = LIFT * side[..., None] * normals

@@ -1,4 +1,5 @@
-"""The swarm's own bodies in the way of waves: each an opaque disc across the path, with its Fresnel shadow."""
+"""The swarm's own bodies in the way of waves: each an opaque disc across the path, with its Fresnel
+shadow."""
 
 from __future__ import annotations
 
@@ -36,13 +37,16 @@ class Bodies:
         return cls(names, places, np.array([uavs[name].body_radius_m for name in names]))
 
     def factor(self, chain: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
-        """Amplitude factor of paths past the bodies: the product of `disc` over the bodies and the straight parts.
+        """Amplitude factor of paths past the bodies: the product of `disc` over the bodies and the
+        straight parts.
 
         Parameters
         ----------
-        chain : (K, B + 2, 3) both ends and the B points between them at which each path is mirrored or bent
+        chain : (K, B + 2, 3) both ends and the B points between them at which each path is mirrored
+            or bent
         wavelength : [m]
-        spared : names of the bodies at the ends and of the one that echoes; a body does not shadow itself
+        spared : names of the bodies at the ends and of the one that echoes; a body does not shadow
+            itself
 
         Returns
         -------
@@ -55,20 +59,43 @@ class Bodies:
             self._shade(out, chain[:, k], chain[:, k + 1], before[:, k], total, wavelength, spared)
         return out
 
-    def sight(self, place: np.ndarray, points: np.ndarray, distance: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
-        """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,) [m]."""
+    def sight(
+        self,
+        place: np.ndarray,
+        points: np.ndarray,
+        distance: np.ndarray,
+        wavelength: float,
+        spared: Collection[str],
+    ) -> np.ndarray:
+        """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,)
+        [m]."""
         out = np.ones(len(points), complex)
-        self._shade(out, np.broadcast_to(place, points.shape), points, np.zeros(len(points)), distance, wavelength, spared)
+        self._shade(
+            out,
+            np.broadcast_to(place, points.shape),
+            points,
+            np.zeros(len(points)),
+            distance,
+            wavelength,
+            spared,
+        )
         return np.abs(out)
 
-    def _shade(self, out, starts, ends, before, total, wavelength: float, spared: Collection[str]) -> None:
-        """Multiply `out` by the factors of straight parts that begin `before` along paths of length `total`."""
+    def _shade(
+        self, out, starts, ends, before, total, wavelength: float, spared: Collection[str]
+    ) -> None:
+        """Multiply `out` by the factors of straight parts that begin `before` along paths of length
+        `total`."""
         for name, place, radius in zip(self.names, self.places, self.radii, strict=True):
             if name in spared:
                 continue
-            path, off, along = _near(starts, ends, before, total, place, radius, wavelength, LIT_REACH)
+            path, off, along = _near(
+                starts, ends, before, total, place, radius, wavelength, LIT_REACH
+            )
             if path.size:
-                far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
+                far = np.maximum(
+                    total[path] - along, radius
+                )  # nearer than its own size a disc is none
                 unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
                 nu, size = off / unit, radius / unit
                 out[path] *= tapered(disc(nu, size), nu - size)
@@ -76,7 +103,8 @@ class Bodies:
 
 @numba.njit(cache=True, nogil=True)
 def _near(starts, ends, before, total, place, radius, wavelength, reach):
-    """Paths whose straight part passes the body within its shadow's reach, the distance of its centre, and that along the path."""
+    """Paths whose straight part passes the body within its shadow's reach, the distance of its
+    centre, and that along the path."""
     which, off, along = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for i in range(starts.shape[0]):
         sx, sy, sz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]

@@ -10,8 +10,8 @@ import numpy as np
 from isac_rt.world.city.mesh import City, distance_to_triangles
 
 CLEARANCE = 0.01
-"""Sionna's rays start a little off where they should: a transmitter within a millimetre of a wall loses its reflection, one exactly on
-it sees both sides; from a centimetre on all is well [m]."""
+"""Sionna's rays start a little off where they should: a transmitter within a millimetre of a wall
+loses its reflection, one exactly on it sees both sides; from a centimetre on all is well [m]."""
 
 
 class ClearanceWarning(UserWarning):
@@ -32,10 +32,15 @@ class Clearance:
             if name in self._warned or not city.num_faces:
                 continue
             near = np.flatnonzero(np.abs(city.normals @ place - city.plane_offsets) < CLEARANCE)
-            if near.size and (apart := float(distance_to_triangles(city.corners[near], place).min())) < CLEARANCE:
+            if (
+                near.size
+                and (apart := float(distance_to_triangles(city.corners[near], place).min()))
+                < CLEARANCE
+            ):
                 self._warned.add(name)
                 warnings.warn(
-                    f"{name} is {apart:.3f} m from a surface of {city.name} at {time:.4g} s: within {CLEARANCE} m the ray tracer loses "
+                    f"{name} is {apart:.3f} m from a surface of {city.name} at {time:.4g} s: "
+                    f"within {CLEARANCE} m the ray tracer loses "
                     "reflections and may see through the surface; fly it farther off",
                     ClearanceWarning,
                     stacklevel=2,

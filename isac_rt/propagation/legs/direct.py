@@ -1,7 +1,9 @@
-"""Straight legs between bodies, bent round the shadow edge that matters: no leg is switched when it meets the city's edges.
+"""Straight legs between bodies, bent round the shadow edge that matters: no leg is switched when it
+meets the city's edges.
 
-On the lit side a leg stays straight and its amplitude ripples; in the shadow it runs by way of the edge, with that detour's length,
-rate and directions. Both are F(nu) of the knife edge under Friis's amplitude, and the same at the edge.
+On the lit side a leg stays straight and its amplitude ripples; in the shadow it runs by way of the
+edge, with that detour's length, rate and directions. Both are F(nu) of the knife edge under Friis's
+amplitude, and the same at the edge.
 """
 
 from __future__ import annotations
@@ -20,9 +22,14 @@ Pair = tuple[str, str]
 
 
 def past_edges_and_bodies(
-    legs: dict[Pair, LegSet], poses: dict[str, Pose], edges: ShadowEdges, bodies: Bodies, wavelength: float
+    legs: dict[Pair, LegSet],
+    poses: dict[str, Pose],
+    edges: ShadowEdges,
+    bodies: Bodies,
+    wavelength: float,
 ) -> dict[Pair, LegSet]:
-    """Traced legs of all pairs with straight ones that bend (in place of those that are there or not), past the swarm's bodies."""
+    """Traced legs of all pairs with straight ones that bend (in place of those that are there or
+    not), past the swarm's bodies."""
     direct, out = direct_legs(poses, list(legs), edges, bodies, wavelength), {}
     for pair, found in legs.items():
         depth = found.faces.shape[1]
@@ -34,20 +41,30 @@ def past_edges_and_bodies(
             ends = [np.broadcast_to(poses[name].position, (which.size, 1, 3)) for name in pair]
             chain = np.concatenate([ends[0], legs_here.points[:, :count], ends[1]], axis=1)
             amplitude = found.amplitude[which] * bodies.factor(chain, wavelength, pair)
-            parts.append((amplitude, legs_here, found.faces[which, :count], found.planes[which, :count]))
+            parts.append(
+                (amplitude, legs_here, found.faces[which, :count], found.planes[which, :count])
+            )
         out[pair] = leg_set(parts, depth)
     return out
 
 
 def direct_legs(
-    poses: dict[str, Pose], pairs: list[tuple[str, str]], edges: ShadowEdges, bodies: Bodies, wavelength: float
+    poses: dict[str, Pose],
+    pairs: list[tuple[str, str]],
+    edges: ShadowEdges,
+    bodies: Bodies,
+    wavelength: float,
 ) -> dict[tuple[str, str], Direct]:
     """Amplitude (0 or 1,) and leg of every pair of bodies at different places.
 
     `points` (.., 1, 3) of a leg holds the edge round which it bends, else NaN.
     """
-    apart = [(a, b) for a, b in pairs if np.linalg.norm(poses[b].position - poses[a].position) > 1e-9]
-    starts, ends = (np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1))
+    apart = [
+        (a, b) for a, b in pairs if np.linalg.norm(poses[b].position - poses[a].position) > 1e-9
+    ]
+    starts, ends = (
+        np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1)
+    )
     bends = edges.bends(starts, ends)
     factors = edge_factor(bends.nu)
     out = {}
@@ -59,9 +76,18 @@ def direct_legs(
         if nu > 0:
             leg = _bent(start, end, point)
             chain = np.stack([start.position, point, end.position])[None]
-            factor = factor * np.exp(2j * np.pi * (leg.length - direct.length) / wavelength)  # the detour's phase is in its delay
+            factor = factor * np.exp(
+                2j * np.pi * (leg.length - direct.length) / wavelength
+            )  # the detour's phase is in its delay
         else:
-            leg = Legs(direct.length, direct.rate, direct.accel, direct.departure, direct.arrival, np.full((1, 1, 3), np.nan))
+            leg = Legs(
+                direct.length,
+                direct.rate,
+                direct.accel,
+                direct.departure,
+                direct.arrival,
+                np.full((1, 1, 3), np.nan),
+            )
             chain = np.stack([start.position, end.position])[None]
         friis = wavelength / (4 * np.pi * direct.length)
         out[pair] = friis * factor * bodies.factor(chain, wavelength, pair), leg
@@ -69,7 +95,15 @@ def direct_legs(
 
 
 def _bent(start: Pose, end: Pose, point: np.ndarray) -> Legs:
-    """The leg by way of a point at rest. Where the detour is the shortest over an edge, its rate is that of the detour as it moves too."""
+    """The leg by way of a point at rest. Where the detour is the shortest over an edge, its rate is
+    that of the detour as it moves too."""
     there, on = straight(start, point[None]), straight(end, point[None])
     points = point[None, None]
-    return Legs(there.length + on.length, there.rate + on.rate, there.accel + on.accel, there.departure, on.departure, points)
+    return Legs(
+        there.length + on.length,
+        there.rate + on.rate,
+        there.accel + on.accel,
+        there.departure,
+        on.departure,
+        points,
+    )

@@ -1,8 +1,10 @@
-"""Shadow edges of a city near straight paths: which edge of the mesh bends a wave round an obstacle, or brushes it in passing.
+"""Shadow edges of a city near straight paths: which edge of the mesh bends a wave round an
+obstacle, or brushes it in passing.
 
-Of all edges the one with the shortest detour counts, alone: where two edges shade one path at once (a broad roof, two
-houses in a row) the result is that of the one whose detour is free, and nothing where no single detour is. That is a path
-in full shadow behind several edges, where a double edge would add what is 20 dB and more further down.
+Of all edges the one with the shortest detour counts, alone: where two edges shade one path at once
+(a broad roof, two houses in a row) the result is that of the one whose detour is free, and nothing
+where no single detour is. That is a path in full shadow behind several edges, where a double edge
+would add what is 20 dB and more further down.
 
 Import only after `isac_rt.runtime.activate()`.
 """
@@ -19,7 +21,8 @@ from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
 from isac_rt.world.city.mesh import City
 
 BESIDE = 0.01
-"""How far beside an edge rays are sent that find out which side of it is free [m]; float32 rays are good to a hundredth of that."""
+"""How far beside an edge rays are sent that find out which side of it is free [m]; float32 rays are
+good to a hundredth of that."""
 MOST_TRIED = 24
 """Edges near a path, the shortest detours first, that are tried."""
 FLAT = 1e-3
@@ -42,10 +45,16 @@ class Edges:
 
     @classmethod
     def of(cls, city: City) -> Edges:
-        """All edges of a city, flat ones left out; one between more than two faces stands there for each pair of neighbours in the list."""
+        """All edges of a city, flat ones left out; one between more than two faces stands there for
+        each pair of neighbours in the list."""
         faces = city.faces.astype(np.int64)
-        ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        third, face = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]), np.tile(np.arange(len(faces)), 3)
+        ends = np.sort(
+            np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1
+        )
+        third, face = (
+            np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]),
+            np.tile(np.arange(len(faces)), 3),
+        )
         order = np.lexsort([face, ends[:, 1], ends[:, 0]])
         ends, third, face = ends[order], third[order], face[order]
         same = (ends[1:] == ends[:-1]).all(axis=1)
@@ -65,7 +74,8 @@ class Bends:
 
     Attributes
     ----------
-    nu : (K,) Fresnel-Kirchhoff parameter, > 0 in the shadow: 2 sqrt(detour/wavelength); -inf free of edges, inf beyond all
+    nu : (K,) Fresnel-Kirchhoff parameter, > 0 in the shadow: 2 sqrt(detour/wavelength); -inf free
+        of edges, inf beyond all
     points : (K, 3) where the detour meets the edge; NaN without one
     """
 
@@ -80,7 +90,8 @@ class ShadowEdges:
         self._edges, self._shadows, self._wavelength = Edges.of(city), shadows, wavelength
 
     def bends(self, starts: np.ndarray, ends: np.ndarray) -> Bends:
-        """For paths (K, 3) to (K, 3), neither end nearer to a surface than `BESIDE`. Local coordinates."""
+        """For paths (K, 3) to (K, 3), neither end nearer to a surface than `BESIDE`. Local
+        coordinates."""
         count = len(starts)
         nu, points = np.full(count, -np.inf), np.full((count, 3), np.nan)
         if not count or not len(self._edges.start):
@@ -88,7 +99,10 @@ class ShadowEdges:
         lit = self._shadows.clear(starts, ends)
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
-        found = [_near(*vars(self._edges).values(), s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]  # type: ignore[call-arg]
+        found = [
+            _near(*vars(self._edges).values(), s, e, far)
+            for s, e, far in zip(starts, ends, reach, strict=True)
+        ]  # type: ignore[call-arg]
         path = np.repeat(np.arange(count), [len(f[0]) for f in found])
         if not path.size:
             return Bends(nu, points)
@@ -98,10 +112,13 @@ class ShadowEdges:
         free, covered = at + BESIDE * out, at - BESIDE * out
         from_here, to_there = starts[path], ends[path]
         tests = self._shadows.clear(
-            np.concatenate([from_here, free, from_here, covered - ahead]), np.concatenate([free, to_there, covered + ahead, to_there])
+            np.concatenate([from_here, free, from_here, covered - ahead]),
+            np.concatenate([free, to_there, covered + ahead, to_there]),
         ).reshape(4, -1)
         true = np.flatnonzero(tests[0] & tests[1] & ~(tests[2] & tests[3]))
-        which, first = np.unique(path[true], return_index=True)  # the shortest detour of each path comes first
+        which, first = np.unique(
+            path[true], return_index=True
+        )  # the shortest detour of each path comes first
         size = 2 * np.sqrt(np.maximum(detour[true[first]], 0.0) / self._wavelength)
         nu[which] = np.where(lit[which], -size, size)
         points[which] = at[true[first]]
@@ -110,11 +127,14 @@ class ShadowEdges:
 
 @numba.njit(cache=True, nogil=True)
 def _near(start, span, wings, source, sink, reach):
-    """Of silhouette edges: detours [m] (of at most `reach`, shortest first), points on the edges, directions away from what they bound."""
+    """Of silhouette edges: detours [m] (of at most `reach`, shortest first), points on the edges,
+    directions away from what they bound."""
     ahead = sink - source
     length = np.sqrt((ahead**2).sum())
     ahead = ahead / length
-    aside = np.sqrt(reach * (reach + 2 * length)) / 2  # half the width of the ellipsoid of all points within reach
+    aside = (
+        np.sqrt(reach * (reach + 2 * length)) / 2
+    )  # half the width of the ellipsoid of all points within reach
     detours, which, where = [0.0 for _ in range(0)], [0 for _ in range(0)], [0.0 for _ in range(0)]
     for i in range(start.shape[0]):
         mx = start[i, 0] + span[i, 0] / 2 - source[0]
@@ -123,7 +143,11 @@ def _near(start, span, wings, source, sink, reach):
         half = np.sqrt(span[i, 0] ** 2 + span[i, 1] ** 2 + span[i, 2] ** 2) / 2
         along = mx * ahead[0] + my * ahead[1] + mz * ahead[2]
         along = min(max(along, 0.0), length)
-        off = (mx - along * ahead[0]) ** 2 + (my - along * ahead[1]) ** 2 + (mz - along * ahead[2]) ** 2
+        off = (
+            (mx - along * ahead[0]) ** 2
+            + (my - along * ahead[1]) ** 2
+            + (mz - along * ahead[2]) ** 2
+        )
         if off > (half + aside + reach) ** 2:
             continue
         unit = span[i] / (2 * half)
@@ -132,16 +156,23 @@ def _near(start, span, wings, source, sink, reach):
         pa, pb = np.sqrt(max((a * a).sum() - sa**2, 0.0)), np.sqrt(max((b * b).sum() - sb**2, 0.0))
         if pa + pb < 1e-9:
             continue
-        t = min(max((sa * pb + sb * pa) / (pa + pb), 0.0), 2 * half)  # Fermat: equal angles with the edge
+        t = min(
+            max((sa * pb + sb * pa) / (pa + pb), 0.0), 2 * half
+        )  # Fermat: equal angles with the edge
         point = start[i] + t * unit
-        detour = np.sqrt(((point - source) ** 2).sum()) + np.sqrt(((point - sink) ** 2).sum()) - length
+        detour = (
+            np.sqrt(((point - source) ** 2).sum()) + np.sqrt(((point - sink) ** 2).sum()) - length
+        )
         if detour > reach:
             continue
         normal = np.cross(unit, ahead)
         size = np.sqrt((normal**2).sum())
         if size < 1e-6:
             continue
-        left, right = ((wings[i, 0] - start[i]) * normal).sum(), ((wings[i, 1] - start[i]) * normal).sum()
+        left, right = (
+            ((wings[i, 0] - start[i]) * normal).sum(),
+            ((wings[i, 1] - start[i]) * normal).sum(),
+        )
         if left * right <= 0:
             continue
         detours.append(detour)

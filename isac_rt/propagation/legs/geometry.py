@@ -1,7 +1,8 @@
 """Path geometry in float64: mirror images, and straight legs to a moving point.
 
-A chain of mirror reflections is unfolded: the transmitter's image behind the chain's planes sends straight to the receiver. Length,
-rate and acceleration follow from the relative motion of the image and the receiver, so curved flight is in them.
+A chain of mirror reflections is unfolded: the transmitter's image behind the chain's planes sends
+straight to the receiver. Length, rate and acceleration follow from the relative motion of the image
+and the receiver, so curved flight is in them.
 """
 
 from __future__ import annotations
@@ -78,8 +79,14 @@ def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> 
     return Legs(length, rate, accel, departure, -e, points)
 
 
-def straight(start: Pose, points: np.ndarray, velocity: np.ndarray | float = 0.0, acceleration: np.ndarray | float = 0.0) -> Legs:
-    """Legs from `start` to points (K, 3) that move with `velocity` and `acceleration` (K, 3 or one for all)."""
+def straight(
+    start: Pose,
+    points: np.ndarray,
+    velocity: np.ndarray | float = 0.0,
+    acceleration: np.ndarray | float = 0.0,
+) -> Legs:
+    """Legs from `start` to points (K, 3) that move with `velocity` and `acceleration` (K, 3 or one
+    for all)."""
     span = points - start.position
     length = np.linalg.norm(span, axis=1)
     e = span / length[:, None]
@@ -90,10 +97,11 @@ def straight(start: Pose, points: np.ndarray, velocity: np.ndarray | float = 0.0
 
 
 def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest face.
+    """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest
+    face.
 
-    All triangles of a wall are then one mirror, to the last bit: a path that slides from one to the next does not jump, and
-    one that was found on both is recognised.
+    All triangles of a wall are then one mirror, to the last bit: a path that slides from one to the
+    next does not jump, and one that was found on both is recognised.
     """
     by_area = np.argsort(-city.areas, kind="stable")
     _, first, plane = np.unique(city.plane_of_face[by_area], return_index=True, return_inverse=True)
@@ -109,10 +117,13 @@ EDGE = 1e-3
 def edges_in_any_order(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Planes (K, B) of chains with those that are met at one point (K, B, 3) in rising order.
 
-    A wave that meets two walls in their edge meets them in either order: the same path, the same image.
+    A wave that meets two walls in their edge meets them in either order: the same path, the same
+    image.
     """
     out = planes.copy()
-    for b in range(1, planes.shape[1]):  # bubble sort of short rows, over the neighbours that share a point
+    for b in range(
+        1, planes.shape[1]
+    ):  # bubble sort of short rows, over the neighbours that share a point
         for a in range(planes.shape[1] - b):
             together = np.linalg.norm(points[:, a + 1] - points[:, a], axis=1) < EDGE
             swap = together & (out[:, a] > out[:, a + 1])
@@ -121,10 +132,12 @@ def edges_in_any_order(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def one_of_each_chain(planes: np.ndarray, faces: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with the lowest faces (K, B).
+    """Indices of one path per chain of planes (K, B), sorted by the planes; of several that with
+    the lowest faces (K, B).
 
-    Mirrors leave two points one path over a chain of planes, so what shares the chain was found twice: on both triangles of a
-    seam, or by Sionna's hash of planes, which coordinates far from the origin defeat.
+    Mirrors leave two points one path over a chain of planes, so what shares the chain was found
+    twice: on both triangles of a seam, or by Sionna's hash of planes, which coordinates far from
+    the origin defeat.
     """
     which = np.flatnonzero(good)
     if planes.shape[1] == 0:

@@ -1,4 +1,5 @@
-"""What mirror reflections do to a vertically polarised wave: slab coefficients along chains of walls, in float64."""
+"""What mirror reflections do to a vertically polarised wave: slab coefficients along chains of
+walls, in float64."""
 
 from __future__ import annotations
 
@@ -10,11 +11,15 @@ from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
 from isac_rt.world.city.mesh import City
 
 
-def slab_coefficients(material: Material, cosine: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Complex reflection coefficients of a slab for TE and TM waves over the cosine of incidence (ITU-R P.2040-3, eqs. 37, 43, 44),
-    less what the material scatters."""
+def slab_coefficients(
+    material: Material, cosine: np.ndarray, wavelength: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Complex reflection coefficients of a slab for TE and TM waves over the cosine of incidence
+    (ITU-R P.2040-3, eqs. 37, 43, 44), less what the material scatters."""
     omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
-    eta = material.relative_permittivity - 1j * material.conductivity / (omega * VACUUM_PERMITTIVITY)
+    eta = material.relative_permittivity - 1j * material.conductivity / (
+        omega * VACUUM_PERMITTIVITY
+    )
     root = np.sqrt(eta - (1 - cosine**2))
     turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
     mirrored = np.sqrt(1 - material.scattering_coefficient**2)
@@ -24,7 +29,8 @@ def slab_coefficients(material: Material, cosine: np.ndarray, wavelength: float)
 
 
 def vertical(direction: np.ndarray) -> np.ndarray:
-    """(K, 3) the spherical unit vector theta of directions (K, 3): the field of a vertically polarised isotropic element.
+    """(K, 3) the spherical unit vector theta of directions (K, 3): the field of a vertically
+    polarised isotropic element.
 
     A vertical direction leaves it open; it is x then.
     """
@@ -34,8 +40,11 @@ def vertical(direction: np.ndarray) -> np.ndarray:
     return np.stack([direction[:, 2] * x, direction[:, 2] * y, -flat], axis=1)
 
 
-def mirror_amplitude(city: City, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float) -> np.ndarray:
-    """(K,) complex amplitudes of unfolded chains between isotropic vertical elements, without the carrier phase.
+def mirror_amplitude(
+    city: City, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float
+) -> np.ndarray:
+    """(K,) complex amplitudes of unfolded chains between isotropic vertical elements, without the
+    carrier phase.
 
     Parameters
     ----------
@@ -52,13 +61,21 @@ def mirror_amplitude(city: City, normals: np.ndarray, faces: np.ndarray, legs: L
         out = along - 2 * into[:, None] * normal
         across = np.cross(along, normal)
         size = np.linalg.norm(across, axis=1, keepdims=True)
-        level = np.cross(along, np.where(np.abs(along[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))  # any, at normal incidence
-        across = np.where(size > 1e-9, across / np.maximum(size, 1e-9), level / np.linalg.norm(level, axis=1, keepdims=True))
+        level = np.cross(
+            along, np.where(np.abs(along[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])
+        )  # any, at normal incidence
+        across = np.where(
+            size > 1e-9,
+            across / np.maximum(size, 1e-9),
+            level / np.linalg.norm(level, axis=1, keepdims=True),
+        )
         te, tm = np.empty(count, complex), np.empty(count, complex)
         material = city.face_material[faces[:, b]]
         for index in np.unique(material):
             here = material == index
-            te[here], tm[here] = slab_coefficients(city.materials[index], np.minimum(np.abs(into[here]), 1.0), wavelength)
+            te[here], tm[here] = slab_coefficients(
+                city.materials[index], np.minimum(np.abs(into[here]), 1.0), wavelength
+            )
         first, second = (field * across).sum(1), (field * np.cross(across, along)).sum(1)
         field = (te * first)[:, None] * across + (tm * second)[:, None] * np.cross(across, out)
         along = out

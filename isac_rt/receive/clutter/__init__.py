@@ -1,1 +1,2 @@
-"""Clutter at the receiver: filtered, predicted from the mesh, whitened, and detectors that look beside it."""
+"""Clutter at the receiver: filtered, predicted from the mesh, whitened, and detectors that look
+beside it."""

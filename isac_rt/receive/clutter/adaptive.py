@@ -1,22 +1,27 @@
-r"""Angle-Doppler filters: the adaptive matched filter in every range-Doppler cell, scanned over direction.
+r"""Angle-Doppler filters: the adaptive matched filter in every range-Doppler cell, scanned over
+direction.
 
-With x the channels of a cell, R their covariance under clutter and noise and a(u) the steering vector,
+With x the channels of a cell, R their covariance under clutter and noise and a(u) the steering
+vector,
 
 .. math:: T(u) = |a^H R^{-1} x|^2 / (a^H R^{-1} a)
 
-is exponential of mean one where there is no target [1]_. The largest over u exceeds t with a probability that for high t is the mean Euler
-characteristic of the set {T > t} (Worsley [2]_, his chi-squared field of two degrees of freedom):
+is exponential of mean one where there is no target [1]_. The largest over u exceeds t with a
+probability that for high t is the mean Euler characteristic of the set {T > t} (Worsley [2]_, his
+chi-squared field of two degrees of freedom):
 
 .. math:: e^{-t}\,(1 + \mu_1\sqrt{t/\pi} + \mu_2 (2t - 1)/(2\pi)),
 
-mu the length and area of the scanned directions in units of the correlation length, which follows from the variances of the channels'
-places. Beams are half a lobe apart. R comes from the mesh (`predicted`), or from the cells around (`sampled`), whose finite number
-makes the tail heavier.
+mu the length and area of the scanned directions in units of the correlation length, which follows
+from the variances of the channels' places. Beams are half a lobe apart. R comes from the mesh
+(`predicted`), or from the cells around (`sampled`), whose finite number makes the tail heavier.
 
 References
 ----------
-.. [1] F. C. Robey et al., "A CFAR adaptive matched filter detector", IEEE Trans. Aerosp. Electron. Syst. 28(1), 1992, doi:10.1109/7.135446
-.. [2] K. J. Worsley, "Local maxima and the expected Euler characteristic of excursion sets of chi-squared, F and t fields", Adv. Appl.
+.. [1] F. C. Robey et al., "A CFAR adaptive matched filter detector", IEEE Trans. Aerosp. Electron.
+Syst. 28(1), 1992, doi:10.1109/7.135446
+.. [2] K. J. Worsley, "Local maxima and the expected Euler characteristic of excursion sets of
+chi-squared, F and t fields", Adv. Appl.
    Probab. 26(1), 1994, doi:10.2307/1427576
 """
 
@@ -60,8 +65,11 @@ class Beams:
     area: float
 
 
-def beams_of(channels: Channels, waveform: Waveform, antennas: Antennas, axes: tuple[int, ...]) -> Beams:
-    """Beams half a lobe apart over the field of view, along the axes (0 is X, 2 is Z) that the channels span."""
+def beams_of(
+    channels: Channels, waveform: Waveform, antennas: Antennas, axes: tuple[int, ...]
+) -> Beams:
+    """Beams half a lobe apart over the field of view, along the axes (0 is X, 2 is Z) that the
+    channels span."""
     k = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT
     limit = float(np.sin(min(antennas.half_view, np.pi / 2)))
     lines = []
@@ -74,16 +82,22 @@ def beams_of(channels: Channels, waveform: Waveform, antennas: Antennas, axes: t
     for axis, values in zip(axes, grid, strict=True):
         cosines[:, axis] = values.ravel()
     cosines = cosines[(cosines**2).sum(axis=1) <= 1]
-    covariance = k**2 * np.cov(channels.places[:, list(axes)].T, bias=True).reshape(len(axes), len(axes))
+    covariance = k**2 * np.cov(channels.places[:, list(axes)].T, bias=True).reshape(
+        len(axes), len(axes)
+    )
     sides = tuple(2 * limit * float(np.sqrt(covariance[i, i])) for i in range(len(axes)))
     area = float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance))) if len(axes) == 2 else 0.0
-    return Beams(cosines, steering(channels.places, cosines, waveform).astype(np.complex64), sides, area)
+    return Beams(
+        cosines, steering(channels.places, cosines, waveform).astype(np.complex64), sides, area
+    )
 
 
 def expected_count(t: np.ndarray, beams: Beams) -> np.ndarray:
     """Mean Euler characteristic of {T > t}; at least that of one beam."""
     t = np.asarray(t, float)
-    more = sum(beams.lengths) * np.sqrt(np.maximum(t, 0) / np.pi) + beams.area * np.maximum(2 * t - 1, 0) / (2 * np.pi)
+    more = sum(beams.lengths) * np.sqrt(np.maximum(t, 0) / np.pi) + beams.area * np.maximum(
+        2 * t - 1, 0
+    ) / (2 * np.pi)
     return np.exp(-t) * (1 + more)
 
 
@@ -105,8 +119,11 @@ def _threshold(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) 
         below = np.exp(-expected_count(grid, Beams(*nothing, lengths, area)))
         one = np.diff(np.maximum.accumulate(below), prepend=0.0)
         size = 2 * grid.size
-        density = np.fft.irfft(np.fft.rfft(density, size) * np.fft.rfft(one, size), size)[: grid.size]
-    # below 1e-12 the transforms have no digits left: every tail is exp(-t) times a slow factor there
+        density = np.fft.irfft(np.fft.rfft(density, size) * np.fft.rfft(one, size), size)[
+            : grid.size
+        ]
+    # below 1e-12 the transforms have no digits left: every tail is exp(-t) times a slow factor
+    # there
     tail = np.cumsum(density[::-1])[::-1]
     trusted = np.flatnonzero(tail > 1e-10)[-1]
     if rate >= tail[trusted]:
@@ -147,14 +164,20 @@ def predicted(
     Parameters
     ----------
     frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
-    noise : mean noise power of a cell of one channel, of each frame; the covariance is made for their mean
-    wanted : (rows, P) bool, cells with clutter to speak of, Doppler in FFT order; the others are taken to hold noise alone
+    noise : mean noise power of a cell of one channel, of each frame; the covariance is made for
+        their mean
+    wanted : (rows, P) bool, cells with clutter to speak of, Doppler in FFT order; the others are
+        taken to hold noise alone
     """
-    snapshots = [np.ascontiguousarray(np.moveaxis(maps[channels.tx, channels.rx], 0, -1)) for maps in frames]  # rows, P, L
+    snapshots = [
+        np.ascontiguousarray(np.moveaxis(maps[channels.tx, channels.rx], 0, -1)) for maps in frames
+    ]  # rows, P, L
     scans = [_white(x, beams, n) for x, n in zip(snapshots, noise, strict=True)]
     level = float(np.mean(noise))
     eye, scale = np.eye(len(channels), dtype=np.complex64), np.float32(np.sqrt(level))
-    for row, bins, R in covariances(clutter, waveform, channels, wanted, schedule, delay_symbols, taper):
+    for row, bins, R in covariances(
+        clutter, waveform, channels, wanted, schedule, delay_symbols, taper
+    ):
         matched = Matched.of(R / np.float32(level) + eye, beams)
         for scan, x in zip(scans, snapshots, strict=True):
             matched.fill(scan, row, bins, x[row, bins] / scale)
@@ -162,10 +185,12 @@ def predicted(
 
 
 def sampled(maps: np.ndarray, channels: Channels, beams: Beams, noise: float, guard: int) -> Scan:
-    """Scan with the sample matrix of the cells around: 2 L range rows outside the guard, half on each side, and a bin on each side.
+    """Scan with the sample matrix of the cells around: 2 L range rows outside the guard, half on
+    each side, and a bin on each side.
 
-    T is transformed to what an exponential variable would have to exceed as rarely: with N training snapshots the tail of T is
-    E[(1 + rho T/N)^-(N-L+1)], rho ~ Beta(N-L+2, L-1) [1]_. The range neighbours are windowed, which `TRAINED` counts.
+    T is transformed to what an exponential variable would have to exceed as rarely: with N training
+    snapshots the tail of T is E[(1 + rho T/N)^-(N-L+1)], rho ~ Beta(N-L+2, L-1) [1]_. The range
+    neighbours are windowed, which `TRAINED` counts.
     """
     x = np.ascontiguousarray(np.moveaxis(maps[channels.tx, channels.rx], 0, -1))
     rows, columns, size = x.shape
@@ -177,9 +202,14 @@ def sampled(maps: np.ndarray, channels: Channels, beams: Beams, noise: float, gu
         begin, end = max(low - guard - each, 0), min(int(block[-1]) + guard + each + 1, rows)
         pairs = x[begin:end][..., first] * x[begin:end][..., second].conj()
         pairs = sum(np.roll(pairs, s, axis=1) for s in range(-SIDE_BINS, SIDE_BINS + 1))
-        total = np.concatenate([np.zeros_like(pairs[:1]), np.cumsum(pairs, axis=0, dtype=np.complex128)])
+        total = np.concatenate(
+            [np.zeros_like(pairs[:1]), np.cumsum(pairs, axis=0, dtype=np.complex128)]
+        )
         for row in block.tolist():
-            spans = [(max(row - guard - each, 0), max(row - guard, 0)), (row + guard + 1, min(row + guard + 1 + each, rows))]
+            spans = [
+                (max(row - guard - each, 0), max(row - guard, 0)),
+                (row + guard + 1, min(row + guard + 1 + each, rows)),
+            ]
             spans = [(a - begin, b - begin) for a, b in spans if b > a]
             count = sum(b - a for a, b in spans) * (2 * SIDE_BINS + 1)
             mean = sum(total[b] - total[a] for a, b in spans) / (count * noise)
@@ -187,7 +217,9 @@ def sampled(maps: np.ndarray, channels: Channels, beams: Beams, noise: float, gu
             R[:, first, second] = mean
             R[:, second, first] = mean.conj()
             R += np.float32(LOADING) * np.eye(size, dtype=np.complex64)
-            Matched.of(R, beams).fill(scan, row, np.arange(columns), x[row] / np.float32(np.sqrt(noise)))
+            Matched.of(R, beams).fill(
+                scan, row, np.arange(columns), x[row] / np.float32(np.sqrt(noise))
+            )
     grid = np.geomspace(1e-3, 1e6, 600)
     equal = like_exponential(grid, 2 * each * (2 * SIDE_BINS + 1) * TRAINED, size)
     return Scan(np.interp(scan.peak, grid, equal).astype(np.float32), scan.beam, scan.energy)
@@ -198,15 +230,24 @@ TRAINED = 0.5
 
 
 def like_exponential(t: np.ndarray, snapshots: float, size: int) -> np.ndarray:
-    """-ln P[T > t] of one beam's matched filter whose covariance comes from so many snapshots of `size` channels."""
-    rho = stats.beta(max(snapshots - size + 2, 1), max(size - 1, 1)).ppf((np.arange(200) + 0.5) / 200)
-    return -np.log(np.mean((1 + rho[:, None] * np.asarray(t) / snapshots) ** -(snapshots - size + 1), axis=0))
+    """-ln P[T > t] of one beam's matched filter whose covariance comes from so many snapshots of
+    `size` channels."""
+    rho = stats.beta(max(snapshots - size + 2, 1), max(size - 1, 1)).ppf(
+        (np.arange(200) + 0.5) / 200
+    )
+    return -np.log(
+        np.mean((1 + rho[:, None] * np.asarray(t) / snapshots) ** -(snapshots - size + 1), axis=0)
+    )
 
 
 def _white(snapshots: np.ndarray, beams: Beams, noise: float) -> Scan:
     """The scan where there is noise alone."""
     rows, columns, size = snapshots.shape
-    scan = Scan(np.empty((rows, columns), np.float32), np.empty((rows, columns), np.int32), np.empty((rows, columns), np.float32))
+    scan = Scan(
+        np.empty((rows, columns), np.float32),
+        np.empty((rows, columns), np.int32),
+        np.empty((rows, columns), np.float32),
+    )
     against = beams.steer.conj().T
     for row, x in enumerate(snapshots):
         power = np.abs(x @ against) ** 2
@@ -235,10 +276,15 @@ class Matched:
     def of(cls, R: np.ndarray, beams: Beams) -> Matched:
         inverse = np.linalg.inv(R)
         against = beams.steer.conj().T
-        return cls(inverse, np.maximum((against * np.matmul(inverse, beams.steer.T)).sum(axis=1).real, 1e-12), against)
+        return cls(
+            inverse,
+            np.maximum((against * np.matmul(inverse, beams.steer.T)).sum(axis=1).real, 1e-12),
+            against,
+        )
 
     def fill(self, scan: Scan, row: int, bins: np.ndarray, x: np.ndarray) -> None:
-        """Set the cells of a scan from their snapshots (S, L), in units of the noise's amplitude."""
+        """Set the cells of a scan from their snapshots (S, L), in units of the noise's
+        amplitude."""
         y = np.einsum("sij,sj->si", self.inverse, x)
         power = np.abs(y @ self.against) ** 2 / self.norm
         scan.beam[row, bins] = power.argmax(axis=1)
@@ -247,13 +293,13 @@ class Matched:
 
 
 def map_factor(level: np.ndarray, looks: int, false_alarm_rate: float) -> np.ndarray:
-    """What the mean power over the channels, in units of the noise, exceeds at a rate where the expected clutter is `level`.
+    """What the mean power over the channels, in units of the noise, exceeds at a rate where the
+    expected clutter is `level`.
 
-    Noise is a mean of `looks` exponentials. Clutter of one direction is alike on all channels, one exponential: of the laws
-    with this mean the one that reaches highest. The sum is taken as the Gamma variable of its mean and variance.
+    Noise is a mean of `looks` exponentials. Clutter of one direction is alike on all channels, one
+    exponential: of the laws with this mean the one that reaches highest. The sum is taken as the
+    Gamma variable of its mean and variance.
     """
     c = np.asarray(level, float)
     mean, variance = 1 + c, 1 / looks + c**2
     return stats.gamma.isf(false_alarm_rate, mean**2 / variance, scale=variance / mean)
-
-

@@ -1,14 +1,16 @@
 """The paper's clutter filter: find consecutive occupied range cells, then filter what lies in them.
 
-The paper (section V.A) says no more than that. Here a cell is occupied if its power exceeds the median over all cells, which
-most of the noise-only cells share, by `occupied_factor`; gaps of up to `GAP` cells are closed (Rayleigh amplitudes fade); a run
-counts as clutter from a least number of cells on. What happens in a run:
+The paper (section V.A) says no more than that. Here a cell is occupied if its power exceeds the
+median over all cells, which most of the noise-only cells share, by `occupied_factor`; gaps of up to
+`GAP` cells are closed (Rayleigh amplitudes fade); a run counts as clutter from a least number of
+cells on. What happens in a run:
 
-- the AT, which has taken its data out, subtracts from each range cell what stands still over the chirps of each antenna and group.
-  A target at rest relative to the radar goes with it;
-  `zero_doppler` does so in all range cells, for clutter that is too weak or too short to make a run;
-- a PT, which does not know the data yet, leaves the run out of the symbol decision, chirp by chirp. A line of sight within
-  the run is left out too.
+- the AT, which has taken its data out, subtracts from each range cell what stands still over the
+  chirps of each antenna and group. A target at rest relative to the radar goes with it;
+  `zero_doppler` does so in all range cells, for clutter that is too weak or too short to make a
+  run;
+- a PT, which does not know the data yet, leaves the run out of the symbol decision, chirp by chirp.
+  A line of sight within the run is left out too.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ LEAST_FACTOR = 2.0
 
 
 def occupied_factor(looks: float) -> float:
-    """Power over the median of noise, a mean of `looks` exponentials, from which on a cell is occupied; at least 3 dB."""
+    """Power over the median of noise, a mean of `looks` exponentials, from which on a cell is
+    occupied; at least 3 dB."""
     noise = stats.gamma(looks, scale=1 / looks)
     return max(float(noise.isf(FALSE_RATE) / noise.median()), LEAST_FACTOR)
 
@@ -38,8 +41,8 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
 
     Parameters
     ----------
-    power : (..., cells) mean power over `looks` independent channels, of a windowed spectrum (without a window the sidelobes of
-        strong clutter make one endless run)
+    power : (..., cells) mean power over `looks` independent channels, of a windowed spectrum
+        (without a window the sidelobes of strong clutter make one endless run)
 
     Returns
     -------
@@ -56,7 +59,8 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
 
 
 def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
-    """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna and group.
+    """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna
+    and group.
 
     Parameters
     ----------

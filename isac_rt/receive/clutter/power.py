@@ -1,13 +1,15 @@
 r"""Power and covariance of expected clutter in every range-Doppler cell.
 
-A scatterer of power p at beat f and Doppler bin g answers on channel l of a range-Doppler cell (r, d) with
-h_r(r - f) h_d(d - g) exp(-j k v_l.u), v_l the channel's place. Scatterers are independent, so that
+A scatterer of power p at beat f and Doppler bin g answers on channel l of a range-Doppler cell (r,
+d) with h_r(r - f) h_d(d - g) exp(-j k v_l.u), v_l the channel's place. Scatterers are independent,
+so that
 
 .. math:: R(r,d) = \sum_s p_s |h_r(r-f_s)|^2 |h_d(d-g_s)|^2 a_s a_s^H.
 
-It is summed in three steps: scatterers onto a grid of half cells, the range response across it, the Doppler response by a circular
-convolution. Past half the unambiguous range the data gate a path chirp by chirp: there the Doppler response is that of the
-chirps that hold the row, which the active terminal knows. What the terminal does not know exactly (its velocity, the mesh, migration within
+It is summed in three steps: scatterers onto a grid of half cells, the range response across it, the
+Doppler response by a circular convolution. Past half the unambiguous range the data gate a path
+chirp by chirp: there the Doppler response is that of the chirps that hold the row, which the active
+terminal knows. What the terminal does not know exactly (its velocity, the mesh, migration within
 the frame) is a `Taper`: boxes over which each response is averaged.
 """
 
@@ -35,12 +37,13 @@ ROWS = 16
 
 @dataclass(frozen=True)
 class Taper:
-    """Full widths of the boxes over which responses are averaged, and how finely the grid divides a cell.
+    """Full widths of the boxes over which responses are averaged, and how finely the grid divides a
+    cell.
 
     Attributes
     ----------
-    range_cells, doppler_bins : at 10 m/s a frame of the paper's settings migrates 0.3 cells, 0.1 m of mesh error are 0.4 cells and
-        0.1 m/s of velocity error 0.4 bins
+    range_cells, doppler_bins : at 10 m/s a frame of the paper's settings migrates 0.3 cells, 0.1 m
+        of mesh error are 0.4 cells and 0.1 m/s of velocity error 0.4 bins
     cosine : of direction cosines
     fine : grid points per cell and per bin; a scatterer goes to the nearest
     """
@@ -70,7 +73,8 @@ class Channels:
 
 
 def arm_channels(antennas: Antennas, axis: int) -> Channels:
-    """The virtual arm along X (axis 0) or Z (axis 2) of an echo: transmit and receive elements of that axis."""
+    """The virtual arm along X (axis 0) or Z (axis 2) of an echo: transmit and receive elements of
+    that axis."""
     a = antennas
     tx = np.arange(a.tx_x) if axis == 0 else np.arange(a.tx_x - 1, a.num_tx)
     rx = np.arange(a.rx_x) if axis == 0 else np.arange(a.rx_x - 1, a.num_rx)
@@ -82,17 +86,30 @@ def joint_channels(antennas: Antennas) -> Channels:
     """Both arms of the virtual L; their common corner once."""
     x, z = arm_channels(antennas, 0), arm_channels(antennas, 2)
     new = ~np.isin(z.tx * antennas.num_rx + z.rx, x.tx * antennas.num_rx + x.rx)
-    return Channels(np.append(x.tx, z.tx[new]), np.append(x.rx, z.rx[new]), np.concatenate([x.places, z.places[new]]))
+    return Channels(
+        np.append(x.tx, z.tx[new]),
+        np.append(x.rx, z.rx[new]),
+        np.concatenate([x.places, z.places[new]]),
+    )
 
 
 def one_each(antennas_sent: int) -> Channels:
-    """One isotropic channel per transmit antenna: the diagonal of its covariance is the clutter's power."""
-    return Channels(np.arange(antennas_sent), np.zeros(antennas_sent, int), np.zeros((antennas_sent, 3)))
+    """One isotropic channel per transmit antenna: the diagonal of its covariance is the clutter's
+    power."""
+    return Channels(
+        np.arange(antennas_sent), np.zeros(antennas_sent, int), np.zeros((antennas_sent, 3))
+    )
 
 
 def steering(places: np.ndarray, cosines: np.ndarray, waveform: Waveform) -> np.ndarray:
-    """(K, L) exp(-j k v.u) of echoes from body directions (K, 3), at the frequency of the window's middle."""
-    k = 2 * np.pi * (waveform.carrier_frequency + waveform.slope * window_middle(waveform)) / SPEED_OF_LIGHT
+    """(K, L) exp(-j k v.u) of echoes from body directions (K, 3), at the frequency of the window's
+    middle."""
+    k = (
+        2
+        * np.pi
+        * (waveform.carrier_frequency + waveform.slope * window_middle(waveform))
+        / SPEED_OF_LIGHT
+    )
     return np.exp(-1j * k * (cosines @ places.T))
 
 
@@ -111,7 +128,8 @@ def range_power(waveform: Waveform, offset: np.ndarray, width: float) -> np.ndar
 
 
 def doppler_products(waveform: Waveform, kept: np.ndarray, width: float, fine: int) -> np.ndarray:
-    """h_d h_d'* of every pair of transmit antennas for a path at bin 0, averaged over a box of `width` bins.
+    """h_d h_d'* of every pair of transmit antennas for a path at bin 0, averaged over a box of
+    `width` bins.
 
     Parameters
     ----------
@@ -128,10 +146,14 @@ def doppler_products(waveform: Waveform, kept: np.ndarray, width: float, fine: i
     return np.mean([np.roll(product, s, axis=2) for s in range(-span, span + 1)], axis=0)[..., ::4]
 
 
-def kept_slots(waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray, row: int) -> np.ndarray:
-    """(L_tx, P) bool: whether the data let a path of a range row through the IF filter in the slot's chirp of each antenna.
+def kept_slots(
+    waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray, row: int
+) -> np.ndarray:
+    """(L_tx, P) bool: whether the data let a path of a range row through the IF filter in the
+    slot's chirp of each antenna.
 
-    Its beat with the data must be below N. A slot in which no group uses the antenna counts as not kept.
+    Its beat with the data must be below N. A slot in which no group uses the antenna counts as not
+    kept.
     """
     passes = row + delay_symbols < waveform.num_samples
     return np.stack([(passes & (schedule == tx)).any(axis=0) for tx in range(waveform.num_tx)])
@@ -152,11 +174,13 @@ def covariances(
     ----------
     clutter : ExpectedClutter of an active terminal's own link
     wanted : (rows, P) bool, cells from range row 0 on, Doppler in FFT order
-    schedule, delay_symbols : (M, P) of the frame, one group per transmit antenna; the data gate the rows past N/2
+    schedule, delay_symbols : (M, P) of the frame, one group per transmit antenna; the data gate the
+        rows past N/2
 
     Yields
     ------
-    row, bins, R : of each row with a wanted cell its columns (S,), and (S, L, L) complex64 in units of `channel_maps` squared
+    row, bins, R : of each row with a wanted cell its columns (S,), and (S, L, L) complex64 in units
+        of `channel_maps` squared
     """
     w, t = waveform, taper or Taper()
     beat, doppler = cells_of(clutter, w)
@@ -169,9 +193,14 @@ def covariances(
     pairs = channels.tx[first], channels.tx[second]
 
     def kernel(kept: np.ndarray) -> np.ndarray:
-        """(P * fine, T) Doppler response that goes with each pair of channels; one column, real, where all chirps are kept."""
+        """(P * fine, T) Doppler response that goes with each pair of channels; one column, real,
+        where all chirps are kept."""
         products = doppler_products(w, kept, t.doppler_bins, t.fine)
-        return products[0, 0, :, None].real.astype(np.float32) if kept.all() else products[pairs].T.astype(np.complex64)
+        return (
+            products[0, 0, :, None].real.astype(np.float32)
+            if kept.all()
+            else products[pairs].T.astype(np.complex64)
+        )
 
     whole = kernel(kept_slots(w, schedule, delay_symbols, 0))
     rows = np.flatnonzero(wanted.any(axis=1))
@@ -179,14 +208,24 @@ def covariances(
         low, high = int(block[0]) - REACH, int(block[-1]) + REACH
         some = slice(*np.searchsorted(beat, [low, high]))
         line = np.round((beat[some] - low) * t.fine).astype(np.int64)
-        grid = np.zeros(((high - low) * t.fine + 1, w.num_chirps * t.fine, first.size), np.complex64)
+        grid = np.zeros(
+            ((high - low) * t.fine + 1, w.num_chirps * t.fine, first.size), np.complex64
+        )
         steer = steering(channels.places, clutter.arrival[some], w).astype(np.complex64)
         _accumulate(grid, line, column[some], clutter.power[some].astype(np.float32), steer)
         offset = block[:, None] - (low + np.arange(len(grid)) / t.fine)
         response = range_power(w, offset, t.range_cells) * (np.abs(offset) <= REACH)
         spread = response.astype(np.float32) @ grid.reshape(len(grid), -1).view(np.float32)
-        for row, line_of in zip(block.tolist(), spread.view(np.complex64).reshape(block.size, *grid.shape[1:]), strict=True):
-            turned = whole if row <= w.num_delay_symbols else kernel(kept_slots(w, schedule, delay_symbols, row))
+        for row, line_of in zip(
+            block.tolist(),
+            spread.view(np.complex64).reshape(block.size, *grid.shape[1:]),
+            strict=True,
+        ):
+            turned = (
+                whole
+                if row <= w.num_delay_symbols
+                else kernel(kept_slots(w, schedule, delay_symbols, row))
+            )
             bins = np.flatnonzero(wanted[row])
             along = _across(turned, line_of, bins * t.fine) * shape
             out = np.empty((bins.size, size, size), np.complex64)
@@ -196,7 +235,8 @@ def covariances(
 
 
 def _across(kernel: np.ndarray, line: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(S, T) circular convolution along Doppler of (G, T) values with (G, T or 1), at the grid points `at`."""
+    """(S, T) circular convolution along Doppler of (G, T) values with (G, T or 1), at the grid
+    points `at`."""
     shift = (at[:, None] - np.arange(len(line))) % len(line)
     if kernel.shape[1] == 1:
         return (kernel[shift, 0] @ np.ascontiguousarray(line).view(np.float32)).view(np.complex64)
@@ -221,7 +261,9 @@ def power_map(
     """(num_rows, P) mean clutter power over the channels, Doppler centred as in `accumulate`."""
     out = np.zeros((num_rows, waveform.num_chirps), np.float32)
     channels, wanted = one_each(waveform.num_tx), np.ones(out.shape, bool)
-    for row, _, one in covariances(clutter, waveform, channels, wanted, schedule, delay_symbols, taper):
+    for row, _, one in covariances(
+        clutter, waveform, channels, wanted, schedule, delay_symbols, taper
+    ):
         out[row] = np.fft.fftshift(np.maximum(np.einsum("pii->p", one).real, 0)) / len(channels)
     return out
 

@@ -1,7 +1,9 @@
-"""The active terminal's detections where another detector than the CFAR decides: peaks of its statistic, estimated off the grid.
+"""The active terminal's detections where another detector than the CFAR decides: peaks of its
+statistic, estimated off the grid.
 
-A filter that looks at directions also estimates there: the beam towards a detection takes out most of the clutter that shares its
-range-Doppler cell from elsewhere. The estimates' beam is the plain one, so that clutter within a lobe still pulls them.
+A filter that looks at directions also estimates there: the beam towards a detection takes out most
+of the clutter that shares its range-Doppler cell from elsewhere. The estimates' beam is the plain
+one, so that clutter within a lobe still pulls them.
 """
 
 from __future__ import annotations
@@ -57,15 +59,22 @@ def sense_in_clutter(
         local = kind(spectra, w, schedule, delay_symbols, row)
         if isinstance(local, BeamSpectra):
             local.weights = _beam(antennas, w, cosines)
-        found.append(estimate_at(local, power if kind is LocalSpectra else ratio, row, column, settings))
+        found.append(
+            estimate_at(local, power if kind is LocalSpectra else ratio, row, column, settings)
+        )
     snr = power[rows, bins] / judged.level[rows, bins]
     on_grid = settings.refinement == "grid"
-    detections = describe(found, np.maximum(snr, ratio[rows, bins]), antennas, w, 2, on_grid=on_grid)
+    detections = describe(
+        found, np.maximum(snr, ratio[rows, bins]), antennas, w, 2, on_grid=on_grid
+    )
     direction = detections.direction.copy()
     for i, cosines in enumerate(towards):
         if np.isfinite(cosines).all():
             direction[i] = cosines if on_grid else _direction(found[i], antennas, w, cosines)
-    named = {name: getattr(detections, name) for name in ("range", "velocity", "snr", "std", "is_reference")}
+    named = {
+        name: getattr(detections, name)
+        for name in ("range", "velocity", "snr", "std", "is_reference")
+    }
     return Sensed(found, type(detections)(direction=direction, **named), power, judged.level)
 
 
@@ -73,18 +82,24 @@ def _beam(antennas: Antennas, waveform: Waveform, cosines: np.ndarray) -> np.nda
     """(L_tx, L_rx) weights of the virtual L towards (u_x, u_z), zero off the L."""
     channels = joint_channels(antennas)
     out = np.zeros((antennas.num_tx, antennas.num_rx), complex)
-    out[channels.tx, channels.rx] = steering(channels.places, np.array([[cosines[0], 0.0, cosines[1]]]), waveform)[0]
+    out[channels.tx, channels.rx] = steering(
+        channels.places, np.array([[cosines[0], 0.0, cosines[1]]]), waveform
+    )[0]
     return out
 
 
-def _direction(estimate: Estimate, antennas: Antennas, waveform: Waveform, cosines: np.ndarray) -> np.ndarray:
+def _direction(
+    estimate: Estimate, antennas: Antennas, waveform: Waveform, cosines: np.ndarray
+) -> np.ndarray:
     """(u_x, u_z) of the most power of the virtual L near the filter's beam."""
     channels = joint_channels(antennas)
     values = estimate.channels[channels.tx, channels.rx]
     best = np.array(cosines, float)
     for step in FINE:
         i, j = np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij")
-        tried = np.stack([best[0] + step * i.ravel(), np.zeros(25), best[1] + step * j.ravel()], axis=1)
+        tried = np.stack(
+            [best[0] + step * i.ravel(), np.zeros(25), best[1] + step * j.ravel()], axis=1
+        )
         power = np.abs(steering(channels.places, tried, waveform).conj() @ values) ** 2
         best = tried[power.argmax()][[0, 2]]
     return best if (best**2).sum() <= 1 else np.full(2, np.nan)

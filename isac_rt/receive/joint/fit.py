@@ -1,13 +1,16 @@
-"""Joint maximum likelihood of several paths on a frame's samples: range, velocity, direction and amplitude of all at once.
+"""Joint maximum likelihood of several paths on a frame's samples: range, velocity, direction and
+amplitude of all at once.
 
 No window, no cells: the samples of the frame are compared with the sum of the paths' exact signals,
 
-    s = sum_k a_k T_k + noise,    T_k = beta exp(j 2 pi (f_c tau + alpha tau (u - tau/2))),   tau = tau_D + tau_k + tau_dot_k t + e_k,
+    s = sum_k a_k T_k + noise,    T_k = beta exp(j 2 pi (f_c tau + alpha tau (u - tau/2))),   tau =
+    tau_D + tau_k + tau_dot_k t + e_k,
 
-e_k the delays of the elements, spherical at the path's range. Gauss-Newton needs of the samples only, for each path, chirp and
-receiver, the sums of s T* and of n s T* over the chirp; what the paths leave in each other's sums is known in closed form (a tone's
-transform and its derivatives). In white noise the estimate of an isolated path reaches the Cramer-Rao bound; paths within one
-cell are told apart by their directions and velocities.
+e_k the delays of the elements, spherical at the path's range. Gauss-Newton needs of the samples
+only, for each path, chirp and receiver, the sums of s T* and of n s T* over the chirp; what the
+paths leave in each other's sums is known in closed form (a tone's transform and its derivatives).
+In white noise the estimate of an isolated path reaches the Cramer-Rao bound; paths within one cell
+are told apart by their directions and velocities.
 """
 
 from __future__ import annotations
@@ -78,7 +81,12 @@ class Frame:
     def middle(self) -> np.ndarray:
         """(M, P) middles of the chirps' samples [s], from the frame's."""
         w = self.waveform
-        return w.chirp_time + w.window_start + (w.num_samples - 1) / 2 * w.sample_interval - w.frame_duration / 2
+        return (
+            w.chirp_time
+            + w.window_start
+            + (w.num_samples - 1) / 2 * w.sample_interval
+            - w.frame_duration / 2
+        )
 
     @property
     def units(self) -> np.ndarray:
@@ -87,8 +95,11 @@ class Frame:
         return np.array([w.delay_step, 1 / (w.frame_duration * w.effective_carrier), 1.0, 1.0])
 
 
-def element_delays(positions: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of elements (E, 3) against the centroid for a spherical wave [s], (E,), and its derivative with respect to u_x, u_z (2, E)."""
+def element_delays(
+    positions: np.ndarray, direction: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Delay of elements (E, 3) against the centroid for a spherical wave [s], (E,), and its
+    derivative with respect to u_x, u_z (2, E)."""
     place = positions[:, [0, 2]]
     along = place @ direction
     delay = (-along + ((positions**2).sum(axis=1) - along**2) / (2 * radius)) / SPEED_OF_LIGHT
@@ -97,10 +108,12 @@ def element_delays(positions: np.ndarray, direction: np.ndarray, radius: float) 
 
 @dataclass(frozen=True)
 class _Tone:
-    """A path's signal: phase [cycles] and frequency [cycles per sample] at mid-chirp, (M, rx, P), curvature, and the sensitivities.
+    """A path's signal: phase [cycles] and frequency [cycles per sample] at mid-chirp, (M, rx, P),
+    curvature, and the sensitivities.
 
-    `constant`, `slope` : (4 + 2 A, M, rx, P), derivative of the signal over the signal, at mid-chirp and per sample, by the
-    scaled parameters and the real and imaginary parts of the amplitudes.
+    `constant`, `slope` : (4 + 2 A, M, rx, P), derivative of the signal over the signal, at
+    mid-chirp and per sample, by the scaled parameters and the real and imaginary parts of the
+    amplitudes.
     """
 
     phase: np.ndarray
@@ -131,7 +144,9 @@ def _tone(frame: Frame, path: JointPath) -> _Tone:
     frequency = (path.delay_rate * g + w.slope * tau) * T_s
     apart = e_rx[:, None] * g[:, None, :] - w.slope * e_rx[:, None] ** 2 / 2
     amplitude = path.amplitude[frame.amplitude_index]
-    constant, slope = _sensitivity(frame, g, t, de_rx, de_tx[:, schedule], amplitude, path.amplitude.size)
+    constant, slope = _sensitivity(
+        frame, g, t, de_rx, de_tx[:, schedule], amplitude, path.amplitude.size
+    )
     return _Tone(
         phase=phase[:, None, :] + apart,
         frequency=frequency[:, None, :] + w.slope * T_s * e_rx[:, None],
@@ -139,16 +154,25 @@ def _tone(frame: Frame, path: JointPath) -> _Tone:
         common_phase=phase,
         common_frequency=frequency,
         receiver_delay=e_rx,
-        amplitude=np.broadcast_to(amplitude[:, None, :], (len(schedule), len(e_rx), schedule.shape[1])),
+        amplitude=np.broadcast_to(
+            amplitude[:, None, :], (len(schedule), len(e_rx), schedule.shape[1])
+        ),
         constant=constant,
         slope=slope,
     )
 
 
 def _sensitivity(
-    frame: Frame, g: np.ndarray, t: np.ndarray, de_rx: np.ndarray, de_tx: np.ndarray, amplitude: np.ndarray, count: int
+    frame: Frame,
+    g: np.ndarray,
+    t: np.ndarray,
+    de_rx: np.ndarray,
+    de_tx: np.ndarray,
+    amplitude: np.ndarray,
+    count: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`constant` and `slope` of `_Tone`: j 2 pi a dPhi by the parameters, 1 and j by the amplitudes."""
+    """`constant` and `slope` of `_Tone`: j 2 pi a dPhi by the parameters, 1 and j by the
+    amplitudes."""
     w, T_s, units = frame.waveform, frame.waveform.sample_interval, frame.units
     shape = (g.shape[0], de_rx.shape[1], g.shape[1])
     constant = np.zeros((PARAMETERS + 2 * count, *shape), np.complex128)
@@ -172,7 +196,9 @@ def _moments(frame: Frame, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
     w, samples = frame.waveform, frame.cube.samples
     n = np.arange(w.num_samples) - (w.num_samples - 1) / 2
     zeroth, first = np.empty((2, *tone.phase.shape), np.complex128)
-    ramps = np.exp(-2j * np.pi * np.outer(tone.receiver_delay * w.slope * w.sample_interval, n)).astype(np.complex64)
+    ramps = np.exp(
+        -2j * np.pi * np.outer(tone.receiver_delay * w.slope * w.sample_interval, n)
+    ).astype(np.complex64)
     for m in range(len(samples)):
         cycles = tone.common_frequency[m][:, None] * n + (tone.curvature * n**2)
         template = np.exp(-2j * np.pi * (cycles % 1.0).astype(np.float32))
@@ -188,21 +214,27 @@ def _moments(frame: Frame, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
 
 
 def match_chirps(frame: Frame, path: JointPath) -> np.ndarray:
-    """(M, P) the chirps against a path's signal, summed over their samples and the receivers in phase."""
+    """(M, P) the chirps against a path's signal, summed over their samples and the receivers in
+    phase."""
     tone = _tone(frame, path)
     return (_moments(frame, tone)[0] * tone.amplitude.conj()).sum(axis=1)
 
 
 def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums over n = -(N-1)/2 .. (N-1)/2 of 1, n and n^2 times exp(j 2 pi x n), x in cycles per sample below a half in magnitude; the
-    first and the last are real, the second imaginary (returned without its j)."""
+    """Sums over n = -(N-1)/2 .. (N-1)/2 of 1, n and n^2 times exp(j 2 pi x n), x in cycles per
+    sample below a half in magnitude; the first and the last are real, the second imaginary
+    (returned without its j)."""
     x = np.where(np.abs(offset) < 1e-2 / size, 1e-2 / size, offset)  # the series takes over there
     s, c = np.sin(np.pi * size * x), np.cos(np.pi * size * x)
     t, k = np.sin(np.pi * x), np.cos(np.pi * x)
     sum0 = s / t
     sum1 = -(size * c * t - s * k) / (2 * t**2)
     sum2 = -((1 - size**2) * s / (4 * t) - k * (size * c * t - s * k) / (2 * t**3))
-    small, second, fourth = np.abs(offset) < 1e-2 / size, size * (size**2 - 1) / 12, size * (size**2 - 1) * (3 * size**2 - 7) / 240
+    small, second, fourth = (
+        np.abs(offset) < 1e-2 / size,
+        size * (size**2 - 1) / 12,
+        size * (size**2 - 1) * (3 * size**2 - 7) / 240,
+    )
     y = 2 * np.pi * offset
     sum0 = np.where(small, size - second * y**2 / 2, sum0)
     sum1 = np.where(small, second * y, sum1)
@@ -211,7 +243,8 @@ def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _cross(frame: Frame, of: _Tone, at: _Tone) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of T_of T_at* times 1, n, n^2 over each chirp; the difference of their curvatures (0.003 cycles) is left out."""
+    """Sums of T_of T_at* times 1, n, n^2 over each chirp; the difference of their curvatures (0.003
+    cycles) is left out."""
     sums = tone_sums(of.frequency - at.frequency, frame.waveform.num_samples)
     turn = np.exp(2j * np.pi * (of.phase - at.phase))
     return sums[0] * turn, 1j * sums[1] * turn, sums[2] * turn
@@ -234,13 +267,16 @@ def fit(frame: Frame, paths: list[JointPath], iterations: int = 4) -> list[Joint
         gradient, gram, left = _normal_equations(frame, paths)
         covariance = np.linalg.inv(gram)
         step = covariance @ gradient
-        paths = [_moved(frame, p, s) for p, s in zip(paths, np.split(step, len(paths)), strict=True)]
+        paths = [
+            _moved(frame, p, s) for p, s in zip(paths, np.split(step, len(paths)), strict=True)
+        ]
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0) * left / 2)
         if (np.abs(step) < SETTLED * deviation).all():
             break
     units, size = frame.units, len(step) // len(paths)
     return [
-        replace(p, std=deviation[i * size : i * size + PARAMETERS] * units) for i, p in enumerate(paths)
+        replace(p, std=deviation[i * size : i * size + PARAMETERS] * units)
+        for i, p in enumerate(paths)
     ]
 
 
@@ -251,12 +287,18 @@ def _with_amplitudes(frame: Frame, paths: list[JointPath]) -> list[JointPath]:
     gradient, gram, _ = _normal_equations(frame, paths)
     size = PARAMETERS + 2 * count
     amplitudes = np.concatenate([np.arange(PARAMETERS, size) + i * size for i in range(len(paths))])
-    step = np.linalg.solve(gram[np.ix_(amplitudes, amplitudes)], gradient[amplitudes]).reshape(len(paths), count, 2)
-    return [replace(p, amplitude=p.amplitude + s[:, 0] + 1j * s[:, 1]) for p, s in zip(paths, step, strict=True)]
+    step = np.linalg.solve(gram[np.ix_(amplitudes, amplitudes)], gradient[amplitudes]).reshape(
+        len(paths), count, 2
+    )
+    return [
+        replace(p, amplitude=p.amplitude + s[:, 0] + 1j * s[:, 1])
+        for p, s in zip(paths, step, strict=True)
+    ]
 
 
 def _normal_equations(frame: Frame, paths: list[JointPath]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Gradient and Gram matrix of the scaled parameters, path by path, and the noise power that the paths leave."""
+    """Gradient and Gram matrix of the scaled parameters, path by path, and the noise power that the
+    paths leave."""
     tones = [_tone(frame, p) for p in paths]
     size, cells = tones[0].constant.shape[0], tones[0].phase.size
     gradient, gram = np.zeros(size * len(paths)), np.zeros((size * len(paths),) * 2)
@@ -292,20 +334,26 @@ def residual_channels(
     Yields
     ------
     path
-    channels : (F, L_tx, L_rx) mean residual amplitude over the chirps of a transmit antenna times the root of their samples
+    channels : (F, L_tx, L_rx) mean residual amplitude over the chirps of a transmit antenna times
+        the root of their samples
     counts : samples per amplitude of the path
     noise : power of a sample that all paths leave
     """
     w, schedule = frame.waveform, frame.cube.schedule
     tones = [_tone(frame, p) for p in paths]
     left = _normal_equations(frame, paths)[2]
-    turns = np.exp(-2j * np.pi * offsets[:, None, None] * frame.middle / w.frame_duration)  # a bin is one turn per frame
+    turns = np.exp(
+        -2j * np.pi * offsets[:, None, None] * frame.middle / w.frame_duration
+    )  # a bin is one turn per frame
     for path, at in zip(paths, tones, strict=True):
         residual = _moments(frame, at)[0]
         for of in tones:
             residual = residual - of.amplitude * _cross(frame, of, at)[0]
         channels = np.empty((len(offsets), frame.antennas.num_tx, residual.shape[1]), np.complex128)
-        sent = np.array([(schedule == tx).sum() for tx in range(frame.antennas.num_tx)]) * w.num_samples
+        sent = (
+            np.array([(schedule == tx).sum() for tx in range(frame.antennas.num_tx)])
+            * w.num_samples
+        )
         for tx in range(frame.antennas.num_tx):
             mine = np.where(schedule == tx, turns, 0.0)
             channels[:, tx] = np.einsum("fmp,mrp->fr", mine, residual) / np.sqrt(sent[tx])
@@ -314,13 +362,22 @@ def residual_channels(
 
 
 def _moved(frame: Frame, path: JointPath, step: np.ndarray) -> JointPath:
-    """A path after a step. The phase turns by 128 cycles per cell of delay: the amplitude follows that turn, and not its tangent."""
+    """A path after a step. The phase turns by 128 cycles per cell of delay: the amplitude follows
+    that turn, and not its tangent."""
     change = np.clip(step[:PARAMETERS], -LARGEST_STEP, LARGEST_STEP)
     constant, index = _tone(frame, path).constant[:PARAMETERS], frame.amplitude_index
-    mine = [np.broadcast_to((index == i)[:, None, :], constant.shape[1:]) for i in range(path.amplitude.size)]
+    mine = [
+        np.broadcast_to((index == i)[:, None, :], constant.shape[1:])
+        for i in range(path.amplitude.size)
+    ]
     turn = np.array([constant[:, m].mean(axis=1) for m in mine]) / path.amplitude[:, None]
     pairs = step[PARAMETERS:].reshape(-1, 2)
-    amplitude = path.amplitude + pairs[:, 0] + 1j * pairs[:, 1] + path.amplitude * (turn @ step[:PARAMETERS])
+    amplitude = (
+        path.amplitude
+        + pairs[:, 0]
+        + 1j * pairs[:, 1]
+        + path.amplitude * (turn @ step[:PARAMETERS])
+    )
     move = change * frame.units
     return replace(
         path,

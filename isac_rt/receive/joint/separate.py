@@ -1,8 +1,9 @@
-"""Detections through the joint model: estimates at the Cramer-Rao bound, and paths that share a cell told apart by direction and velocity.
+"""Detections through the joint model: estimates at the Cramer-Rao bound, and paths that share a
+cell told apart by direction and velocity.
 
-Takes what the windowed map found, fits the strongest of it at once (`isac_rt.receive.joint.fit`), and looks in what the fit leaves about
-each path for another one that the map could not show: at the same delay, within two Doppler bins, from any other direction in
-view. What is found joins the fit.
+Takes what the windowed map found, fits the strongest of it at once (`isac_rt.receive.joint.fit`),
+and looks in what the fit leaves about each path for another one that the map could not show: at the
+same delay, within two Doppler bins, from any other direction in view. What is found joins the fit.
 """
 
 from __future__ import annotations
@@ -22,14 +23,16 @@ MAX_HIDDEN = 3
 FALSE_RATE = 1e-4
 """Chance that noise invents a path in one search."""
 WEAKEST_DB = 25.0
-"""A path this far under the one whose cell it shares is not told from what the model leaves (acceleration, near field)."""
+"""A path this far under the one whose cell it shares is not told from what the model leaves
+(acceleration, near field)."""
 DIRECTIONS, DOPPLER_OFFSETS = 31, np.arange(-2.0, 2.01, 0.5)
 FARTHEST = np.array([1.5, 3.0])
 """Cells and bins that a path found beside another one may move away from it in the fit."""
 
 
 def separate(frame: Frame, detections: Detections) -> tuple[Detections, np.ndarray]:
-    """Detections with joint estimates, strongest first after a reference, and the power of each path per sample (NaN if not fitted)."""
+    """Detections with joint estimates, strongest first after a reference, and the power of each
+    path per sample (NaN if not fitted)."""
     d = detections
     usable = np.flatnonzero(np.isfinite(d.direction).all(axis=1) & (d.range > 0))
     order = usable[np.argsort(~d.is_reference[usable], kind="stable")][:MAX_PATHS]
@@ -39,7 +42,9 @@ def separate(frame: Frame, detections: Detections) -> tuple[Detections, np.ndarr
     paths = fit(frame, start)
     parent = list(range(len(paths)))
     if not all(_near(frame, p, s) for p, s in zip(paths, start, strict=True)):
-        return d, np.full(len(d), np.nan)  # two detections of one path: the fit has no single answer
+        return d, np.full(
+            len(d), np.nan
+        )  # two detections of one path: the fit has no single answer
     for _ in range(MAX_HIDDEN):
         found = _hidden(frame, paths)
         if found is None:
@@ -54,16 +59,25 @@ def separate(frame: Frame, detections: Detections) -> tuple[Detections, np.ndarr
 
 def _path(frame: Frame, d: Detections, i: int) -> JointPath:
     scale = frame.passes / SPEED_OF_LIGHT
-    return JointPath(float(d.range[i]) * scale, float(d.velocity[i]) * scale, d.direction[i].copy(), np.ones(1), np.zeros(4))
+    return JointPath(
+        float(d.range[i]) * scale,
+        float(d.velocity[i]) * scale,
+        d.direction[i].copy(),
+        np.ones(1),
+        np.zeros(4),
+    )
 
 
 def _near(frame: Frame, path: JointPath, start: JointPath) -> bool:
     moved = np.abs([path.delay - start.delay, path.delay_rate - start.delay_rate]) / frame.units[:2]
-    return bool(np.isfinite(moved).all() and (moved < FARTHEST).all() and (path.direction**2).sum() < 1)
+    return bool(
+        np.isfinite(moved).all() and (moved < FARTHEST).all() and (path.direction**2).sum() < 1
+    )
 
 
 def _credible(frame: Frame, paths: list[JointPath], near: list[JointPath]) -> bool:
-    """Whether a fit stayed near its start, and the new path, the last, is within `WEAKEST_DB` of its neighbour and not on top of it."""
+    """Whether a fit stayed near its start, and the new path, the last, is within `WEAKEST_DB` of
+    its neighbour and not on top of it."""
     if not all(_near(frame, p, n) for p, n in zip(paths, near, strict=True)):
         return False
     power = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
@@ -72,7 +86,8 @@ def _credible(frame: Frame, paths: list[JointPath], near: list[JointPath]) -> bo
 
 
 def _hidden(frame: Frame, paths: list[JointPath]) -> tuple[int, JointPath] | None:
-    """The surest path that the residual of a fit holds about one of its paths, with that path's number."""
+    """The surest path that the residual of a fit holds about one of its paths, with that path's
+    number."""
     limit = np.sin(min(frame.antennas.half_view, np.pi / 2 - 1e-3))
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -80,10 +95,16 @@ def _hidden(frame: Frame, paths: list[JointPath]) -> tuple[int, JointPath] | Non
     best: tuple[float, int, JointPath] | None = None
     sums = 1 if frame.passes == 2 else frame.antennas.num_tx
     level = stats.gamma(sums).isf(FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
-    for k, (path, channels, counts, noise) in enumerate(residual_channels(frame, paths, DOPPLER_OFFSETS)):
-        power = _beams(frame, path, channels, grid) / noise  # (direction, offset), a sum of `sums` exponentials in noise
+    for k, (path, channels, counts, noise) in enumerate(
+        residual_channels(frame, paths, DOPPLER_OFFSETS)
+    ):
+        power = (
+            _beams(frame, path, channels, grid) / noise
+        )  # (direction, offset), a sum of `sums` exponentials in noise
         i, j = np.unravel_index(power.argmax(), power.shape)
-        floor = 10 ** (-WEAKEST_DB / 10) * float((np.abs(path.amplitude) ** 2 * counts).sum()) / noise
+        floor = (
+            10 ** (-WEAKEST_DB / 10) * float((np.abs(path.amplitude) ** 2 * counts).sum()) / noise
+        )
         if power[i, j] > max(level, floor) and (best is None or power[i, j] > best[0]):
             rate = path.delay_rate + DOPPLER_OFFSETS[j] * frame.units[1]
             best = float(power[i, j]), k, replace(path, delay_rate=rate, direction=grid[i].copy())
@@ -91,15 +112,18 @@ def _hidden(frame: Frame, paths: list[JointPath]) -> tuple[int, JointPath] | Non
 
 
 def _beams(frame: Frame, path: JointPath, channels: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Power of channel residuals (offset, L_tx, L_rx) in the directions of `grid` (G, 2): over both arrays for an echo; at a PT over
-    the receivers, added over the transmit antennas. Normalised to what one beam of white noise holds per unit `noise`."""
+    """Power of channel residuals (offset, L_tx, L_rx) in the directions of `grid` (G, 2): over both
+    arrays for an echo; at a PT over the receivers, added over the transmit antennas. Normalised to
+    what one beam of white noise holds per unit `noise`."""
     w, a = frame.waveform, frame.antennas
     radius = max(path.delay * SPEED_OF_LIGHT / frame.passes, w.range_cell(frame.passes))
     turn = 2j * np.pi * w.effective_carrier
 
     def steer(positions: np.ndarray) -> np.ndarray:
         own = element_delays(positions, path.direction, radius)[0]
-        return np.exp(turn * (np.array([element_delays(positions, u, radius)[0] for u in grid]) - own))
+        return np.exp(
+            turn * (np.array([element_delays(positions, u, radius)[0] for u in grid]) - own)
+        )
 
     beams = channels @ steer(a.rx_positions).conj().T  # (offset, L_tx, G)
     if frame.passes == 2:
@@ -114,14 +138,21 @@ def _merged(
     """The detections with the fitted ones in place of theirs and the new ones behind."""
     scale, extra = SPEED_OF_LIGHT / frame.passes, len(paths) - order.size
     rows = np.concatenate([order, np.arange(len(d), len(d) + extra)])
-    source = np.concatenate([np.arange(len(d)), order[parent[order.size :]] if extra else np.zeros(0, int)]).astype(int)
-    values = {name: getattr(d, name)[source].copy() for name in ("range", "velocity", "direction", "snr", "std", "is_reference")}
+    source = np.concatenate(
+        [np.arange(len(d)), order[parent[order.size :]] if extra else np.zeros(0, int)]
+    ).astype(int)
+    values = {
+        name: getattr(d, name)[source].copy()
+        for name in ("range", "velocity", "direction", "snr", "std", "is_reference")
+    }
     power = np.full(len(source), np.nan)
     power[rows] = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     values["range"][rows] = [p.delay * scale for p in paths]
     values["velocity"][rows] = [p.delay_rate * scale for p in paths]
     limit = np.sin(frame.antennas.half_view) if frame.antennas.half_view < np.pi / 2 else 1.0
-    values["direction"][rows] = [np.where(np.abs(p.direction) <= limit, p.direction, np.nan) for p in paths]
+    values["direction"][rows] = [
+        np.where(np.abs(p.direction) <= limit, p.direction, np.nan) for p in paths
+    ]
     values["std"][rows] = [p.std * [scale, scale, 1, 1] for p in paths]
     values["snr"][len(d) :] *= power[len(d) :] / power[source[len(d) :]]
     values["is_reference"][len(d) :] = False
@@ -129,12 +160,17 @@ def _merged(
     return Detections(**values), power
 
 
-def _earlier_reference(values: dict[str, np.ndarray], power: np.ndarray, source: np.ndarray, old: int) -> None:
-    """Of paths found in the reference's cell within 10 dB of it the earliest is the line of sight. In place."""
+def _earlier_reference(
+    values: dict[str, np.ndarray], power: np.ndarray, source: np.ndarray, old: int
+) -> None:
+    """Of paths found in the reference's cell within 10 dB of it the earliest is the line of sight.
+    In place."""
     reference = np.flatnonzero(values["is_reference"])
     if not reference.size:
         return
     r = int(reference[0])
-    siblings = np.concatenate([[r], old + np.flatnonzero((source[old:] == r) & (power[old:] > 0.1 * power[r]))])
+    siblings = np.concatenate(
+        [[r], old + np.flatnonzero((source[old:] == r) & (power[old:] > 0.1 * power[r]))]
+    )
     values["is_reference"][r] = False
     values["is_reference"][siblings[np.argmin(values["range"][siblings])]] = True

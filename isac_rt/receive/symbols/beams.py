@@ -1,9 +1,11 @@
 """Symbol decisions from beams towards the predicted paths, and what every bit is worth.
 
-The paper adds the powers of the receivers. Once the directions are tracked, the receivers can be added in phase: one beam per predicted
-path, with the other paths that share its range cells kept out by the weights. Beams of several paths, each read at its own beat and
-turned by its own motion, are combined for the delay and for the DPSK symbols. The error of the predicted velocity turns the
-transitions of all groups and antennas in proportion to their spacing in time: it is found from all of them at once and taken out.
+The paper adds the powers of the receivers. Once the directions are tracked, the receivers can be
+added in phase: one beam per predicted path, with the other paths that share its range cells kept
+out by the weights. Beams of several paths, each read at its own beat and turned by its own motion,
+are combined for the delay and for the DPSK symbols. The error of the predicted velocity turns the
+transitions of all groups and antennas in proportion to their spacing in time: it is found from all
+of them at once and taken out.
 """
 
 from __future__ import annotations
@@ -19,29 +21,40 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.estimate import beat_cells, middle_times
 from isac_rt.receive.joint.fit import element_delays
-from isac_rt.receive.symbols.powers import EXTRA_CELLS, WEAKEST_WEIGHT, Symbols, known_cycles, symbol_cells
+from isac_rt.receive.symbols.powers import (
+    EXTRA_CELLS,
+    WEAKEST_WEIGHT,
+    Symbols,
+    known_cycles,
+    symbol_cells,
+)
 from isac_rt.receive.types import Prediction
 
 SHARED_CELLS = 2.0
 """Paths nearer than this in beat lie in each other's cells."""
 LOADING = 1e-2
-"""Of the weights that keep another path out: noise they may take up, relative to a path of weight 1 on one receiver."""
+"""Of the weights that keep another path out: noise they may take up, relative to a path of weight 1
+on one receiver."""
 VELOCITY_STEPS = 81
 FARTHEST_BINS, FARTHEST_STDS = 1.0, 4.0
 """Where the true velocity is sought about the predicted one."""
 
 
 def usable_paths(prediction: Prediction) -> np.ndarray:
-    """Numbers of the predicted paths that have a direction and enough power; empty if the reference has none."""
+    """Numbers of the predicted paths that have a direction and enough power; empty if the reference
+    has none."""
     known = np.isfinite(prediction.direction).all(axis=1) & (prediction.weight >= WEAKEST_WEIGHT)
     known[0] = np.isfinite(prediction.direction[0]).all()
     return np.flatnonzero(known) if known[0] else np.zeros(0, int)
 
 
-def beam_weights(prediction: Prediction, beats: np.ndarray, antennas: Antennas, waveform: Waveform) -> np.ndarray:
+def beam_weights(
+    prediction: Prediction, beats: np.ndarray, antennas: Antennas, waveform: Waveform
+) -> np.ndarray:
     """(K, L_rx) weights of unit noise gain towards each path, against those within `SHARED_CELLS`.
 
-    w_k ~ (sum_j g_j a_j a_j^H + loading I)^-1 a_k over the paths that share k's cells; alone this is the plain beam.
+    w_k ~ (sum_j g_j a_j a_j^H + loading I)^-1 a_k over the paths that share k's cells; alone this
+    is the plain beam.
     """
     turn = 2j * np.pi * waveform.effective_carrier
     steer = np.exp(
@@ -54,15 +67,22 @@ def beam_weights(prediction: Prediction, beats: np.ndarray, antennas: Antennas, 
     for k, a in enumerate(steer):
         near = np.abs(beats - beats[k]) < SHARED_CELLS
         near[k] = False
-        R = LOADING * np.eye(a.size) + np.einsum("j,jr,js->rs", prediction.weight[near], steer[near], steer[near].conj())
+        R = LOADING * np.eye(a.size) + np.einsum(
+            "j,jr,js->rs", prediction.weight[near], steer[near], steer[near].conj()
+        )
         out[k] = np.linalg.solve(R, a)
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
 def demodulate_beams(
-    cube: IFCube, prediction: Prediction, antennas: Antennas, dpsk_order: int, run_cells: int | None = None
+    cube: IFCube,
+    prediction: Prediction,
+    antennas: Antennas,
+    dpsk_order: int,
+    run_cells: int | None = None,
 ) -> Symbols:
-    """Decide all symbols of a frame from beams; parameters as for `demodulate`, which decides where the reference has no direction."""
+    """Decide all symbols of a frame from beams; parameters as for `demodulate`, which decides where
+    the reference has no direction."""
     w = cube.waveform
     rows = usable_paths(prediction)
     p = Prediction(**{name: value[rows] for name, value in vars(prediction).items()})
@@ -76,7 +96,9 @@ def demodulate_beams(
     raw = cells[best]
     peak = np.take_along_axis(metric, best[..., None], axis=-1)[..., 0]
     sure = peak / np.maximum((metric.sum(axis=-1) - peak) / (cells.size - 1), 1e-300)
-    picked = np.take_along_axis(spectra, best[None, ..., None], axis=-1)[..., 0].astype(np.complex128)
+    picked = np.take_along_axis(spectra, best[None, ..., None], axis=-1)[..., 0].astype(
+        np.complex128
+    )
     for k in range(len(rows)):
         picked[k] *= np.exp(-2j * np.pi * known_cycles(w, delays[k], rates[k], raw))
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
@@ -93,7 +115,9 @@ def demodulate_beams(
     own = likelihood[..., EXTRA_CELLS:-EXTRA_CELLS]
     soft_delay, right = soft_delay_bits(own)
     chains = by_antenna(right, cube.schedule, w.num_tx)
-    soft = np.concatenate([soft_delay, soft_phase_bits(summed, chains[..., 1:] * chains[..., :-1], dpsk_order)])
+    soft = np.concatenate(
+        [soft_delay, soft_phase_bits(summed, chains[..., 1:] * chains[..., :-1], dpsk_order)]
+    )
     return Symbols(
         raw=raw,
         delay=delay,
@@ -108,16 +132,28 @@ def demodulate_beams(
     )
 
 
-def _beam_spectra(cube: IFCube, p: Prediction, antennas: Antennas, cells: np.ndarray, run_cells: int | None) -> np.ndarray:
-    """(K, M, P, len(cells)) complex64, spectra of the beams, each derotated by its path's beat, at the cells of the symbols."""
+def _beam_spectra(
+    cube: IFCube, p: Prediction, antennas: Antennas, cells: np.ndarray, run_cells: int | None
+) -> np.ndarray:
+    """(K, M, P, len(cells)) complex64, spectra of the beams, each derotated by its path's beat, at
+    the cells of the symbols."""
     w, shape = cube.waveform, cube.schedule.shape
-    beats = [beat_cells(w, r / SPEED_OF_LIGHT, v / SPEED_OF_LIGHT) for r, v in zip(p.range, p.velocity, strict=True)]
-    weights = beam_weights(p, np.array([b.mean() for b in beats]), antennas, w).conj().astype(np.complex64)
+    beats = [
+        beat_cells(w, r / SPEED_OF_LIGHT, v / SPEED_OF_LIGHT)
+        for r, v in zip(p.range, p.velocity, strict=True)
+    ]
+    weights = (
+        beam_weights(p, np.array([b.mean() for b in beats]), antennas, w)
+        .conj()
+        .astype(np.complex64)
+    )
     out = np.empty((len(beats), *shape, cells.size), np.complex64)
     fast = np.arange(w.num_samples)
     for k, beat in enumerate(beats):
         for m in range(shape[0]):
-            turn = np.exp(-2j * np.pi * ((beat[m][:, None] * fast / w.num_samples) % 1.0)).astype(np.complex64)
+            turn = np.exp(-2j * np.pi * ((beat[m][:, None] * fast / w.num_samples) % 1.0)).astype(
+                np.complex64
+            )
             beam = np.tensordot(weights[k], cube.samples[m], axes=1)
             spectrum = scipy.fft.fft(beam * turn, axis=-1, workers=1, overwrite_x=True)
             if run_cells is not None:
@@ -127,8 +163,8 @@ def _beam_spectra(cube: IFCube, p: Prediction, antennas: Antennas, cells: np.nda
 
 
 def _likelihood(spectra: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Noise power of a cell, SNR of the path's cell, and the log likelihood of each cell (M, P, S) as the path's, its phase unknown:
-    ln I_0(2 sqrt(g E / N)) with E the cell's power."""
+    """Noise power of a cell, SNR of the path's cell, and the log likelihood of each cell (M, P, S)
+    as the path's, its phase unknown: ln I_0(2 sqrt(g E / N)) with E the cell's power."""
     power = np.abs(spectra) ** 2
     noise = max(float(np.median(power) / np.log(2)), 1e-300)
     snr = max(float(np.median(power.max(axis=-1))) / noise - 1, 1e-3)
@@ -136,9 +172,11 @@ def _likelihood(spectra: np.ndarray) -> tuple[float, float, np.ndarray]:
     return noise, snr, np.log(special.i0e(x)) + x
 
 
-def _transitions(picked: np.ndarray, cube: IFCube, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Products of each antenna's consecutive chirps with the conjugate of the earlier one, (K, M, L_tx, P/L_tx - 1), and the time
-    between them [s] (M, L_tx, P/L_tx - 1)."""
+def _transitions(
+    picked: np.ndarray, cube: IFCube, raw: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of each antenna's consecutive chirps with the conjugate of the earlier one, (K, M,
+    L_tx, P/L_tx - 1), and the time between them [s] (M, L_tx, P/L_tx - 1)."""
     w = cube.waveform
     products = []
     for one in picked:
@@ -148,35 +186,49 @@ def _transitions(picked: np.ndarray, cube: IFCube, raw: np.ndarray) -> tuple[np.
     return np.array(products), np.diff(times, axis=-1)
 
 
-def _rate_error(product: np.ndarray, length: np.ndarray, far: float, order: int, waveform: Waveform) -> float:
-    """Error of a predicted delay rate from the DPSK phases of all groups and antennas: the maximum of |sum of z^D / |z|^(D-1) turned
-    back by D times the rate's phase|, real part, so that the constellation falls on its symbols; parabola through the three points."""
+def _rate_error(
+    product: np.ndarray, length: np.ndarray, far: float, order: int, waveform: Waveform
+) -> float:
+    """Error of a predicted delay rate from the DPSK phases of all groups and antennas: the maximum
+    of |sum of z^D / |z|^(D-1) turned back by D times the rate's phase|, real part, so that the
+    constellation falls on its symbols; parabola through the three points."""
     raised = np.abs(product) * np.exp(1j * order * np.angle(product))
     rates = np.linspace(-far, far, VELOCITY_STEPS)
-    fit = [float((raised * np.exp(-2j * np.pi * order * r * waveform.effective_carrier * length)).sum().real) for r in rates]
+    fit = [
+        float(
+            (raised * np.exp(-2j * np.pi * order * r * waveform.effective_carrier * length))
+            .sum()
+            .real
+        )
+        for r in rates
+    ]
     i = int(np.clip(np.argmax(fit), 1, VELOCITY_STEPS - 2))
     before, peak, after = fit[i - 1 : i + 2]
     bend = before - 2 * peak + after
-    return float(rates[i] + (0.5 * (before - after) / bend if bend < 0 else 0.0) * (rates[1] - rates[0]))
+    return float(
+        rates[i] + (0.5 * (before - after) / bend if bend < 0 else 0.0) * (rates[1] - rates[0])
+    )
 
 
 def soft_delay_bits(likelihood: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-likelihood ratios ln P(0)/P(1) of the delay bits, in the order of the payload, and the probability of each chirp's best
-    symbol, from log likelihoods (M, P, N/2)."""
+    """Log-likelihood ratios ln P(0)/P(1) of the delay bits, in the order of the payload, and the
+    probability of each chirp's best symbol, from log likelihoods (M, P, N/2)."""
     bits = gray_bits(likelihood.shape[-1])
     probability = np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
     probability /= probability.sum(axis=-1, keepdims=True)
     ones = (probability @ bits).reshape(-1)
     zeros = (probability @ (1.0 - bits)).reshape(-1)
-    return np.log(np.maximum(zeros, 1e-30)) - np.log(np.maximum(ones, 1e-30)), probability.max(axis=-1)
+    return np.log(np.maximum(zeros, 1e-30)) - np.log(np.maximum(ones, 1e-30)), probability.max(
+        axis=-1
+    )
 
 
 def soft_phase_bits(summed: np.ndarray, right: np.ndarray, order: int) -> np.ndarray:
     """Log-likelihood ratios ln P(0)/P(1) of the DPSK bits, in the order of the payload.
 
-    Given the earlier chirp the later one is Gaussian about its turned copy, so that a symbol's log likelihood is Re(z exp(-j phase)) with z
-    the product scaled by 2 g / (N (1 + 2 g)), g the SNR and N the noise of a cell. Unless both delay symbols are `right`, the
-    phase says nothing.
+    Given the earlier chirp the later one is Gaussian about its turned copy, so that a symbol's log
+    likelihood is Re(z exp(-j phase)) with z the product scaled by 2 g / (N (1 + 2 g)), g the SNR
+    and N the noise of a cell. Unless both delay symbols are `right`, the phase says nothing.
     """
     phase = 2 * np.pi / order * np.arange(order)
     likelihood = (summed[..., None] * np.exp(-1j * phase)).real

@@ -1,8 +1,9 @@
 """Delay symbols and DPSK symbols of a frame, given a prediction of the reference path.
 
-Every chirp is derotated by the predicted beat, fraction and migration included, so that the symbol is the number of the
-strongest cell. A prediction that is a whole cell off gives symbols that are all one off: the same signal. That is why
-the search runs a few cells past the alphabet (`raw`), where such a slip shows.
+Every chirp is derotated by the predicted beat, fraction and migration included, so that the symbol
+is the number of the strongest cell. A prediction that is a whole cell off gives symbols that are
+all one off: the same signal. That is why the search runs a few cells past the alphabet (`raw`),
+where such a slip shows.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do no
 class Symbols:
     """Decisions of a frame; shapes as in `Reception`.
 
-    `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a transition, the cosine-like share
-    |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions from their symbols [rad].
-    `looks` receivers are added in power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
+    `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a
+    transition, the cosine-like share
+    |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions
+    from their symbols [rad]. `looks` receivers are added in power. `soft_bits` are the bits'
+    log-likelihood ratios ln P(0)/P(1), from beams only.
     """
 
     raw: np.ndarray
@@ -50,10 +53,12 @@ class Symbols:
 
 @lru_cache(maxsize=64)
 def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
-    """Median delay confidence over a frame that noise alone exceeds in fewer than one frame in a million.
+    """Median delay confidence over a frame that noise alone exceeds in fewer than one frame in a
+    million.
 
-    In noise the confidence is the largest of `num_cells` Gamma(L_rx) means. Its median over the chirps exceeds the level
-    that one chirp exceeds with probability q in P[Binomial(num_chirps, q) >= num_chirps/2].
+    In noise the confidence is the largest of `num_cells` Gamma(L_rx) means. Its median over the
+    chirps exceeds the level that one chirp exceeds with probability q in P[Binomial(num_chirps, q)
+    >= num_chirps/2].
     """
     share = np.linspace(0.01, 0.5, 491)
     tail = stats.binom.sf(num_chirps // 2 - 1, num_chirps, share)
@@ -67,7 +72,11 @@ def symbol_cells(waveform: Waveform) -> np.ndarray:
 
 
 def demodulate(
-    cube: IFCube, prediction: Prediction, dpsk_order: int, run_cells: int | None = None, profile: np.ndarray | None = None
+    cube: IFCube,
+    prediction: Prediction,
+    dpsk_order: int,
+    run_cells: int | None = None,
+    profile: np.ndarray | None = None,
 ) -> Symbols:
     """Decide all symbols of a frame.
 
@@ -76,15 +85,20 @@ def demodulate(
     cube : IFCube of a modulated frame
     prediction : row 0 is the reference path; further rows vote with their predicted power
     dpsk_order : D
-    run_cells : leave runs of so many occupied cells out of the decision (`isac_rt.receive.clutter.filter`); None: do not look
-    profile : (N,) power over noise in the cells from the reference on; given, the delay symbols are decided by correlation with it
-        (`isac_rt.receive.symbols.profile`), and predicted paths do not vote
+    run_cells : leave runs of so many occupied cells out of the decision
+        (`isac_rt.receive.clutter.filter`); None: do not look
+    profile : (N,) power over noise in the cells from the reference on; given, the delay symbols are
+        decided by correlation with it (`isac_rt.receive.symbols.profile`), and predicted paths do
+        not vote
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
     beats = beat_cells(w, delays[0], rates[0])
     others = [
-        (float(prediction.weight[k]), np.round(beat_cells(w, delays[k], rates[k]) - beats).astype(int))
+        (
+            float(prediction.weight[k]),
+            np.round(beat_cells(w, delays[k], rates[k]) - beats).astype(int),
+        )
         for k in range(1, delays.size)
         if prediction.weight[k] >= WEAKEST_WEIGHT
     ]
@@ -101,8 +115,14 @@ def demodulate(
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
         if profile is not None:
             power = correlate(power, profile)
-        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others] if profile is None else [], w)
-        if profile is not None:  # next to the right symbol the template still overlaps itself: the mean of the rest is not the noise's
+        raw[m], sure[m] = decide(
+            power, [(g, o[m]) for g, o in others] if profile is None else [], w
+        )
+        if (
+            profile is not None
+            # next to the right symbol the template still overlaps itself: the mean of the rest is
+            # not the noise's
+        ):
             sure[m] = power.max(axis=1) / np.median(power, axis=1)
         picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
@@ -122,15 +142,21 @@ def demodulate(
     )
 
 
-def known_cycles(waveform: Waveform, delay: float, delay_rate: float, raw: np.ndarray) -> np.ndarray:
-    """(M, P) phase [cycles] of the picked cells of a path that is as predicted and carries the symbols `raw`, but for its DPSK."""
+def known_cycles(
+    waveform: Waveform, delay: float, delay_rate: float, raw: np.ndarray
+) -> np.ndarray:
+    """(M, P) phase [cycles] of the picked cells of a path that is as predicted and carries the
+    symbols `raw`, but for its DPSK."""
     w, beats = waveform, beat_cells(waveform, delay, delay_rate)
     cycles = middle_phase(w, delay, delay_rate) - beats * (window_length(w) / 2 / w.num_samples)
     return cycles + data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay
 
 
-def decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
-    """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from (P, N) power."""
+def decide(
+    power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: Waveform
+) -> tuple[np.ndarray, np.ndarray]:
+    """Strongest symbol of every chirp in [-EXTRA_CELLS, N/2 + EXTRA_CELLS) and its confidence, from
+    (P, N) power."""
     cells = symbol_cells(waveform)
     metric = power[:, cells % waveform.num_samples].astype(np.float64)
     chirps = np.arange(power.shape[0])[:, None]
@@ -142,8 +168,11 @@ def decide(power: np.ndarray, others: list[tuple[float, np.ndarray]], waveform: 
     return cells[best], peak / np.maximum(rest, 1e-300)
 
 
-def decide_transitions(picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of the earlier one."""
+def decide_transitions(
+    picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of
+    the earlier one."""
     chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
     product = chains[..., 1:] * chains[..., :-1].conj()
     summed = product.sum(axis=2)
@@ -157,9 +186,10 @@ def decide_transitions(picked: np.ndarray, schedule: np.ndarray, num_tx: int, or
 def moves_as_predicted(symbols: Symbols, order: int) -> bool:
     """Whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
 
-    The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole symbols of its Doppler, so that
-    a reflection always ends up near the predicted cell. But unless it moves as predicted its phases lie anywhere between the symbols:
-    a spread of pi/D/sqrt(3). The spread from noise is sqrt((1 + 1/(2 g)) / (L_rx g)) with g the SNR of a cell.
+    The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole
+    symbols of its Doppler, so that a reflection always ends up near the predicted cell. But unless
+    it moves as predicted its phases lie anywhere between the symbols: a spread of pi/D/sqrt(3). The
+    spread from noise is sqrt((1 + 1/(2 g)) / (L_rx g)) with g the SNR of a cell.
     """
     anywhere = np.pi / order / np.sqrt(3)
     g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)

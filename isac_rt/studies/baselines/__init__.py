@@ -1,4 +1,5 @@
-"""What the paper compares with, at the same parameters: conventional TDM-MIMO FMCW and mmWave-LoRadar, each a receiver of its own."""
+"""What the paper compares with, at the same parameters: conventional TDM-MIMO FMCW and
+mmWave-LoRadar, each a receiver of its own."""
 
 from isac_rt.studies.baselines.fmcw import fmcw_frame, receive_fmcw
 from isac_rt.studies.baselines.loradar import (

@@ -1,4 +1,5 @@
-"""Conventional TDM-MIMO sensing, which both baselines share: a Doppler transform per transmit antenna, a non-coherent sum, CFAR, angles."""
+"""Conventional TDM-MIMO sensing, which both baselines share: a Doppler transform per transmit
+antenna, a non-coherent sum, CFAR, angles."""
 
 from __future__ import annotations
 
@@ -16,14 +17,18 @@ from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers
 
 SIDELOBES = 1e-6
-"""Share of a path's power that may lie in any Doppler bin of its range row: Hann's far sidelobes and migration."""
+"""Share of a path's power that may lie in any Doppler bin of its range row: Hann's far sidelobes
+and migration."""
 
 Conversion = Callable[[float, float], tuple[float, float]]
 """From a range cell and a Doppler bin (both fractional) to delay [s] and delay rate."""
 
 
-def doppler_maps(spectra: np.ndarray, schedule: np.ndarray, times: np.ndarray, frame_duration: float, num_tx: int) -> np.ndarray:
-    """Hann-windowed Doppler transform of each antenna's own P/L_tx chirps, on bins of 1/frame_duration.
+def doppler_maps(
+    spectra: np.ndarray, schedule: np.ndarray, times: np.ndarray, frame_duration: float, num_tx: int
+) -> np.ndarray:
+    """Hann-windowed Doppler transform of each antenna's own P/L_tx chirps, on bins of
+    1/frame_duration.
 
     Parameters
     ----------
@@ -33,7 +38,8 @@ def doppler_maps(spectra: np.ndarray, schedule: np.ndarray, times: np.ndarray, f
 
     Returns
     -------
-    maps : (L_tx, L_rx, rows, P/L_tx) complex64, FFT order, phases referred to time 0 at the bin's own frequency
+    maps : (L_tx, L_rx, rows, P/L_tx) complex64, FFT order, phases referred to time 0 at the bin's
+        own frequency
     """
     num_rx, rows, num_chirps = spectra.shape
     pulses = num_chirps // num_tx
@@ -43,7 +49,9 @@ def doppler_maps(spectra: np.ndarray, schedule: np.ndarray, times: np.ndarray, f
     for tx in range(num_tx):
         mine = np.flatnonzero(schedule == tx)
         operator = (np.exp(-2j * np.pi * np.outer(bins, times[mine])) * window).astype(np.complex64)
-        np.matmul(spectra[..., mine].reshape(-1, pulses), operator.T, out=out[tx].reshape(-1, pulses))
+        np.matmul(
+            spectra[..., mine].reshape(-1, pulses), operator.T, out=out[tx].reshape(-1, pulses)
+        )
     return out
 
 
@@ -57,7 +65,8 @@ def sense_tdm(
     settings: Receivers,
     first_row: int,
 ) -> Detections:
-    """Detections of a monostatic conventional TDM-MIMO radar; unambiguous up to max_velocity / L_tx.
+    """Detections of a monostatic conventional TDM-MIMO radar; unambiguous up to max_velocity /
+    L_tx.
 
     Parameters
     ----------
@@ -70,10 +79,15 @@ def sense_tdm(
     maps = doppler_maps(spectra, schedule, times, w.frame_duration, w.num_tx)
     power = accumulate(maps)
     looks = antennas.num_tx * antennas.num_rx
-    above, level = detect(power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells)
+    above, level = detect(
+        power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
+    )
     above[:first_row] = False
     rows, columns = strongest_peaks(power, above, settings, SIDELOBES)
-    estimates = [estimate_tdm(maps, power, int(r), int(c), schedule, times, convert, w) for r, c in zip(rows, columns, strict=True)]
+    estimates = [
+        estimate_tdm(maps, power, int(r), int(c), schedule, times, convert, w)
+        for r, c in zip(rows, columns, strict=True)
+    ]
     return describe(estimates, power[rows, columns] / level[rows, columns], antennas, w, 2)
 
 
@@ -89,9 +103,13 @@ def estimate_tdm(
 ) -> Estimate:
     """The path behind a peak of the accumulated, centred map `power` of `maps`."""
     w = waveform
-    cell, fraction = row + hann_fraction(power[:, column], row, False), hann_fraction(power[row], column, True)
+    cell, fraction = (
+        row + hann_fraction(power[:, column], row, False),
+        hann_fraction(power[row], column, True),
+    )
     centred = column - power.shape[1] // 2
-    # TDM: antennas answer at different times; the whole bin's turn is in the transform, the fraction's is taken out here
+    # TDM: antennas answer at different times; the whole bin's turn is in the transform, the
+    # fraction's is taken out here
     middle = np.array([times[schedule == tx].mean() for tx in range(w.num_tx)])
     turn = np.exp(-2j * np.pi * fraction / w.frame_duration * middle)
     channels = maps[:, :, row, centred % power.shape[1]] * turn[:, None]
@@ -99,9 +117,13 @@ def estimate_tdm(
 
 
 def hann_fraction(power: np.ndarray, peak: int, wraps: bool) -> float:
-    """Offset of a Hann-windowed tone from its strongest cell, from the stronger neighbour's amplitude."""
+    """Offset of a Hann-windowed tone from its strongest cell, from the stronger neighbour's
+    amplitude."""
     size = power.size
-    before, after = (peak - 1) % size if wraps else max(peak - 1, 0), (peak + 1) % size if wraps else min(peak + 1, size - 1)
+    before, after = (
+        (peak - 1) % size if wraps else max(peak - 1, 0),
+        (peak + 1) % size if wraps else min(peak + 1, size - 1),
+    )
     low, middle, high = np.sqrt(power[[before, peak, after]].astype(float))
     if middle == 0:
         return 0.0
@@ -111,7 +133,11 @@ def hann_fraction(power: np.ndarray, peak: int, wraps: bool) -> float:
 
 
 def resolution(waveform: Waveform, antennas: Antennas) -> np.ndarray:
-    """(4,) range [m], velocity [m/s] and the two direction cosines that an echo's estimates resolve: within these an estimate hits."""
+    """(4,) range [m], velocity [m/s] and the two direction cosines that an echo's estimates
+    resolve: within these an estimate hits."""
     w, spacing = waveform, antennas.spacing * waveform.carrier_frequency / SPEED_OF_LIGHT
-    arms = [1 / (spacing * num_tx * num_rx) for num_tx, num_rx in ((antennas.tx_x, antennas.rx_x), (antennas.tx_z, antennas.rx_z))]
+    arms = [
+        1 / (spacing * num_tx * num_rx)
+        for num_tx, num_rx in ((antennas.tx_x, antennas.rx_x), (antennas.tx_z, antennas.rx_z))
+    ]
     return np.array([w.range_cell(2), w.velocity_cell(2), *arms])

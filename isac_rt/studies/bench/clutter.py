@@ -1,10 +1,13 @@
-"""Scatterers pinned to the mesh: advancing them to a frame against tracing anew, and leaving the faintest out.
+"""Scatterers pinned to the mesh: advancing them to a frame against tracing anew, and leaving the
+faintest out.
 
-Two errors, told apart by `error_of`. Advancing: the mean power of all scatterers of the field against that of Sionna RT's diffuse
-solution with as many rays, averaged over the same frames, |P/P_sionna - 1|; the re-trace is the oracle of cost. Samples: noise-free
-samples of the scatterers that are kept against those of all, ||Y - Y_all||/||Y_all||, both by the gridded synthesis.
+Two errors, told apart by `error_of`. Advancing: the mean power of all scatterers of the field
+against that of Sionna RT's diffuse solution with as many rays, averaged over the same frames,
+|P/P_sionna - 1|; the re-trace is the oracle of cost. Samples: noise-free samples of the scatterers
+that are kept against those of all, ||Y - Y_all||/||Y_all||, both by the gridded synthesis.
 
-The scene is `town` with its active terminal alone: one link, frames that follow each other, tests of sight on the way included.
+The scene is `town` with its active terminal alone: one link, frames that follow each other, tests
+of sight on the way included.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ LINK = ("AT", "AT")
 
 
 def rows(quick: bool) -> list[dict[str, object]]:
-    """Cost against the number of scatterers, and error and cost of leaving the faintest out of the samples."""
+    """Cost against the number of scatterers, and error and cost of leaving the faintest out of the
+    samples."""
     floor, out, hits = floor_seconds((3, 15, 120, 1024)), [], _hits_per_ray()
     for area in AREAS[:2] if quick else AREAS:
         setup = prepare(_scene(model="field", cell_area_per_metre_m=area))
@@ -57,7 +61,8 @@ def _hits_per_ray() -> float:
 
 
 def advance(setup: Setup, frames: range) -> tuple[float, float, int]:
-    """CPU seconds per frame of advancing the field through some frames, its mean power gain and how many scatterers were in sight."""
+    """CPU seconds per frame of advancing the field through some frames, its mean power gain and how
+    many scatterers were in sight."""
     field, power, seen = tracer_of(setup).field, 0.0, 0
     begin = time.process_time()
     for frame in frames:
@@ -91,17 +96,35 @@ def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[st
         seconds["traced anew by Sionna RT"].append(time.process_time() - begin)
         powers.append([power, float((amplitude**2).sum())])
     total = np.sum(powers, axis=0)
-    common: dict[str, Any] = {"kind": "clutter", "size": scatterers, "unit": "scatterers", "floor_s": floor,
-                              "error_of": "mean power against Sionna RT", "job": f"{FRAMES} frames in a row, one link"}  # fmt: skip
+    common: dict[str, Any] = {
+        "kind": "clutter",
+        "size": scatterers,
+        "unit": "scatterers",
+        "floor_s": floor,
+        "error_of": "mean power against Sionna RT",
+        "job": f"{FRAMES} frames in a row, one link",
+    }
     out = []
-    for (method, of), error in zip(seconds.items(), (float(abs(total[0] / total[1] - 1)), 0.0), strict=True):
+    for (method, of), error in zip(
+        seconds.items(), (float(abs(total[0] / total[1] - 1)), 0.0), strict=True
+    ):
         cpu = median(of[1:])
-        out.append({**common, "method": method, "error": error, "cost": cpu / floor, "seconds": cpu, "oracle": error == 0})
+        out.append(
+            {
+                **common,
+                "method": method,
+                "error": error,
+                "cost": cpu / floor,
+                "seconds": cpu,
+                "oracle": error == 0,
+            }
+        )
     return out
 
 
 def _of_samples(setup: Setup, floor: float, repeats: int) -> list[dict[str, object]]:
-    """Samples of all scatterers, and of those that are left when the faintest of each range cell are left out."""
+    """Samples of all scatterers, and of those that are left when the faintest of each range cell
+    are left out."""
     poses, found = setup.find(0)
     paths = found[LINK].select(found[LINK].kind == PathKind.DIFFUSE)
     cell = np.floor(paths.delay / setup.waveform.delay_step).astype(int)
@@ -109,15 +132,36 @@ def _of_samples(setup: Setup, floor: float, repeats: int) -> list[dict[str, obje
     sent = setup.transmission("AT", 0, poses["AT"])
 
     def samples(some: PathSet) -> np.ndarray:
-        return if_signal(setup.waveform, [(sent, some)], poses["AT"], setup.antennas, start_time=setup.timetable.start_time(0, "AT"),
-                         filter_transition=setup.scenario.radio.filter_transition_hz, method="gridded").samples  # fmt: skip
+        return if_signal(
+            setup.waveform,
+            [(sent, some)],
+            poses["AT"],
+            setup.antennas,
+            start_time=setup.timetable.start_time(0, "AT"),
+            filter_transition=setup.scenario.radio.filter_transition_hz,
+            method="gridded",
+        ).samples
 
     truth, out = samples(paths), []
     for limit in (0.0, *LEFT_OUT):
         kept = paths.select(~faintest(share, cell, limit)[0]) if limit else paths
         method = f"samples, {limit:g} of a cell's power left out" if limit else "samples of all"
-        error = float(np.linalg.norm(samples(kept) - truth) / np.linalg.norm(truth)) if limit else 0.0
+        error = (
+            float(np.linalg.norm(samples(kept) - truth) / np.linalg.norm(truth)) if limit else 0.0
+        )
         seconds = cpu_seconds(partial(samples, kept), repeats)
-        out.append({"kind": "clutter", "method": method, "size": len(kept), "unit": "scatterers", "error": error, "oracle": not limit,
-                    "error_of": "samples", "cost": seconds / floor, "seconds": seconds, "floor_s": floor})  # fmt: skip
+        out.append(
+            {
+                "kind": "clutter",
+                "method": method,
+                "size": len(kept),
+                "unit": "scatterers",
+                "error": error,
+                "oracle": not limit,
+                "error_of": "samples",
+                "cost": seconds / floor,
+                "seconds": seconds,
+                "floor_s": floor,
+            }
+        )
     return out

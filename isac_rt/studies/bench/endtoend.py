@@ -1,8 +1,10 @@
-"""Whole runs of `scenes/street_canyon.yaml` under the three presets of the budget, with 300 rays of clutter: 100 scatterers a link.
+"""Whole runs of `scenes/street_canyon.yaml` under the three presets of the budget, with 300 rays of
+clutter: 100 scatterers a link.
 
-Error: of the noise-free samples of the frame in the middle against those under the preset everything, ||Y - Y_full||/||Y_full||, the
-largest of the links. Cost: CPU time of a run per frame, receivers and trackers included, set-up left out. In a short run more of the frames
-are traced than in a long one.
+Error: of the noise-free samples of the frame in the middle against those under the preset
+everything, ||Y - Y_full||/||Y_full||, the largest of the links. Cost: CPU time of a run per frame,
+receivers and trackers included, set-up left out. In a short run more of the frames are traced than
+in a long one.
 """
 
 from __future__ import annotations
@@ -36,11 +38,27 @@ def rows(quick: bool) -> list[dict[str, object]]:
         full = cubes["everything"]
         seconds_per_frame(scenario("fastest", FRAMES[0]), 1)  # compiles what the runs share
         for preset, s in scenarios.items():
-            error = max(float(np.linalg.norm(cubes[preset][link] - full[link]) / np.linalg.norm(full[link])) for link in full)
+            error = max(
+                float(np.linalg.norm(cubes[preset][link] - full[link]) / np.linalg.norm(full[link]))
+                for link in full
+            )
             seconds = seconds_per_frame(s, 1 if quick else 3)
-            out.append({"kind": "endtoend", "method": preset, "size": frames, "unit": "frames", "error": error, "cost": seconds / floor,
-                        "seconds": seconds, "floor_s": floor, "oracle": preset == "everything", "job": JOB,
-                        "error_of": "samples of a frame", "traced_frames": len(prepare(s).plan.traced_frames)})  # fmt: skip
+            out.append(
+                {
+                    "kind": "endtoend",
+                    "method": preset,
+                    "size": frames,
+                    "unit": "frames",
+                    "error": error,
+                    "cost": seconds / floor,
+                    "seconds": seconds,
+                    "floor_s": floor,
+                    "oracle": preset == "everything",
+                    "job": JOB,
+                    "error_of": "samples of a frame",
+                    "traced_frames": len(prepare(s).plan.traced_frames),
+                }
+            )
     return out
 
 
@@ -50,7 +68,8 @@ def scenario(preset: str, frames: int) -> Scenario:
 
 
 def seconds_per_frame(of: Scenario, repeats: int) -> float:
-    """Median CPU time of a run per frame; every run has a set-up of its own, since set-ups remember what was traced."""
+    """Median CPU time of a run per frame; every run has a set-up of its own, since set-ups remember
+    what was traced."""
     times = []
     for _ in range(repeats):
         setup = prepare(of)
@@ -61,15 +80,21 @@ def seconds_per_frame(of: Scenario, repeats: int) -> float:
 
 
 def samples(setup: Setup) -> dict[Link, np.ndarray]:
-    """Noise-free samples of the frame in the middle of a run, by link, by the method that the run would take."""
+    """Noise-free samples of the frame in the middle of a run, by link, by the method that the run
+    would take."""
     number = setup.scenario.frames // 2
     poses, paths = setup.trace(number)
     out = {}
     for link in setup.timetable.links(number):
         sent = setup.transmission(link[0], number, poses[link[0]])
         out[link] = if_signal(
-            setup.waveform, [(sent, paths[link])], poses[link[1]], setup.antennas,
-            start_time=setup.timetable.start_time(number, link[0]), filter_transition=setup.scenario.radio.filter_transition_hz,
-            noise_power=setup.noise_power(poses, link), method=setup.plan.synthesis(len(paths[link])),
-        ).samples  # fmt: skip
+            setup.waveform,
+            [(sent, paths[link])],
+            poses[link[1]],
+            setup.antennas,
+            start_time=setup.timetable.start_time(number, link[0]),
+            filter_transition=setup.scenario.radio.filter_transition_hz,
+            noise_power=setup.noise_power(poses, link),
+            method=setup.plan.synthesis(len(paths[link])),
+        ).samples
     return out

@@ -19,14 +19,19 @@ SIZES = (10, 300, 3000)
 DIRECT_SIZES = (1, 4, 12)
 
 
-def fit(num_chirps: int = 60, repeats: int = 5, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
-    """Measure each method at three sizes and fit its two coefficients by least squares of relative deviations.
+def fit(
+    num_chirps: int = 60, repeats: int = 5, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Measure each method at three sizes and fit its two coefficients by least squares of relative
+    deviations.
 
-    The jobs are those of the bench with fewer chirps. Methods are measured in turn, so that what else the machine does weighs on all alike.
+    The jobs are those of the bench with fewer chirps. Methods are measured in turn, so that what
+    else the machine does weighs on all alike.
 
     Returns
     -------
-    model : what `isac_rt.signal.choice.read` reads, with the machine, the day, and the largest deviation of each fit
+    model : what `isac_rt.signal.choice.read` reads, with the machine, the day, and the largest
+        deviation of each fit
     """
     from isac_rt.studies.bench.report import machine
 
@@ -36,8 +41,12 @@ def fit(num_chirps: int = 60, repeats: int = 5, progress: Callable[[int, int], N
     jobs: dict[tuple[str, int], Callable[[], object]] = {}
     for size in SIZES:
         links = job.paths(size)
-        jobs |= {(c.name, size): partial(job.samples, links, "gridded", c.setting) for c in CANDIDATES}
-    jobs |= {(DIRECT, size): partial(job.samples, job.paths(size), "direct") for size in DIRECT_SIZES}
+        jobs |= {
+            (c.name, size): partial(job.samples, links, "gridded", c.setting) for c in CANDIDATES
+        }
+    jobs |= {
+        (DIRECT, size): partial(job.samples, job.paths(size), "direct") for size in DIRECT_SIZES
+    }
     found: dict[tuple[str, int], list[float]] = {key: [] for key in jobs}
     for turn in range(repeats):
         for key, work in jobs.items():
@@ -61,4 +70,8 @@ def _line(sizes: np.ndarray, nanoseconds: np.ndarray) -> dict[str, float]:
     (fixed, each), _ = nnls(matrix, np.ones_like(sizes))
     fixed, each = max(fixed, 1e-3), max(each, 1e-3)
     worst = float(np.abs((fixed + each * sizes) / nanoseconds - 1).max())
-    return {"chirp_ns": round(float(fixed), 3), "path_ns": round(float(each), 3), "deviation": round(worst, 3)}
+    return {
+        "chirp_ns": round(float(fixed), 3),
+        "path_ns": round(float(each), 3),
+        "deviation": round(worst, 3),
+    }

@@ -1,11 +1,13 @@
-"""The job that HermesPy is measured on, run by an interpreter that has it: `python hermespy_job.py JSON`, the answer on stdout.
+"""The job that HermesPy is measured on, run by an interpreter that has it: `python hermespy_job.py
+JSON`, the answer on stdout.
 
-It knows nothing of isac_rt, whose dependencies that interpreter need not have. HermesPy's radar channel takes the samples of one
-transmit antenna at the sampling rate B and adds for every path a delayed copy at each receive antenna; how far its delays are from
-those asked for is told by the same sum with the chirps delayed in continuous time.
+It knows nothing of isac_rt, whose dependencies that interpreter need not have. HermesPy's radar
+channel takes the samples of one transmit antenna at the sampling rate B and adds for every path a
+delayed copy at each receive antenna; how far its delays are from those asked for is told by the
+same sum with the chirps delayed in continuous time.
 
-Argument: {"bandwidth_hz", "carrier_hz", "num_samples", "num_chirps", "num_rx", "sizes": [K, ...], "error_paths": K, "seed"}.
-Answer: {"seconds": {K: CPU s}, "error", "versions"}.
+Argument: {"bandwidth_hz", "carrier_hz", "num_samples", "num_chirps", "num_rx", "sizes": [K, ...],
+"error_paths": K, "seed"}. Answer: {"seconds": {K: CPU s}, "error", "versions"}.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ LONGEST = 0.2
 
 
 def chirps(times: np.ndarray, job: dict) -> np.ndarray:
-    """FMCW of unit amplitude from -B/2 to B/2, chirp after chirp, at any times [s]; nothing before 0."""
+    """FMCW of unit amplitude from -B/2 to B/2, chirp after chirp, at any times [s]; nothing before
+    0."""
     bandwidth, duration = job["bandwidth_hz"], job["num_samples"] / job["bandwidth_hz"]
     within = times % duration
     wave = np.exp(1j * np.pi * (bandwidth / duration * within - bandwidth) * within)
@@ -35,17 +38,28 @@ def chirps(times: np.ndarray, job: dict) -> np.ndarray:
 
 
 def channel(job: dict, count: int) -> RadarChannelSample:
-    """`count` static targets in front of a transmitter with one antenna and a receiver with a line of them, at the same place."""
+    """`count` static targets in front of a transmitter with one antenna and a receiver with a line
+    of them, at the same place."""
     f_c, bandwidth, rng = job["carrier_hz"], job["bandwidth_hz"], np.random.default_rng(job["seed"])
     farthest = LIGHT * LONGEST * job["num_samples"] / bandwidth / 2
     states = []
     for antennas in (1, job["num_rx"]):
         array = SimulatedUniformArray(SimulatedIdealAntenna, LIGHT / f_c / 2, (antennas, 1, 1))
-        states.append(SimulatedDevice(carrier_frequency=f_c, bandwidth=bandwidth, antennas=array).state())
+        states.append(
+            SimulatedDevice(carrier_frequency=f_c, bandwidth=bandwidth, antennas=array).state()
+        )
     direction = rng.normal(size=(count, 3)) * [1, 1, 0.3] + [0, 0, 1]
-    place = direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(0.01, 0.99, (count, 1)) * farthest
+    place = (
+        direction
+        / np.linalg.norm(direction, axis=1, keepdims=True)
+        * rng.uniform(0.01, 0.99, (count, 1))
+        * farthest
+    )
     phase = rng.uniform(0, 2 * np.pi, count)
-    paths = [RadarTargetPath(p, np.zeros(3), 1.0, a, attenuate=False, static=True) for p, a in zip(place, phase, strict=True)]
+    paths = [
+        RadarTargetPath(p, np.zeros(3), 1.0, a, attenuate=False, static=True)
+        for p, a in zip(place, phase, strict=True)
+    ]
     return RadarChannelSample(paths, 1.0, LinkState(*states, f_c, bandwidth, 0.0))
 
 
@@ -57,7 +71,8 @@ def propagated(job: dict, sample: RadarChannelSample) -> np.ndarray:
 
 
 def error(job: dict) -> float:
-    """Relative RMS deviation from chirps delayed in continuous time, over the part of each chirp that all paths have reached."""
+    """Relative RMS deviation from chirps delayed in continuous time, over the part of each chirp
+    that all paths have reached."""
     few = job | {"num_chirps": 3}
     sample = channel(few, job["error_paths"])
     times = np.arange(few["num_chirps"] * few["num_samples"]) / few["bandwidth_hz"]
@@ -79,7 +94,9 @@ def main(job: dict) -> dict:
         begin = time.process_time()
         propagated(job, sample)
         seconds[count] = time.process_time() - begin
-    versions = {name: version(name) for name in ("hermespy", "numpy", "scipy")} | {"python": sys.version.split()[0]}
+    versions = {name: version(name) for name in ("hermespy", "numpy", "scipy")} | {
+        "python": sys.version.split()[0]
+    }
     return {"seconds": seconds, "error": error(job), "versions": versions}
 
 

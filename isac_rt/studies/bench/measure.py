@@ -11,7 +11,8 @@ import scipy.fft
 
 
 def cpu_seconds(work: Callable[[], object], repeats: int = 5, warm_up: int = 1) -> float:
-    """Median CPU time of all threads of this process [s] over `repeats` calls, after `warm_up` calls that compile."""
+    """Median CPU time of all threads of this process [s] over `repeats` calls, after `warm_up`
+    calls that compile."""
     for _ in range(warm_up):
         work()
     times = []
@@ -23,7 +24,8 @@ def cpu_seconds(work: Callable[[], object], repeats: int = 5, warm_up: int = 1) 
 
 
 def floor_seconds(shape: tuple[int, ...], repeats: int = 5) -> float:
-    """The floor of a job on cubes of this shape [CPU s]: fill one with complex64 once, and transform it once along its last axis."""
+    """The floor of a job on cubes of this shape [CPU s]: fill one with complex64 once, and
+    transform it once along its last axis."""
     cube = np.empty(shape, np.complex64)
 
     def work() -> None:

@@ -1,10 +1,12 @@
-"""Cost of a full reception of one frame (M = 3) at the active and at the passive terminal, over the number of paths that are seen.
+"""Cost of a full reception of one frame (M = 3) at the active and at the passive terminal, over the
+number of paths that are seen.
 
-The frame is made by the program's own synthesis: the strongest path some 13 dB over the noise of a sample, each further one 2 dB weaker.
-`error` is that of the estimated ranges of all paths in range cells (RMS over those that have a detection within two cells). Beside it
-are the cost over that of its transforms alone - `scipy.fft` of the cube once (AT) or twice (PT: to decode and to sense) and once over the
-chirps of the range cells that are looked at - and the memory at most, the cube included, in cubes. One thread, as a run gives every
-terminal.
+The frame is made by the program's own synthesis: the strongest path some 13 dB over the noise of a
+sample, each further one 2 dB weaker. `error` is that of the estimated ranges of all paths in range
+cells (RMS over those that have a detection within two cells). Beside it are the cost over that of
+its transforms alone - `scipy.fft` of the cube once (AT) or twice (PT: to decode and to sense) and
+once over the chirps of the range cells that are looked at - and the memory at most, the cube
+included, in cubes. One thread, as a run gives every terminal.
 """
 
 from __future__ import annotations
@@ -36,31 +38,58 @@ _DPSK = 8
 
 
 def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
-    """A noisy cube of `count` paths at whole path lengths from 40 m on, and what a PT would expect of the first."""
+    """A noisy cube of `count` paths at whole path lengths from 40 m on, and what a PT would expect
+    of the first."""
     rng, w = np.random.default_rng(count), Waveform()
     antennas = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, _DPSK, rng)
-    sender = Transmission(name="A", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
+    sender = Transmission(
+        name="A", pose=pose, antennas=antennas, schedule=schedule, payload=payload
+    )
     length, speed = 40.0 + 9.37 * np.arange(count), rng.uniform(-8, 8, count)
     across = rng.uniform(-0.4, 0.4, (count, 2))
     u = np.stack([across[:, 0], np.sqrt(1 - (across**2).sum(1)), across[:, 1]], axis=1)
     paths = make_paths(
-        epoch=w.frame_duration / 2, tx="A", rx="B", gain=10 ** (-np.arange(count) / 10) * np.exp(1j * np.arange(count)),
-        delay=length / SPEED_OF_LIGHT, delay_rate=speed / SPEED_OF_LIGHT, delay_accel=np.zeros(count), departure=u, arrival=u,
-        tx_radius=np.inf, rx_radius=np.inf, kind=PathKind.TARGET,
-    )  # fmt: skip
-    cube = if_signal(w, [(sender, paths)], pose, antennas, start_time=0.0, filter_transition=0.4e6, method="direct")
+        epoch=w.frame_duration / 2,
+        tx="A",
+        rx="B",
+        gain=10 ** (-np.arange(count) / 10) * np.exp(1j * np.arange(count)),
+        delay=length / SPEED_OF_LIGHT,
+        delay_rate=speed / SPEED_OF_LIGHT,
+        delay_accel=np.zeros(count),
+        departure=u,
+        arrival=u,
+        tx_radius=np.inf,
+        rx_radius=np.inf,
+        kind=PathKind.TARGET,
+    )
+    cube = if_signal(
+        w,
+        [(sender, paths)],
+        pose,
+        antennas,
+        start_time=0.0,
+        filter_transition=0.4e6,
+        method="direct",
+    )
     cube = add_noise(cube, 0.05, np.array([3, count], np.uint32))
     one = np.ones(1)
-    prediction = Prediction(range=length[:1], velocity=speed[:1], direction=u[:1, [0, 2]], range_std=0.05 * one,
-                            velocity_std=0.05 * one, weight=one)  # fmt: skip
+    prediction = Prediction(
+        range=length[:1],
+        velocity=speed[:1],
+        direction=u[:1, [0, 2]],
+        range_std=0.05 * one,
+        velocity_std=0.05 * one,
+        weight=one,
+    )
     return cube, payload, antennas, prediction
 
 
 def _range_error(found: Detections, count: int, passes: int) -> float | None:
-    """RMS of the range errors in cells, over the paths with a detection within two cells of them; None without any."""
+    """RMS of the range errors in cells, over the paths with a detection within two cells of them;
+    None without any."""
     cell = Waveform().range_cell(passes)
     truth = (40.0 + 9.37 * np.arange(count)) / passes
     if not len(found):
@@ -85,16 +114,29 @@ def _jobs(
     """Name, passes of the way and work of each reception."""
     settings = Receivers()
     return [
-        ("active terminal (DCA-SPE)", 2, lambda: receive_active(cube, payload, antennas, settings).detections),
-        ("passive terminal (J-SPEDD)", 1, lambda: receive_passive(cube, antennas, settings, _DPSK, prediction, True).detections),
+        (
+            "active terminal (DCA-SPE)",
+            2,
+            lambda: receive_active(cube, payload, antennas, settings).detections,
+        ),
+        (
+            "passive terminal (J-SPEDD)",
+            1,
+            lambda: receive_passive(cube, antennas, settings, _DPSK, prediction, True).detections,
+        ),
     ]
 
 
 def _transform_seconds(cube: IFCube, repeats: int) -> tuple[float, float]:
-    """CPU seconds of `scipy.fft` along the samples of a cube, and along the chirps of the cells that a map shows."""
+    """CPU seconds of `scipy.fft` along the samples of a cube, and along the chirps of the cells
+    that a map shows."""
     w, samples = cube.waveform, cube.samples
-    cells = np.zeros((w.num_tx, samples.shape[1], w.num_delay_symbols, samples.shape[2]), np.complex64)
-    return cpu_seconds(lambda: fft(samples, axis=-1), repeats), cpu_seconds(lambda: fft(cells, axis=-1), repeats)
+    cells = np.zeros(
+        (w.num_tx, samples.shape[1], w.num_delay_symbols, samples.shape[2]), np.complex64
+    )
+    return cpu_seconds(lambda: fft(samples, axis=-1), repeats), cpu_seconds(
+        lambda: fft(cells, axis=-1), repeats
+    )
 
 
 def rows(quick: bool) -> list[dict[str, object]]:
@@ -113,8 +155,22 @@ def _rows(quick: bool) -> list[dict[str, object]]:
         for method, passes, work in _jobs(cube, payload, antennas, prediction):
             seconds, cubes = cpu_seconds(work, repeats), _peak_cubes(work, cube)
             ratio = seconds / (along_range * (3 - passes) + along_chirps)
-            out.append({"kind": "reception", "method": method, "size": size, "unit": "paths", "error": _range_error(work(), size, passes),
-                        "error_of": "RMS range error in cells", "cost": seconds / floor, "seconds": seconds, "floor_s": floor,
-                        "oracle": False, "job": "one frame, M = 3, full reception", "transforms": ratio, "memory_cubes": cubes,
-                        "also": f"{ratio:.2f} of its transforms, {cubes:.2f} cubes of memory"})  # fmt: skip
+            out.append(
+                {
+                    "kind": "reception",
+                    "method": method,
+                    "size": size,
+                    "unit": "paths",
+                    "error": _range_error(work(), size, passes),
+                    "error_of": "RMS range error in cells",
+                    "cost": seconds / floor,
+                    "seconds": seconds,
+                    "floor_s": floor,
+                    "oracle": False,
+                    "job": "one frame, M = 3, full reception",
+                    "transforms": ratio,
+                    "memory_cubes": cubes,
+                    "also": f"{ratio:.2f} of its transforms, {cubes:.2f} cubes of memory",
+                }
+            )
     return out

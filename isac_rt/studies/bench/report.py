@@ -1,4 +1,5 @@
-"""Tables and figures of the benchmarks: speed against error, and cost against size with its growth."""
+"""Tables and figures of the benchmarks: speed against error, and cost against size with its
+growth."""
 
 from __future__ import annotations
 
@@ -21,7 +22,11 @@ Row = Mapping[str, Any]
 
 def stages() -> list[str]:
     """Stages whose measurements are there."""
-    return [name for name, module in STAGES.items() if importlib.util.find_spec(f"isac_rt.studies.bench.{module}") is not None]
+    return [
+        name
+        for name, module in STAGES.items()
+        if importlib.util.find_spec(f"isac_rt.studies.bench.{module}") is not None
+    ]
 
 
 def machine() -> dict[str, Any]:
@@ -29,14 +34,24 @@ def machine() -> dict[str, Any]:
     model = ""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+        model = next(
+            (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), ""
+        )
     except OSError:
         model = platform.processor()
-    return {"processor": model or platform.machine(), "cores": os.cpu_count(), "platform": platform.platform(), "versions": versions()}
+    return {
+        "processor": model or platform.machine(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "versions": versions(),
+    }
 
 
-def measure(names: Sequence[str], quick: bool, progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
-    """All rows of some stages, with the machine, the growth of every curve, and why a stage was left out."""
+def measure(
+    names: Sequence[str], quick: bool, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """All rows of some stages, with the machine, the growth of every curve, and why a stage was
+    left out."""
     rows: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
     for done, name in enumerate(names):
@@ -48,7 +63,13 @@ def measure(names: Sequence[str], quick: bool, progress: Callable[[int, int], No
             left_out[name] = reason
         if progress:
             progress(done + 1, len(names))
-    return {"machine": machine(), "quick": quick, "rows": rows, "growth": growth(rows), "left_out": left_out}
+    return {
+        "machine": machine(),
+        "quick": quick,
+        "rows": rows,
+        "growth": growth(rows),
+        "left_out": left_out,
+    }
 
 
 def curves(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
@@ -77,16 +98,31 @@ def growth(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def markdown(found: Mapping[str, Any]) -> str:
     """The tables of `measure`."""
     m = found["machine"]
-    text = [f"Machine: {m['processor']}, {m['cores']} cores, {m['platform']}. Cost in floors of the same run (CPU time).", ""]
+    text = [
+        f"Machine: {m['processor']}, {m['cores']} cores, {m['platform']}. Cost in floors of the "
+        "same run (CPU time).",
+        "",
+    ]
     for kind in dict.fromkeys(row["kind"] for row in found["rows"]):
-        text += [f"## {kind}", "", "| method | size | cost [floors] | CPU s | floor [s] | error | of | also |",
-                 "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+        text += [
+            f"## {kind}",
+            "",
+            "| method | size | cost [floors] | CPU s | floor [s] | error | of | also |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
         for (of_kind, method, unit), rows in curves(found["rows"]).items():
             if of_kind == kind:
                 text += [_line(method, unit, row) for row in rows]
         text.append("")
-    text += ["## Growth of cost with size", "", "| stage | method | size | exponent |", "|---|---|---|---|"]
-    text += [f"| {g['kind']} | {g['method']} | {g['unit']} | {g['exponent']} |" for g in found["growth"]]
+    text += [
+        "## Growth of cost with size",
+        "",
+        "| stage | method | size | exponent |",
+        "|---|---|---|---|",
+    ]
+    text += [
+        f"| {g['kind']} | {g['method']} | {g['unit']} | {g['exponent']} |" for g in found["growth"]
+    ]
     text += [f"\n{name} left out: {reason}" for name, reason in found.get("left_out", {}).items()]
     return "\n".join(text) + "\n"
 
@@ -94,8 +130,11 @@ def markdown(found: Mapping[str, Any]) -> str:
 def _line(method: str, unit: str, row: Row) -> str:
     error = "" if row["error"] is None else "oracle" if row.get("oracle") else f"{row['error']:.2g}"
     seconds = row.get("seconds", row["cost"] * row["floor_s"])
-    return (f"| {method} | {row['size']:,} {unit} | {row['cost']:.3g} | {seconds:.3g} | {row['floor_s']:.3g} | {error} "
-            f"| {row.get('error_of', 'samples')} | {row.get('also', '')} |")  # fmt: skip
+    return (
+        f"| {method} | {row['size']:,} {unit} | {row['cost']:.3g} | {seconds:.3g} | "
+        f"{row['floor_s']:.3g} | {error} "
+        f"| {row.get('error_of', 'samples')} | {row.get('also', '')} |"
+    )
 
 
 def write(found: Mapping[str, Any], folder: Path) -> list[Path]:
@@ -115,18 +154,32 @@ _MARKERS = "os^D"
 
 
 def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
-    """Cost against error and against size of one stage; the oracle is marked, the floor is the line at one."""
+    """Cost against error and against size of one stage; the oracle is marked, the floor is the line
+    at one."""
     import matplotlib.pyplot as plt
 
-    drawn = [(method, unit, rows) for (of_kind, method, unit), rows in curves(found["rows"]).items() if of_kind == kind]
+    drawn = [
+        (method, unit, rows)
+        for (of_kind, method, unit), rows in curves(found["rows"]).items()
+        if of_kind == kind
+    ]
     with plt.rc_context({"font.size": 8, "axes.grid": True, "grid.alpha": 0.3}):
-        canvas, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.9 + 0.08 * len(drawn)), layout="constrained")
+        canvas, (left, right) = plt.subplots(
+            1, 2, figsize=(9.5, 3.9 + 0.08 * len(drawn)), layout="constrained"
+        )
         for number, (method, unit, rows) in enumerate(drawn):
             cost = [row["cost"] for row in rows]
             oracle = any(row.get("oracle") for row in rows)
             error = [max(row["error"] or 0.0, 1e-8) for row in rows]
-            marker = "*" if oracle else _MARKERS[number // 10 % len(_MARKERS)]  # there are ten colours
-            (line,) = right.loglog([r["size"] for r in rows], cost, marker=marker, label=f"{method} ({unit})" if unit else method)
+            marker = (
+                "*" if oracle else _MARKERS[number // 10 % len(_MARKERS)]
+            )  # there are ten colours
+            (line,) = right.loglog(
+                [r["size"] for r in rows],
+                cost,
+                marker=marker,
+                label=f"{method} ({unit})" if unit else method,
+            )
             if rows[0]["error"] is not None and (not oracle or max(error) > 1e-8):
                 left.loglog(error, cost, ls="none", marker=marker, color=line.get_color())
         for axis in (left, right):
@@ -143,10 +196,14 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
 
 
 def _whole_decades(axis: Any) -> None:
-    """Limits at powers of ten with labels there only, so that neighbours do not look far apart nor labels run into each other."""
+    """Limits at powers of ten with labels there only, so that neighbours do not look far apart nor
+    labels run into each other."""
     from matplotlib.ticker import NullFormatter
 
     axis.set_xscale("log")
-    for one, limits, move in ((axis.xaxis, axis.get_xlim(), axis.set_xlim), (axis.yaxis, axis.get_ylim(), axis.set_ylim)):
+    for one, limits, move in (
+        (axis.xaxis, axis.get_xlim(), axis.set_xlim),
+        (axis.yaxis, axis.get_ylim(), axis.set_ylim),
+    ):
         move(10 ** np.floor(np.log10(limits[0])), 10 ** np.ceil(np.log10(limits[1])))
         one.set_minor_formatter(NullFormatter())

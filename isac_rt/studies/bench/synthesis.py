@@ -1,8 +1,11 @@
-"""Cost and error of the IF synthesis: each method over the number of paths, range profiles by way of samples and directly, and noise.
+"""Cost and error of the IF synthesis: each method over the number of paths, range profiles by way
+of samples and directly, and noise.
 
-The job is the full cube 3 x 120 x 1024 x 15 with data on, |v| <= 15 m/s and directions up to 60 degrees to both sides in azimuth and
-elevation. Errors are measured on 40 such paths in three chirps per group (they hardly depend on either) against the exact float64 model,
-nothing removed: "narrowband" rows against the model whose receive elements only turn the phase, the others against the full one.
+The job is the full cube 3 x 120 x 1024 x 15 with data on, |v| <= 15 m/s and directions up to 60
+degrees to both sides in azimuth and elevation. Errors are measured on 40 such paths in three chirps
+per group (they hardly depend on either) against the exact float64 model, nothing removed:
+"narrowband" rows against the model whose receive elements only turn the phase, the others against
+the full one.
 """
 
 from __future__ import annotations
@@ -45,56 +48,121 @@ GRIDS = (
     ("gridded wideband, 1.5 N, width 6", DEFAULT),
     ("gridded wideband, cubic, 1.5 N, width 8", ACCURATE),
 )
-DIRECTLY = (("profiles directly, 1.25 N, width 6", PROFILES), ("profiles directly, cubic, 1.5 N, width 8", ACCURATE))
+DIRECTLY = (
+    ("profiles directly, 1.25 N, width 6", PROFILES),
+    ("profiles directly, cubic, 1.5 N, width 8", ACCURATE),
+)
 
 
 class Job:
-    """A receiver and a sender with data; paths by their number, of which none is faster than `speed` [m/s]."""
+    """A receiver and a sender with data; paths by their number, of which none is faster than
+    `speed` [m/s]."""
 
     def __init__(self, num_chirps: int, num_groups: int = 3, speed: float = 15.0) -> None:
         rng = np.random.default_rng(1)
         w = replace(Waveform(), num_chirps=num_chirps, num_groups=num_groups)
         self.waveform, self.speed = w, speed
-        self.antennas = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
+        self.antennas = Antennas(
+            tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength
+        )
         self.pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
         schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
         payload = random_payload(w, schedule, 8, rng)
-        self.sender = Transmission(name="A", pose=self.pose, antennas=self.antennas, schedule=schedule, payload=payload)
+        self.sender = Transmission(
+            name="A", pose=self.pose, antennas=self.antennas, schedule=schedule, payload=payload
+        )
 
     def paths(self, count: int) -> list:
         w, rng = self.waveform, np.random.default_rng(count)
         azimuth, elevation = np.radians(rng.uniform(-60, 60, (2, count)))
-        u = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1)
-        return [(self.sender, make_paths(
-            epoch=w.frame_duration / 2, tx="A", rx="B", gain=rng.normal(size=count) + 1j * rng.normal(size=count),
-            delay=rng.uniform(0.01, 0.99, count) * w.max_delay, delay_rate=2 * rng.uniform(-self.speed, self.speed, count) / SPEED_OF_LIGHT,
-            delay_accel=np.zeros(count), departure=u, arrival=u, tx_radius=np.inf, rx_radius=np.inf, kind=PathKind.DIFFUSE,
-        ))]  # fmt: skip
+        u = np.stack(
+            [
+                np.sin(azimuth) * np.cos(elevation),
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ],
+            axis=1,
+        )
+        return [
+            (
+                self.sender,
+                make_paths(
+                    epoch=w.frame_duration / 2,
+                    tx="A",
+                    rx="B",
+                    gain=rng.normal(size=count) + 1j * rng.normal(size=count),
+                    delay=rng.uniform(0.01, 0.99, count) * w.max_delay,
+                    delay_rate=2 * rng.uniform(-self.speed, self.speed, count) / SPEED_OF_LIGHT,
+                    delay_accel=np.zeros(count),
+                    departure=u,
+                    arrival=u,
+                    tx_radius=np.inf,
+                    rx_radius=np.inf,
+                    kind=PathKind.DIFFUSE,
+                ),
+            )
+        ]
 
     def samples(self, links: list, method: Method, setting: Setting = DEFAULT) -> np.ndarray:
-        return if_signal(self.waveform, links, self.pose, self.antennas, start_time=0.0, filter_transition=_TRANSITION,
-                         method=method, setting=setting).samples  # fmt: skip
+        return if_signal(
+            self.waveform,
+            links,
+            self.pose,
+            self.antennas,
+            start_time=0.0,
+            filter_transition=_TRANSITION,
+            method=method,
+            setting=setting,
+        ).samples
 
     def transformed(self, links: list, method: Method, setting: Setting = DEFAULT) -> np.ndarray:
         """Range profiles of a receiver that knows the data, by way of the samples."""
         samples = self.samples(links, method, setting)
-        cube = IFCube(samples=samples, waveform=self.waveform, schedule=self.sender.schedule, start_time=0.0)
-        return clean_spectrum(cube, self.sender.payload.delay_symbols, self.sender.payload.phases, self.waveform.num_delay_symbols)
+        cube = IFCube(
+            samples=samples, waveform=self.waveform, schedule=self.sender.schedule, start_time=0.0
+        )
+        return clean_spectrum(
+            cube,
+            self.sender.payload.delay_symbols,
+            self.sender.payload.phases,
+            self.waveform.num_delay_symbols,
+        )
 
     def profiles(self, links: list, setting: Setting) -> np.ndarray:
-        return range_profiles(self.waveform, links, self.pose, self.antennas, self.sender.payload, start_time=0.0,
-                              filter_transition=_TRANSITION, setting=setting).spectra  # fmt: skip
+        return range_profiles(
+            self.waveform,
+            links,
+            self.pose,
+            self.antennas,
+            self.sender.payload,
+            start_time=0.0,
+            filter_transition=_TRANSITION,
+            setting=setting,
+        ).spectra
 
     def narrowband(self, links: list) -> np.ndarray:
-        """The exact model path by path with one element in the middle of the array, times the elements' phases at mid-window."""
+        """The exact model path by path with one element in the middle of the array, times the
+        elements' phases at mid-window."""
         w, (sender, paths) = self.waveform, links[0]
         middle = replace(self.antennas, rx_x=1, rx_z=1)
         total = np.zeros(())
         for k in range(len(paths)):
-            one = if_signal(w, [(sender, paths.select(np.array([k])))], self.pose, middle, start_time=0.0,
-                            filter_transition=_TRANSITION, method="exact").samples  # fmt: skip
-            delay = -(self.pose.to_world(self.antennas.rx_positions) @ paths.arrival[k]) / SPEED_OF_LIGHT
-            cycles = (w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]) * delay - w.slope * delay**2 / 2
+            one = if_signal(
+                w,
+                [(sender, paths.select(np.array([k])))],
+                self.pose,
+                middle,
+                start_time=0.0,
+                filter_transition=_TRANSITION,
+                method="exact",
+            ).samples
+            delay = (
+                -(self.pose.to_world(self.antennas.rx_positions) @ paths.arrival[k])
+                / SPEED_OF_LIGHT
+            )
+            cycles = (
+                w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
+            ) * delay - w.slope * delay**2 / 2
             total = total + one * np.exp(2j * np.pi * cycles)[None, :, None, None]
         return total
 
@@ -110,7 +178,9 @@ def errors() -> dict[str, float]:
     full, narrow = job.samples(links, "exact"), job.narrowband(links)
     found = {"direct": relative(job.samples(links, "direct"), full)}
     for name, setting in GRIDS:
-        found[name] = relative(job.samples(links, "gridded", setting), full if setting.wideband else narrow)
+        found[name] = relative(
+            job.samples(links, "gridded", setting), full if setting.wideband else narrow
+        )
     whole = job.transformed(links, "exact")
     found[BOTH] = relative(job.transformed(links, "gridded"), whole)
     found |= {name: relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
@@ -118,9 +188,11 @@ def errors() -> dict[str, float]:
 
 
 def rows(quick: bool) -> list[dict[str, Any]]:
-    """Rows of the benchmark (`isac_rt.studies.bench`): cost in floors and error of each method, over the number of paths.
+    """Rows of the benchmark (`isac_rt.studies.bench`): cost in floors and error of each method,
+    over the number of paths.
 
-    The floor is measured before each size and at the end: what else the machine does changes it from minute to minute.
+    The floor is measured before each size and at the end: what else the machine does changes it
+    from minute to minute.
     """
     job, repeats = Job(120), 3 if quick else 5
     w = job.waveform
@@ -128,27 +200,76 @@ def rows(quick: bool) -> list[dict[str, Any]]:
     floors, error = [floor_seconds(shape, repeats)], errors()
     out: list[dict[str, Any]] = []
 
-    def add(method: str, size: int, unit: str, seconds: float, deviation: float | None, oracle: bool = False) -> None:
-        out.append({"kind": "synthesis", "method": method, "size": size, "unit": unit, "error": deviation, "error_of": ERROR_OF,
-                    "seconds": seconds, "oracle": oracle, "job": JOB})  # fmt: skip
+    def add(
+        method: str,
+        size: int,
+        unit: str,
+        seconds: float,
+        deviation: float | None,
+        oracle: bool = False,
+    ) -> None:
+        out.append(
+            {
+                "kind": "synthesis",
+                "method": method,
+                "size": size,
+                "unit": unit,
+                "error": deviation,
+                "error_of": ERROR_OF,
+                "seconds": seconds,
+                "oracle": oracle,
+                "job": JOB,
+            }
+        )
 
     for size in QUICK_SIZES if quick else SIZES:
         links = job.paths(size)
         times = repeats if size <= 10_000 else 3
         floors.append(floor_seconds(shape, repeats))
         if size <= MOST_DIRECT:
-            add("direct", size, "paths", cpu_seconds(partial(job.samples, links, "direct"), times), error["direct"])
+            add(
+                "direct",
+                size,
+                "paths",
+                cpu_seconds(partial(job.samples, links, "direct"), times),
+                error["direct"],
+            )
         if size == SIZES[0]:
-            add("exact", size, "paths", cpu_seconds(partial(job.samples, links, "exact"), 1, 0), 0.0, oracle=True)
+            add(
+                "exact",
+                size,
+                "paths",
+                cpu_seconds(partial(job.samples, links, "exact"), 1, 0),
+                0.0,
+                oracle=True,
+            )
         for name, setting in GRIDS:
             seconds = cpu_seconds(partial(job.samples, links, "gridded", setting), times)
             add(name, size, "paths", seconds, error[name])
         if size in PROFILE_SIZES:
-            add(BOTH, size, "paths", cpu_seconds(partial(job.transformed, links, "gridded"), times), error[BOTH])
+            add(
+                BOTH,
+                size,
+                "paths",
+                cpu_seconds(partial(job.transformed, links, "gridded"), times),
+                error[BOTH],
+            )
             for name, setting in DIRECTLY:
-                add(name, size, "paths", cpu_seconds(partial(job.profiles, links, setting), times), error[name])
+                add(
+                    name,
+                    size,
+                    "paths",
+                    cpu_seconds(partial(job.profiles, links, setting), times),
+                    error[name],
+                )
     cube = np.zeros(shape, np.complex64)
     words = np.array([1, 2], np.uint32)
-    add("noise", cube.size, "samples", cpu_seconds(lambda: add_white_noise(cube, 1.0, words), repeats), None)
+    add(
+        "noise",
+        cube.size,
+        "samples",
+        cpu_seconds(lambda: add_white_noise(cube, 1.0, words), repeats),
+        None,
+    )
     floor = median([*floors, floor_seconds(shape, repeats)])
     return [row | {"cost": row["seconds"] / floor, "floor_s": floor} for row in out]

@@ -1,7 +1,7 @@
 """Paths of a frame: traced, and unfolded anew between two traced instants.
 
-Error: ||g - g_full|| / ||g_full|| over the complex gains of all paths, those that only one of the two found included, the largest of the
-frames between.
+Error: ||g - g_full|| / ||g_full|| over the complex gains of all paths, those that only one of the
+two found included, the largest of the frames between.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ def gain_error(found: PathSet, full: PathSet) -> float:
     return float(np.sqrt(wrong / full.power.sum()))
 
 
-def _of(scenario: Scenario, size: int | None, unit: str, floor: float, quick: bool) -> list[dict[str, object]]:
+def _of(
+    scenario: Scenario, size: int | None, unit: str, floor: float, quick: bool
+) -> list[dict[str, object]]:
     setup = prepare(scenario)
     size = setup.city.num_faces if size is None else size
     between = tracer_of(setup)
@@ -55,13 +57,33 @@ def _of(scenario: Scenario, size: int | None, unit: str, floor: float, quick: bo
         poses, found = setup.find(frame)
         when = setup.timetable.epoch(frame)
         truth = full.paths(poses, when, list(found))
-        errors += [gain_error(found[link], truth[link]) for link in found if truth[link].power.any()]
+        errors += [
+            gain_error(found[link], truth[link]) for link in found if truth[link].power.any()
+        ]
     repeats = 3 if quick else 7
-    common: dict[str, Any] = {"kind": "tracing", "size": size, "unit": unit, "floor_s": floor, "error_of": "gains of all paths"}
+    common: dict[str, Any] = {
+        "kind": "tracing",
+        "size": size,
+        "unit": unit,
+        "floor_s": floor,
+        "error_of": "gains of all paths",
+    }
     out = []
-    for method, tracer, error in (("traced", full, 0.0), ("unfolded between traces", between, max(errors))):
+    for method, tracer, error in (
+        ("traced", full, 0.0),
+        ("unfolded between traces", between, max(errors)),
+    ):
         seconds = _seconds(setup, tracer, repeats)
-        out.append({**common, "method": method, "error": error, "cost": seconds / floor, "seconds": seconds, "oracle": tracer is full})
+        out.append(
+            {
+                **common,
+                "method": method,
+                "error": error,
+                "cost": seconds / floor,
+                "seconds": seconds,
+                "oracle": tracer is full,
+            }
+        )
     return out
 
 

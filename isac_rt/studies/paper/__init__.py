@@ -32,7 +32,11 @@ TITLES = {
 
 def names() -> tuple[str, ...]:
     """The experiments there are, in the paper's order."""
-    return tuple(name for name in TITLES if importlib.util.find_spec(f"isac_rt.studies.paper.{name}") is not None)
+    return tuple(
+        name
+        for name in TITLES
+        if importlib.util.find_spec(f"isac_rt.studies.paper.{name}") is not None
+    )
 
 
 def experiment(name: str) -> Experiment:

@@ -1,4 +1,5 @@
-"""Claims on complexity: how the processor time of the program's own steps grows with each number that the paper's expressions contain."""
+"""Claims on complexity: how the processor time of the program's own steps grows with each number
+that the paper's expressions contain."""
 
 from __future__ import annotations
 
@@ -42,8 +43,15 @@ class Growth:
     deviation: float
 
 
-def growth(step: str, number: str, sizes: Sequence[int], make: Callable[[int], Callable[[], object]], repeats: int) -> Growth:
-    """Fit seconds = a size^b to the least of `repeats` processor times; `make` prepares a call for a size."""
+def growth(
+    step: str,
+    number: str,
+    sizes: Sequence[int],
+    make: Callable[[int], Callable[[], object]],
+    repeats: int,
+) -> Growth:
+    """Fit seconds = a size^b to the least of `repeats` processor times; `make` prepares a call for
+    a size."""
     seconds = []
     for size in sizes:
         call = make(size)
@@ -59,16 +67,22 @@ def growth(step: str, number: str, sizes: Sequence[int], make: Callable[[int], C
     (slope, offset), *_ = np.linalg.lstsq(design, y, rcond=None)
     rest = y - design @ np.array([slope, offset])
     deviation = np.sqrt((rest @ rest) / max(len(x) - 2, 1) / ((x - x.mean()) @ (x - x.mean())))
-    return Growth(step, number, np.asarray(sizes), np.asarray(seconds), float(slope), float(deviation))
+    return Growth(
+        step, number, np.asarray(sizes), np.asarray(seconds), float(slope), float(deviation)
+    )
 
 
-def _cube(seed: int, *, samples: int = 512, chirps: int = 60, receivers: int = 4, groups: int = 1) -> tuple[IFCube, Payload]:
+def _cube(
+    seed: int, *, samples: int = 512, chirps: int = 60, receivers: int = 4, groups: int = 1
+) -> tuple[IFCube, Payload]:
     """Noise with a random payload: the steps do not look at what is in it."""
     w = Waveform(num_samples=samples, num_chirps=chirps, num_groups=groups)
     rng = generator(seed, "claims", "cost")
     schedule = pseudo_random_schedule(groups, chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, 8, rng)
-    data = rng.standard_normal((groups, receivers, chirps, samples, 2), np.float32).view(np.complex64)[..., 0]
+    data = rng.standard_normal((groups, receivers, chirps, samples, 2), np.float32).view(
+        np.complex64
+    )[..., 0]
     return IFCube(samples=data, waveform=w, schedule=schedule, start_time=0.0), payload
 
 
@@ -77,7 +91,9 @@ def data_removal(seed: int, repeats: int) -> list[Growth]:
 
     def make(**change: int) -> Callable[[], object]:
         cube, payload = _cube(seed, **change)
-        return lambda: clean_spectrum(cube, payload.delay_symbols, payload.phases, cube.waveform.num_delay_symbols)
+        return lambda: clean_spectrum(
+            cube, payload.delay_symbols, payload.phases, cube.waveform.num_delay_symbols
+        )
 
     name = "range DFT and data removal"
     return [
@@ -105,10 +121,14 @@ def matching_pursuit(seed: int, repeats: int) -> list[Growth]:
 
 
 def decisions(seed: int, repeats: int) -> list[Growth]:
-    """Delay symbols from the power over chirps and cells, DPSK symbols from the cells that were picked."""
+    """Delay symbols from the power over chirps and cells, DPSK symbols from the cells that were
+    picked."""
 
     def delays(chirps: int = 240, paths: int = 4, samples: int = 512) -> Callable[[], object]:
-        w, rng = Waveform(num_samples=samples, num_chirps=chirps, num_groups=1), generator(seed, "claims", "cost", "delays")
+        w, rng = (
+            Waveform(num_samples=samples, num_chirps=chirps, num_groups=1),
+            generator(seed, "claims", "cost", "delays"),
+        )
         power = rng.exponential(size=(chirps, samples)).astype(np.float32)
         others = [(0.5, rng.integers(0, 40, chirps)) for _ in range(paths - 1)]
         return lambda: decide(power, others, w)
@@ -121,10 +141,22 @@ def decisions(seed: int, repeats: int) -> list[Growth]:
 
     return [
         growth("delay decisions", "K", [2, 4, 8, 16], lambda n: delays(paths=n), repeats),
-        growth("delay decisions", "P", [240 * k for k in SCALES], lambda n: delays(chirps=n), repeats),
-        growth("delay decisions", "N", [512 * k for k in SCALES], lambda n: delays(samples=n), repeats),
-        growth("DPSK decisions", "P", [960 * k for k in SCALES], lambda n: phases(chirps=n), repeats),
-        growth("DPSK decisions", "L_rx", [16 * k for k in SCALES], lambda n: phases(receivers=n), repeats),
+        growth(
+            "delay decisions", "P", [240 * k for k in SCALES], lambda n: delays(chirps=n), repeats
+        ),
+        growth(
+            "delay decisions", "N", [512 * k for k in SCALES], lambda n: delays(samples=n), repeats
+        ),
+        growth(
+            "DPSK decisions", "P", [960 * k for k in SCALES], lambda n: phases(chirps=n), repeats
+        ),
+        growth(
+            "DPSK decisions",
+            "L_rx",
+            [16 * k for k in SCALES],
+            lambda n: phases(receivers=n),
+            repeats,
+        ),
     ]
 
 
@@ -135,13 +167,24 @@ def cost(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[
     for i, part in enumerate(parts):
         found += part(seed, repeats)
         report(i + 1, len(parts))
-    rows = [{"step": g.step, "number": g.number, "size": n, "cpu_seconds": s, "exponent": g.exponent, "exponent_std": g.deviation}
-            for g in found for n, s in zip(g.sizes, g.seconds, strict=True)]  # fmt: skip
+    rows = [
+        {
+            "step": g.step,
+            "number": g.number,
+            "size": n,
+            "cpu_seconds": s,
+            "exponent": g.exponent,
+            "exponent_std": g.deviation,
+        }
+        for g in found
+        for n, s in zip(g.sizes, g.seconds, strict=True)
+    ]
     return pd.DataFrame(rows), _verdicts({(g.step, g.number): g for g in found})
 
 
 _ALLOWED = 0.5
-"""By which a fitted exponent may exceed 1 and still count as linear: a log N, caches, other programs."""
+"""By which a fitted exponent may exceed 1 and still count as linear: a log N, caches, other
+programs."""
 
 
 def _verdicts(by: dict[tuple[str, str], Growth]) -> tuple[Verdict, ...]:
@@ -149,7 +192,10 @@ def _verdicts(by: dict[tuple[str, str], Growth]) -> tuple[Verdict, ...]:
         return all(by[step, n].exponent < 1 + _ALLOWED for n in numbers.split())
 
     def text(step: str, numbers: str) -> str:
-        return ", ".join(f"{n}^({by[step, n].exponent:.2f} +- {by[step, n].deviation:.2f})" for n in numbers.split())
+        return ", ".join(
+            f"{n}^({by[step, n].exponent:.2f} +- {by[step, n].deviation:.2f})"
+            for n in numbers.split()
+        )
 
     def judge(good: bool, condition: bool = False) -> Judgement:
         return "does not hold" if not good else "holds under a condition" if condition else "holds"
@@ -160,27 +206,59 @@ def _verdicts(by: dict[tuple[str, str], Growth]) -> tuple[Verdict, ...]:
     w = Waveform()
     rows = w.num_delay_symbols * 45 * w.num_groups
     return (
-        Verdict("Compensating the delays and removing the phases costs O(M N L_rx P) each", judge(linear(removal, "N P L_rx M")),
-                f"processor time of both with the range DFT grows as {text(removal, 'N P L_rx M')}"),
-        Verdict("Deciding the delay symbols costs O(M K P)", judge(linear("delay decisions", "K P"), True),
-                f"once the peaks are known; finding them searches the cells: time grows as {text('delay decisions', 'K P N')}"),
-        Verdict("Deciding the phases costs O(M L_rx K P)", judge(linear("DPSK decisions", "P L_rx")),
-                f"time grows as {text('DPSK decisions', 'P L_rx')} (here the line of sight alone is decided on)"),
-        Verdict("OMP costs O(M K P log P + M K^2 P/L_tx)", "does not hold",
-                f"that is one vector; it runs for every range row and antenna pair, N L times: time grows as {text('OMP', 'vectors K P')}"),
-        Verdict("OMP's load remains acceptable", "holds under a condition",
-                f"only at the rows with a detection: {each * 1e6:.1f} us per vector of 40 chirps here, {rows * each * 1e3:.0f} ms for all "
-                f"{rows} of a frame of {w.frame_duration * 1e3:.2f} ms"),
-    )  # fmt: skip
+        Verdict(
+            "Compensating the delays and removing the phases costs O(M N L_rx P) each",
+            judge(linear(removal, "N P L_rx M")),
+            f"processor time of both with the range DFT grows as {text(removal, 'N P L_rx M')}",
+        ),
+        Verdict(
+            "Deciding the delay symbols costs O(M K P)",
+            judge(linear("delay decisions", "K P"), True),
+            "once the peaks are known; finding them searches the cells: time grows as "
+            f"{text('delay decisions', 'K P N')}",
+        ),
+        Verdict(
+            "Deciding the phases costs O(M L_rx K P)",
+            judge(linear("DPSK decisions", "P L_rx")),
+            f"time grows as {text('DPSK decisions', 'P L_rx')} (here the line of sight alone is "
+            "decided on)",
+        ),
+        Verdict(
+            "OMP costs O(M K P log P + M K^2 P/L_tx)",
+            "does not hold",
+            "that is one vector; it runs for every range row and antenna pair, N L times: time "
+            f"grows as {text('OMP', 'vectors K P')}",
+        ),
+        Verdict(
+            "OMP's load remains acceptable",
+            "holds under a condition",
+            f"only at the rows with a detection: {each * 1e6:.1f} us per vector of 40 chirps here, "
+            f"{rows * each * 1e3:.0f} ms for all "
+            f"{rows} of a frame of {w.frame_duration * 1e3:.2f} ms",
+        ),
+    )
 
 
 def draw(ax: Axes, table: pd.DataFrame) -> None:
     """Time over the smallest size's, against size over the smallest."""
     for i, ((step, number), part) in enumerate(table.groupby(["step", "number"], sort=False)):
-        ax.plot(part["size"] / part["size"].iloc[0], part.cpu_seconds / part.cpu_seconds.iloc[0], "osD^v*<>"[i % 8] + "-", ms=4, lw=0.9,
-                color=f"C{i % 10}", label=f"{step}: {number} ({part.exponent.iloc[0]:.2f})")  # fmt: skip
+        ax.plot(
+            part["size"] / part["size"].iloc[0],
+            part.cpu_seconds / part.cpu_seconds.iloc[0],
+            "osD^v*<>"[i % 8] + "-",
+            ms=4,
+            lw=0.9,
+            color=f"C{i % 10}",
+            label=f"{step}: {number} ({part.exponent.iloc[0]:.2f})",
+        )
     ax.plot([1, 8], [1, 8], "k--", lw=1, label="linear")
-    ax.set(xscale="log", yscale="log", xlabel="size over the smallest", ylabel="time over the smallest's", title="Complexity (exponent)")
+    ax.set(
+        xscale="log",
+        yscale="log",
+        xlabel="size over the smallest",
+        ylabel="time over the smallest's",
+        title="Complexity (exponent)",
+    )
     ax.set_xticks(SCALES, [str(k) for k in SCALES])
     ax.minorticks_off()
     ax.legend(fontsize=5.8, loc="upper left")

@@ -1,4 +1,5 @@
-"""Claims on the signal: the approximations of its model, intervals of the modulation, ambiguities, angles, a late clock."""
+"""Claims on the signal: the approximations of its model, intervals of the modulation, ambiguities,
+angles, a late clock."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ SPACING = 0.5774
 
 
 def separable(w: Waveform, payload: Payload, length: float, rate: float) -> np.ndarray:
-    """The paper's sampled IF (equations for AT and PT) of a path of unit amplitude: (M, P, N) complex."""
+    """The paper's sampled IF (equations for AT and PT) of a path of unit amplitude: (M, P, N)
+    complex."""
     n, p = np.arange(w.num_samples) / w.num_samples, np.arange(w.num_chirps) / w.num_chirps
     cells, bins = length / C / w.delay_step, w.frame_duration * w.carrier_frequency * rate / C
     fast = n * (cells + payload.delay_symbols[..., None])
@@ -37,12 +39,19 @@ def separable(w: Waveform, payload: Payload, length: float, rate: float) -> np.n
 
 
 def model_error(velocity: float, modulated: bool, seed: int) -> float:
-    """Relative RMS error of the separable model of an echo from 50 m once the best complex factor is taken out, one group."""
+    """Relative RMS error of the separable model of an echo from 50 m once the best complex factor
+    is taken out, one group."""
     w = Waveform(num_groups=1)
     schedule = conventional_schedule(1, w.num_chirps, w.num_tx)
-    payload = random_payload(w, schedule, 8, generator(seed, "claims", "model")) if modulated else unmodulated(w)
+    payload = (
+        random_payload(w, schedule, 8, generator(seed, "claims", "model"))
+        if modulated
+        else unmodulated(w)
+    )
     length, rate = 100.0, 2 * velocity
-    exact = onepath.frame(w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C).samples[:, 0]
+    exact = onepath.frame(
+        w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C
+    ).samples[:, 0]
     # the paper's range is that at the start of the frame
     paper = separable(w, payload, length - rate * w.frame_duration / 2, rate)
     factor = np.vdot(paper, exact) / np.vdot(paper, paper).real
@@ -51,49 +60,70 @@ def model_error(velocity: float, modulated: bool, seed: int) -> float:
 
 def model(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """How good the approximation after equation (8) is."""
-    rows = [{"velocity_mps": v, "data": data, "relative_rms_error": model_error(v, data, seed)}
-            for data in (False, True) for v in (0.0, 0.5, 1.0, 5.0, 15.0)]  # fmt: skip
+    rows = [
+        {"velocity_mps": v, "data": data, "relative_rms_error": model_error(v, data, seed)}
+        for data in (False, True)
+        for v in (0.0, 0.5, 1.0, 5.0, 15.0)
+    ]
     table = pd.DataFrame(rows)
     still = table[~table.data].set_index("velocity_mps").relative_rms_error
     worst = table[table.data].relative_rms_error.min()
     text = ", ".join(f"{e:.2g} at {v:g} m/s" for v, e in still.items() if v)
     return table, (
-        Verdict("The approximations that make the IF a product of range, Doppler and angle are negligible", "does not hold",
-                f"relative RMS error without data {text} (migration and the Doppler within a chirp); with data at least {worst:.2f} "
-                "at any velocity, because the phases of the data delay are left out"),
-    )  # fmt: skip
+        Verdict(
+            "The approximations that make the IF a product of range, Doppler and angle are "
+            "negligible",
+            "does not hold",
+            f"relative RMS error without data {text} (migration and the Doppler within a chirp); "
+            f"with data at least {worst:.2f} "
+            "at any velocity, because the phases of the data delay are left out",
+        ),
+    )
 
 
 # ---------------------------------------------------------------- intervals of the modulation
 
 
 def travel_cells(w: Waveform) -> float:
-    """Range cells that an echo at the unambiguous velocity moves in a frame: the right side of the paper's condition on the interval."""
+    """Range cells that an echo at the unambiguous velocity moves in a frame: the right side of the
+    paper's condition on the interval."""
     return 2 * C / (4 * w.slot_duration * w.carrier_frequency) * w.frame_duration / C / w.delay_step
 
 
 def prediction(length: float, rate: float) -> Prediction:
     """A prediction of one path."""
     return Prediction(
-        range=np.array([length]), velocity=np.array([rate]), direction=np.zeros((1, 2)), range_std=np.array([0.02]),
-        velocity_std=np.array([0.1]), weight=np.ones(1),
-    )  # fmt: skip
+        range=np.array([length]),
+        velocity=np.array([rate]),
+        direction=np.zeros((1, 2)),
+        range_std=np.array([0.02]),
+        velocity_std=np.array([0.1]),
+        weight=np.ones(1),
+    )
 
 
 def tolerated_error(order: int, seed: int, steps: int = 9) -> tuple[float, float]:
-    """Velocity error [m/s] up to which a PT decides all DPSK symbols of a noiseless frame, by bisection, and the closed form
-    c/(2 p f D) with p the longest time between two chirps of an antenna."""
+    """Velocity error [m/s] up to which a PT decides all DPSK symbols of a noiseless frame, by
+    bisection, and the closed form c/(2 p f D) with p the longest time between two chirps of an
+    antenna."""
     w = Waveform(num_groups=1)
-    schedule = pseudo_random_schedule(1, w.num_chirps, w.num_tx, generator(seed, "claims", "interval", "schedule"))
+    schedule = pseudo_random_schedule(
+        1, w.num_chirps, w.num_tx, generator(seed, "claims", "interval", "schedule")
+    )
     payload = random_payload(w, schedule, order, generator(seed, "claims", "interval", order))
     length, rate = 43.817, 7.3
-    cube = onepath.frame(w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C)
+    cube = onepath.frame(
+        w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C
+    )
     gap = max(int(np.diff(np.flatnonzero(schedule[0] == tx)).max()) for tx in range(w.num_tx))
     limit = C / (2 * gap * w.slot_duration * w.effective_carrier * order)
     low, high = 0.5 * limit, 1.5 * limit
     for _ in range(steps):
         middle = (low + high) / 2
-        right = (demodulate(cube, prediction(length, rate + middle), order).transitions == payload.transitions).all()
+        right = (
+            demodulate(cube, prediction(length, rate + middle), order).transitions
+            == payload.transitions
+        ).all()
         low, high = (middle, high) if right else (low, middle)
     return (low + high) / 2, limit
 
@@ -107,26 +137,42 @@ def intervals(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
         rows.append({"D": order, "tolerated_velocity_error_mps": measured, "formula_mps": formula})
     table = pd.DataFrame(rows)
     close = bool((np.abs(table.tolerated_velocity_error_mps / table.formula_mps - 1) < 0.05).all())
-    text = ", ".join(f"{r.tolerated_velocity_error_mps:.2f} (formula {r.formula_mps:.2f})" for r in table.itertuples())
+    text = ", ".join(
+        f"{r.tolerated_velocity_error_mps:.2f} (formula {r.formula_mps:.2f})"
+        for r in table.itertuples()
+    )
     return table, (
-        Verdict("A delay interval of one cell exceeds what a target moves in a frame", "holds" if cells < 1 else "does not hold",
-                f"{cells:.4f} cells at the unambiguous velocity; what is needed besides is a prediction within half a cell (Fig. 12)"),
-        Verdict("The interval of the phases must exceed what the velocity error turns in p < 2 L_tx slots",
-                "holds under a condition" if close else "does not hold",
-                "read as angles, 2 pi p f |dv|/c < pi/D at a PT (the paper compares complex numbers, and the AT's 4 pi is not the PT's); "
-                f"tolerated without noise for D = 2, 4, 8, 16: {text} m/s"),
-    )  # fmt: skip
+        Verdict(
+            "A delay interval of one cell exceeds what a target moves in a frame",
+            "holds" if cells < 1 else "does not hold",
+            f"{cells:.4f} cells at the unambiguous velocity; what is needed besides is a "
+            "prediction within half a cell (Fig. 12)",
+        ),
+        Verdict(
+            "The interval of the phases must exceed what the velocity error turns in p < 2 L_tx "
+            "slots",
+            "holds under a condition" if close else "does not hold",
+            "read as angles, 2 pi p f |dv|/c < pi/D at a PT (the paper compares complex numbers, "
+            "and the AT's 4 pi is not the PT's); "
+            f"tolerated without noise for D = 2, 4, 8, 16: {text} m/s",
+        ),
+    )
 
 
 # ---------------------------------------------------------------- ambiguities
 
 
 def unambiguous(num_tx: int, random: bool, seed: int) -> tuple[float, float]:
-    """Velocity up to which an echo's spectrum has one answer [m/s], and the error of its peak at 0.93 of c/(4 T f) [m/s]."""
+    """Velocity up to which an echo's spectrum has one answer [m/s], and the error of its peak at
+    0.93 of c/(4 T f) [m/s]."""
     w = Waveform(num_groups=1, num_tx=num_tx)
     arrays = Antennas(tx_x=num_tx, tx_z=1, rx_x=1, rx_z=1, spacing=SPACING * w.wavelength)
     rng = generator(seed, "claims", "ambiguity", num_tx)
-    schedule = (pseudo_random_schedule(1, w.num_chirps, num_tx, rng) if random else conventional_schedule(1, w.num_chirps, num_tx))
+    schedule = (
+        pseudo_random_schedule(1, w.num_chirps, num_tx, rng)
+        if random
+        else conventional_schedule(1, w.num_chirps, num_tx)
+    )
     velocity, pilot = 0.93 * w.max_velocity(2), unmodulated(w)
     cube = onepath.frame(w, schedule, pilot, arrays, delay=2 * 23.7 / C, rate=2 * velocity / C)
     spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, 256)
@@ -136,22 +182,42 @@ def unambiguous(num_tx: int, random: bool, seed: int) -> tuple[float, float]:
 
 
 def ambiguities(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
-    """Whether the random order multiplies the unambiguous velocity by L_tx, for other L_tx than the paper's."""
+    """Whether the random order multiplies the unambiguous velocity by L_tx, for other L_tx than the
+    paper's."""
     rows = []
     for num_tx in (2, 3, 4, 6):
-        (plain, _), (random, error) = unambiguous(num_tx, False, seed), unambiguous(num_tx, True, seed)
-        rows.append({"L_tx": num_tx, "conventional_mps": plain, "pseudo_random_mps": random, "ratio": random / plain, "error_mps": error})
+        (plain, _), (random, error) = (
+            unambiguous(num_tx, False, seed),
+            unambiguous(num_tx, True, seed),
+        )
+        rows.append(
+            {
+                "L_tx": num_tx,
+                "conventional_mps": plain,
+                "pseudo_random_mps": random,
+                "ratio": random / plain,
+                "error_mps": error,
+            }
+        )
     table = pd.DataFrame(rows)
     exact = bool((np.abs(table.ratio - table.L_tx) < 1e-9).all())
-    text = "; ".join(f"L_tx = {r.L_tx}: {r.conventional_mps:.2f} to {r.pseudo_random_mps:.2f} m/s" for r in table.itertuples())
+    text = "; ".join(
+        f"L_tx = {r.L_tx}: {r.conventional_mps:.2f} to {r.pseudo_random_mps:.2f} m/s"
+        for r in table.itertuples()
+    )
     return table, (
-        Verdict("The maximum unambiguous velocity is L_tx times that of conventional TDM-MIMO", "holds" if exact else "does not hold",
-                f"{text}; it still falls as L_tx grows, since the guard interval 2 L_tx T_d lengthens the slot"),
-    )  # fmt: skip
+        Verdict(
+            "The maximum unambiguous velocity is L_tx times that of conventional TDM-MIMO",
+            "holds" if exact else "does not hold",
+            f"{text}; it still falls as L_tx grows, since the guard interval 2 L_tx T_d lengthens "
+            "the slot",
+        ),
+    )
 
 
 def kept_chirps(length: float, seed: int) -> tuple[int, int]:
-    """Data chirps whose beat of a path of this length stays in the IF band, from the samples' power, and all of them."""
+    """Data chirps whose beat of a path of this length stays in the IF band, from the samples'
+    power, and all of them."""
     w = Waveform(num_groups=1, num_chirps=1200)
     schedule = conventional_schedule(1, w.num_chirps, w.num_tx)
     payload = random_payload(w, schedule, 8, generator(seed, "claims", "kept"))
@@ -163,15 +229,25 @@ def kept_chirps(length: float, seed: int) -> tuple[int, int]:
 
 
 def paper_angle(angle: float, elements: int = 16, redundancy: int = 64) -> float:
-    """The angle [deg] that the paper's redundant dictionary, exp(-j pi l sin), finds for a wave from `angle` [deg]."""
+    """The angle [deg] that the paper's redundant dictionary, exp(-j pi l sin), finds for a wave
+    from `angle` [deg]."""
     element = np.arange(elements)
-    grid = np.deg2rad((np.arange(redundancy * elements) - redundancy * elements / 2) * 180 / (redundancy * elements))
+    grid = np.deg2rad(
+        (np.arange(redundancy * elements) - redundancy * elements / 2)
+        * 180
+        / (redundancy * elements)
+    )
     wave = np.exp(2j * np.pi * SPACING * element * np.sin(np.deg2rad(angle)))
-    return float(np.rad2deg(grid[np.abs(np.exp(-1j * np.pi * np.outer(np.sin(grid), element)) @ wave).argmax()]))
+    return float(
+        np.rad2deg(
+            grid[np.abs(np.exp(-1j * np.pi * np.outer(np.sin(grid), element)) @ wave).argmax()]
+        )
+    )
 
 
 def departure_answers(sine: float = 0.137) -> int:
-    """Angles of departure within the field of view that two transmit elements 8 spacings apart cannot tell from `sine`."""
+    """Angles of departure within the field of view that two transmit elements 8 spacings apart
+    cannot tell from `sine`."""
     period = 1 / (8 * SPACING)
     limit = np.sin(np.pi / 3)
     answers = sine + period * np.arange(-40, 41)
@@ -180,21 +256,35 @@ def departure_answers(sine: float = 0.137) -> int:
 
 def angles() -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """The paper's dictionaries against the paper's own array."""
-    table = pd.DataFrame([{"angle_deg": a, "paper_deg": paper_angle(a)} for a in (10.0, 20.0, 45.0, 59.0)])
+    table = pd.DataFrame(
+        [{"angle_deg": a, "paper_deg": paper_angle(a)} for a in (10.0, 20.0, 45.0, 59.0)]
+    )
     text = ", ".join(f"{r.angle_deg:.0f} to {r.paper_deg:.1f}" for r in table.itertuples())
     w = Waveform()
     aperture = 15 * SPACING * w.wavelength
     far = 2 * aperture**2 / w.wavelength
     return table, (
-        Verdict("The redundant DFT dictionary gives the angles", "does not hold",
-                f"exp(-j pi l sin) belongs to half a wavelength; at {SPACING} wavelengths it turns {text} degrees"),
-        Verdict("A PT estimates angles of departure", "does not hold",
-                f"its two transmit elements per axis stand {8 * SPACING:.2f} wavelengths apart: {departure_answers()} answers within the "
-                "field of view"),
-        Verdict("UAVs are far-field points", "holds",
-                f"2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture * 1e3:.1f} mm; the least distance of the flight is "
-                "4 m (wavefronts are spherical here all the same)"),
-    )  # fmt: skip
+        Verdict(
+            "The redundant DFT dictionary gives the angles",
+            "does not hold",
+            f"exp(-j pi l sin) belongs to half a wavelength; at {SPACING} wavelengths it turns "
+            f"{text} degrees",
+        ),
+        Verdict(
+            "A PT estimates angles of departure",
+            "does not hold",
+            f"its two transmit elements per axis stand {8 * SPACING:.2f} wavelengths apart: "
+            f"{departure_answers()} answers within the "
+            "field of view",
+        ),
+        Verdict(
+            "UAVs are far-field points",
+            "holds",
+            f"2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture * 1e3:.1f} mm; the "
+            "least distance of the flight is "
+            "4 m (wavefronts are spherical here all the same)",
+        ),
+    )
 
 
 # ---------------------------------------------------------------- a late clock
@@ -205,24 +295,44 @@ def late_frames(offset: float, snr_db: float, frames: int, seed: int) -> tuple[f
 
     Returns
     -------
-    bias : of the acquired range [m], NaN where nothing was found (then the data are read with the true sum of path and clock)
+    bias : of the acquired range [m], NaN where nothing was found (then the data are read with the
+        true sum of path and clock)
     symbols : delay errors and symbols, DPSK errors and symbols, all of them decided
     """
     w = Waveform()
     arrays = onepath.antennas(w, 4)
-    schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, generator(seed, "claims", "late"))
+    schedule = pseudo_random_schedule(
+        w.num_groups, w.num_chirps, w.num_tx, generator(seed, "claims", "late")
+    )
     length, rate = 43.817, 3.7
     path = {"delay": length / C, "rate": rate / C, "clock_offset": offset}
-    pilot = onepath.frame(w, schedule, unmodulated(w), arrays, **path, snr_db=10.0, seed=seed, purpose=("late", "pilot"))
+    pilot = onepath.frame(
+        w,
+        schedule,
+        unmodulated(w),
+        arrays,
+        **path,
+        snr_db=10.0,
+        seed=seed,
+        purpose=("late", "pilot"),
+    )
     found = receive_passive(pilot, arrays, Receivers(), 8, None, False).detections
     i = np.flatnonzero(found.is_reference)
-    known = prediction(float(found.range[i[0]]), float(found.velocity[i[0]])) if i.size else prediction(length + offset * C, rate)
+    known = (
+        prediction(float(found.range[i[0]]), float(found.velocity[i[0]]))
+        if i.size
+        else prediction(length + offset * C, rate)
+    )
     count = np.zeros(4, int)
     for k in range(frames):
         payload = random_payload(w, schedule, 8, generator(seed, "claims", "late", k))
-        cube = onepath.frame(w, schedule, payload, arrays, **path, snr_db=snr_db, seed=seed, purpose=("late", k))
+        cube = onepath.frame(
+            w, schedule, payload, arrays, **path, snr_db=snr_db, seed=seed, purpose=("late", k)
+        )
         got = demodulate(cube, known, 8)
-        for at, (sent, decided) in enumerate(((payload.delay_symbols, got.delay), (payload.transitions, got.transitions))):
+        for at, (sent, decided) in enumerate(
+            ((payload.delay_symbols, got.delay), (payload.transitions, got.transitions))
+        ):
             count[2 * at : 2 * at + 2] += (sent != decided).sum(), sent.size
     return float(found.range[i[0]]) - length if i.size else float("nan"), count
 
@@ -240,36 +350,60 @@ def late_clock(quick: bool, seed: int, report) -> tuple[pd.DataFrame, tuple[Verd
     frames, rows = 3 if quick else 16, []
     for k, offset in enumerate((*OFFSETS, TOO_LATE)):
         bias, n = late_frames(offset, LATE_SNR, frames, seed)
-        rows.append({"clock_offset_ns": offset * 1e9, "range_bias_m": bias, "expected_bias_m": offset * C, "delay_errors": n[0],
-                     "delay_symbols": n[1], "dpsk_errors": n[2], "dpsk_symbols": n[3]})  # fmt: skip
+        rows.append(
+            {
+                "clock_offset_ns": offset * 1e9,
+                "range_bias_m": bias,
+                "expected_bias_m": offset * C,
+                "delay_errors": n[0],
+                "delay_symbols": n[1],
+                "dpsk_errors": n[2],
+                "dpsk_symbols": n[3],
+            }
+        )
         report(k + 1, len(OFFSETS) + 1)
     table = pd.DataFrame(rows)
     inside = table.iloc[: len(OFFSETS)]
     biased = float(np.abs(inside.range_bias_m - inside.expected_bias_m).max())
 
     def rates(part: Iterable) -> str:
-        return "; ".join(f"{r.clock_offset_ns:.0f} ns: delay {proportion(r.delay_errors, r.delay_symbols)}, DPSK "
-                         f"{proportion(r.dpsk_errors, r.dpsk_symbols)}" for r in part)  # fmt: skip
+        return "; ".join(
+            f"{r.clock_offset_ns:.0f} ns: delay {proportion(r.delay_errors, r.delay_symbols)}, "
+            "DPSK "
+            f"{proportion(r.dpsk_errors, r.dpsk_symbols)}"
+            for r in part
+        )
 
     same = True
-    for kind in ("delay", "dpsk"):  # each rate within four deviations of that without an offset, both being random
+    for kind in (
+        "delay",
+        "dpsk",
+    ):  # each rate within four deviations of that without an offset, both being random
         p = inside[f"{kind}_errors"] / inside[f"{kind}_symbols"]
         spread = np.sqrt(2 * p.mean() * (1 - p.mean()) / inside[f"{kind}_symbols"].iloc[0])
         same &= bool((np.abs(p - p.iloc[0]) <= 4 * spread).all())
     judged: Judgement = "holds under a condition" if biased < 0.05 and same else "does not hold"
     return table, (
-        Verdict("A constant synchronisation delay biases the range and leaves the data alone", judged,
-                f"the range is off by c times the delay to within {biased * 1e3:.1f} mm; symbol error rates at {LATE_SNR:g} dB, 7 receive "
-                f"antennas: {rates(inside.itertuples())}; on condition that path and clock together stay below half of the range: "
-                f"{rates(table.iloc[len(OFFSETS):].itertuples())}, and no acquisition"),
-    )  # fmt: skip
+        Verdict(
+            "A constant synchronisation delay biases the range and leaves the data alone",
+            judged,
+            f"the range is off by c times the delay to within {biased * 1e3:.1f} mm; symbol error "
+            f"rates at {LATE_SNR:g} dB, 7 receive "
+            f"antennas: {rates(inside.itertuples())}; on condition that path and clock together "
+            "stay below half of the range: "
+            f"{rates(table.iloc[len(OFFSETS) :].itertuples())}, and no acquisition",
+        ),
+    )
 
 
 def beyond_half(seed: int) -> Verdict:
     """Data and range share the band."""
     inside, outside = kept_chirps(2 * 120.0, seed), kept_chirps(2 * 200.0, seed)
     half = Waveform().max_delay * C / 4
-    return Verdict("Range below N/2 cells and data below N/2 cells keep every chirp in its resource block",
-                   "holds" if inside[0] == inside[1] and outside[0] < outside[1] else "does not hold",
-                   f"chirps that keep an echo from 120 m: {proportion(*inside)}; from 200 m, beyond the {half:.1f} m: "
-                   f"{proportion(*outside)}")  # fmt: skip
+    return Verdict(
+        "Range below N/2 cells and data below N/2 cells keep every chirp in its resource block",
+        "holds" if inside[0] == inside[1] and outside[0] < outside[1] else "does not hold",
+        f"chirps that keep an echo from 120 m: {proportion(*inside)}; from 200 m, beyond the "
+        f"{half:.1f} m: "
+        f"{proportion(*outside)}",
+    )

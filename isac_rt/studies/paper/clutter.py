@@ -1,9 +1,12 @@
-"""The paper's symbol-error and hit-rate curves in three kinds of clutter on the same terminals: Gaussian, Rayleigh, a mesh's.
+"""The paper's symbol-error and hit-rate curves in three kinds of clutter on the same terminals:
+Gaussian, Rayleigh, a mesh's.
 
-Places, terminals and scatterers are those of `clutter_scenes`; a PT flies 11.31 m ahead of the AT, at rest or at 10 m/s together with
-it. "paper": clutter scaled to the paper's level, so that the mean over the 45 strongest neighbouring cells is 10 dB over the reference
-(the line of sight at a PT, the target at the AT). "physical": as strong as the geometry makes it, the target a small UAV at 30 m. SNR is
-per sample and antenna, of the reference. A frame is one group at the PT, three at the AT; the AT's targets share a frame.
+Places, terminals and scatterers are those of `clutter_scenes`; a PT flies 11.31 m ahead of the AT,
+at rest or at 10 m/s together with it. "paper": clutter scaled to the paper's level, so that the
+mean over the 45 strongest neighbouring cells is 10 dB over the reference (the line of sight at a
+PT, the target at the AT). "physical": as strong as the geometry makes it, the target a small UAV at
+30 m. SNR is per sample and antenna, of the reference. A frame is one group at the PT, three at the
+AT; the AT's targets share a frame.
 """
 
 from __future__ import annotations
@@ -50,9 +53,11 @@ AT_SNR = np.array([-48.0, -45.0, -42.0, -39.0, -35.0, -30.0])
 FALSE_ALARMS = 1e-4
 TARGETS = 16
 CLEAR_ROWS = 4
-"""Range cells from a target within which a crossing of the threshold is not counted as a false alarm."""
+"""Range cells from a target within which a crossing of the threshold is not counted as a false
+alarm."""
 PILOTS = {"profile": 1, "old profile": 12}
-"""Frames from the pilot that a range profile is learned from to the data: one, and half of `modulation.pilot_every_frames`' 25."""
+"""Frames from the pilot that a range profile is learned from to the data: one, and half of
+`modulation.pilot_every_frames`' 25."""
 ORDER = 8
 
 
@@ -68,13 +73,21 @@ class Kind:
         return self.clutter if self.clutter in ("gaussian", "rayleigh") else f"mesh, {self.clutter}"
 
 
-def resting(ranges: np.ndarray, gains: np.ndarray, passes: int, epoch: float, direction: np.ndarray) -> PathSet:
+def resting(
+    ranges: np.ndarray, gains: np.ndarray, passes: int, epoch: float, direction: np.ndarray
+) -> PathSet:
     """Paths that stand still, all from one direction."""
     along = np.tile(direction, (ranges.size, 1))
     return make_paths(
-        gain=gains, delay=passes * ranges / SPEED_OF_LIGHT, departure=along, arrival=along if passes == 2 else -along,
-        kind=int(PathKind.DIFFUSE), epoch=epoch, tx="AT", rx="AT" if passes == 2 else "PT",
-    )  # fmt: skip
+        gain=gains,
+        delay=passes * ranges / SPEED_OF_LIGHT,
+        departure=along,
+        arrival=along if passes == 2 else -along,
+        kind=int(PathKind.DIFFUSE),
+        epoch=epoch,
+        tx="AT",
+        rx="AT" if passes == 2 else "PT",
+    )
 
 
 def strongest_mean(paths: PathSet, waveform: Waveform) -> float:
@@ -95,7 +108,12 @@ class Bench:
     """Cubes of both links for every kind of clutter, in units of the reference's amplitude."""
 
     def __init__(self, scenes: Scenes, seed: int) -> None:
-        self.scenes, self.seed, self.waveform, self.antennas = scenes, seed, scenes.setup.waveform, scenes.setup.antennas
+        self.scenes, self.seed, self.waveform, self.antennas = (
+            scenes,
+            seed,
+            scenes.setup.waveform,
+            scenes.setup.antennas,
+        )
 
     def poses(self, kind: Kind) -> tuple[Pose, Pose]:
         """AT, and PT ahead of it that looks back."""
@@ -111,8 +129,12 @@ class Bench:
         if kind.clutter == "gaussian":
             return None
         if kind.clutter == "rayleigh":
-            ranges, gains = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(passes), UAV_M, own_rng)
-            return resting(ranges, gains, passes, self.scenes.epoch, self.poses(kind)[0].rotation[:, 1])
+            ranges, gains = rayleigh_cells(
+                Clutter(model="rayleigh"), w.range_cell(passes), UAV_M, own_rng
+            )
+            return resting(
+                ranges, gains, passes, self.scenes.epoch, self.poses(kind)[0].rotation[:, 1]
+            )
         own, other = self.poses(kind)
         origin = self.scenes.setup.city.origin
         start = replace(own, position=own.position - origin)
@@ -121,57 +143,109 @@ class Bench:
         common = {"epoch": self.scenes.epoch, "tx": names[0], "rx": names[1], "target_names": ()}
         paths = self.scenes.field.paths(*names, start, end, self.antennas, common)
         other_draw = own_rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
-        paths = weeded(replace(paths, gain=_mean_amplitude(self.scenes, paths, names, start, end) * other_draw))
+        paths = weeded(
+            replace(paths, gain=_mean_amplitude(self.scenes, paths, names, start, end) * other_draw)
+        )
         gain = self.antennas.gain
         if not physical:
-            return replace(paths, gain=paths.gain * np.sqrt(10 ** (LEVEL_DB / 10) / strongest_mean(paths, w)))
+            return replace(
+                paths, gain=paths.gain * np.sqrt(10 ** (LEVEL_DB / 10) / strongest_mean(paths, w))
+            )
         if passes == 2:
-            return replace(paths, gain=paths.gain / (gain * radar_amplitude(w.wavelength, SMALL_UAV_M2, UAV_M, UAV_M)))
+            return replace(
+                paths,
+                gain=paths.gain
+                / (gain * radar_amplitude(w.wavelength, SMALL_UAV_M2, UAV_M, UAV_M)),
+            )
         return replace(paths, gain=paths.gain / (gain * friis_amplitude(w.wavelength, DISTANCE)))
 
 
-def _mean_amplitude(scenes: Scenes, paths: PathSet, names: tuple[str, str], start: Pose, end: Pose) -> np.ndarray:
+def _mean_amplitude(
+    scenes: Scenes, paths: PathSet, names: tuple[str, str], start: Pose, end: Pose
+) -> np.ndarray:
     """Root of the mean power of a field's paths, without the field's own amplitudes."""
     seen = scenes.field.seen(*names, start, end, paths.epoch)
     return np.abs(paths.gain / scenes.field.cells.amplitude[seen.index])
 
 
-def pt_errors(bench: Bench, kind: Kind, physical: bool, frame: int) -> dict[tuple[str, str], np.ndarray]:
-    """Errors of one group's frame at each SNR, {(symbol, decision): counts}: the delay symbols by the strongest cell and by the profiles
-    of unmodulated frames before it (`PILOTS`), the DPSK symbols from the cells so decided."""
+def pt_errors(
+    bench: Bench, kind: Kind, physical: bool, frame: int
+) -> dict[tuple[str, str], np.ndarray]:
+    """Errors of one group's frame at each SNR, {(symbol, decision): counts}: the delay symbols by
+    the strongest cell and by the profiles of unmodulated frames before it (`PILOTS`), the DPSK
+    symbols from the cells so decided."""
     w = replace(bench.waveform, num_groups=1)
     own, other = bench.poses(kind)
-    schedule, rng = bench.scenes.setup.schedule[:1], generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame)
+    schedule, rng = (
+        bench.scenes.setup.schedule[:1],
+        generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame),
+    )
     sight, clutter = _sight(bench, own, other), bench.clutter(kind, 1, frame, physical)
 
     def received(payload: Payload, before: int) -> IFCube:
-        sent = Transmission(name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload)
-        links = [(sent, sight)] if clutter is None else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
-        return if_signal(w, links, other, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-3)
+        sent = Transmission(
+            name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload
+        )
+        links = (
+            [(sent, sight)]
+            if clutter is None
+            else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
+        )
+        return if_signal(
+            w, links, other, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-3
+        )
 
     payload = random_payload(w, schedule, ORDER, rng)
     cube = received(payload, 0)
-    pilots = {name: received(unmodulated(w), frames) for name, frames in PILOTS.items() if kind.speed or frames == 1}
+    pilots = {
+        name: received(unmodulated(w), frames)
+        for name, frames in PILOTS.items()
+        if kind.speed or frames == 1
+    }
     beats = beat_cells(w, DISTANCE / SPEED_OF_LIGHT, 0.0)[0]
     shape = cube.samples[0].shape
-    pairs = rng.standard_normal((*shape[:2], 2 * shape[2]), np.float32) * np.float32(np.sqrt(w.num_samples / 2))
+    pairs = rng.standard_normal((*shape[:2], 2 * shape[2]), np.float32) * np.float32(
+        np.sqrt(w.num_samples / 2)
+    )
     cells = make_cells(cube.samples[0].copy(), beats, pairs.view(np.complex64))
     one = np.ones(1)
-    reference = Prediction(range=DISTANCE * one, velocity=0 * one, direction=np.zeros((1, 2)), range_std=one, velocity_std=one, weight=one)
-    wrong: dict[tuple[str, str], list[int]] = {(symbol, d): [] for symbol in ("delay", "dpsk") for d in ("strongest cell", *pilots)}
+    reference = Prediction(
+        range=DISTANCE * one,
+        velocity=0 * one,
+        direction=np.zeros((1, 2)),
+        range_std=one,
+        velocity_std=one,
+        weight=one,
+    )
+    wrong: dict[tuple[str, str], list[int]] = {
+        (symbol, d): [] for symbol in ("delay", "dpsk") for d in ("strongest cell", *pilots)
+    }
     for number, level in enumerate(10 ** (-PT_SNR / 20)):
         power = cells.power(level)
         metrics = {"strongest cell": power}
         for name, pilot in pilots.items():
-            words = seed_sequence(bench.seed, "pilot noise", name, kind.clutter, frame, number).generate_state(2)
-            profile = learn_profile(add_noise(replace(pilot, samples=pilot.samples.copy()), level**2, words), reference)
+            words = seed_sequence(
+                bench.seed, "pilot noise", name, kind.clutter, frame, number
+            ).generate_state(2)
+            profile = learn_profile(
+                add_noise(replace(pilot, samples=pilot.samples.copy()), level**2, words), reference
+            )
             metrics[name] = correlate(power, profile) if profile.any() else power
         for name, metric in metrics.items():
             raw = decide(metric, [], w)[0]
-            wrong["delay", name].append(int((np.clip(raw, 0, w.num_delay_symbols - 1) != payload.delay_symbols[0]).sum()))
+            wrong["delay", name].append(
+                int((np.clip(raw, 0, w.num_delay_symbols - 1) != payload.delay_symbols[0]).sum())
+            )
             known = known_cycles(w, DISTANCE / SPEED_OF_LIGHT, 0.0, raw[None])
             picked = cells.at(raw % w.num_samples, level) * np.exp(-2j * np.pi * known)[:, None]
-            wrong["dpsk", name].append(int((decide_transitions(picked, schedule, w.num_tx, ORDER)[0] != payload.transitions).sum()))
+            wrong["dpsk", name].append(
+                int(
+                    (
+                        decide_transitions(picked, schedule, w.num_tx, ORDER)[0]
+                        != payload.transitions
+                    ).sum()
+                )
+            )
     return {name: np.array(counts) for name, counts in wrong.items()}
 
 
@@ -179,40 +253,65 @@ def _sight(bench: Bench, own: Pose, other: Pose) -> PathSet:
     """The line of sight from AT to PT, of unit amplitude; they fly side by side."""
     ahead = (other.position - own.position) / DISTANCE
     return make_paths(
-        gain=np.ones(1), delay=np.array([DISTANCE / SPEED_OF_LIGHT]), departure=ahead[None], arrival=-ahead[None],
-        kind=int(PathKind.LINE_OF_SIGHT), epoch=bench.scenes.epoch, tx="AT", rx="PT", tx_radius=DISTANCE, rx_radius=DISTANCE,
-    )  # fmt: skip
+        gain=np.ones(1),
+        delay=np.array([DISTANCE / SPEED_OF_LIGHT]),
+        departure=ahead[None],
+        arrival=-ahead[None],
+        kind=int(PathKind.LINE_OF_SIGHT),
+        epoch=bench.scenes.epoch,
+        tx="AT",
+        rx="PT",
+        tx_radius=DISTANCE,
+        rx_radius=DISTANCE,
+    )
 
 
 def earlier(paths: PathSet, seconds: float) -> PathSet:
-    """The same scatterers some time before, gains and directions as they are: 0.94 m of flight in 12 frames at 10 m/s."""
+    """The same scatterers some time before, gains and directions as they are: 0.94 m of flight in
+    12 frames at 10 m/s."""
     rate = paths.delay_rate - seconds * paths.delay_accel
-    return replace(paths, delay=paths.delay - seconds * (rate + seconds * paths.delay_accel / 2), delay_rate=rate)
+    return replace(
+        paths,
+        delay=paths.delay - seconds * (rate + seconds * paths.delay_accel / 2),
+        delay_rate=rate,
+    )
 
 
 def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.ndarray]:
-    """Of `TARGETS` targets of unit amplitude, those that the CFAR finds within a cell at each SNR, without a filter and after the
-    zero-Doppler notch, for the clutter at the paper's level and as it is: {(physical, filter): (SNR, 3) hits, false alarms and cells in
-    which there could have been one}."""
+    """Of `TARGETS` targets of unit amplitude, those that the CFAR finds within a cell at each SNR,
+    without a filter and after the zero-Doppler notch, for the clutter at the paper's level and as
+    it is: {(physical, filter): (SNR, 3) hits, false alarms and cells in which there could have been
+    one}."""
     w, schedule = bench.waveform, bench.scenes.setup.schedule
     own, _ = bench.poses(kind)
     rng = generator(bench.seed, "at data", kind.clutter, round(kind.speed), frame)
     payload = random_payload(w, schedule, 8, rng)
-    sent = Transmission(name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload)
+    sent = Transmission(
+        name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload
+    )
     targets, cells = _targets(bench, own, rng)
     cube = bench.scenes.noisy([], "at", kind.clutter, round(kind.speed), frame)
-    parts = {"noise": replace(cube, samples=cube.samples / np.float32(np.sqrt(bench.scenes.noise))), "targets": _cube(bench, targets, sent)}
+    parts = {
+        "noise": replace(cube, samples=cube.samples / np.float32(np.sqrt(bench.scenes.noise))),
+        "targets": _cube(bench, targets, sent),
+    }
     paths = bench.clutter(kind, 2, frame, False)
     ratio = 1.0
     if paths is not None:
         parts["clutter"] = _cube(bench, paths, sent)
         physical = bench.clutter(kind, 2, frame, True)
-        ratio = float(np.sqrt(physical.power.sum() / paths.power.sum())) if physical is not None else 1.0
+        ratio = (
+            float(np.sqrt(physical.power.sum() / paths.power.sum()))
+            if physical is not None
+            else 1.0
+        )
     out = {}
     for name in ("none", "notch"):
         maps = {}
         for part, one in parts.items():
-            spectra = clean_spectrum(one, payload.delay_symbols, payload.phases, w.num_delay_symbols)
+            spectra = clean_spectrum(
+                one, payload.delay_symbols, payload.phases, w.num_delay_symbols
+            )
             if name == "notch":
                 remove_standing(spectra, schedule, None)
             maps[part] = channel_maps(spectra, w, schedule, payload.delay_symbols)
@@ -220,47 +319,82 @@ def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.n
             fixed = maps["targets"]
             if "clutter" in maps:
                 fixed = fixed + np.float32(ratio if physical_level else 1.0) * maps["clutter"]
-            out[physical_level, name] = np.array([_found(fixed + np.float32(10 ** (-snr / 20)) * maps["noise"], cells) for snr in AT_SNR])
+            out[physical_level, name] = np.array(
+                [
+                    _found(fixed + np.float32(10 ** (-snr / 20)) * maps["noise"], cells)
+                    for snr in AT_SNR
+                ]
+            )
     return out
 
 
 def _cube(bench: Bench, paths: PathSet, sent: Transmission) -> IFCube:
-    return if_signal(bench.waveform, [(sent, paths)], sent.pose, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-2)
+    return if_signal(
+        bench.waveform,
+        [(sent, paths)],
+        sent.pose,
+        bench.antennas,
+        start_time=0.0,
+        filter_transition=4e5,
+        noise_power=1e-2,
+    )
 
 
 def _found(maps: np.ndarray, cells: np.ndarray) -> tuple[int, int, int]:
-    """Targets found; crossings of the threshold in range cells without a target near, and the number of cells there."""
+    """Targets found; crossings of the threshold in range cells without a target near, and the
+    number of cells there."""
     settings = Receivers(false_alarm_rate=FALSE_ALARMS)
     power = accumulate(maps)
-    above, _ = detect(power, maps.shape[0] * maps.shape[1], FALSE_ALARMS, settings.guard_cells, settings.training_cells)
+    above, _ = detect(
+        power,
+        maps.shape[0] * maps.shape[1],
+        FALSE_ALARMS,
+        settings.guard_cells,
+        settings.training_cells,
+    )
     near = ndimage.maximum_filter(above, size=3, mode=("nearest", "wrap"))
     clear = np.abs(np.arange(len(power))[:, None] - cells[:, 0]).min(axis=1) > CLEAR_ROWS
     return int(near[tuple(cells.T)].sum()), int(above[clear].sum()), above[clear].size
 
 
 def _targets(bench: Bench, own: Pose, rng: np.random.Generator) -> tuple[PathSet, np.ndarray]:
-    """Targets between 10 and 100 m at up to 14 m/s, seven cells apart at least, anywhere in view; and their cells."""
+    """Targets between 10 and 100 m at up to 14 m/s, seven cells apart at least, anywhere in view;
+    and their cells."""
     w = bench.waveform
     cells: list[np.ndarray] = []
     while len(cells) < TARGETS:
-        tried = np.array([rng.uniform(10, 100) / w.range_cell(2), rng.uniform(-14, 14) / w.velocity_cell(2)])
+        tried = np.array(
+            [rng.uniform(10, 100) / w.range_cell(2), rng.uniform(-14, 14) / w.velocity_cell(2)]
+        )
         if all(np.abs(tried - c).max() > 7 for c in cells):
             cells.append(tried)
     place = np.array(cells)
     u = rng.uniform(-0.6, 0.6, (TARGETS, 2))
     towards = own.to_world(np.stack([u[:, 0], np.sqrt(1 - (u**2).sum(axis=1)), u[:, 1]], axis=1))
     paths = make_paths(
-        gain=np.exp(2j * np.pi * rng.uniform(size=TARGETS)), delay=place[:, 0] * w.range_cell(2) * 2 / SPEED_OF_LIGHT,
-        delay_rate=place[:, 1] * w.velocity_cell(2) * 2 / SPEED_OF_LIGHT, departure=towards, arrival=towards, kind=int(PathKind.TARGET),
-        epoch=bench.scenes.epoch, tx="AT", rx="AT",
-    )  # fmt: skip
+        gain=np.exp(2j * np.pi * rng.uniform(size=TARGETS)),
+        delay=place[:, 0] * w.range_cell(2) * 2 / SPEED_OF_LIGHT,
+        delay_rate=place[:, 1] * w.velocity_cell(2) * 2 / SPEED_OF_LIGHT,
+        departure=towards,
+        arrival=towards,
+        kind=int(PathKind.TARGET),
+        epoch=bench.scenes.epoch,
+        tx="AT",
+        rx="AT",
+    )
     beat = place[:, 0] + place[:, 1] * w.sampled_duration / w.frame_duration
-    return paths, np.stack([np.round(beat), (np.round(place[:, 1]) + w.num_chirps // 2) % w.num_chirps], axis=1).astype(int)
+    return paths, np.stack(
+        [np.round(beat), (np.round(place[:, 1]) + w.num_chirps // 2) % w.num_chirps], axis=1
+    ).astype(int)
 
 
 def kinds() -> list[Kind]:
     """Statistical clutter knows no motion."""
-    return [Kind("gaussian", 0.0), Kind("rayleigh", 0.0), *(Kind(p, v) for p in PLACES_USED for v in (0.0, SPEED))]
+    return [
+        Kind("gaussian", 0.0),
+        Kind("rayleigh", 0.0),
+        *(Kind(p, v) for p in PLACES_USED for v in (0.0, SPEED)),
+    ]
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
@@ -282,39 +416,86 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         for physical in (False, True) if kind.clutter in PLACES else (False,):
             errors = each(pt_errors, kind, physical)
             for symbol, name in errors[0]:
-                wrong, trials = np.sum([e[symbol, name] for e in errors], axis=0), (120 if symbol == "delay" else 117) * frames
-                symbols += [{"symbol": symbol, **_row(kind, physical, name, s, n, trials)} for s, n in zip(PT_SNR, wrong, strict=True)]
+                wrong, trials = (
+                    np.sum([e[symbol, name] for e in errors], axis=0),
+                    (120 if symbol == "delay" else 117) * frames,
+                )
+                symbols += [
+                    {"symbol": symbol, **_row(kind, physical, name, s, n, trials)}
+                    for s, n in zip(PT_SNR, wrong, strict=True)
+                ]
         found = each(at_hits, kind)
         for physical, name in found[0]:
             if physical and kind.clutter not in PLACES:
                 continue
             count = np.sum([f[physical, name] for f in found], axis=0)
-            hits += [{**_row(kind, physical, name, s, n, TARGETS * frames), "false_alarms": int(a), "free_cells": int(c),
-                      "false_alarm_rate": a / c} for s, (n, a, c) in zip(AT_SNR, count, strict=True)]  # fmt: skip
-    tables = {"symbols": pd.DataFrame(symbols), "hits": pd.DataFrame(hits), "statistics": _statistics(scenes)}
-    settings = {"quick": quick, "seed": seed, "frames": frames, "false_alarm_rate": FALSE_ALARMS, "level_db": LEVEL_DB,
-                "places": {p: PLACES[p].text for p in PLACES_USED}, "speed_mps": SPEED}  # fmt: skip
-    return Outcome("clutter", "Three kinds of clutter", tables, draw(tables, scenes), _verdicts(tables), settings)
+            hits += [
+                {
+                    **_row(kind, physical, name, s, n, TARGETS * frames),
+                    "false_alarms": int(a),
+                    "free_cells": int(c),
+                    "false_alarm_rate": a / c,
+                }
+                for s, (n, a, c) in zip(AT_SNR, count, strict=True)
+            ]
+    tables = {
+        "symbols": pd.DataFrame(symbols),
+        "hits": pd.DataFrame(hits),
+        "statistics": _statistics(scenes),
+    }
+    settings = {
+        "quick": quick,
+        "seed": seed,
+        "frames": frames,
+        "false_alarm_rate": FALSE_ALARMS,
+        "level_db": LEVEL_DB,
+        "places": {p: PLACES[p].text for p in PLACES_USED},
+        "speed_mps": SPEED,
+    }
+    return Outcome(
+        "clutter",
+        "Three kinds of clutter",
+        tables,
+        draw(tables, scenes),
+        _verdicts(tables),
+        settings,
+    )
 
 
 def _row(kind: Kind, physical: bool, decision: str, snr: float, count: int, trials: int) -> dict:
     level = "physical" if physical else "paper"
-    return {"clutter": kind.clutter, "speed_mps": kind.speed, "level": level, "decision": decision, "snr_db": snr, "count": int(count),
-            "trials": trials, "rate": count / trials}  # fmt: skip
+    return {
+        "clutter": kind.clutter,
+        "speed_mps": kind.speed,
+        "level": level,
+        "decision": decision,
+        "snr_db": snr,
+        "count": int(count),
+        "trials": trials,
+        "rate": count / trials,
+    }
 
 
 def _statistics(scenes: Scenes) -> pd.DataFrame:
     rows = [{"clutter": "rayleigh", "speed_mps": 0.0, **numbers.RAYLEIGH}]
     for place in PLACES_USED:
         for speed in (0.0, SPEED):
-            expected = scenes.expectation.clutter(place, scenes.pose(place, speed), scenes.epoch, scenes.amplitude)
-            found = numbers.statistics(expected, scenes.setup.waveform, scenes.amplitude, scenes.setup.antennas.gain)
+            expected = scenes.expectation.clutter(
+                place, scenes.pose(place, speed), scenes.epoch, scenes.amplitude
+            )
+            found = numbers.statistics(
+                expected, scenes.setup.waveform, scenes.amplitude, scenes.setup.antennas.gain
+            )
             rows.append({"clutter": place, "speed_mps": speed, **found})
     return pd.DataFrame(rows)
 
 
 def _verdicts(tables: dict[str, pd.DataFrame]) -> tuple[Verdict, ...]:
-    return (*_of_the_model(tables["statistics"]), _of_the_symbols(tables["symbols"]), _of_the_hits(tables["hits"]))
+    return (
+        *_of_the_model(tables["statistics"]),
+        _of_the_symbols(tables["symbols"]),
+        _of_the_hits(tables["hits"]),
+    )
 
 
 def _judged(always: bool, sometimes: bool = False) -> Judgement:
@@ -331,58 +512,110 @@ def _of_the_model(found: pd.DataFrame) -> list[Verdict]:
 
     near = abs(float(mesh.level_over_uav_db.median()) - LEVEL_DB) <= 5
     return [
-        Verdict("Urban clutter is about 10 dB over the target", _judged(near),
-                f"median over the cells of 20 to 100 m, place by place, over a small UAV: {span(standing, 'level_over_uav_db')} dB; "
-                f"10th percentiles {span(standing, 'level_p10_db')}, 90th {span(standing, 'level_p90_db')} dB"),
-        Verdict("It fills 40 to 50 range cells", _judged(bool(mesh.cells_within_20_db.between(40, 50).all())),
-                f"cells within 20 dB of the strongest: {span(standing, 'cells_within_20_db', '.0f')}"),
-        Verdict("Its amplitudes are Rayleigh", _judged(bool((mesh.fourth_moment < 2.2).all())),
-                f"E|a|^4/(E|a|^2)^2 over the strongest 45 cells: {span(standing, 'fourth_moment', '.2f')} (2 is Rayleigh); each cell by "
-                f"itself is Rayleigh, the levels differ; correlation of neighbouring cells' levels "
-                f"{span(standing, 'level_correlation', '.2f')}"),
-        Verdict("It stands still", _judged(*(bool((part.frame_correlation > 0.99).all()) for part in (moving, standing))),
-                f"hovering yes; at {SPEED:g} m/s a cell's power spreads by {span(moving, 'doppler_rms_mps', '.2f')} m/s rms over "
-                f"{span(moving, 'doppler_cells', '.0f')} Doppler cells, and its amplitude correlates from frame to frame by "
-                f"{span(moving, 'frame_correlation', '.3f')} (hovering 1)"),
-    ]  # fmt: skip
+        Verdict(
+            "Urban clutter is about 10 dB over the target",
+            _judged(near),
+            "median over the cells of 20 to 100 m, place by place, over a small UAV: "
+            f"{span(standing, 'level_over_uav_db')} dB; "
+            f"10th percentiles {span(standing, 'level_p10_db')}, 90th "
+            f"{span(standing, 'level_p90_db')} dB",
+        ),
+        Verdict(
+            "It fills 40 to 50 range cells",
+            _judged(bool(mesh.cells_within_20_db.between(40, 50).all())),
+            f"cells within 20 dB of the strongest: {span(standing, 'cells_within_20_db', '.0f')}",
+        ),
+        Verdict(
+            "Its amplitudes are Rayleigh",
+            _judged(bool((mesh.fourth_moment < 2.2).all())),
+            "E|a|^4/(E|a|^2)^2 over the strongest 45 cells: "
+            f"{span(standing, 'fourth_moment', '.2f')} (2 is Rayleigh); each cell by "
+            f"itself is Rayleigh, the levels differ; correlation of neighbouring cells' levels "
+            f"{span(standing, 'level_correlation', '.2f')}",
+        ),
+        Verdict(
+            "It stands still",
+            _judged(*(bool((part.frame_correlation > 0.99).all()) for part in (moving, standing))),
+            f"hovering yes; at {SPEED:g} m/s a cell's power spreads by "
+            f"{span(moving, 'doppler_rms_mps', '.2f')} m/s rms over "
+            f"{span(moving, 'doppler_cells', '.0f')} Doppler cells, and its amplitude correlates "
+            "from frame to frame by "
+            f"{span(moving, 'frame_correlation', '.3f')} (hovering 1)",
+        ),
+    ]
 
 
-def _share(table: pd.DataFrame, decision: str, level: str, clutter: tuple[str, ...] = PLACES_USED, speed: float | None = None,
-           value: tuple[str, str] = ("count", "trials")) -> tuple[int, int]:  # fmt: skip
+def _share(
+    table: pd.DataFrame,
+    decision: str,
+    level: str,
+    clutter: tuple[str, ...] = PLACES_USED,
+    speed: float | None = None,
+    value: tuple[str, str] = ("count", "trials"),
+) -> tuple[int, int]:
     """Counts of the highest SNR, of some kinds of clutter together."""
-    part = table[(table.snr_db == table.snr_db.max()) & (table.decision == decision) & (table.level == level)]
-    part = part[part.clutter.isin(clutter) & ((part.speed_mps == speed) if speed is not None else True)]
+    part = table[
+        (table.snr_db == table.snr_db.max()) & (table.decision == decision) & (table.level == level)
+    ]
+    part = part[
+        part.clutter.isin(clutter) & ((part.speed_mps == speed) if speed is not None else True)
+    ]
     return int(part[value[0]].sum()), int(part[value[1]].sum())
 
 
 def _of_the_symbols(symbols: pd.DataFrame) -> Verdict:
     delay, dpsk = (symbols[symbols.symbol == name] for name in ("delay", "dpsk"))
     plain, read = (_share(delay, d, "paper") for d in ("strongest cell", "profile"))
-    rayleigh = [proportion(*_share(delay, d, "paper", ("rayleigh",))) for d in ("strongest cell", "profile")]
+    rayleigh = [
+        proportion(*_share(delay, d, "paper", ("rayleigh",))) for d in ("strongest cell", "profile")
+    ]
     old = _share(delay, "old profile", "paper", speed=SPEED)
-    phases = [proportion(*_share(dpsk, *which)) for which in (("profile", "paper"), ("strongest cell", "physical"))]
+    phases = [
+        proportion(*_share(dpsk, *which))
+        for which in (("profile", "paper"), ("strongest cell", "physical"))
+    ]
     return Verdict(
-        "A passive terminal reads its symbols in urban clutter at +10 dB", _judged(plain[0] < 0.01 * plain[1], read[0] < 0.01 * read[1]),
-        f"delay symbols at {PT_SNR[-1]:g} dB SNR by the strongest cell: mesh {proportion(*plain)} wrong, Rayleigh {rayleigh[0]}; "
-        f"by the range profile learned one frame before: mesh {proportion(*read)}, Rayleigh {rayleigh[1]}; learned "
-        f"{PILOTS['old profile']} frames before at {SPEED:g} m/s: mesh {proportion(*old)}; at the physical level, mesh, by the "
-        f"strongest cell: {proportion(*_share(delay, 'strongest cell', 'physical'))}. DPSK symbols (D = {ORDER}), mesh: by the "
+        "A passive terminal reads its symbols in urban clutter at +10 dB",
+        _judged(plain[0] < 0.01 * plain[1], read[0] < 0.01 * read[1]),
+        f"delay symbols at {PT_SNR[-1]:g} dB SNR by the strongest cell: mesh {proportion(*plain)} "
+        f"wrong, Rayleigh {rayleigh[0]}; "
+        f"by the range profile learned one frame before: mesh {proportion(*read)}, Rayleigh "
+        f"{rayleigh[1]}; learned "
+        f"{PILOTS['old profile']} frames before at {SPEED:g} m/s: mesh {proportion(*old)}; at the "
+        "physical level, mesh, by the "
+        f"strongest cell: {proportion(*_share(delay, 'strongest cell', 'physical'))}. DPSK symbols "
+        f"(D = {ORDER}), mesh: by the "
         f"profile at +10 dB {phases[0]}, at the physical level {phases[1]}",
-    )  # fmt: skip
+    )
 
 
 def _of_the_hits(hits: pd.DataFrame) -> Verdict:
-    found = {(d, v): proportion(*_share(hits, d, "paper", speed=v)) for d in ("none", "notch") for v in (0.0, SPEED)}
+    found = {
+        (d, v): proportion(*_share(hits, d, "paper", speed=v))
+        for d in ("none", "notch")
+        for v in (0.0, SPEED)
+    }
     rate = {}
-    for d, v, level in ((d, v, level) for d in ("none", "notch") for v in (0.0, SPEED) for level in ("paper", "physical")):
+    for d, v, level in (
+        (d, v, level)
+        for d in ("none", "notch")
+        for v in (0.0, SPEED)
+        for level in ("paper", "physical")
+    ):
         crossed, cells = _share(hits, d, level, speed=v, value=("false_alarms", "free_cells"))
         rate[d, v, level] = crossed / cells
     kept = [rate["notch", v, "paper"] < 2 * FALSE_ALARMS for v in (SPEED, 0.0)]
     return Verdict(
-        "The clutter filter gives the active terminal its targets back", _judged(*kept),
-        f"hits at {AT_SNR[-1]:g} dB SNR, mesh at +10 dB: hovering {found['none', 0.0]} without and {found['notch', 0.0]} with "
-        f"a zero-Doppler notch; at {SPEED:g} m/s {found['none', SPEED]} without and {found['notch', SPEED]} with it. "
-        f"False alarms per cell, {FALSE_ALARMS:g} by design: hovering {rate['none', 0.0, 'paper']:.1e} and "
-        f"{rate['notch', 0.0, 'paper']:.1e}, at {SPEED:g} m/s {rate['none', SPEED, 'paper']:.1e} and {rate['notch', SPEED, 'paper']:.1e}; "
-        f"at the physical level and {SPEED:g} m/s {rate['none', SPEED, 'physical']:.1e} and {rate['notch', SPEED, 'physical']:.1e}",
-    )  # fmt: skip
+        "The clutter filter gives the active terminal its targets back",
+        _judged(*kept),
+        f"hits at {AT_SNR[-1]:g} dB SNR, mesh at +10 dB: hovering {found['none', 0.0]} without and "
+        f"{found['notch', 0.0]} with "
+        f"a zero-Doppler notch; at {SPEED:g} m/s {found['none', SPEED]} without and "
+        f"{found['notch', SPEED]} with it. "
+        f"False alarms per cell, {FALSE_ALARMS:g} by design: hovering "
+        f"{rate['none', 0.0, 'paper']:.1e} and "
+        f"{rate['notch', 0.0, 'paper']:.1e}, at {SPEED:g} m/s {rate['none', SPEED, 'paper']:.1e} "
+        f"and {rate['notch', SPEED, 'paper']:.1e}; "
+        f"at the physical level and {SPEED:g} m/s {rate['none', SPEED, 'physical']:.1e} and "
+        f"{rate['notch', SPEED, 'physical']:.1e}",
+    )

@@ -1,8 +1,9 @@
-"""Frames over places in Munich, made to be compared: the same clutter, noise and targets for whoever looks at them.
+"""Frames over places in Munich, made to be compared: the same clutter, noise and targets for
+whoever looks at them.
 
-One scenario holds all places as hovering active terminals, so that one field of scatterers serves them; a terminal "in flight" has the same
-position and a velocity. Clutter is the diffuse one of one bounce; mirror flashes and corners, single cells which the mesh
-predicts too, are left out.
+One scenario holds all places as hovering active terminals, so that one field of scatterers serves
+them; a terminal "in flight" has the same position and a velocity. Clutter is the diffuse one of one
+bounce; mirror flashes and corners, single cells which the mesh predicts too, are left out.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ from isac_rt.world.swarm import Pose, attitude
 SPEED = 10.0
 """Of a terminal in flight [m/s], along its boresight over ground."""
 LEFT_OUT_DB = 20.0
-"""Scatterers this far below the noise of one range-Doppler cell are left out: 1 % of the clutter's power at 27 m, 7 % at 60 m."""
+"""Scatterers this far below the noise of one range-Doppler cell are left out: 1 % of the clutter's
+power at 27 m, 7 % at 60 m."""
 WIDEST = np.sin(np.deg2rad(45))
-"""Direction cosine from boresight within which targets are drawn. Elements of 10 dBi are 12 dB down there, both ways together; farther
-out noise alone hides small UAVs at 100 m, and a comparison would count that."""
+"""Direction cosine from boresight within which targets are drawn. Elements of 10 dBi are 12 dB down
+there, both ways together; farther out noise alone hides small UAVs at 100 m, and a comparison would
+count that."""
 SMALL_UAV_M2 = 10 ** (-12.81 / 10)
 """TR 38.901's small UAV."""
 
@@ -57,33 +60,60 @@ PLACES = {
 }
 
 
-def scenario(places: tuple[str, ...], seed: int, cell_area: float, power_dbm: float, partners: float | None = None) -> Scenario:
+def scenario(
+    places: tuple[str, ...],
+    seed: int,
+    cell_area: float,
+    power_dbm: float,
+    partners: float | None = None,
+) -> Scenario:
     """Places of `PLACES` as active terminals that hover.
 
     Parameters
     ----------
     cell_area : largest area of a scatterer over its distance [m^2/m]
     power_dbm : of one antenna
-    partners : distance [m] of a passive terminal ahead of each over ground, NAME-pt; None: there are none
+    partners : distance [m] of a passive terminal ahead of each over ground, NAME-pt; None: there
+        are none
     """
     uavs: dict[str, dict] = {}
     for name in places:
-        uavs[name] = {"role": "active", "position_m": PLACES[name].position, "boresight": PLACES[name].boresight}
+        uavs[name] = {
+            "role": "active",
+            "position_m": PLACES[name].position,
+            "boresight": PLACES[name].boresight,
+        }
     for name in places if partners else ():
         p = PLACES[name]
         flat = partners / np.hypot(*p.boresight[:2])
-        ahead = [p.position[0] + flat * p.boresight[0], p.position[1] + flat * p.boresight[1], p.position[2]]
-        uavs[f"{name}-pt"] = {"role": "passive", "position_m": ahead, "boresight": [-p.boresight[0], -p.boresight[1], p.boresight[2]]}
+        ahead = [
+            p.position[0] + flat * p.boresight[0],
+            p.position[1] + flat * p.boresight[1],
+            p.position[2],
+        ]
+        uavs[f"{name}-pt"] = {
+            "role": "passive",
+            "position_m": ahead,
+            "boresight": [-p.boresight[0], -p.boresight[1], p.boresight[2]],
+        }
     return Scenario.model_validate(
         {
-            "name": "places over Munich", "seed": seed, "frames": 4, "swarm": uavs, "array": {"element_gain_dbi": 10.0},
+            "name": "places over Munich",
+            "seed": seed,
+            "frames": 4,
+            "swarm": uavs,
+            "array": {"element_gain_dbi": 10.0},
             "city": {"source": "builtin", "name": "munich", "keep_radius_m": 110.0},
             "propagation": {"model": "ray_traced", "max_bounces": 1, "leakage": {"enabled": False}},
-            "clutter": {"model": "field", "cell_area_per_metre_m": cell_area, "smallest_cell_m2": 0.05},
+            "clutter": {
+                "model": "field",
+                "cell_area_per_metre_m": cell_area,
+                "smallest_cell_m2": 0.05,
+            },
             "noise": {"tx_power_dbm": power_dbm, "noise_figure_db": 10.0},
             "receivers": {"clutter_detector": "angle_doppler", "false_alarm_rate": 1e-3},
         }
-    )  # fmt: skip
+    )
 
 
 class Scenes:
@@ -107,10 +137,16 @@ class Scenes:
         """Of a terminal that flies over ground along its boresight."""
         p = PLACES[place]
         ahead = np.array([p.boresight[0], p.boresight[1], 0.0])
-        return Pose(np.array(p.position), speed * ahead / np.linalg.norm(ahead), np.zeros(3), attitude(np.array(p.boresight)))
+        return Pose(
+            np.array(p.position),
+            speed * ahead / np.linalg.norm(ahead),
+            np.zeros(3),
+            attitude(np.array(p.boresight)),
+        )
 
     def clutter(self, place: str, speed: float, draw: int) -> PathSet:
-        """Diffuse clutter of the terminal's own link: the field's scatterers, with amplitudes of their own for each draw.
+        """Diffuse clutter of the terminal's own link: the field's scatterers, with amplitudes of
+        their own for each draw.
 
         What is too weak to matter in a range-Doppler cell is left out (`LEFT_OUT_DB`).
         """
@@ -131,21 +167,33 @@ class Scenes:
         """What the terminal sends."""
         s = self.setup
         return Transmission(
-            name=place, pose=self.pose(place, speed), antennas=s.antennas, schedule=s.schedule, payload=payload, amplitude=self.amplitude
+            name=place,
+            pose=self.pose(place, speed),
+            antennas=s.antennas,
+            schedule=s.schedule,
+            payload=payload,
+            amplitude=self.amplitude,
         )
 
     def payload(self, *name: str | int) -> Payload:
         """Random data for a frame."""
         rng = generator(self.setup.scenario.seed, "data", *name)
-        return random_payload(self.setup.waveform, self.setup.schedule, self.setup.scenario.modulation.dpsk_order, rng)
+        return random_payload(
+            self.setup.waveform, self.setup.schedule, self.setup.scenario.modulation.dpsk_order, rng
+        )
 
     def samples(self, paths: PathSet, sent: Transmission) -> IFCube:
         """IF samples of paths, without noise."""
         s = self.setup
         return if_signal(
-            s.waveform, [(sent, paths)], sent.pose, s.antennas, start_time=0.0,
-            filter_transition=s.scenario.radio.filter_transition_hz, noise_power=self.noise,
-        )  # fmt: skip
+            s.waveform,
+            [(sent, paths)],
+            sent.pose,
+            s.antennas,
+            start_time=0.0,
+            filter_transition=s.scenario.radio.filter_transition_hz,
+            noise_power=self.noise,
+        )
 
     def noisy(self, parts: list[IFCube], *name: str | int) -> IFCube:
         """Sum of cubes with the receiver's noise of this name."""
@@ -154,7 +202,11 @@ class Scenes:
         for part in parts:
             total += part.samples
         cube = IFCube(samples=total, waveform=w, schedule=self.setup.schedule, start_time=0.0)
-        return add_noise(cube, self.noise, seed_sequence(self.setup.scenario.seed, "noise", *name).generate_state(2))
+        return add_noise(
+            cube,
+            self.noise,
+            seed_sequence(self.setup.scenario.seed, "noise", *name).generate_state(2),
+        )
 
     def sees(self, place: str, points: np.ndarray) -> np.ndarray:
         """(K,) whether the terminal sees points (K, 3) in the air."""
@@ -163,7 +215,11 @@ class Scenes:
 
         s = self.setup
         shadows = Shadows(shared_scene(s.city, s.waveform.carrier_frequency).scene.mi_scene)
-        return shadows.sees(np.array(PLACES[place].position) - s.city.origin, points - s.city.origin, np.zeros_like(points))
+        return shadows.sees(
+            np.array(PLACES[place].position) - s.city.origin,
+            points - s.city.origin,
+            np.zeros_like(points),
+        )
 
 
 @dataclass(frozen=True)
@@ -190,19 +246,34 @@ class Targets:
     def paths(self, scenes: Scenes, place: str, speed: float) -> PathSet:
         """Their echoes, by the radar equation."""
         pose, antennas = scenes.pose(place, speed), scenes.setup.antennas
-        amplitude = radar_amplitude(scenes.setup.waveform.wavelength, SMALL_UAV_M2, self.range, self.range)
-        phase = generator(scenes.setup.scenario.seed, "echo", place).uniform(0, 2 * np.pi, len(self))
+        amplitude = radar_amplitude(
+            scenes.setup.waveform.wavelength, SMALL_UAV_M2, self.range, self.range
+        )
+        phase = generator(scenes.setup.scenario.seed, "echo", place).uniform(
+            0, 2 * np.pi, len(self)
+        )
         return make_paths(
-            gain=amplitude * antennas.element_gain(pose.to_body(self.direction)) * np.exp(1j * phase),
-            delay=2 * self.range / SPEED_OF_LIGHT, delay_rate=2 * self.velocity / SPEED_OF_LIGHT, departure=self.direction,
-            arrival=self.direction, tx_radius=self.range, rx_radius=self.range, kind=int(PathKind.TARGET), epoch=scenes.epoch,
-            tx=place, rx=place,
-        )  # fmt: skip
+            gain=amplitude
+            * antennas.element_gain(pose.to_body(self.direction))
+            * np.exp(1j * phase),
+            delay=2 * self.range / SPEED_OF_LIGHT,
+            delay_rate=2 * self.velocity / SPEED_OF_LIGHT,
+            departure=self.direction,
+            arrival=self.direction,
+            tx_radius=self.range,
+            rx_radius=self.range,
+            kind=int(PathKind.TARGET),
+            epoch=scenes.epoch,
+            tx=place,
+            rx=place,
+        )
 
 
-def in_the_air(scenes: Scenes, place: str, ranges: np.ndarray, velocities: np.ndarray, rng: np.random.Generator) -> Targets:
-    """Targets at these ranges and radial velocities, each in a direction (`WIDEST`) in which the terminal sees it; those for
-    which 30 draws find none are left out."""
+def in_the_air(
+    scenes: Scenes, place: str, ranges: np.ndarray, velocities: np.ndarray, rng: np.random.Generator
+) -> Targets:
+    """Targets at these ranges and radial velocities, each in a direction (`WIDEST`) in which the
+    terminal sees it; those for which 30 draws find none are left out."""
     pose = scenes.pose(place, 0.0)
     count = ranges.size
     direction, found = np.zeros((count, 3)), np.zeros(count, bool)

@@ -1,4 +1,5 @@
-"""Fig. 10: PT1 estimates and tracks the AT, sees PT2 by its reflection and decodes, frame by frame at 10 dB."""
+"""Fig. 10: PT1 estimates and tracks the AT, sees PT2 by its reflection and decodes, frame by frame
+at 10 dB."""
 
 from __future__ import annotations
 
@@ -16,19 +17,38 @@ PRINTED_FRAMES = 10
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """All 500 frames of the consistent variant, or one in `QUICK_EVERY` over the same time; a few as printed."""
+    """All 500 frames of the consistent variant, or one in `QUICK_EVERY` over the same time; a few
+    as printed."""
     every = QUICK_EVERY if quick else 1
     frames = FRAMES // every
     total = frames + PRINTED_FRAMES
     found = fly("consistent", "PT1", frames, every, seed, lambda k, n: progress(k, total))
-    printed = fly("printed", "PT1", PRINTED_FRAMES, FRAMES // PRINTED_FRAMES, seed, lambda k, n: progress(frames + k, total))
-    settings = {"quick": quick, "seed": seed, "frames": frames, "every_frames": every, "printed_frames": PRINTED_FRAMES, "snr_db": 10,
-                "scene": "paper_swarm_consistent.yaml; as printed: paper_swarm.yaml"}  # fmt: skip
-    tables = {"consistent": tracks.table([found], every, ("AT", "PT2")),
-              "printed": tracks.table([printed], FRAMES // PRINTED_FRAMES, ("AT", "PT2"))}  # fmt: skip
+    printed = fly(
+        "printed",
+        "PT1",
+        PRINTED_FRAMES,
+        FRAMES // PRINTED_FRAMES,
+        seed,
+        lambda k, n: progress(frames + k, total),
+    )
+    settings = {
+        "quick": quick,
+        "seed": seed,
+        "frames": frames,
+        "every_frames": every,
+        "printed_frames": PRINTED_FRAMES,
+        "snr_db": 10,
+        "scene": "paper_swarm_consistent.yaml; as printed: paper_swarm.yaml",
+    }
+    tables = {
+        "consistent": tracks.table([found], every, ("AT", "PT2")),
+        "printed": tracks.table([printed], FRAMES // PRINTED_FRAMES, ("AT", "PT2")),
+    }
     grid = tracks.on_grid([found], ("AT",), every, "PT1")
     figure = tracks.figure([found], every, ("AT",), ("AT", "PT2"), (107, 359), grid)
-    return Outcome("fig10", "Tracking at PT1", tables, figure, _verdicts(found, printed, every, grid), settings)
+    return Outcome(
+        "fig10", "Tracking at PT1", tables, figure, _verdicts(found, printed, every, grid), settings
+    )
 
 
 def _seen(mask: np.ndarray, every: int) -> str:
@@ -44,19 +64,35 @@ def _verdicts(found, printed, every: int, grid: tracks.Pairs) -> tuple[Verdict, 
     two = found.sel(uav="PT2")
     seen = np.isfinite(two.detected_range.values)
     frames = np.flatnonzero(seen) * every
-    tracked: Judgement = "holds under a condition" if followed[0] == followed[1] else "does not hold"
+    tracked: Judgement = (
+        "holds under a condition" if followed[0] == followed[1] else "does not hold"
+    )
     clean: Judgement = "holds under a condition" if wrong[:2].sum() == 0 else "does not hold"
     return (
-        Verdict("The AT stays within PT1's field of view and is tracked", tracked,
-                f"consistent variant: tracked in {proportion(*followed)} frames after {WARM_UP}; as printed heard in {heard} of "
-                f"{PRINTED_FRAMES}, for the AT is behind PT1"),
-        Verdict("Data demodulation is achieved", clean,
-                f"consistent variant: delay symbols wrong in {proportion(int(wrong[0]), int(symbols[0]))}, DPSK symbols in "
-                f"{proportion(int(wrong[1]), int(symbols[1]))}; condition: unmodulated frames first, "
-                "fractional decisions, all data phases removed"),
-        Verdict("PT2 appears between frames 107 and 359", "does not hold",
-                f"consistent variant: in view in frames {_seen(two.in_view.values, every)}, detected in {seen.sum()} of "
-                f"{int(two.in_view.values.sum())}" + (f", frames {frames.min()} to {frames.max()}" if frames.size else "")
-                + f"; as printed in {int(np.isfinite(printed.sel(uav='PT2').detected_range.values).sum())}"),
+        Verdict(
+            "The AT stays within PT1's field of view and is tracked",
+            tracked,
+            f"consistent variant: tracked in {proportion(*followed)} frames after {WARM_UP}; as "
+            f"printed heard in {heard} of "
+            f"{PRINTED_FRAMES}, for the AT is behind PT1",
+        ),
+        Verdict(
+            "Data demodulation is achieved",
+            clean,
+            "consistent variant: delay symbols wrong in "
+            f"{proportion(int(wrong[0]), int(symbols[0]))}, DPSK symbols in "
+            f"{proportion(int(wrong[1]), int(symbols[1]))}; condition: unmodulated frames first, "
+            "fractional decisions, all data phases removed",
+        ),
+        Verdict(
+            "PT2 appears between frames 107 and 359",
+            "does not hold",
+            f"consistent variant: in view in frames {_seen(two.in_view.values, every)}, detected "
+            f"in {seen.sum()} of "
+            f"{int(two.in_view.values.sum())}"
+            + (f", frames {frames.min()} to {frames.max()}" if frames.size else "")
+            + "; as printed in "
+            f"{int(np.isfinite(printed.sel(uav='PT2').detected_range.values).sum())}",
+        ),
         tracks.filter_verdict([found], ("AT",), "PT1", grid),
-    )  # fmt: skip
+    )

@@ -1,4 +1,5 @@
-"""Fig. 11: error rate of the DPSK symbols against SNR, on the link AT -> PT1 of Table II at rest, and mmWave-LoRadar's."""
+"""Fig. 11: error rate of the DPSK symbols against SNR, on the link AT -> PT1 of Table II at rest,
+and mmWave-LoRadar's."""
 
 from __future__ import annotations
 
@@ -13,9 +14,25 @@ from isac_rt.randomness import generator
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.baselines import LoRadar, loradar_symbol_errors
 from isac_rt.studies.paper.fig12 import SNR_DB, clutter_verdict, draw_rate
-from isac_rt.studies.paper.montecarlo import INTERVAL, Counts, Curve, Precision, Steps, dpsk_error_rate, sample
+from isac_rt.studies.paper.montecarlo import (
+    INTERVAL,
+    Counts,
+    Curve,
+    Precision,
+    Steps,
+    dpsk_error_rate,
+    sample,
+)
 from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
-from isac_rt.studies.paper.symbols import RANGE_ERROR_CELLS, VELOCITY_ERROR, Link, decibels, difference, link_waveform, run_link
+from isac_rt.studies.paper.symbols import (
+    RANGE_ERROR_CELLS,
+    VELOCITY_ERROR,
+    Link,
+    decibels,
+    difference,
+    link_waveform,
+    run_link,
+)
 
 _LONG, _SHORT = link_waveform(1024), link_waveform(512)
 LEVEL = 0.1
@@ -25,49 +42,87 @@ LORADAR_BATCH = 8
 
 
 def links() -> tuple[Link, ...]:
-    """The paper's curves, those by its letter, and the clutter with and without knowledge of its profile."""
+    """The paper's curves, those by its letter, and the clutter with and without knowledge of its
+    profile."""
     return (
         Link(name="T = 51.2 us", waveform=_LONG, orders=MODULATION_ORDERS),
         Link(name="letter", waveform=_LONG, orders=(8,), literal=True),
         Link(name="T = 25.6 us", waveform=_SHORT, orders=(8,)),
-        Link(name="exact prediction", waveform=_LONG, orders=MODULATION_ORDERS, exact_prediction=True),
+        Link(
+            name="exact prediction", waveform=_LONG, orders=MODULATION_ORDERS, exact_prediction=True
+        ),
         Link(name="clutter", waveform=_LONG, orders=(8,), clutter=True),
-        Link(name="clutter, filtered", waveform=_LONG, orders=(8,), clutter=True, run_cells=Receivers().clutter_run_cells),
-        Link(name="clutter, profile known", waveform=_LONG, orders=(8,), clutter=True, profile=True),
+        Link(
+            name="clutter, filtered",
+            waveform=_LONG,
+            orders=(8,),
+            clutter=True,
+            run_cells=Receivers().clutter_run_cells,
+        ),
+        Link(
+            name="clutter, profile known", waveform=_LONG, orders=(8,), clutter=True, profile=True
+        ),
     )
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Frames of one group (117 symbols) until every 95 % interval is small enough; `quick` stops at 16 frames a curve."""
+    """Frames of one group (117 symbols) until every 95 % interval is small enough; `quick` stops at
+    16 frames a curve."""
     precision = Precision(16) if quick else Precision(100, absolute=0.001)
     all_links = links()
     steps = Steps(progress, precision.limit * (len(all_links) + 1))
     curves: dict[str, Curve] = {}
     for link in all_links:
-        for name, curve in run_link(link, SNR_DB, precision, seed, steps.part(precision.limit)).items():
+        for name, curve in run_link(
+            link, SNR_DB, precision, seed, steps.part(precision.limit)
+        ).items():
             if name.startswith("dpsk"):
                 curves[f"{link.name}: {name.removeprefix('dpsk ')}"] = curve
     batches = replace(precision, limit=precision.limit // (2 if quick else 1))
-    loradar = sample(lambda i: _loradar(seed, i), LORADAR_SNR_DB, batches, steps.part(batches.limit), key=f"{seed} LoRadar")
+    loradar = sample(
+        lambda i: _loradar(seed, i),
+        LORADAR_SNR_DB,
+        batches,
+        steps.part(batches.limit),
+        key=f"{seed} LoRadar",
+    )
     curves["mmWave-LoRadar"] = loradar["mmWave-LoRadar"]
     progress(precision.limit * (len(all_links) + 1), precision.limit * (len(all_links) + 1))
     theory = {d: dpsk_error_rate(SNR_DB, 1024, d, 15) for d in MODULATION_ORDERS}
     lines = [c.table().assign(curve=name) for name, c in curves.items()]
-    lines += [pd.DataFrame({"curve": f"theory, D = {d}, known delay", "snr_db": SNR_DB, "rate": p}) for d, p in theory.items()]
+    lines += [
+        pd.DataFrame({"curve": f"theory, D = {d}, known delay", "snr_db": SNR_DB, "rate": p})
+        for d, p in theory.items()
+    ]
     settings = {
-        "quick": quick, "seed": seed, "frames": {name: len(c.events) for name, c in curves.items()}, "symbols_per_frame": 117,
-        "loradar_symbols_per_batch": LORADAR_BATCH, "snr": "per complex IF sample and receive antenna, line of sight, before processing",
-        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or {precision.limit} frames",
-        "interval": INTERVAL, "prediction_error": f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s",
-    }  # fmt: skip
-    return Outcome("fig11", "DPSK symbol error rate", {"fig11": pd.concat(lines)}, _figure(curves, theory), _verdicts(curves), settings)
+        "quick": quick,
+        "seed": seed,
+        "frames": {name: len(c.events) for name, c in curves.items()},
+        "symbols_per_frame": 117,
+        "loradar_symbols_per_batch": LORADAR_BATCH,
+        "snr": "per complex IF sample and receive antenna, line of sight, before processing",
+        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or "
+        f"{precision.limit} frames",
+        "interval": INTERVAL,
+        "prediction_error": f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s",
+    }
+    return Outcome(
+        "fig11",
+        "DPSK symbol error rate",
+        {"fig11": pd.concat(lines)},
+        _figure(curves, theory),
+        _verdicts(curves),
+        settings,
+    )
 
 
 def _loradar(seed: int, index: int) -> Counts:
     """LORADAR_BATCH symbols at every SNR: the delay known, one path, as the baseline assumes."""
     system = LoRadar(_LONG)
     wrong = [
-        loradar_symbol_errors(snr, LORADAR_BATCH, generator(seed, "loradar", index, repr(float(snr))), system).sum()
+        loradar_symbol_errors(
+            snr, LORADAR_BATCH, generator(seed, "loradar", index, repr(float(snr))), system
+        ).sum()
         for snr in LORADAR_SNR_DB
     ]
     return {"mmWave-LoRadar": (np.array(wrong), LORADAR_BATCH)}
@@ -79,17 +134,45 @@ def _figure(curves: dict[str, Curve], theory: dict[int, np.ndarray]) -> Figure:
         marks = dict(zip(MODULATION_ORDERS, "osD^", strict=True))
         left, right = axes[0]
         for i, d in enumerate(MODULATION_ORDERS):
-            draw_rate(left, curves[f"T = 51.2 us: {d}"], marks[d] + "-", f"C{i}", f"D = {d}, T = 51.2 us")
-            draw_rate(right, curves[f"exact prediction: {d} known delay"], marks[d], f"C{i}", f"D = {d}, velocity exact")
-            draw_rate(right, curves[f"T = 51.2 us: {d} known delay"], marks[d] + ":", f"C{i}", f"D = {d}, velocity within 0.25 m/s")
+            draw_rate(
+                left, curves[f"T = 51.2 us: {d}"], marks[d] + "-", f"C{i}", f"D = {d}, T = 51.2 us"
+            )
+            draw_rate(
+                right,
+                curves[f"exact prediction: {d} known delay"],
+                marks[d],
+                f"C{i}",
+                f"D = {d}, velocity exact",
+            )
+            draw_rate(
+                right,
+                curves[f"T = 51.2 us: {d} known delay"],
+                marks[d] + ":",
+                f"C{i}",
+                f"D = {d}, velocity within 0.25 m/s",
+            )
             right.plot(SNR_DB, theory[d], color=f"C{i}", lw=0.9, label=f"theory, D = {d}")
         draw_rate(left, curves["T = 25.6 us: 8"], "v--", "C4", "D = 8, T = 25.6 us")
-        draw_rate(left, curves["clutter, profile known: 8"], "P-.", "C5", "D = 8, clutter, its profile known")
-        draw_rate(left, curves["clutter, filtered: 8"], "+:", "C8", "D = 8, clutter, the paper's filter")
-        draw_rate(left, curves["clutter: 8"], "x:", "C6", "D = 8, clutter, line of sight tracked alone")
-        draw_rate(left, curves["letter: 8 literal"], "1:", "C7", "D = 8, data phases left in (as printed)")
+        draw_rate(
+            left,
+            curves["clutter, profile known: 8"],
+            "P-.",
+            "C5",
+            "D = 8, clutter, its profile known",
+        )
+        draw_rate(
+            left, curves["clutter, filtered: 8"], "+:", "C8", "D = 8, clutter, the paper's filter"
+        )
+        draw_rate(
+            left, curves["clutter: 8"], "x:", "C6", "D = 8, clutter, line of sight tracked alone"
+        )
+        draw_rate(
+            left, curves["letter: 8 literal"], "1:", "C7", "D = 8, data phases left in (as printed)"
+        )
         draw_rate(left, curves["mmWave-LoRadar"], "*--", "k", "mmWave-LoRadar")
-        left.set(ylabel="DPSK symbol error rate", yscale="log", ylim=(3e-4, 1.5), title="end to end")
+        left.set(
+            ylabel="DPSK symbol error rate", yscale="log", ylim=(3e-4, 1.5), title="end to end"
+        )
         right.set(title="delay symbols known")
         for ax in (left, right):
             ax.set(xlabel="SNR per sample and antenna [dB]", xlim=(-36, -18))
@@ -113,20 +196,48 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
     finding = "; ".join(f"D = {d}: {decibels(a)}" for d, a in apart.items())
     bits, others = replace(_LONG, num_groups=3).bits_per_frame(8), LoRadar(_LONG).bits_per_frame
     return (
-        Verdict("At very low SNR the SER levels off at a value that depends on D", "holds", f"at -36 dB {floor} by guessing"),
-        Verdict("For T = 51.2 us the SER grows with D", "holds" if rising else "does not hold",
-                f"SER {LEVEL} at {levels}; at -26 dB {rates}"),
-        Verdict("A smaller T raises the SER", "holds" if later[1] > 0 else "does not hold",
-                f"D = 8, T = 25.6 us (all times halved): SER {LEVEL} comes {decibels(later)} later"),
-        clutter_verdict("With urban clutter a higher SNR is needed, and at high SNR the system is still robust", long[8],
-                        curves["clutter: 8"], curves["clutter, filtered: 8"], curves["clutter, profile known: 8"]),
-        Verdict("For D <= 16 mmWave-LoRadar's SER is worse",
-                "holds" if len(better) == 4 else "holds under a condition" if better else "does not hold",
-                f"for D in {better}; SER {LEVEL} of LoRadar (delay and timing known) comes at {decibels(radar.threshold(LEVEL))}, "
-                f"after DPSK by {finding}"),
-        Verdict("A frame carries 4293 bits against LoRadar's 1800", "holds" if (bits, others) == (4293, 1800) else "does not hold",
-                f"{bits} with D = 8 and M = 3; {others}"),
-        Verdict("The detector as printed decides the symbols", "does not hold",
-                "without compensating the data's phases (and with the conjugate it lacks) the SER is "
-                f"{curves['letter: 8 literal'].text(-18)} at -18 dB, guessing"),
-    )  # fmt: skip
+        Verdict(
+            "At very low SNR the SER levels off at a value that depends on D",
+            "holds",
+            f"at -36 dB {floor} by guessing",
+        ),
+        Verdict(
+            "For T = 51.2 us the SER grows with D",
+            "holds" if rising else "does not hold",
+            f"SER {LEVEL} at {levels}; at -26 dB {rates}",
+        ),
+        Verdict(
+            "A smaller T raises the SER",
+            "holds" if later[1] > 0 else "does not hold",
+            f"D = 8, T = 25.6 us (all times halved): SER {LEVEL} comes {decibels(later)} later",
+        ),
+        clutter_verdict(
+            "With urban clutter a higher SNR is needed, and at high SNR the system is still robust",
+            long[8],
+            curves["clutter: 8"],
+            curves["clutter, filtered: 8"],
+            curves["clutter, profile known: 8"],
+        ),
+        Verdict(
+            "For D <= 16 mmWave-LoRadar's SER is worse",
+            "holds"
+            if len(better) == 4
+            else "holds under a condition"
+            if better
+            else "does not hold",
+            f"for D in {better}; SER {LEVEL} of LoRadar (delay and timing known) comes at "
+            f"{decibels(radar.threshold(LEVEL))}, "
+            f"after DPSK by {finding}",
+        ),
+        Verdict(
+            "A frame carries 4293 bits against LoRadar's 1800",
+            "holds" if (bits, others) == (4293, 1800) else "does not hold",
+            f"{bits} with D = 8 and M = 3; {others}",
+        ),
+        Verdict(
+            "The detector as printed decides the symbols",
+            "does not hold",
+            "without compensating the data's phases (and with the conjugate it lacks) the SER is "
+            f"{curves['letter: 8 literal'].text(-18)} at -18 dB, guessing",
+        ),
+    )

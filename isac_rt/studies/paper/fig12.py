@@ -1,4 +1,5 @@
-"""Fig. 12: error rate of the delay symbols against SNR, on the link AT -> PT1 of Table II at rest."""
+"""Fig. 12: error rate of the delay symbols against SNR, on the link AT -> PT1 of Table II at
+rest."""
 
 from __future__ import annotations
 
@@ -11,22 +12,46 @@ from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
-from isac_rt.studies.paper.outcome import Judgement, Outcome, Progress, Verdict, blank, proportion, style
-from isac_rt.studies.paper.symbols import RANGE_ERROR_CELLS, VELOCITY_ERROR, Link, decibels, difference, link_waveform, run_link
+from isac_rt.studies.paper.outcome import (
+    Judgement,
+    Outcome,
+    Progress,
+    Verdict,
+    blank,
+    proportion,
+    style,
+)
+from isac_rt.studies.paper.symbols import (
+    RANGE_ERROR_CELLS,
+    VELOCITY_ERROR,
+    Link,
+    decibels,
+    difference,
+    link_waveform,
+    run_link,
+)
 
-SNR_DB = np.array([-36, -34, -33, -32, -31, -30, -29, -28, -27, -26, -25, -24, -23, -22, -20, -18.0])
+SNR_DB = np.array(
+    [-36, -34, -33, -32, -31, -30, -29, -28, -27, -26, -25, -24, -23, -22, -20, -18.0]
+)
 _LONG, _SHORT = link_waveform(1024), link_waveform(512)
 
 
 def links() -> tuple[Link, ...]:
-    """Orders have draws of their own; the paper's letter is followed at the fixed and at a random fraction of a cell."""
+    """Orders have draws of their own; the paper's letter is followed at the fixed and at a random
+    fraction of a cell."""
     return (
         *(Link(name=f"D = {d}", waveform=_LONG, literal=d == 8) for d in MODULATION_ORDERS),
         Link(name="random fraction", waveform=_LONG, random_fraction=True, literal=True),
         Link(name="exact prediction", waveform=_LONG, exact_prediction=True),
         Link(name="T = 25.6 us", waveform=_SHORT),
         Link(name="clutter", waveform=_LONG, clutter=True),
-        Link(name="clutter, filtered", waveform=_LONG, clutter=True, run_cells=Receivers().clutter_run_cells),
+        Link(
+            name="clutter, filtered",
+            waveform=_LONG,
+            clutter=True,
+            run_cells=Receivers().clutter_run_cells,
+        ),
         Link(name="clutter, profile known", waveform=_LONG, clutter=True, profile=True),
     )
 
@@ -34,29 +59,50 @@ def links() -> tuple[Link, ...]:
 def theory() -> dict[str, np.ndarray]:
     """Closed forms for an exact prediction; the search runs past the alphabet on both sides."""
     sizes = {"51.2 us": _LONG, "25.6 us": _SHORT}
-    return {t: delay_error_rate(SNR_DB, w.num_samples, w.num_delay_symbols + 2 * EXTRA_CELLS, 15) for t, w in sizes.items()}
+    return {
+        t: delay_error_rate(SNR_DB, w.num_samples, w.num_delay_symbols + 2 * EXTRA_CELLS, 15)
+        for t, w in sizes.items()
+    }
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Frames of one group (120 symbols) until every 95 % interval is small enough; `quick` stops at 16 frames a curve."""
+    """Frames of one group (120 symbols) until every 95 % interval is small enough; `quick` stops at
+    16 frames a curve."""
     precision = Precision(16) if quick else Precision(100, absolute=0.001)
     all_links = links()
     steps = Steps(progress, precision.limit * len(all_links))
     curves: dict[str, Curve] = {}
     for link in all_links:
-        for name, curve in run_link(link, SNR_DB, precision, seed, steps.part(precision.limit)).items():
+        for name, curve in run_link(
+            link, SNR_DB, precision, seed, steps.part(precision.limit)
+        ).items():
             curves[link.name if name == "delay" else f"{link.name}, {name.split()[1]}"] = curve
     progress(precision.limit * len(all_links), precision.limit * len(all_links))
     closed = theory()
     lines = [c.table().assign(curve=name) for name, c in curves.items()]
-    lines += [pd.DataFrame({"curve": f"theory, exact prediction, T = {t}", "snr_db": SNR_DB, "rate": p}) for t, p in closed.items()]
+    lines += [
+        pd.DataFrame({"curve": f"theory, exact prediction, T = {t}", "snr_db": SNR_DB, "rate": p})
+        for t, p in closed.items()
+    ]
     settings = {
-        "quick": quick, "seed": seed, "frames": {name: len(c.events) for name, c in curves.items()}, "symbols_per_frame": 120,
-        "snr": "per complex IF sample and receive antenna, line of sight, before processing", "interval": INTERVAL,
-        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or {precision.limit} frames",
+        "quick": quick,
+        "seed": seed,
+        "frames": {name: len(c.events) for name, c in curves.items()},
+        "symbols_per_frame": 120,
+        "snr": "per complex IF sample and receive antenna, line of sight, before processing",
+        "interval": INTERVAL,
+        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or "
+        f"{precision.limit} frames",
         "prediction_error": f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s",
-    }  # fmt: skip
-    return Outcome("fig12", "Delay symbol error rate", {"fig12": pd.concat(lines)}, _figure(curves, closed), _verdicts(curves), settings)
+    }
+    return Outcome(
+        "fig12",
+        "Delay symbol error rate",
+        {"fig12": pd.concat(lines)},
+        _figure(curves, closed),
+        _verdicts(curves),
+        settings,
+    )
 
 
 _LOOKS = {
@@ -83,47 +129,89 @@ def _figure(curves: dict[str, Curve], closed: dict[str, np.ndarray]) -> Figure:
             ax.plot(SNR_DB, p, color="k", lw=0.9, label=label)
         for i, (name, (look, label)) in enumerate(_LOOKS.items()):
             draw_rate(ax, curves[name], look, f"C{i % 10}", label)
-        ax.set(xlabel="SNR per sample and antenna [dB]", ylabel="delay symbol error rate", yscale="log", ylim=(3e-4, 1.5), xlim=(-36, -18))
+        ax.set(
+            xlabel="SNR per sample and antenna [dB]",
+            ylabel="delay symbol error rate",
+            yscale="log",
+            ylim=(3e-4, 1.5),
+            xlim=(-36, -18),
+        )
         ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
 def draw_rate(ax, curve: Curve, look: str, colour: str, label: str, zeros: bool = False) -> None:
-    """A rate with its intervals; `zeros`: points without events too, which a logarithmic axis cannot show."""
+    """A rate with its intervals; `zeros`: points without events too, which a logarithmic axis
+    cannot show."""
     t = curve.table()
     t = t if zeros else t[t.events > 0]
-    ax.errorbar(t.snr_db, t.rate, [t.rate - t.low, t.high - t.rate], fmt=look, color=colour, label=label, capsize=1.5, elinewidth=0.6)
+    ax.errorbar(
+        t.snr_db,
+        t.rate,
+        [t.rate - t.low, t.high - t.rate],
+        fmt=look,
+        color=colour,
+        label=label,
+        capsize=1.5,
+        elinewidth=0.6,
+    )
 
 
 def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
     eight, short = curves["D = 8"], curves["T = 25.6 us"]
     counts = [curves[f"D = {d}"].at(-30) for d in MODULATION_ORDERS]
     chance = stats.chi2_contingency([[k, n - k] for k, n in counts]).pvalue
-    rates = "; ".join(f"D = {d}: {proportion(*c)}" for d, c in zip(MODULATION_ORDERS, counts, strict=True))
+    rates = "; ".join(
+        f"D = {d}: {proportion(*c)}" for d, c in zip(MODULATION_ORDERS, counts, strict=True)
+    )
     later = difference(short, eight, 0.5)
     return (
-        Verdict("For T = 51.2 us the SER remains largely unchanged as D grows", "holds" if chance > 0.01 else "does not hold",
-                f"at -30 dB {rates}; equal with p = {chance:.2f}. Exactly so: turning a chirp leaves every power as it was"),
-        Verdict("With T = 25.6 us the SER is higher, as the time-bandwidth product is smaller",
-                "holds" if later[1] > 0 else "does not hold",
-                f"SER 0.5 at {decibels(eight.threshold(0.5))} (51.2 us) and {decibels(short.threshold(0.5))} (25.6 us, all times "
-                f"halved): {decibels(later)} later; at -25 dB {eight.text(-25)} with 51.2 us"),
-        clutter_verdict("Urban clutter degrades the delay demodulation to a certain degree", eight, curves["clutter"],
-                        curves["clutter, filtered"], curves["clutter, profile known"]),
-        Verdict("The symbol is floor(peak - prediction)", "does not hold",
-                f"with the prediction's fraction kept, at a random fraction of a cell, {curves['random fraction, floor'].text(-18)} fail "
-                f"at -18 dB; derotating by the prediction first, {curves['random fraction'].text(-18)}"),
-    )  # fmt: skip
+        Verdict(
+            "For T = 51.2 us the SER remains largely unchanged as D grows",
+            "holds" if chance > 0.01 else "does not hold",
+            f"at -30 dB {rates}; equal with p = {chance:.2f}. Exactly so: turning a chirp leaves "
+            "every power as it was",
+        ),
+        Verdict(
+            "With T = 25.6 us the SER is higher, as the time-bandwidth product is smaller",
+            "holds" if later[1] > 0 else "does not hold",
+            f"SER 0.5 at {decibels(eight.threshold(0.5))} (51.2 us) and "
+            f"{decibels(short.threshold(0.5))} (25.6 us, all times "
+            f"halved): {decibels(later)} later; at -25 dB {eight.text(-25)} with 51.2 us",
+        ),
+        clutter_verdict(
+            "Urban clutter degrades the delay demodulation to a certain degree",
+            eight,
+            curves["clutter"],
+            curves["clutter, filtered"],
+            curves["clutter, profile known"],
+        ),
+        Verdict(
+            "The symbol is floor(peak - prediction)",
+            "does not hold",
+            "with the prediction's fraction kept, at a random fraction of a cell, "
+            f"{curves['random fraction, floor'].text(-18)} fail "
+            f"at -18 dB; derotating by the prediction first, {curves['random fraction'].text(-18)}",
+        ),
+    )
 
 
-def clutter_verdict(claim: str, without: Curve, alone: Curve, filtered: Curve, known: Curve, level: float = 0.1) -> Verdict:
-    """Robust if a tenth at most fails at -18 dB without knowledge of the clutter, with or without the filter; else under a condition."""
+def clutter_verdict(
+    claim: str, without: Curve, alone: Curve, filtered: Curve, known: Curve, level: float = 0.1
+) -> Verdict:
+    """Robust if a tenth at most fails at -18 dB without knowledge of the clutter, with or without
+    the filter; else under a condition."""
     cases = {"nothing known": alone, "the filter": filtered, "its profile known": known}
     robust = {name: c.at(-18)[0] / c.at(-18)[1] <= level for name, c in cases.items()}
     judged: Judgement = "does not hold" if not any(robust.values()) else "holds under a condition"
     if robust["nothing known"] or robust["the filter"]:
         judged = "holds"
     shown = "; ".join(f"with {name} {c.text(-18)}" for name, c in cases.items())
-    return Verdict(claim, judged, f"at -18 dB {shown} fail, without clutter {without.text(-18)}. SER {level} at "
-                   f"{decibels(known.threshold(level))} with the profile, {decibels(filtered.threshold(level))} with the filter and "
-                   f"{decibels(without.threshold(level))} without clutter")  # fmt: skip
+    return Verdict(
+        claim,
+        judged,
+        f"at -18 dB {shown} fail, without clutter {without.text(-18)}. SER {level} at "
+        f"{decibels(known.threshold(level))} with the profile, "
+        f"{decibels(filtered.threshold(level))} with the filter and "
+        f"{decibels(without.threshold(level))} without clutter",
+    )

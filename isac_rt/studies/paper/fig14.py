@@ -1,4 +1,5 @@
-"""Fig. 14: hit rate against SNR of the AT, the PT, conventional TDM-MIMO FMCW and mmWave-LoRadar."""
+"""Fig. 14: hit rate against SNR of the AT, the PT, conventional TDM-MIMO FMCW and
+mmWave-LoRadar."""
 
 from __future__ import annotations
 
@@ -30,14 +31,47 @@ CASES = (
     Case(name="LoRadar", kind="LoRadar", snr_db=_RADAR, speed=_THIRD),
     Case(name="AT, M = 1", kind="AT", snr_db=_AT, unwindowed=True),
     Case(name="AT, M = 3", kind="AT", snr_db=_UNITED, groups=3),
-    Case(name="AT, M = 1, clutter, moving", kind="AT", snr_db=_CLUTTERED, fixed=True, clutter=True, filtered=True),
-    Case(name="AT, M = 1, clutter, at rest", kind="AT", snr_db=(-34.0, -20.0), fixed=True, clutter=True, filtered=True, speed=0.0),
+    Case(
+        name="AT, M = 1, clutter, moving",
+        kind="AT",
+        snr_db=_CLUTTERED,
+        fixed=True,
+        clutter=True,
+        filtered=True,
+    ),
+    Case(
+        name="AT, M = 1, clutter, at rest",
+        kind="AT",
+        snr_db=(-34.0, -20.0),
+        fixed=True,
+        clutter=True,
+        filtered=True,
+        speed=0.0,
+    ),
     Case(name="PT", kind="PT", snr_db=_PT, orders=MODULATION_ORDERS),
     Case(name="PT, T = 25.6 us", kind="PT", snr_db=_PT, samples=512),
     Case(name="PT, known", kind="PT", snr_db=_AT, known=True),
     Case(name="PT, at rest", kind="PT", snr_db=_PT, fixed=True, speed=0.0, gated=True),
-    Case(name="PT, clutter, filtered", kind="PT", snr_db=_PT, fixed=True, speed=0.0, gated=True, clutter=True, filtered=True),
-    Case(name="PT, clutter, profile known", kind="PT", snr_db=_PT, fixed=True, speed=0.0, gated=True, clutter=True, profile=True),
+    Case(
+        name="PT, clutter, filtered",
+        kind="PT",
+        snr_db=_PT,
+        fixed=True,
+        speed=0.0,
+        gated=True,
+        clutter=True,
+        filtered=True,
+    ),
+    Case(
+        name="PT, clutter, profile known",
+        kind="PT",
+        snr_db=_PT,
+        fixed=True,
+        speed=0.0,
+        gated=True,
+        clutter=True,
+        profile=True,
+    ),
 )
 
 
@@ -49,22 +83,37 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     for case in CASES:
         precision = Precision(limits[case.name], absolute=0.01 if quick else 0.04)
         part = steps.part(precision.limit)
-        found = sample(partial(count_hits, case, seed), np.array(case.snr_db), precision, part, key=f"{seed} {case}")
+        found = sample(
+            partial(count_hits, case, seed),
+            np.array(case.snr_db),
+            precision,
+            part,
+            key=f"{seed} {case}",
+        )
         curves |= {f"{case.name}: {name}": curve for name, curve in found.items()}
     progress(sum(limits.values()), sum(limits.values()))
     table = pd.concat([c.table().assign(curve=name) for name, c in curves.items()])
     settings = {
-        "quick": quick, "seed": seed, "frames": {name: len(c.events) for name, c in curves.items()}, "interval": INTERVAL,
-        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or the limit", "limits": limits,
+        "quick": quick,
+        "seed": seed,
+        "frames": {name: len(c.events) for name, c in curves.items()},
+        "interval": INTERVAL,
+        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or the limit",
+        "limits": limits,
         "snr": "per complex IF sample and receive antenna, before processing",
-        "hit": "range, velocity and both direction cosines of the map's strongest cell within one resolution",
-        "targets": f"{NEAREST:g} to {FARTHEST:g} m, up to {FASTEST} of the unambiguous velocity (radars: of a third of it)",
-    }  # fmt: skip
-    return Outcome("fig14", "Hit rate", {"fig14": table}, _figure(curves), _verdicts(curves), settings)
+        "hit": "range, velocity and both direction cosines of the map's strongest cell within one "
+        "resolution",
+        "targets": f"{NEAREST:g} to {FARTHEST:g} m, up to {FASTEST} of the unambiguous velocity "
+        "(radars: of a third of it)",
+    }
+    return Outcome(
+        "fig14", "Hit rate", {"fig14": table}, _figure(curves), _verdicts(curves), settings
+    )
 
 
 def _limit(case: Case, quick: bool) -> int:
-    """Frames at most: more where a frame takes little time and the threshold is compared with others."""
+    """Frames at most: more where a frame takes little time and the threshold is compared with
+    others."""
     return 8 if quick else 120 if case.name in ("FMCW", "AT, M = 1") else 48
 
 
@@ -80,7 +129,10 @@ _LEFT = {
     "PT, known: data known": ("v--", "PT, data known"),
 }
 _RIGHT = {
-    **{f"PT: D = {d}": (f"{m}-", f"PT, D = {d}, T = 51.2 us") for d, m in zip(MODULATION_ORDERS, "osD^", strict=True)},
+    **{
+        f"PT: D = {d}": (f"{m}-", f"PT, D = {d}, T = 51.2 us")
+        for d, m in zip(MODULATION_ORDERS, "osD^", strict=True)
+    },
     "PT, T = 25.6 us: D = 8": ("v--", "PT, D = 8, T = 25.6 us"),
     "PT, at rest: D = 8": ("1:", "PT1 at its place in Table II, at rest"),
     "PT, clutter, filtered: D = 8": ("+:", "the same, clutter filtered"),
@@ -101,32 +153,59 @@ def _figure(curves: dict[str, Curve]) -> Figure:
 
 
 def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
-    pt, known, fmcw, at = curves["PT: D = 8"], curves["PT, known: data known"], curves["FMCW: hits"], curves["AT, M = 1: hits"]
+    pt, known, fmcw, at = (
+        curves["PT: D = 8"],
+        curves["PT, known: data known"],
+        curves["FMCW: hits"],
+        curves["AT, M = 1: hits"],
+    )
     spent, half = difference(pt, known, 0.5), pt.threshold(0.5)
     follows: Judgement = "holds" if spent[1] > 3 else "does not hold"
     later = difference(curves["PT, T = 25.6 us: D = 8"], pt, 0.5)
     superior, plain = difference(at, fmcw, 0.5), curves["AT, M = 1: hits, no window"].threshold(0.5)
     united = difference(curves["AT, M = 3: hits, united"], fmcw, 0.5)
-    better: Judgement = "does not hold" if superior[1] <= 0 else "holds under a condition" if united[2] < 0 else "holds"
+    better: Judgement = (
+        "does not hold"
+        if superior[1] <= 0
+        else "holds under a condition"
+        if united[2] < 0
+        else "holds"
+    )
     w = Waveform()
     ranges = [part * w.num_samples * w.range_cell(2) for part in (0.5, 1.0)]
     return (
-        Verdict("The hit rate at the PT follows the delay demodulation", follows,
-                f"half of the frames hit at {decibels(half)}, where the delay SER is {curves['PT: D = 8, delay errors'].text(half[0])}; "
-                f"with the data known at {decibels(known.threshold(0.5))}, {decibels(spent)} earlier"),
+        Verdict(
+            "The hit rate at the PT follows the delay demodulation",
+            follows,
+            f"half of the frames hit at {decibels(half)}, where the delay SER is "
+            f"{curves['PT: D = 8, delay errors'].text(half[0])}; "
+            f"with the data known at {decibels(known.threshold(0.5))}, {decibels(spent)} earlier",
+        ),
         _orders(curves),
-        Verdict("A smaller T lowers the hit rate", "holds" if later[1] > 0 else "does not hold",
-                f"D = 8, T = 25.6 us (all times halved): half hit {decibels(later)} later"),
+        Verdict(
+            "A smaller T lowers the hit rate",
+            "holds" if later[1] > 0 else "does not hold",
+            f"D = 8, T = 25.6 us (all times halved): half hit {decibels(later)} later",
+        ),
         _clutter(curves),
-        Verdict("TDM-MIMO FMCW's hit rate is higher, the proposed scheme's slightly lower", better,
-                f"half hit at {decibels(fmcw.threshold(0.5))} (FMCW), {decibels(at.threshold(0.5))} (AT, one group, OMP) and "
-                f"{decibels(half)} (PT); AT without a range window {decibels(plain)}; with three groups united "
-                f"{decibels(united)} after FMCW (negative: earlier). FMCW within a third of the velocities alone: over all "
-                f"of them {curves['FMCW, full velocity range: hits'].text(-36)}"),
+        Verdict(
+            "TDM-MIMO FMCW's hit rate is higher, the proposed scheme's slightly lower",
+            better,
+            f"half hit at {decibels(fmcw.threshold(0.5))} (FMCW), {decibels(at.threshold(0.5))} "
+            "(AT, one group, OMP) and "
+            f"{decibels(half)} (PT); AT without a range window {decibels(plain)}; with three "
+            "groups united "
+            f"{decibels(united)} after FMCW (negative: earlier). FMCW within a third of the "
+            "velocities alone: over all "
+            f"of them {curves['FMCW, full velocity range: hits'].text(-36)}",
+        ),
         _loradar(curves, at),
-        Verdict("The unambiguous distance is smaller than FMCW's", "holds", f"AT {ranges[0]:.1f} m, FMCW {ranges[1]:.1f} m: half of the "
-                "cells are the data's"),
-    )  # fmt: skip
+        Verdict(
+            "The unambiguous distance is smaller than FMCW's",
+            "holds",
+            f"AT {ranges[0]:.1f} m, FMCW {ranges[1]:.1f} m: half of the cells are the data's",
+        ),
+    )
 
 
 def _orders(curves: dict[str, Curve]) -> Verdict:
@@ -135,20 +214,33 @@ def _orders(curves: dict[str, Curve]) -> Verdict:
     spread = max(t[0] for t in at.values()) - min(t[0] for t in at.values())
     together = all(a[1] <= b[2] for a in at.values() for b in at.values())
     text = "; ".join(f"D = {d}: {decibels(t)}" for d, t in at.items())
-    return Verdict("The hit rate does not change much with D", "holds" if together or spread < 1 else "does not hold",
-                   f"half hit at {text}; {spread:.2f} dB apart")  # fmt: skip
+    return Verdict(
+        "The hit rate does not change much with D",
+        "holds" if together or spread < 1 else "does not hold",
+        f"half hit at {text}; {spread:.2f} dB apart",
+    )
 
 
 def _clutter(curves: dict[str, Curve]) -> Verdict:
     rest, known = curves["PT, at rest: D = 8"], curves["PT, clutter, profile known: D = 8"]
-    filtered, moving = curves["PT, clutter, filtered: D = 8"], curves["AT, M = 1, clutter, moving: hits"]
+    filtered, moving = (
+        curves["PT, clutter, filtered: D = 8"],
+        curves["AT, M = 1, clutter, moving: hits"],
+    )
     robust = [c.at(100.0)[0] / c.at(100.0)[1] >= 0.9 for c in (known, filtered, moving)]
-    judged: Judgement = "holds" if all(robust) else "holds under a condition" if any(robust) else "does not hold"
-    return Verdict("Urban clutter degrades the hit rate, which stays favourable", judged,
-                   f"PT1 at rest at -22 dB: {rest.text(-22)} without clutter, {filtered.text(-22)} with the paper's filter, "
-                   f"{known.text(-22)} with the clutter's profile known; AT at -20 dB with the filter: moving targets "
-                   f"{moving.text(-20)}, half of them from {decibels(moving.threshold(0.5))} on, at rest "
-                   f"{curves['AT, M = 1, clutter, at rest: hits'].text(-20)}")  # fmt: skip
+    judged: Judgement = (
+        "holds" if all(robust) else "holds under a condition" if any(robust) else "does not hold"
+    )
+    return Verdict(
+        "Urban clutter degrades the hit rate, which stays favourable",
+        judged,
+        f"PT1 at rest at -22 dB: {rest.text(-22)} without clutter, {filtered.text(-22)} with the "
+        "paper's filter, "
+        f"{known.text(-22)} with the clutter's profile known; AT at -20 dB with the filter: moving "
+        "targets "
+        f"{moving.text(-20)}, half of them from {decibels(moving.threshold(0.5))} on, at rest "
+        f"{curves['AT, M = 1, clutter, at rest: hits'].text(-20)}",
+    )
 
 
 def _loradar(curves: dict[str, Curve], at: Curve) -> Verdict:
@@ -156,8 +248,21 @@ def _loradar(curves: dict[str, Curve], at: Curve) -> Verdict:
     apart = {way: difference(curves[f"LoRadar: {name}"], at, 0.5) for way, name in ways.items()}
     united = difference(curves["LoRadar: phase"], curves["AT, M = 3: hits, united"], 0.5)
     lows = [a[1] > 0 for a in apart.values()]
-    judged: Judgement = "holds" if all(lows) else "holds under a condition" if any(lows) or united[1] > 0 else "does not hold"
+    judged: Judgement = (
+        "holds"
+        if all(lows)
+        else "holds under a condition"
+        if any(lows) or united[1] > 0
+        else "does not hold"
+    )
     half = {way: decibels(curves[f"LoRadar: {name}"].threshold(0.5)) for way, name in ways.items()}
-    text = "; ".join(f"{way}: half hit at {half[way]}, {decibels(a)} after the AT's one group with OMP" for way, a in apart.items())
-    return Verdict("The proposed scheme's hit rate is higher than mmWave-LoRadar's", judged,
-                   f"{text}; phases compensated, {decibels(united)} after three groups united (negative: earlier)")  # fmt: skip
+    text = "; ".join(
+        f"{way}: half hit at {half[way]}, {decibels(a)} after the AT's one group with OMP"
+        for way, a in apart.items()
+    )
+    return Verdict(
+        "The proposed scheme's hit rate is higher than mmWave-LoRadar's",
+        judged,
+        f"{text}; phases compensated, {decibels(united)} after three groups united (negative: "
+        "earlier)",
+    )

@@ -1,7 +1,9 @@
-"""Fig. 5: the four antenna schedules, and what each does to the velocity spectrum of one target, on the exact signal.
+"""Fig. 5: the four antenna schedules, and what each does to the velocity spectrum of one target, on
+the exact signal.
 
-Each schedule is processed as the paper does, one group at a time (the mean of the groups' maps), and with all groups united, which
-for three groups under the Latin constraint samples every antenna in every slot.
+Each schedule is processed as the paper does, one group at a time (the mean of the groups' maps),
+and with all groups united, which for three groups under the Latin constraint samples every antenna
+in every slot.
 """
 
 from __future__ import annotations
@@ -22,7 +24,12 @@ from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
 
-NAMES = {"a": "conventional TDM-MIMO", "b": "pseudo-random TDM-MIMO", "c": "conventional, 3 groups", "d": "pseudo-random, 3 groups"}
+NAMES = {
+    "a": "conventional TDM-MIMO",
+    "b": "pseudo-random TDM-MIMO",
+    "c": "conventional, 3 groups",
+    "d": "pseudo-random, 3 groups",
+}
 RANGE, VELOCITY_SHARE = 23.7, 0.23
 """Of the target: range [m], and radial velocity as a share of the unambiguous one."""
 _EQUAL_DB = 1.0
@@ -56,21 +63,36 @@ def schedules(seed: int) -> dict[str, Schedule]:
     w = Waveform()
     shape = (w.num_chirps, w.num_tx)
     return {
-        "a": conventional_schedule(1, *shape), "b": pseudo_random_schedule(1, *shape, generator(seed, "fig5", "b")),
-        "c": conventional_schedule(3, *shape), "d": pseudo_random_schedule(3, *shape, generator(seed, "fig5", "d")),
-    }  # fmt: skip
+        "a": conventional_schedule(1, *shape),
+        "b": pseudo_random_schedule(1, *shape, generator(seed, "fig5", "b")),
+        "c": conventional_schedule(3, *shape),
+        "d": pseudo_random_schedule(3, *shape, generator(seed, "fig5", "d")),
+    }
 
 
 def spectra(scheme: str, schedule: Schedule) -> list[Spectrum]:
     """Spectra group by group and, for several groups, united."""
     w = replace(Waveform(), num_groups=len(schedule))
-    velocity, arrays, pilot = VELOCITY_SHARE * w.max_velocity(2), onepath.antennas(w, 2), unmodulated(w)
-    cube = onepath.frame(w, schedule, pilot, arrays, delay=2 * RANGE / SPEED_OF_LIGHT, rate=2 * velocity / SPEED_OF_LIGHT)
+    velocity, arrays, pilot = (
+        VELOCITY_SHARE * w.max_velocity(2),
+        onepath.antennas(w, 2),
+        unmodulated(w),
+    )
+    cube = onepath.frame(
+        w,
+        schedule,
+        pilot,
+        arrays,
+        delay=2 * RANGE / SPEED_OF_LIGHT,
+        rate=2 * velocity / SPEED_OF_LIGHT,
+    )
     clean = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
     single = replace(w, num_groups=1)
     rows = []
     for m in range(w.num_groups):
-        maps = channel_maps(clean[m : m + 1], single, schedule[m : m + 1], pilot.delay_symbols[m : m + 1])
+        maps = channel_maps(
+            clean[m : m + 1], single, schedule[m : m + 1], pilot.delay_symbols[m : m + 1]
+        )
         power = accumulate(maps)
         rows.append(power[power.max(axis=1).argmax()])
     out = [judge(scheme, False, np.mean(rows, axis=0), w)]
@@ -89,7 +111,14 @@ def judge(scheme: str, united: bool, power: np.ndarray, w: Waveform) -> Spectrum
     second = apart[elsewhere & (level > -_EQUAL_DB)]
     velocity = doppler_bins(w) * w.velocity_cell(2)
     bins = int(second.min()) if second.size else count
-    return Spectrum(scheme, united, velocity, level, bins / 2 * w.velocity_cell(2), float(level[elsewhere].max()))
+    return Spectrum(
+        scheme,
+        united,
+        velocity,
+        level,
+        bins / 2 * w.velocity_cell(2),
+        float(level[elsewhere].max()),
+    )
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
@@ -98,38 +127,91 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     for i, (scheme, schedule) in enumerate(chosen.items()):
         found += spectra(scheme, schedule)
         progress(i + 1, len(chosen))
-    summary = pd.DataFrame([{"scheme": s.scheme, "groups_united": s.united, "unambiguous_velocity_mps": s.unambiguous,
-                             "highest_sidelobe_db": s.sidelobe_db} for s in found])  # fmt: skip
-    curves = pd.concat([pd.DataFrame({"scheme": s.scheme, "groups_united": s.united, "velocity_mps": s.velocity,
-                                      "power_db": s.power_db}) for s in found])  # fmt: skip
-    slots = pd.DataFrame([{"scheme": k, "group": m, "slot": p, "antenna": int(v[m, p])} for k, v in chosen.items()
-                          for m in range(len(v)) for p in range(v.shape[1])])  # fmt: skip
+    summary = pd.DataFrame(
+        [
+            {
+                "scheme": s.scheme,
+                "groups_united": s.united,
+                "unambiguous_velocity_mps": s.unambiguous,
+                "highest_sidelobe_db": s.sidelobe_db,
+            }
+            for s in found
+        ]
+    )
+    curves = pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "scheme": s.scheme,
+                    "groups_united": s.united,
+                    "velocity_mps": s.velocity,
+                    "power_db": s.power_db,
+                }
+            )
+            for s in found
+        ]
+    )
+    slots = pd.DataFrame(
+        [
+            {"scheme": k, "group": m, "slot": p, "antenna": int(v[m, p])}
+            for k, v in chosen.items()
+            for m in range(len(v))
+            for p in range(v.shape[1])
+        ]
+    )
     true_velocity = VELOCITY_SHARE * Waveform().max_velocity(2)
-    settings = {"quick": quick, "seed": seed, "range_m": RANGE, "velocity_mps": true_velocity, "noise": "none", "window": "Hann"}
+    settings = {
+        "quick": quick,
+        "seed": seed,
+        "range_m": RANGE,
+        "velocity_mps": true_velocity,
+        "noise": "none",
+        "window": "Hann",
+    }
     tables = {"summary": summary, "spectra": curves, "schedules": slots}
-    return Outcome("fig5", "Antenna schedules", tables, _figure(chosen, found), _verdicts(found), settings)
+    return Outcome(
+        "fig5", "Antenna schedules", tables, _figure(chosen, found), _verdicts(found), settings
+    )
 
 
 def _verdicts(found: list[Spectrum]) -> tuple[Verdict, ...]:
     by = {(s.scheme, s.united): s for s in found}
-    a, b, c, d, united_c, united_d = (by[k] for k in (("a", False), ("b", False), ("c", False), ("d", False), ("c", True), ("d", True)))
+    a, b, c, d, united_c, united_d = (
+        by[k]
+        for k in (("a", False), ("b", False), ("c", False), ("d", False), ("c", True), ("d", True))
+    )
 
     def text(s: Spectrum) -> str:
         level = round(s.sidelobe_db, 1) + 0.0  # no "-0.0"
-        return f"({s.scheme}){' united' if s.united else ''} {s.unambiguous:.2f} m/s, highest other peak {level:.1f} dB"
+        return (
+            f"({s.scheme}){' united' if s.united else ''} {s.unambiguous:.2f} m/s, highest "
+            f"other peak {level:.1f} dB"
+        )
 
     # the spacing of the ambiguities is a whole number of bins, so that the ratio is exact
     gain = all(abs(s.unambiguous / a.unambiguous - 3) < 1e-9 for s in (b, d))
     reduced = a.sidelobe_db > -_EQUAL_DB and a.unambiguous < b.unambiguous
     return (
-        Verdict("Conventional TDM-MIMO reduces the unambiguous velocity", "holds" if reduced else "does not hold", text(a)),
-        Verdict("Pseudo-random TDM-MIMO makes it L_tx times larger", "holds" if gain else "does not hold",
-                f"{text(a)}; {text(b)}; {text(d)}"),
-        Verdict("With 3 groups the pseudo-random order is needed for it",
-                "holds under a condition" if united_c.sidelobe_db < -20 and c.sidelobe_db > -_EQUAL_DB else "holds",
-                f"only when each group is processed alone: {text(c)}; {text(united_c)}; {text(united_d)}; by the Latin property the "
-                "groups together sample every antenna in every slot, whatever the order"),
-    )  # fmt: skip
+        Verdict(
+            "Conventional TDM-MIMO reduces the unambiguous velocity",
+            "holds" if reduced else "does not hold",
+            text(a),
+        ),
+        Verdict(
+            "Pseudo-random TDM-MIMO makes it L_tx times larger",
+            "holds" if gain else "does not hold",
+            f"{text(a)}; {text(b)}; {text(d)}",
+        ),
+        Verdict(
+            "With 3 groups the pseudo-random order is needed for it",
+            "holds under a condition"
+            if united_c.sidelobe_db < -20 and c.sidelobe_db > -_EQUAL_DB
+            else "holds",
+            f"only when each group is processed alone: {text(c)}; {text(united_c)}; "
+            f"{text(united_d)}; by the Latin property the "
+            "groups together sample every antenna in every slot, whatever the order",
+        ),
+    )
 
 
 def _figure(chosen: dict[str, Schedule], found: list[Spectrum]) -> Figure:
@@ -138,11 +220,26 @@ def _figure(chosen: dict[str, Schedule], found: list[Spectrum]) -> Figure:
         for (scheme, schedule), (left, right) in zip(chosen.items(), axes, strict=True):
             _slots(left, scheme, schedule)
             for s in (x for x in found if x.scheme == scheme):
-                how, colour = ("groups united", "#D55E00") if s.united else ("each group alone", "#0072B2")
-                right.plot(s.velocity, s.power_db, "-" if s.united or len(schedule) == 1 else "--", color=colour,
-                           label=f"{how}: unambiguous to {s.unambiguous:.2f} m/s")  # fmt: skip
-            right.axvline(VELOCITY_SHARE * Waveform().max_velocity(2), color="#303030", lw=0.8, ls=":", label="true velocity")
-            right.set(ylim=(-60, 30), xlim=(-15, 15), ylabel="power [dB]", xlabel="radial velocity [m/s]")
+                how, colour = (
+                    ("groups united", "#D55E00") if s.united else ("each group alone", "#0072B2")
+                )
+                right.plot(
+                    s.velocity,
+                    s.power_db,
+                    "-" if s.united or len(schedule) == 1 else "--",
+                    color=colour,
+                    label=f"{how}: unambiguous to {s.unambiguous:.2f} m/s",
+                )
+            right.axvline(
+                VELOCITY_SHARE * Waveform().max_velocity(2),
+                color="#303030",
+                lw=0.8,
+                ls=":",
+                label="true velocity",
+            )
+            right.set(
+                ylim=(-60, 30), xlim=(-15, 15), ylabel="power [dB]", xlabel="radial velocity [m/s]"
+            )
             right.legend(loc="upper right", ncols=2, fontsize=6.5)
     return figure
 

@@ -1,8 +1,10 @@
-"""Fig. 8: velocity by OMP from pseudo-random pulses and by FFT from conventional ones, in a target's range cell after the range transform.
+"""Fig. 8: velocity by OMP from pseudo-random pulses and by FFT from conventional ones, in a
+target's range cell after the range transform.
 
-One antenna has P/L_tx = 40 of the 120 slots. Conventional TDM takes every third, which folds velocities beyond a third of the range;
-pseudo-random TDM one at random of every three, with 120 hypotheses. The paper does not say how many pulses either curve has: here both
-have 40, and beside it OMP has all 120 slots. With one path and one atom OMP is the strongest correlation.
+One antenna has P/L_tx = 40 of the 120 slots. Conventional TDM takes every third, which folds
+velocities beyond a third of the range; pseudo-random TDM one at random of every three, with 120
+hypotheses. The paper does not say how many pulses either curve has: here both have 40, and beside
+it OMP has all 120 slots. With one path and one atom OMP is the strongest correlation.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ VECTORS = 50
 
 @dataclass(frozen=True)
 class Case:
-    """`span`: share of the velocity range in use (1/3 is the FFT's own); `pulses` that OMP has; channels summed in power."""
+    """`span`: share of the velocity range in use (1/3 is the FFT's own); `pulses` that OMP has;
+    channels summed in power."""
 
     name: str
     span: float
@@ -50,20 +53,38 @@ CASES = (
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Batches of 50 velocities until every 95 % interval is small enough; `quick` stops at 20 batches (4 for 45 channels)."""
+    """Batches of 50 velocities until every 95 % interval is small enough; `quick` stops at 20
+    batches (4 for 45 channels)."""
     steps = Steps(progress, sum(_limit(case, quick) for case in CASES))
     curves: dict[str, Curve] = {}
     for case in CASES:
         precision = Precision(_limit(case, quick), absolute=0.02 if quick else 0.005)
-        found = sample(partial(hits, case, seed), SNR_DB, precision, steps.part(precision.limit), key=f"{seed} {case}")
+        found = sample(
+            partial(hits, case, seed),
+            SNR_DB,
+            precision,
+            steps.part(precision.limit),
+            key=f"{seed} {case}",
+        )
         curves |= {f"{case.name}: {name}": c for name, c in found.items()}
     table = pd.concat([c.table().assign(curve=name) for name, c in curves.items()])
     settings = {
-        "quick": quick, "seed": seed, "trials": {name: VECTORS * len(c.events) for name, c in curves.items()},
-        "stop": f"half-width <= max(0.1 p, {0.02 if quick else 0.005}) or the limit of batches", "interval": INTERVAL,
-        "snr": "per pulse after the range transform; 30.1 dB less per IF sample", "hit": "velocity error below one Doppler bin",
-    }  # fmt: skip
-    return Outcome("fig8", "Velocity by OMP and by FFT", {"fig8": table}, _figure(curves), _verdicts(curves), settings)
+        "quick": quick,
+        "seed": seed,
+        "trials": {name: VECTORS * len(c.events) for name, c in curves.items()},
+        "stop": f"half-width <= max(0.1 p, {0.02 if quick else 0.005}) or the limit of batches",
+        "interval": INTERVAL,
+        "snr": "per pulse after the range transform; 30.1 dB less per IF sample",
+        "hit": "velocity error below one Doppler bin",
+    }
+    return Outcome(
+        "fig8",
+        "Velocity by OMP and by FFT",
+        {"fig8": table},
+        _figure(curves),
+        _verdicts(curves),
+        settings,
+    )
 
 
 def _limit(case: Case, quick: bool) -> int:
@@ -75,10 +96,16 @@ def hits(case: Case, seed: int, index: int) -> Counts:
     rng = generator(seed, "fig8", case.name, index)
     bins = rng.uniform(-0.5, 0.5, VECTORS) * (SLOTS * case.span - 1)
     bins = bins if case.off_grid else np.round(bins)
-    chosen = np.flatnonzero(pseudo_random_schedule(1, SLOTS, 3, rng)[0] == 0) if case.pulses == PULSES else np.arange(SLOTS)
+    chosen = (
+        np.flatnonzero(pseudo_random_schedule(1, SLOTS, 3, rng)[0] == 0)
+        if case.pulses == PULSES
+        else np.arange(SLOTS)
+    )
     regular = np.arange(0, SLOTS, 3)
     phases = np.exp(2j * np.pi * rng.random((VECTORS, case.channels, 1)))
-    noise = (rng.standard_normal((VECTORS, case.channels, SLOTS, 2)) / np.sqrt(2)).view(complex)[..., 0]
+    noise = (rng.standard_normal((VECTORS, case.channels, SLOTS, 2)) / np.sqrt(2)).view(complex)[
+        ..., 0
+    ]
     signal = phases * np.exp(2j * np.pi * bins[:, None, None] * np.arange(SLOTS) / SLOTS)
     found: dict[str, list[int]] = {"OMP": [], "FFT": []}
     for level in 10 ** (-SNR_DB / 20):
@@ -90,7 +117,8 @@ def hits(case: Case, seed: int, index: int) -> Counts:
 
 
 def _count(spectra: np.ndarray, bins: np.ndarray) -> int:
-    """Of (V, channels, bins) spectra in FFT order: how many have their strongest summed power within a bin of the truth."""
+    """Of (V, channels, bins) spectra in FFT order: how many have their strongest summed power
+    within a bin of the truth."""
     size = spectra.shape[-1]
     best = np.fft.fftfreq(size, 1 / size)[(np.abs(spectra) ** 2).sum(axis=1).argmax(axis=1)]
     # bins of 40 and of 120 slots are equally wide; an estimate that folds is wrong
@@ -122,20 +150,35 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
     equal, more, wide = CASES[0].name, CASES[3].name, CASES[2].name
     above, below = advantage(curves, equal)
     above_more, below_more = advantage(curves, more)
-    half = {n: decibels(curves[n].threshold(0.5)) for case in (equal, more) for n in (f"{case}: OMP", f"{case}: FFT")}
+    half = {
+        n: decibels(curves[n].threshold(0.5))
+        for case in (equal, more)
+        for n in (f"{case}: OMP", f"{case}: FFT")
+    }
     crosses = bool(above.size and below.size)
     full = {n: curves[f"{wide}: {n}"].text(SNR_DB[-1]) for n in ("OMP", "FFT")}
     above_wide, below_wide = advantage(curves, wide)
     return (
-        Verdict("At low SNR OMP finds the velocity less often than the FFT, at moderate SNR more often, at high SNR both find it",
-                "holds" if crosses else "does not hold",
-                f"40 pulses each, in the FFT's range and on its grid: half are found at {half[f'{equal}: OMP']} (OMP) and "
-                f"{half[f'{equal}: FFT']} (FFT); OMP is better beyond the intervals at {_list(above)}, worse at {_list(below)}. With all "
-                f"120 pulses OMP needs {half[f'{more}: OMP']}: better at {_list(above_more)}, worse at {_list(below_more)}. Velocities "
-                f"over the full range: better at {_list(above_wide)}, worse at {_list(below_wide)}; there the FFT folds and ends at 1/3"),
-        Verdict("Pseudo-random pulses keep the full velocity range", "holds" if above_wide.size else "does not hold",
-                f"velocities over the full range at {SNR_DB[-1]:g} dB: OMP {full['OMP']}, FFT {full['FFT']}"),
-    )  # fmt: skip
+        Verdict(
+            "At low SNR OMP finds the velocity less often than the FFT, at moderate SNR more "
+            "often, at high SNR both find it",
+            "holds" if crosses else "does not hold",
+            "40 pulses each, in the FFT's range and on its grid: half are found at "
+            f"{half[f'{equal}: OMP']} (OMP) and "
+            f"{half[f'{equal}: FFT']} (FFT); OMP is better beyond the intervals at {_list(above)}, "
+            f"worse at {_list(below)}. With all "
+            f"120 pulses OMP needs {half[f'{more}: OMP']}: better at {_list(above_more)}, worse at "
+            f"{_list(below_more)}. Velocities "
+            f"over the full range: better at {_list(above_wide)}, worse at {_list(below_wide)}; "
+            "there the FFT folds and ends at 1/3",
+        ),
+        Verdict(
+            "Pseudo-random pulses keep the full velocity range",
+            "holds" if above_wide.size else "does not hold",
+            f"velocities over the full range at {SNR_DB[-1]:g} dB: OMP {full['OMP']}, FFT "
+            f"{full['FFT']}",
+        ),
+    )
 
 
 def _list(points: np.ndarray) -> str:

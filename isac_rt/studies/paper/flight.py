@@ -1,6 +1,8 @@
-"""The flight of Table II, as printed and made consistent: who is in whose view, and the flight as the receivers saw it.
+"""The flight of Table II, as printed and made consistent: who is in whose view, and the flight as
+the receivers saw it.
 
-Figs. 9 and 10 and Table II share it. The consistent variant turns PT2 to fly along +y and PT1 to face -y.
+Figs. 9 and 10 and Table II share it. The consistent variant turns PT2 to fly along +y and PT1 to
+face -y.
 """
 
 from __future__ import annotations
@@ -28,13 +30,15 @@ def scenario(variant: str, seed: int | None = None, overrides: tuple[str, ...] =
 
     Raises
     ------
-    isac_rt.scenario.file.ScenarioError  If the file is not there: the scenes lie beside the package in its repository.
+    isac_rt.scenario.file.ScenarioError  If the file is not there: the scenes lie beside the package
+    in its repository.
     """
     return load(SCENES / VARIANTS[variant], overrides, None, seed)
 
 
 def views(scene: Scenario) -> dict[tuple[str, str], np.ndarray]:
-    """Whether each UAV has each other in its own field of view, frame by frame, from the poses alone: {(who, whom): (frames,)}."""
+    """Whether each UAV has each other in its own field of view, frame by frame, from the poses
+    alone: {(who, whom): (frames,)}."""
     w = waveform_of(scene)
     antennas, swarm = antennas_of(scene, w), Swarm.from_scenario(scene)
     poses = [swarm.poses((k + 0.5) * w.frame_duration) for k in range(scene.frames)]
@@ -51,7 +55,10 @@ def sees(antennas: Antennas, who: Pose, whom: Pose) -> bool:
 def span(seen: np.ndarray) -> str:
     """Frames in view as text: "133 to 499", "never", or several spans."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(int), [0]])))
-    return ", ".join(f"{a} to {b - 1}" for a, b in zip(edges[::2], edges[1::2], strict=True)) or "never"
+    return (
+        ", ".join(f"{a} to {b - 1}" for a, b in zip(edges[::2], edges[1::2], strict=True))
+        or "never"
+    )
 
 
 def closing_speed(scene: Scenario, who: str, whom: str) -> tuple[float, float]:
@@ -65,22 +72,34 @@ def closing_speed(scene: Scenario, who: str, whom: str) -> tuple[float, float]:
     return min(rates), max(rates)
 
 
-def fly(variant: str, observer: str, frames: int, every: int, seed: int, progress: Progress) -> xr.Dataset:
-    """One observer's part of the results over `frames` frames, `every` frames apart: the same instants as in contiguous frames.
+def fly(
+    variant: str, observer: str, frames: int, every: int, seed: int, progress: Progress
+) -> xr.Dataset:
+    """One observer's part of the results over `frames` frames, `every` frames apart: the same
+    instants as in contiguous frames.
 
-    The other passive terminal is only a target, so that its own receiver costs nothing; the AT processes each frame for itself, or none.
+    The other passive terminal is only a target, so that its own receiver costs nothing; the AT
+    processes each frame for itself, or none.
     """
     interval = every * waveform_of(scenario(variant)).frame_duration
     own = observer == "AT"
-    changes = [f"frame_interval_s={interval!r}", f"frames={frames}", f"receivers.active_every_frames={1 if own else frames}"]
+    changes = [
+        f"frame_interval_s={interval!r}",
+        f"frames={frames}",
+        f"receivers.active_every_frames={1 if own else frames}",
+    ]
     scene = scenario(variant, seed, (*changes, "swarm.PT2.role=target"))
     return simulate.run(scene, progress=progress).dataset.sel(observer=observer)
 
 
 def errors(part: xr.Dataset, uav: str, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute errors (n,) of the detected and of the tracked value, where there are both; m, m/s or degrees."""
+    """Absolute errors (n,) of the detected and of the tracked value, where there are both; m, m/s
+    or degrees."""
     one = part.sel(uav=uav)
     scale = 180 / np.pi if quantity == "azimuth" else 1.0
-    raw, fused = (np.abs((one[f"{group}_{quantity}"] - one[f"truth_{quantity}"]).values) * scale for group in ("detected", "tracked"))
+    raw, fused = (
+        np.abs((one[f"{group}_{quantity}"] - one[f"truth_{quantity}"]).values) * scale
+        for group in ("detected", "tracked")
+    )
     both = np.isfinite(raw) & np.isfinite(fused)
     return raw[both], fused[both]

@@ -1,11 +1,14 @@
-"""Hits of one target in noise, frame by frame, for figure 14: AT, PT, conventional FMCW and mmWave-LoRadar.
+"""Hits of one target in noise, frame by frame, for figure 14: AT, PT, conventional FMCW and
+mmWave-LoRadar.
 
-A frame holds one target (or, at a PT, one line of sight). The signal is the program's own; spectra and maps are linear in the samples as
-long as the data are known, so that those of the signal and of the noise serve all SNR points. At a PT the data are decided anew at every
-SNR. The estimate is that of the strongest cell of the map: there is one target, and the receiver is told so. A hit is an estimate whose
-errors in range, velocity and both direction cosines are all below the resolution. With "detected" the cell is above the CFAR's
-threshold as well. A PT beside clutter, whose cells are stronger than its line of sight, looks near its prediction only, as the program's
-receiver does ("gated").
+A frame holds one target (or, at a PT, one line of sight). The signal is the program's own; spectra
+and maps are linear in the samples as long as the data are known, so that those of the signal and of
+the noise serve all SNR points. At a PT the data are decided anew at every SNR. The estimate is that
+of the strongest cell of the map: there is one target, and the receiver is told so. A hit is an
+estimate whose errors in range, velocity and both direction cosines are all below the resolution.
+With "detected" the cell is above the CFAR's threshold as well. A PT beside clutter, whose cells are
+stronger than its line of sight, looks near its prediction only, as the program's receiver does
+("gated").
 """
 
 from __future__ import annotations
@@ -48,7 +51,8 @@ from isac_rt.studies.paper.symbols import PLACE, RANGE_ERROR_CELLS, VELOCITY_ERR
 from isac_rt.world.swarm import Pose
 
 NEAREST, FARTHEST, WIDEST = 5.0, 100.0, 50.0
-"""Ranges (of a PT: path lengths) [m] and azimuths and elevations [deg] that targets are drawn from, uniformly."""
+"""Ranges (of a PT: path lengths) [m] and azimuths and elevations [deg] that targets are drawn from,
+uniformly."""
 FASTEST = 0.93
 """Largest speed drawn, as a share of the unambiguous one."""
 SETTINGS = Receivers()
@@ -126,7 +130,9 @@ def draw_target(case: Case, rng: np.random.Generator) -> Target:
     phase = np.exp(2j * np.pi * rng.random())
     ranges, amplitudes = np.zeros(0), np.zeros(0)
     if case.clutter:
-        ranges, amplitudes = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(case.passes), distance, rng)
+        ranges, amplitudes = rayleigh_cells(
+            Clutter(model="rayleigh"), w.range_cell(case.passes), distance, rng
+        )
     return Target(np.array([distance, velocity, *u]), away, phase, ranges, amplitudes)
 
 
@@ -147,16 +153,31 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
     lengths, count = case.passes * np.append(distance, target.ranges), 1 + target.ranges.size
     still = np.arange(count) > 0
     paths = make_paths(
-        gain=np.append(target.phase, target.amplitudes), delay=lengths / SPEED_OF_LIGHT,
-        delay_rate=np.where(still, 0.0, case.passes * velocity / SPEED_OF_LIGHT), arrival=np.tile(u, (count, 1)),
-        departure=np.tile(u if case.passes == 2 else _forward(target.departure), (count, 1)), tx_radius=lengths / case.passes,
-        rx_radius=lengths / case.passes, kind=np.where(still, PathKind.DIFFUSE, PathKind.TARGET), epoch=w.frame_duration / 2,
-        tx="AT", rx="AT" if case.passes == 2 else "PT",
-    )  # fmt: skip
+        gain=np.append(target.phase, target.amplitudes),
+        delay=lengths / SPEED_OF_LIGHT,
+        delay_rate=np.where(still, 0.0, case.passes * velocity / SPEED_OF_LIGHT),
+        arrival=np.tile(u, (count, 1)),
+        departure=np.tile(u if case.passes == 2 else _forward(target.departure), (count, 1)),
+        tx_radius=lengths / case.passes,
+        rx_radius=lengths / case.passes,
+        kind=np.where(still, PathKind.DIFFUSE, PathKind.TARGET),
+        epoch=w.frame_duration / 2,
+        tx="AT",
+        rx="AT" if case.passes == 2 else "PT",
+    )
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
     sent = Transmission(name="AT", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
     method: Method = "auto" if case.clutter else "direct"
-    return if_signal(w, [(sent, paths)], pose, antennas, start_time=0.0, filter_transition=4e5, method=method, max_direct=1)
+    return if_signal(
+        w,
+        [(sent, paths)],
+        pose,
+        antennas,
+        start_time=0.0,
+        filter_transition=4e5,
+        method=method,
+        max_direct=1,
+    )
 
 
 def make_noise(case: Case, seed: int, index: int) -> np.ndarray:
@@ -178,7 +199,9 @@ def count_hits(case: Case, seed: int, index: int) -> Counts:
     target = draw_target(case, rng)
     run = {"FMCW": _fmcw, "AT": _active, "PT": _passive, "LoRadar": _loradar}[case.kind]
     run(case, target, rng, partial(make_noise, case, seed, index), note)
-    return {name: (np.array([c for c, _ in counts]), counts[0][1]) for name, counts in found.items()}
+    return {
+        name: (np.array([c for c, _ in counts]), counts[0][1]) for name, counts in found.items()
+    }
 
 
 Note = Callable[..., None]
@@ -196,14 +219,24 @@ def hit(case: Case, target: Target, estimate: Estimate, antennas: Antennas) -> b
     bound = resolution(w, antennas)
     if case.passes == 1:
         spacing = antennas.spacing / w.wavelength
-        bound = np.array([w.range_cell(1), w.velocity_cell(1), 1 / (spacing * antennas.rx_x), 1 / (spacing * antennas.rx_z)])
+        bound = np.array(
+            [
+                w.range_cell(1),
+                w.velocity_cell(1),
+                1 / (spacing * antennas.rx_x),
+                1 / (spacing * antennas.rx_z),
+            ]
+        )
     d = describe([estimate], np.ones(1), antennas, w, case.passes)
     errors = np.abs(np.array([d.range[0], d.velocity[0], *d.direction[0]]) - target.truth)
     return bool((errors < bound).all())  # an angle out of view is NaN and no hit
 
 
-def strongest(power: np.ndarray, first: int, near: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Row and column of the strongest cell, from row `first` on or within the receiver's gate about the cell `near`."""
+def strongest(
+    power: np.ndarray, first: int, near: tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """Row and column of the strongest cell, from row `first` on or within the receiver's gate about
+    the cell `near`."""
     if near is not None:
         rows = np.arange(max(near[0] - GATE_CELLS, 0), near[0] + GATE_CELLS + 1)
         columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + near[1]) % power.shape[1]
@@ -215,7 +248,9 @@ def strongest(power: np.ndarray, first: int, near: tuple[int, int] | None = None
 
 def is_detected(power: np.ndarray, row: int, column: int, looks: int) -> bool:
     """Whether a cell is above the CFAR's threshold."""
-    above, _ = detect(power, looks, SETTINGS.false_alarm_rate, SETTINGS.guard_cells, SETTINGS.training_cells)
+    above, _ = detect(
+        power, looks, SETTINGS.false_alarm_rate, SETTINGS.guard_cells, SETTINGS.training_cells
+    )
     return bool(above[row, column])
 
 
@@ -224,15 +259,32 @@ def first_row(case: Case, cell: float) -> int:
     return int(np.ceil(SETTINGS.min_range_m / cell))
 
 
-def _fmcw(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note) -> None:
+def _fmcw(
+    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+) -> None:
     w, schedule, payload = fmcw_frame(case.waveform)
     times = np.arange(w.num_chirps) * w.slot_duration
-    both = [fmcw_spectra(samples[0]) for samples in (make_cube(case, target, schedule, payload).samples, noise())]
+    both = [
+        fmcw_spectra(samples[0])
+        for samples in (make_cube(case, target, schedule, payload).samples, noise())
+    ]
     first = first_row(case, w.range_cell(2))
-    _tdm(case, target, both, schedule[0], times, lambda cell, bin_: to_delay(cell, bin_, w), first, "hits", note)
+    _tdm(
+        case,
+        target,
+        both,
+        schedule[0],
+        times,
+        lambda cell, bin_: to_delay(cell, bin_, w),
+        first,
+        "hits",
+        note,
+    )
 
 
-def _loradar(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note) -> None:
+def _loradar(
+    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+) -> None:
     system, (r, v, *u) = LoRadar(case.waveform), target.truth
     antennas = paper_antennas(case.waveform)
     echo = Echoes(np.array([r]), np.array([v]), np.array([u]), np.array([target.phase]))
@@ -242,7 +294,17 @@ def _loradar(case: Case, target: Target, rng: np.random.Generator, noise: MakeNo
     for kind in kinds:
         spectra, times = loradar_spectra(sent, system, kind)
         both = [spectra, loradar_spectra(replace(sent, samples=white), system, kind)[0]]
-        _tdm(case, target, both, sent.schedule, times, partial(loradar_delay, system), first_row(case, system.range_cell), kind, note)
+        _tdm(
+            case,
+            target,
+            both,
+            sent.schedule,
+            times,
+            partial(loradar_delay, system),
+            first_row(case, system.range_cell),
+            kind,
+            note,
+        )
 
 
 def _tdm(
@@ -263,28 +325,41 @@ def _tdm(
         maps = signal + np.float32(level) * noise
         power = accumulate(maps)
         row, column = strongest(power, first)
-        success = hit(case, target, estimate_tdm(maps, power, row, column, schedule, times, convert, w), antennas)
+        success = hit(
+            case,
+            target,
+            estimate_tdm(maps, power, row, column, schedule, times, convert, w),
+            antennas,
+        )
         note(name, success)
         note(f"{name}, detected", success and is_detected(power, row, column, 45))
 
 
-def _active(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note) -> None:
+def _active(
+    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+) -> None:
     w = case.waveform
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, case.orders[0], rng)
     cubes = [cube := make_cube(case, target, schedule, payload), replace(cube, samples=noise())]
-    signal, white = (clean_spectrum(c, payload.delay_symbols, payload.phases, w.num_delay_symbols) for c in cubes)
+    signal, white = (
+        clean_spectrum(c, payload.delay_symbols, payload.phases, w.num_delay_symbols) for c in cubes
+    )
     if case.filtered:  # not linear in the samples
         for level in levels(case):
             spectra = signal + np.float32(level) * white
             remove_standing(spectra, schedule, SETTINGS.clutter_run_cells)
             look = _Look(case, target, spectra, schedule, payload.delay_symbols)
             note("hits", look.at(one_atom_power(spectra, w, schedule))[0])
-            _note_united(look, accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols)), note)
+            _note_united(
+                look, accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols)), note
+            )
         return
     sums = {"hits": _Sums(*(correlations(s, w, schedule) for s in (signal, white)))}
     if case.unwindowed:
-        sums["hits, no window"] = _Sums(*(correlations(plain_spectrum(c, payload), w, schedule) for c in cubes))
+        sums["hits, no window"] = _Sums(
+            *(correlations(plain_spectrum(c, payload), w, schedule) for c in cubes)
+        )
     united = _Parts(*(channel_maps(s, w, schedule, payload.delay_symbols) for s in (signal, white)))
     for level in levels(case):
         spectra = signal + np.float32(level) * white
@@ -295,7 +370,8 @@ def _active(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoi
 
 
 def _note_united(look: _Look, power: np.ndarray, note: Note) -> None:
-    """Whether the map of the united correlations hits (M = L_tx: the transform of the full sampling), and whether in a detection."""
+    """Whether the map of the united correlations hits (M = L_tx: the transform of the full
+    sampling), and whether in a detection."""
     success, cell = look.at(power)
     note("hits, united", success)
     note("hits, united, detected", success and is_detected(power, *cell, 45))
@@ -313,7 +389,8 @@ class _Look:
     near: tuple[int, int] | None = None
 
     def by_omp(self) -> bool:
-        """Whether the paper's map hits: OMP, summed over the channels; made near the prediction only where nothing else is looked at."""
+        """Whether the paper's map hits: OMP, summed over the channels; made near the prediction
+        only where nothing else is looked at."""
         w, num_rows = self.case.waveform, self.spectra.shape[2]
         if self.near is None:
             return self.at(one_atom_power(self.spectra, w, self.schedule))[0]
@@ -325,14 +402,17 @@ class _Look:
     def at(self, power: np.ndarray) -> tuple[bool, tuple[int, int]]:
         """Whether the estimate at a map's strongest cell hits, and the cell."""
         w = self.case.waveform
-        row, column = strongest(power, first_row(self.case, w.range_cell(self.case.passes)), self.near)
+        row, column = strongest(
+            power, first_row(self.case, w.range_cell(self.case.passes)), self.near
+        )
         local = LocalSpectra(self.spectra, w, self.schedule, self.delay_symbols, row)
         estimate = refine(local, *start_point(power, row, column, w))
         return hit(self.case, self.target, estimate, paper_antennas(w)), (row, column)
 
 
 class _Sums:
-    """Maps of OMP with one atom at any noise amplitude, from the correlations of signal and noise."""
+    """Maps of OMP with one atom at any noise amplitude, from the correlations of signal and
+    noise."""
 
     def __init__(self, signal: Iterable[np.ndarray], white: Iterable[np.ndarray]) -> None:
         self._pairs = list(zip(signal, white, strict=True))
@@ -345,11 +425,14 @@ class _Sums:
 
 
 class _Parts:
-    """Mean power over the channels of maps at any noise amplitude s: |S|^2 + 2 s Re(conj(S) W) + s^2 |W|^2."""
+    """Mean power over the channels of maps at any noise amplitude s: |S|^2 + 2 s Re(conj(S) W) +
+    s^2 |W|^2."""
 
     def __init__(self, signal: np.ndarray, white: np.ndarray) -> None:
         both = signal + white
-        self._signal, self._white, together = (accumulate(maps).astype(float) for maps in (signal, white, both))
+        self._signal, self._white, together = (
+            accumulate(maps).astype(float) for maps in (signal, white, both)
+        )
         self._cross = together - self._signal - self._white
 
     def power(self, level: float) -> np.ndarray:
@@ -362,17 +445,23 @@ def plain_spectrum(cube: IFCube, payload: Payload) -> np.ndarray:
     out = np.empty((*cube.samples.shape[:2], w.num_delay_symbols, w.num_chirps), np.complex64)
     for m, samples in enumerate(cube.samples):
         cells = (symbols[m][:, None] + np.arange(w.num_delay_symbols)) % w.num_samples
-        turn = (payload.phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, symbols[m]))).astype(np.complex64)[:, None]
+        turn = (payload.phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, symbols[m]))).astype(
+            np.complex64
+        )[:, None]
         turn = turn * tones(shift_of(w, symbols[m]) / w.num_samples, w.num_delay_symbols)
         for rx, one in enumerate(samples):
-            out[m, rx] = (np.take_along_axis(scipy.fft.fft(one, axis=1, workers=1), cells, axis=1) * turn).T
+            out[m, rx] = (
+                np.take_along_axis(scipy.fft.fft(one, axis=1, workers=1), cells, axis=1) * turn
+            ).T
     return out
 
 
 def one_atom_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
-    """(rows, P) power of OMP with one atom in every vector, summed over groups, antennas and receivers, Doppler centred.
+    """(rows, P) power of OMP with one atom in every vector, summed over groups, antennas and
+    receivers, Doppler centred.
 
-    With one atom OMP keeps the strongest correlation of each vector of an antenna's chirps and no other.
+    With one atom OMP keeps the strongest correlation of each vector of an antenna's chirps and no
+    other.
     """
     total = np.zeros(spectra.shape[2:])
     for found in correlations(spectra, waveform, schedule):
@@ -380,8 +469,11 @@ def one_atom_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) 
     return np.fft.fftshift(total, axes=-1)
 
 
-def correlations(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> Iterator[np.ndarray]:
-    """(L_rx, rows, P) complex64 for every group and transmit antenna: its chirps against the Doppler atoms, FFT order."""
+def correlations(
+    spectra: np.ndarray, waveform: Waveform, schedule: Schedule
+) -> Iterator[np.ndarray]:
+    """(L_rx, rows, P) complex64 for every group and transmit antenna: its chirps against the
+    Doppler atoms, FFT order."""
     num_chirps = waveform.num_chirps
     bins = np.fft.fftfreq(num_chirps, 1 / num_chirps)
     for m, group in enumerate(spectra):
@@ -406,7 +498,9 @@ def _add_strongest(total, found):  # pragma: no cover - compiled
             total[row, best] += largest
 
 
-def _passive(case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note) -> None:
+def _passive(
+    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+) -> None:
     w = case.waveform
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payloads = {order: random_payload(w, schedule, order, rng) for order in case.orders}
@@ -417,17 +511,36 @@ def _passive(case: Case, target: Target, rng: np.random.Generator, noise: MakeNo
     cube, white = make_cube(case, target, schedule, bare), noise()
     for level in levels(case):
         for order, payload in payloads.items():
-            samples = cube.samples * payload.phases.astype(np.complex64)[:, None, :, None] + np.float32(level) * white
+            samples = (
+                cube.samples * payload.phases.astype(np.complex64)[:, None, :, None]
+                + np.float32(level) * white
+            )
             got = replace(cube, samples=samples)
             if case.known:
-                note("data known", _read(case, target, got, first.delay_symbols, payload.phases, predicted))
+                note(
+                    "data known",
+                    _read(case, target, got, first.delay_symbols, payload.phases, predicted),
+                )
                 continue
-            symbols = demodulate(got, predicted, order, SETTINGS.clutter_run_cells if case.filtered else None)
-            note(f"D = {order}, delay errors", (symbols.delay != first.delay_symbols).sum(), symbols.delay.size)
+            symbols = demodulate(
+                got, predicted, order, SETTINGS.clutter_run_cells if case.filtered else None
+            )
+            note(
+                f"D = {order}, delay errors",
+                (symbols.delay != first.delay_symbols).sum(),
+                symbols.delay.size,
+            )
             note(f"D = {order}", _read(case, target, got, symbols.raw, symbols.phases, predicted))
 
 
-def _read(case: Case, target: Target, cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, predicted: Prediction) -> bool:
+def _read(
+    case: Case,
+    target: Target,
+    cube: IFCube,
+    delay_symbols: np.ndarray,
+    phases: np.ndarray,
+    predicted: Prediction,
+) -> bool:
     """Whether sensing hits with these symbols taken out."""
     spectra = clean_spectrum(cube, delay_symbols, phases, case.waveform.num_delay_symbols)
     near = predicted_cell(predicted, case.waveform) if case.gated else None
@@ -435,13 +548,23 @@ def _read(case: Case, target: Target, cube: IFCube, delay_symbols: np.ndarray, p
 
 
 def _predict(case: Case, target: Target, rng: np.random.Generator) -> Prediction:
-    """The line of sight with the errors of figures 11 and 12, and the clutter where its profile is known."""
-    error, rate = RANGE_ERROR_CELLS * case.waveform.range_cell(1) * rng.standard_normal(), rng.uniform(-1, 1) * VELOCITY_ERROR
+    """The line of sight with the errors of figures 11 and 12, and the clutter where its profile is
+    known."""
+    error, rate = (
+        RANGE_ERROR_CELLS * case.waveform.range_cell(1) * rng.standard_normal(),
+        rng.uniform(-1, 1) * VELOCITY_ERROR,
+    )
     ranges, weights = target.truth[:1] + error, np.ones(1)
     velocity = target.truth[1] + rate
     if case.profile:
         ranges = np.append(ranges, target.ranges + error)
         weights = np.append(weights, np.abs(target.amplitudes) ** 2)
     still = np.zeros(ranges.size)
-    return Prediction(range=ranges, velocity=np.where(np.arange(ranges.size) > 0, rate, velocity), direction=np.zeros((ranges.size, 2)),
-                      range_std=still, velocity_std=still, weight=weights)  # fmt: skip
+    return Prediction(
+        range=ranges,
+        velocity=np.where(np.arange(ranges.size) > 0, rate, velocity),
+        direction=np.zeros((ranges.size, 2)),
+        range_std=still,
+        velocity_std=still,
+        weight=weights,
+    )

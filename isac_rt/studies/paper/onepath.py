@@ -1,4 +1,5 @@
-"""A frame of one path, for experiments that need no scene: exact signal by the package's own synthesis."""
+"""A frame of one path, for experiments that need no scene: exact signal by the package's own
+synthesis."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ FILTER_TRANSITION = 4e5
 
 def antennas(waveform: Waveform, per_arm: int) -> Antennas:
     """The paper's transmit L and a receive L with `per_arm` elements on each arm."""
-    return Antennas(tx_x=2, tx_z=2, rx_x=per_arm, rx_z=per_arm, spacing=0.5774 * waveform.wavelength)
+    return Antennas(
+        tx_x=2, tx_z=2, rx_x=per_arm, rx_z=per_arm, spacing=0.5774 * waveform.wavelength
+    )
 
 
 def frame(
@@ -47,12 +50,28 @@ def frame(
     """
     ahead = np.array([[0.0, 1.0, 0.0]])
     path = make_paths(
-        gain=np.ones(1), delay=np.array([delay]), delay_rate=rate, departure=ahead, arrival=ahead,
-        kind=int(PathKind.LINE_OF_SIGHT), epoch=waveform.frame_duration / 2, tx="sender", rx="receiver",
-    )  # fmt: skip
+        gain=np.ones(1),
+        delay=np.array([delay]),
+        delay_rate=rate,
+        departure=ahead,
+        arrival=ahead,
+        kind=int(PathKind.LINE_OF_SIGHT),
+        epoch=waveform.frame_duration / 2,
+        tx="sender",
+        rx="receiver",
+    )
     pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
-    sent = Transmission(name="sender", pose=pose, antennas=arrays, schedule=schedule, payload=payload, clock_offset=clock_offset)
-    cube = if_signal(waveform, [(sent, path)], pose, arrays, start_time=0.0, filter_transition=FILTER_TRANSITION)
+    sent = Transmission(
+        name="sender",
+        pose=pose,
+        antennas=arrays,
+        schedule=schedule,
+        payload=payload,
+        clock_offset=clock_offset,
+    )
+    cube = if_signal(
+        waveform, [(sent, path)], pose, arrays, start_time=0.0, filter_transition=FILTER_TRANSITION
+    )
     if snr_db is None:
         return cube
     return add_noise(cube, 10 ** (-snr_db / 10), seed_sequence(seed, *purpose).generate_state(2))

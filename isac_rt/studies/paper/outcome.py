@@ -22,10 +22,18 @@ Progress = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
 
 STYLE: Any = {
-    "figure.dpi": 130, "figure.constrained_layout.use": True, "font.size": 9, "axes.grid": True, "grid.color": "#D8D8D8",
-    "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.titlesize": 9.5, "legend.fontsize": 8, "lines.linewidth": 1.4,
+    "figure.dpi": 130,
+    "figure.constrained_layout.use": True,
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "#D8D8D8",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.titlesize": 9.5,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.4,
     "lines.markersize": 4.5,
-}  # fmt: skip
+}
 """Boxed axes with a full grid, as in the paper's figures."""
 
 
@@ -37,7 +45,8 @@ class Verdict:
     ----------
     claim : as the paper says it
     verdict : "holds", "holds under a condition" or "does not hold"
-    finding : the number that shows it, with its confidence interval where it is random, and the condition where there is one
+    finding : the number that shows it, with its confidence interval where it is random, and the
+        condition where there is one
     """
 
     claim: str
@@ -67,7 +76,8 @@ class Outcome:
 
 
 def proportion(successes: int, trials: int, confidence: float = 0.95) -> str:
-    """A proportion and its Clopper-Pearson interval as text: ``0.5130 [0.4843, 0.5416] (616 of 1200)``."""
+    """A proportion and its Clopper-Pearson interval as text: ``0.5130 [0.4843, 0.5416] (616 of
+    1200)``."""
     low, high = binomial_interval(successes, trials, confidence)
     return f"{successes / trials:.4g} [{low:.4g}, {high:.4g}] ({successes} of {trials})"
 
@@ -79,14 +89,18 @@ def style() -> Iterator[None]:
         yield
 
 
-def blank(rows: int = 1, columns: int = 1, size: tuple[float, float] = (6.4, 4.6), **options: Any) -> tuple[Figure, Any]:
-    """A figure outside pyplot, so that none stays open, and its axes (rows, columns). Call it within `style`."""
+def blank(
+    rows: int = 1, columns: int = 1, size: tuple[float, float] = (6.4, 4.6), **options: Any
+) -> tuple[Figure, Any]:
+    """A figure outside pyplot, so that none stays open, and its axes (rows, columns). Call it
+    within `style`."""
     figure = Figure(figsize=size)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def write(outcome: Outcome, folder: str | Path) -> list[Path]:
-    """Write NAME.csv (NAME_TABLE.csv where there are several), NAME.png and NAME.json; each appears whole or not at all.
+    """Write NAME.csv (NAME_TABLE.csv where there are several), NAME.png and NAME.json; each appears
+    whole or not at all.
 
     Returns
     -------
@@ -104,11 +118,21 @@ def write(outcome: Outcome, folder: str | Path) -> list[Path]:
     if (figure := outcome.figure) is not None:
         written.append(folder / f"{outcome.name}.png")
         with style():
-            write_bytes(written[-1], lambda temporary: figure.savefig(temporary, format="png", metadata={"Software": None}))
+            write_bytes(
+                written[-1],
+                lambda temporary: figure.savefig(
+                    temporary, format="png", metadata={"Software": None}
+                ),
+            )
     about = {
-        "name": outcome.name, "title": outcome.title, "verdicts": [asdict(v) for v in outcome.verdicts], "settings": dict(outcome.settings),
-        "files": [file.name for file in written], "versions": versions(), "commit": commit(),
-    }  # fmt: skip
+        "name": outcome.name,
+        "title": outcome.title,
+        "verdicts": [asdict(v) for v in outcome.verdicts],
+        "settings": dict(outcome.settings),
+        "files": [file.name for file in written],
+        "versions": versions(),
+        "commit": commit(),
+    }
     written.append(folder / f"{outcome.name}.json")
     write_text(written[-1], json.dumps(about, indent=1, allow_nan=False) + "\n")
     return written

@@ -1,4 +1,5 @@
-"""Figs. 9 and 10: the estimates of one terminal over the flight, raw and from the filter, and the distributions of their errors."""
+"""Figs. 9 and 10: the estimates of one terminal over the flight, raw and from the filter, and the
+distributions of their errors."""
 
 from __future__ import annotations
 
@@ -31,7 +32,12 @@ def table(runs: Sequence[xr.Dataset], every: int, uavs: Sequence[str]) -> pd.Dat
     for number, run in enumerate(runs):
         for uav in uavs:
             one = run.sel(uav=uav)
-            columns = {"run": number, "frame": one.frame.values * every, "uav": uav, "in_view": one.in_view.values}
+            columns = {
+                "run": number,
+                "frame": one.frame.values * every,
+                "uav": uav,
+                "in_view": one.in_view.values,
+            }
             for quantity in UNITS:
                 scale = 180 / np.pi if quantity == "azimuth" else 1.0
                 for group, word in (("truth", "true"), ("detected", "raw"), ("tracked", "ekf")):
@@ -40,17 +46,20 @@ def table(runs: Sequence[xr.Dataset], every: int, uavs: Sequence[str]) -> pd.Dat
     return pd.concat(parts, ignore_index=True)
 
 
-def pooled(runs: Sequence[xr.Dataset], uavs: Sequence[str], quantity: str) -> tuple[np.ndarray, np.ndarray]:
+def pooled(
+    runs: Sequence[xr.Dataset], uavs: Sequence[str], quantity: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Absolute errors of all runs, raw and filtered."""
     both = [errors(run, uav, quantity) for run in runs for uav in uavs]
     return np.concatenate([a for a, _ in both]), np.concatenate([b for _, b in both])
 
 
 def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observer: str) -> Pairs:
-    """Errors with estimates as coarse as the paper's: detections rounded to range cells, Doppler bins and `ANGLE_STEP_DEG`, and an EKF
-    that knows it (cell/sqrt(12)).
+    """Errors with estimates as coarse as the paper's: detections rounded to range cells, Doppler
+    bins and `ANGLE_STEP_DEG`, and an EKF that knows it (cell/sqrt(12)).
 
-    The paper's DFT and OMP choose cells; this program's receivers estimate between them, so that their raw errors are a hundredth.
+    The paper's DFT and OMP choose cells; this program's receivers estimate between them, so that
+    their raw errors are a hundredth.
     """
     scene = scenario("consistent")
     w, swarm, passes = waveform_of(scene), Swarm.from_scenario(scene), 2 if observer == "AT" else 1
@@ -60,7 +69,9 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
     for run in runs:
         for uav in uavs:
             one, state, count, last = run.sel(uav=uav), None, 0, 0.0
-            for k in np.flatnonzero(np.isfinite(one.detected_range.values) & np.isfinite(one.detected_azimuth.values)):
+            for k in np.flatnonzero(
+                np.isfinite(one.detected_range.values) & np.isfinite(one.detected_azimuth.values)
+            ):
                 time = (k * every + 0.5) * w.frame_duration
                 own = swarm.poses(time)[observer]
                 found = np.array([one[f"detected_{quantity}"].values[k] for quantity in UNITS])
@@ -70,20 +81,34 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                     state = birth(z, std, own)
                 else:
                     state = predict(state, time - last, scene.tracking.acceleration_std_mps2)
-                    state = update(state, z, measurement_covariance(std, state.mean), own, velocity_period=2 * w.max_velocity(passes))
+                    state = update(
+                        state,
+                        z,
+                        measurement_covariance(std, state.mean),
+                        own,
+                        velocity_period=2 * w.max_velocity(passes),
+                    )
                 last, count = time, count + 1
                 if state is None or count <= SETTLED:
                     continue
                 r, v, u_x, u_z = measure(state.mean, own)
-                for i, (quantity, fused) in enumerate(zip(UNITS, (r, v, np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), strict=True)):
-                    truth, scale = float(one[f"truth_{quantity}"].values[k]), 180 / np.pi if quantity == "azimuth" else 1.0
+                for i, (quantity, fused) in enumerate(
+                    zip(UNITS, (r, v, np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), strict=True)
+                ):
+                    truth, scale = (
+                        float(one[f"truth_{quantity}"].values[k]),
+                        180 / np.pi if quantity == "azimuth" else 1.0,
+                    )
                     out[quantity][0].append(abs(raw[i] - truth) * scale)
                     out[quantity][1].append(abs(float(fused) - truth) * scale)
     return {quantity: (np.array(a), np.array(b)) for quantity, (a, b) in out.items()}
 
 
-def filter_verdict(runs: Sequence[xr.Dataset], uavs: Sequence[str], terminal: str, grid: Pairs) -> Verdict:
-    """Whether the distributions of the filter's errors lie to the left of the raw ones, on the paper's grids and for refined estimates."""
+def filter_verdict(
+    runs: Sequence[xr.Dataset], uavs: Sequence[str], terminal: str, grid: Pairs
+) -> Verdict:
+    """Whether the distributions of the filter's errors lie to the left of the raw ones, on the
+    paper's grids and for refined estimates."""
     refined = {quantity: pooled(runs, uavs, quantity) for quantity in UNITS}
     left = {name: left_of(pairs) for name, pairs in (("grid", grid), ("refined", refined))}
     judged: Judgement = "does not hold"
@@ -92,17 +117,24 @@ def filter_verdict(runs: Sequence[xr.Dataset], uavs: Sequence[str], terminal: st
     elif left["grid"] or left["refined"]:
         judged = "holds under a condition"
     return Verdict(
-        f"The EKF shifts the CDFs of the errors at the {terminal} to the left", judged,
-        f"estimates on the paper's grids: {_improvement(grid)}; left at every decile: {', '.join(left['grid']) or 'none'}. Estimates "
-        f"between the cells, this program's: {_improvement(refined)}; left at every decile: {', '.join(left['refined']) or 'none'} (the "
+        f"The EKF shifts the CDFs of the errors at the {terminal} to the left",
+        judged,
+        f"estimates on the paper's grids: {_improvement(grid)}; left at every decile: "
+        f"{', '.join(left['grid']) or 'none'}. Estimates "
+        f"between the cells, this program's: {_improvement(refined)}; left at every decile: "
+        f"{', '.join(left['refined']) or 'none'} (the "
         "filter allows for errors of 1 mm, 1 cm/s and 2e-4, which these are below)",
-    )  # fmt: skip
+    )
 
 
 def left_of(pairs: Pairs) -> list[str]:
     """Quantities whose filtered errors have the smaller quantile at every decile."""
     share = np.linspace(0.1, 0.9, 9)
-    return [q for q, (raw, fused) in pairs.items() if (np.quantile(fused, share) < np.quantile(raw, share)).all()]
+    return [
+        q
+        for q, (raw, fused) in pairs.items()
+        if (np.quantile(fused, share) < np.quantile(raw, share)).all()
+    ]
 
 
 def _improvement(pairs: Pairs) -> str:
@@ -110,12 +142,16 @@ def _improvement(pairs: Pairs) -> str:
     for quantity, (raw, fused) in pairs.items():
         before, after = (float(np.sqrt(np.mean(e**2))) for e in (raw, fused))
         closer = proportion(int((fused < raw).sum()), raw.size)
-        texts.append(f"{quantity} RMS {before:.2g} raw, {after:.2g} {UNITS[quantity]} filtered, closer in {closer}")
+        texts.append(
+            f"{quantity} RMS {before:.2g} raw, {after:.2g} {UNITS[quantity]} filtered, closer in "
+            f"{closer}"
+        )
     return "; ".join(texts)
 
 
 def followed(runs: Sequence[xr.Dataset], uav: str, after: int) -> tuple[int, int]:
-    """Frames with a track of `uav` within three resolutions, and frames in view, both after the first `after` in view."""
+    """Frames with a track of `uav` within three resolutions, and frames in view, both after the
+    first `after` in view."""
     hits = total = 0
     for run in runs:
         one = run.sel(uav=uav)
@@ -126,9 +162,15 @@ def followed(runs: Sequence[xr.Dataset], uav: str, after: int) -> tuple[int, int
 
 
 def figure(
-    runs: Sequence[xr.Dataset], every: int, tracked: Sequence[str], shown: Sequence[str], marks: Sequence[float], grid: Pairs
+    runs: Sequence[xr.Dataset],
+    every: int,
+    tracked: Sequence[str],
+    shown: Sequence[str],
+    marks: Sequence[float],
+    grid: Pairs,
 ) -> Figure:
-    """Time series on the left, from the first run; on the right CDFs over all runs of the UAVs that are tracked."""
+    """Time series on the left, from the first run; on the right CDFs over all runs of the UAVs that
+    are tracked."""
     with style():
         out, axes = blank(3, 2, size=(9.6, 7.4), width_ratios=(1.7, 1))
         for (quantity, unit), (ax, cdf) in zip(UNITS.items(), axes, strict=True):
@@ -136,22 +178,67 @@ def figure(
             for mark in marks:
                 ax.axvline(mark, color="#303030", lw=0.9, ls="--")
             ax.set(xlabel="frame", ylabel=f"{quantity} [{unit}]", xlim=(0, 500))
-            for e, dash, name in zip(pooled(runs, tracked, quantity), ("--", "-"), ("True Estimate", "Fused Estimate"), strict=True):
-                cdf.plot(np.sort(e), np.arange(1, e.size + 1) / e.size, "k" + dash, label=f"{name} ({e.size})")
-            for e, dash, name in zip(grid[quantity], ("--", "-"), ("paper's grid", "paper's grid, EKF"), strict=True):
-                cdf.plot(np.sort(e), np.arange(1, e.size + 1) / e.size, dash, color="#D55E00", label=f"{name} ({e.size})")
-            cdf.set(xlabel=f"|{quantity} error| [{unit}]", ylabel="CDF", ylim=(0, 1.02), xscale="log")
-        handles, labels = (a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in axes[0]), strict=True))
+            for e, dash, name in zip(
+                pooled(runs, tracked, quantity),
+                ("--", "-"),
+                ("True Estimate", "Fused Estimate"),
+                strict=True,
+            ):
+                cdf.plot(
+                    np.sort(e),
+                    np.arange(1, e.size + 1) / e.size,
+                    "k" + dash,
+                    label=f"{name} ({e.size})",
+                )
+            for e, dash, name in zip(
+                grid[quantity], ("--", "-"), ("paper's grid", "paper's grid, EKF"), strict=True
+            ):
+                cdf.plot(
+                    np.sort(e),
+                    np.arange(1, e.size + 1) / e.size,
+                    dash,
+                    color="#D55E00",
+                    label=f"{name} ({e.size})",
+                )
+            cdf.set(
+                xlabel=f"|{quantity} error| [{unit}]", ylabel="CDF", ylim=(0, 1.02), xscale="log"
+            )
+        handles, labels = (
+            a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in axes[0]), strict=True)
+        )
         out.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=7)
     return out
 
 
-def _series(ax, run: xr.Dataset, every: int, shown: Sequence[str], tracked: Sequence[str], quantity: str) -> None:
+def _series(
+    ax, run: xr.Dataset, every: int, shown: Sequence[str], tracked: Sequence[str], quantity: str
+) -> None:
     scale, frame = 180 / np.pi if quantity == "azimuth" else 1.0, run.frame.values * every
     for uav in shown:
         one, colour = run.sel(uav=uav), _COLOURS[uav]
         seen = one.in_view.values
-        ax.plot(frame, np.where(seen, one[f"truth_{quantity}"].values * scale, np.nan), color=colour, lw=1, label=f"{uav}, True Parameter")
-        ax.plot(frame, one[f"detected_{quantity}"].values * scale, "o", mfc="none", color=colour, ms=4, label=f"{uav}, True Estimate")
+        ax.plot(
+            frame,
+            np.where(seen, one[f"truth_{quantity}"].values * scale, np.nan),
+            color=colour,
+            lw=1,
+            label=f"{uav}, True Parameter",
+        )
+        ax.plot(
+            frame,
+            one[f"detected_{quantity}"].values * scale,
+            "o",
+            mfc="none",
+            color=colour,
+            ms=4,
+            label=f"{uav}, True Estimate",
+        )
         if uav in tracked:
-            ax.plot(frame, one[f"tracked_{quantity}"].values * scale, "x", color=colour, ms=4.5, label=f"{uav}, Fused Estimate")
+            ax.plot(
+                frame,
+                one[f"tracked_{quantity}"].values * scale,
+                "x",
+                color=colour,
+                ms=4.5,
+                label=f"{uav}, Fused Estimate",
+            )

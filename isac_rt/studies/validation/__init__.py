@@ -1,4 +1,5 @@
-"""Every physical and numerical claim of the program as a case with an independent truth: what `isac-rt validate` runs."""
+"""Every physical and numerical claim of the program as a case with an independent truth: what
+`isac-rt validate` runs."""
 
 from isac_rt.studies.validation.case import Case, Planted, Skipped, Verdict, run_case, run_cases
 
@@ -7,7 +8,16 @@ __all__ = ["Case", "Planted", "Skipped", "Verdict", "all_cases", "run_case", "ru
 
 def all_cases(quick: bool = False) -> list[Case]:
     """All cases, or the quick selection, in the order of their groups."""
-    from isac_rt.studies.validation import amplitude, clutter, crosschecks, geometry, noise, receivers, signal, tracking
+    from isac_rt.studies.validation import (
+        amplitude,
+        clutter,
+        crosschecks,
+        geometry,
+        noise,
+        receivers,
+        signal,
+        tracking,
+    )
     from isac_rt.studies.validation.case import cases_of
 
     modules = (geometry, amplitude, clutter, signal, noise, receivers, tracking, crosschecks)

@@ -24,7 +24,10 @@ from isac_rt.world.city.materials import Material, resolve_materials, water_perm
 from isac_rt.world.city.materials import MaterialUse as Use
 
 SIGMA = 10**-1.17
-FLOAT32 = "Sionna's amplitudes are float32: a few 1e-7, through Fresnel's equations up to 1e-5, more where an edge slants"
+FLOAT32 = (
+    "Sionna's amplitudes are float32: a few 1e-7, through Fresnel's equations up to 1e-5, "
+    "more where an edge slants"
+)
 PLACES = ((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
 
 
@@ -35,7 +38,9 @@ def _gap(i: int, j: int) -> float:
 def _free(tx: str, rx: str, gain: float = 1.0):
     s = stage.scenario(traced=False)
     antennas = replace(stage.FEW, gain=gain)
-    return FreeSpace(s.swarm, antennas, WAVELENGTH, s.seed).paths(stage.swarm(*PLACES), 0.0, [(tx, rx)])[tx, rx]
+    return FreeSpace(s.swarm, antennas, WAVELENGTH, s.seed).paths(
+        stage.swarm(*PLACES), 0.0, [(tx, rx)]
+    )[tx, rx]
 
 
 @case(
@@ -74,22 +79,33 @@ def radar_equation() -> float:
     for rx, second in (("A", _gap(0, 2)), ("P", _gap(1, 2))):
         found = _free("A", rx, 10**0.31)
         power = found.power[found.target == 2][0]
-        truth = 6.2 + 10 * np.log10(WAVELENGTH**2 * SIGMA / (4 * np.pi) ** 3) - 20 * np.log10(_gap(0, 2) * second)
+        truth = (
+            6.2
+            + 10 * np.log10(WAVELENGTH**2 * SIGMA / (4 * np.pi) ** 3)
+            - 20 * np.log10(_gap(0, 2) * second)
+        )
         worst = max(worst, abs(10 * np.log10(power) - truth))
     return worst
 
 
 def _ground(conductivity: float, permittivity: float = 5.31) -> City:
-    return stage.rectangle((-900, -900, 0), (1800, 0, 0), (0, 1800, 0), stage.material(permittivity, conductivity))
+    return stage.rectangle(
+        (-900, -900, 0), (1800, 0, 0), (0, 1800, 0), stage.material(permittivity, conductivity)
+    )
 
 
-def _two_rays(distance: float, low: float, high: float, permittivity: float, conductivity: float) -> complex:
-    """Field of both rays over the line of sight's amplitude, carrier phases included, in long double."""
+def _two_rays(
+    distance: float, low: float, high: float, permittivity: float, conductivity: float
+) -> complex:
+    """Field of both rays over the line of sight's amplitude, carrier phases included, in long
+    double."""
     d, h1, h2 = (np.longdouble(v) for v in (distance, low, high))
     direct, folded = np.sqrt(d * d + (h1 - h2) ** 2), np.sqrt(d * d + (h1 + h2) ** 2)
     reflection = slab_reflection(permittivity, conductivity, 0.1, float((h1 + h2) / folded))[1]
     turn = (folded - direct) / (truths.LIGHT / np.longdouble(truths.CARRIER))
-    return 1 + reflection * float(direct / folded) * np.exp(-2j * np.pi * float(turn - np.floor(turn)))
+    return 1 + reflection * float(direct / folded) * np.exp(
+        -2j * np.pi * float(turn - np.floor(turn))
+    )
 
 
 @case(
@@ -105,7 +121,8 @@ def _two_rays(distance: float, low: float, high: float, permittivity: float, con
     tracer=True,
 )
 def two_rays_across_the_breakpoint() -> float:
-    """The sum of direct and ground ray over concrete from well before the breakpoint (at 98 m) to well beyond it, vertical polarisation."""
+    """The sum of direct and ground ray over concrete from well before the breakpoint (at 98 m) to
+    well beyond it, vertical polarisation."""
     low, high, eps, sigma = 0.31, 0.307, 5.31, 1.9
     worst, model = 0.0, stage.tracer(_ground(sigma, eps), 1)
     for distance in (7.3, 23.9, 61.7, 97.1, 203.0, 411.0):
@@ -114,33 +131,44 @@ def two_rays_across_the_breakpoint() -> float:
         paths = paths.select(paths.target < 0)
         turn = (truths.CARRIER * (paths.delay - paths.delay[0])) % 1.0
         field = (paths.gain * np.exp(-2j * np.pi * turn)).sum() / np.abs(paths.gain[0])
-        worst = max(worst, abs(field - _two_rays(distance, low, high, eps, sigma)) if len(paths) == 2 else np.inf)
+        worst = max(
+            worst,
+            abs(field - _two_rays(distance, low, high, eps, sigma)) if len(paths) == 2 else np.inf,
+        )
     return float(worst)
 
 
 @case(
-    truth="image of a perfect conductor, lambda / (4 pi 2 d), times Fresnel's 0.9991 of the tracer's metal",
+    truth="image of a perfect conductor, lambda / (4 pi 2 d), times Fresnel's 0.9991 of the "
+    "tracer's metal",
     unit="relative",
     bound=5e-06,
     why=FLOAT32,
     planted=(
         "propagation/raytrace.py",
         (
-            "delay=legs.length / SPEED_OF_LIGHT,\n            delay_rate=legs.rate / SPEED_OF_LIGHT,\n            "
-            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n            "
+            "delay=legs.length / SPEED_OF_LIGHT,\n            delay_rate=legs.rate / "
+            "SPEED_OF_LIGHT,\n            "
+            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n     "
+            "       "
             "arrival=legs.arrival,\n            tx_radius=legs.length,"
         ),
         (
-            "delay=legs.length / SPEED_OF_LIGHT / 2,\n            delay_rate=legs.rate / SPEED_OF_LIGHT,\n            "
-            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n            "
+            "delay=legs.length / SPEED_OF_LIGHT / 2,\n            delay_rate=legs.rate / "
+            "SPEED_OF_LIGHT,\n            "
+            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n     "
+            "       "
             "arrival=legs.arrival,\n            tx_radius=legs.length,"
         ),
     ),
     tracer=True,
 )
 def conducting_plate() -> float:
-    """A large metal plate at right angles returns one image to its radar: amplitude and delay, on the seam of its triangles."""
-    plate = stage.rectangle((31.7, -20, -20), (0, 40, 0), (0, 0, 40), stage.material(conductivity=stage.METAL))
+    """A large metal plate at right angles returns one image to its radar: amplitude and delay, on
+    the seam of its triangles."""
+    plate = stage.rectangle(
+        (31.7, -20, -20), (0, 40, 0), (0, 0, 40), stage.material(conductivity=stage.METAL)
+    )
     poses = stage.swarm((0.3, 0.0, 0.0), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4))
     paths = stage.tracer(plate).paths(poses, 0.0, [("A", "A")])["A", "A"]
     paths = paths.select(paths.kind == PathKind.SPECULAR)
@@ -164,20 +192,37 @@ def conducting_plate() -> float:
     tracer=True,
 )
 def conducting_corner() -> float:
-    """A vertical edge of two metal walls at right angles returns one image, twice the distance to the edge away."""
+    """A vertical edge of two metal walls at right angles returns one image, twice the distance to
+    the edge away."""
     corner = np.array([21.3, -14.7, 0.0])
-    points = 40 * np.array([(0, 0, -1), (0, 0, 1), (1, 0, -1), (1, 0, 1), (0, 1, -1), (0, 1, 1)], float) + corner
+    points = (
+        40 * np.array([(0, 0, -1), (0, 0, 1), (1, 0, -1), (1, 0, 1), (0, 1, -1), (0, 1, 1)], float)
+        + corner
+    )
     faces = np.array([(0, 2, 3), (0, 3, 1), (0, 1, 5), (0, 5, 4)], np.int32)
-    mesh = City("corner", points, faces, np.zeros(4, np.int16), (stage.material(conductivity=stage.METAL),), np.zeros(3))
+    mesh = City(
+        "corner",
+        points,
+        faces,
+        np.zeros(4, np.int16),
+        (stage.material(conductivity=stage.METAL),),
+        np.zeros(3),
+    )
     away = np.array([9.3, 13.1, 0.0])
     radar = corner + away + np.array([0, 0, 1.7])
-    paths = stage.tracer(mesh, 2).paths(stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7])), 0.0, [("A", "A")])["A", "A"]
+    paths = stage.tracer(mesh, 2).paths(
+        stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7])), 0.0, [("A", "A")]
+    )["A", "A"]
     paths = paths.select((paths.kind == PathKind.SPECULAR) & (paths.bounces == 2))
     if len(paths) != 1:
         return np.inf
     cosines = away[:2] / np.linalg.norm(away)
-    reflection = np.prod([abs(slab_reflection(5.31, stage.METAL, 0.1, float(c))[0]) for c in cosines])
-    return abs(abs(paths.gain[0]) / (reflection * WAVELENGTH / (8 * np.pi * np.linalg.norm(away))) - 1)
+    reflection = np.prod(
+        [abs(slab_reflection(5.31, stage.METAL, 0.1, float(c))[0]) for c in cosines]
+    )
+    return abs(
+        abs(paths.gain[0]) / (reflection * WAVELENGTH / (8 * np.pi * np.linalg.norm(away))) - 1
+    )
 
 
 @case(
@@ -193,10 +238,13 @@ def conducting_corner() -> float:
     tracer=True,
 )
 def reflection_of_a_slab() -> float:
-    """Amplitude and phase of the ground's ray off concrete and off a pane, above, near and far below Brewster's angle."""
+    """Amplitude and phase of the ground's ray off concrete and off a pane, above, near and far
+    below Brewster's angle."""
     worst = 0.0
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (2.7, 0.6, 0.004)):
-        mesh = stage.rectangle((-150, -150, 0), (300, 0, 0), (0, 300, 0), stage.material(eps, sigma, 0.0, thickness))
+        mesh = stage.rectangle(
+            (-150, -150, 0), (300, 0, 0), (0, 300, 0), stage.material(eps, sigma, 0.0, thickness)
+        )
         model = stage.tracer(mesh, 1)
         for h in (0.9, 7.3, 31.0):
             poses = stage.swarm((-9.7, 3.1, h), (13.9, -4.3, 0.7 * h), (0.5, 40.0, 11.0))
@@ -221,23 +269,38 @@ def reflection_of_a_slab() -> float:
     tracer=True,
 )
 def ghosts_over_a_conducting_wall() -> float:
-    """Echo and ghosts of a target beside a metal wall: each is a product of a straight and a folded leg."""
-    wall = stage.rectangle((-60, 25.0, -40), (120, 0, 0), (0, 0, 80), stage.material(conductivity=stage.METAL))
+    """Echo and ghosts of a target beside a metal wall: each is a product of a straight and a folded
+    leg."""
+    wall = stage.rectangle(
+        (-60, 25.0, -40), (120, 0, 0), (0, 0, 80), stage.material(conductivity=stage.METAL)
+    )
     a, u = np.array([1.3, -2.7, 0.9]), np.array([9.1, 6.3, 0.9])
-    paths = stage.tracer(wall, 2).paths(stage.swarm(a, (-30.0, -20.0, 3.0), u), 0.0, [("A", "A")])["A", "A"]
+    paths = stage.tracer(wall, 2).paths(stage.swarm(a, (-30.0, -20.0, 3.0), u), 0.0, [("A", "A")])[
+        "A", "A"
+    ]
     paths = paths.select(paths.target == 2)
     image = np.array([u[0], 50 - u[1], u[2]])
     direct, folded = np.linalg.norm(u - a), np.linalg.norm(image - a)
     reflection = abs(slab_reflection(5.31, stage.METAL, 0.1, float((image - a)[1] / folded))[0])
     truth = [(direct, direct, 0), (direct, folded, 1), (direct, folded, 1), (folded, folded, 2)]
-    expected = np.array([WAVELENGTH * np.sqrt(SIGMA / (4 * np.pi) ** 3) / (p * q) * reflection**b for p, q, b in truth])
+    expected = np.array(
+        [
+            WAVELENGTH * np.sqrt(SIGMA / (4 * np.pi) ** 3) / (p * q) * reflection**b
+            for p, q, b in truth
+        ]
+    )
     found = np.abs(paths.gain)[np.argsort(paths.delay)]
     return float(np.abs(found / expected - 1).max()) if found.size == 4 else np.inf
 
 
 def _field_tracer(poses: dict, city: City, **clutter: Any) -> Any:
-    where = {n: {"role": r, "position_m": poses[n].position.tolist()} for n, r in (("A", "active"), ("P", "passive"))}
-    s = stage.scenario(swarm=where, frames=40, propagation={"max_bounces": 0}, clutter={"model": "field"} | clutter)
+    where = {
+        n: {"role": r, "position_m": poses[n].position.tolist()}
+        for n, r in (("A", "active"), ("P", "passive"))
+    }
+    s = stage.scenario(
+        swarm=where, frames=40, propagation={"max_bounces": 0}, clutter={"model": "field"} | clutter
+    )
     from isac_rt.frame.waveform import waveform_of
     from isac_rt.propagation.raytrace import RayTracer
 
@@ -254,7 +317,10 @@ def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
     truth="double integral of Lambert's law over the wall",
     unit="dB",
     bound=0.02,
-    why=("cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 of the power but for grazing angles"),
+    why=(
+        "cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 "
+        "of the power but for grazing angles"
+    ),
     planted=(
         "propagation/clutter/field.py",
         "power *= abs(back) / np.pi",
@@ -264,12 +330,23 @@ def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
     quick=False,
 )
 def lambertian_wall() -> float:
-    """Mean power that the clutter field of a wall of 120 m x 60 m returns, to its radar and to a second terminal."""
-    city = stage.rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), stage.material(conductivity=stage.METAL, scattering=0.43))
-    poses = {"A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)), "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0))}
+    """Mean power that the clutter field of a wall of 120 m x 60 m returns, to its radar and to a
+    second terminal."""
+    city = stage.rectangle(
+        (-60.0, 50.0, -30.0),
+        (120.0, 0, 0),
+        (0, 0, 60.0),
+        stage.material(conductivity=stage.METAL, scattering=0.43),
+    )
+    poses = {
+        "A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)),
+        "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0)),
+    }
     worst = 0.0
     for tx, rx in (("A", "A"), ("A", "P")):
-        truth = truths.lambertian_wall(poses[tx].position, poses[rx].position, 0.43, 50.0, (60.0, 30.0))
+        truth = truths.lambertian_wall(
+            poses[tx].position, poses[rx].position, 0.43, 50.0, (60.0, 30.0)
+        )
         worst = max(worst, abs(10 * np.log10(_field_power(tx, rx, poses, city) / truth)))
     return worst
 
@@ -278,7 +355,8 @@ def lambertian_wall() -> float:
     truth="double integral of Lambert's law over the wall, one end at its image under the ground",
     unit="dB",
     bound=0.04,
-    why="cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a vertical wave at these angles, 0.02 dB",
+    why="cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a "
+    "vertical wave at these angles, 0.02 dB",
     planted=(
         "propagation/clutter/two_bounces.py",
         "motion[0 if before else 1] = mirror.image(start if before else end)",
@@ -288,21 +366,40 @@ def lambertian_wall() -> float:
     quick=False,
 )
 def lambertian_wall_by_way_of_the_ground() -> float:
-    """Mean power of clutter of two bounces: a metal ground and a wall of 120 m x 60 m on it, in either order."""
+    """Mean power of clutter of two bounces: a metal ground and a wall of 120 m x 60 m on it, in
+    either order."""
     share, metal = 0.43, stage.material(conductivity=stage.METAL, scattering=0.43)
     wall = stage.rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), metal)
     ground = stage.rectangle((-80.0, -30.0, -30.0), (160.0, 0, 0), (0, 110.0, 0), metal)
     faces = np.concatenate([wall.faces, ground.faces + len(wall.vertices)]).astype(np.int32)
-    city = City("wall and ground", np.concatenate([wall.vertices, ground.vertices]), faces, np.zeros(4, np.int16), (metal,), np.zeros(3))
-    poses = {"A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)), "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0))}
+    city = City(
+        "wall and ground",
+        np.concatenate([wall.vertices, ground.vertices]),
+        faces,
+        np.zeros(4, np.int16),
+        (metal,),
+        np.zeros(3),
+    )
+    poses = {
+        "A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)),
+        "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0)),
+    }
     ways = _field_tracer(poses, city, mirrors=2).twice.seen("A", "P", poses["A"], poses["P"], 0.0)
     worst, count = 0.0, 0
     for part in ways:
         if abs(part.mirror.normal[2]) > 0.5:
             ends = [poses["A"].position, poses["P"].position]
-            ends[0 if part.before else 1] = ends[0 if part.before else 1] * [1, 1, -1] - [0, 0, 60.0]
-            truth = (1 - share**2) * truths.lambertian_wall(ends[0], ends[1], share, 50.0, (60.0, 30.0))
-            worst = max(worst, abs(10 * np.log10((part.seen.magnitude.astype(float) ** 2).sum() / truth)))
+            ends[0 if part.before else 1] = ends[0 if part.before else 1] * [1, 1, -1] - [
+                0,
+                0,
+                60.0,
+            ]
+            truth = (1 - share**2) * truths.lambertian_wall(
+                ends[0], ends[1], share, 50.0, (60.0, 30.0)
+            )
+            worst = max(
+                worst, abs(10 * np.log10((part.seen.magnitude.astype(float) ** 2).sum() / truth))
+            )
             count += 1
     return worst if count == 2 else np.inf
 
@@ -320,13 +417,16 @@ def lambertian_wall_by_way_of_the_ground() -> float:
     tracer=True,
 )
 def reflectivity_of_scatterers() -> float:
-    """Power reflectivity of a slab for both polarisations, from grazing to upright incidence, as the clutter field uses it."""
+    """Power reflectivity of a slab for both polarisations, from grazing to upright incidence, as
+    the clutter field uses it."""
     from isac_rt.propagation.clutter.field import slab_reflectivity
 
     cosines, worst = np.array([0.03, 0.21, 0.5, 0.83, 1.0]), 0.0
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (6.31, 1.21, 0.012)):
         found = slab_reflectivity(stage.material(eps, sigma, 0.3, thickness), cosines, WAVELENGTH)
-        truth = np.array([[abs(r) ** 2 for r in slab_reflection(eps, sigma, thickness, c)] for c in cosines]).T
+        truth = np.array(
+            [[abs(r) ** 2 for r in slab_reflection(eps, sigma, thickness, c)] for c in cosines]
+        ).T
         worst = max(worst, float(np.abs(np.array(found) - truth).max()))
     return worst
 
@@ -344,7 +444,8 @@ def reflectivity_of_scatterers() -> float:
     tracer=True,
 )
 def lobes_radiate_their_power() -> float:
-    """The norm of the directive scattering pattern, for exponents 1, 4 and 7 and directions from grazing to upright."""
+    """The norm of the directive scattering pattern, for exponents 1, 4 and 7 and directions from
+    grazing to upright."""
     from isac_rt.propagation.clutter.field import lobe_norm
 
     worst = 0.0
@@ -379,7 +480,9 @@ def materials_at_77_ghz() -> float:
     worst = 0.0
     for one in found:
         eps, sigma = truth[one.name]
-        worst = max(worst, abs(one.relative_permittivity / eps - 1), abs(one.conductivity / sigma - 1))
+        worst = max(
+            worst, abs(one.relative_permittivity / eps - 1), abs(one.conductivity / sigma - 1)
+        )
     return worst
 
 
@@ -395,7 +498,8 @@ def materials_at_77_ghz() -> float:
     ),
 )
 def water() -> float:
-    """Static permittivity and relaxation frequency of water, on which the permittivity of soil and leaves rests."""
+    """Static permittivity and relaxation frequency of water, on which the permittivity of soil and
+    leaves rests."""
     f = np.linspace(10e9, 30e9, 2001)
     peak = f[np.argmax([-water_permittivity(x).imag for x in f])]
     return max(abs(water_permittivity(1e6).real / 80.1 - 1), abs(peak / 17.3e9 - 1))
@@ -417,7 +521,10 @@ def cross_section_of_a_small_uav() -> float:
     section, worst = CrossSection(Rcs(), "U1", 7), 0.0
     for beta in (0.0, 0.41, 1.57, 2.6):
         u, v = np.array([[1.0, 0, 0]]), np.array([[np.cos(beta), np.sin(beta), 0]])
-        worst = max(worst, abs(10 * np.log10(section.square_metres(u, v)[0]) - (-12.81 - 3 * np.sin(beta / 2))))
+        worst = max(
+            worst,
+            abs(10 * np.log10(section.square_metres(u, v)[0]) - (-12.81 - 3 * np.sin(beta / 2))),
+        )
     return worst
 
 
@@ -433,11 +540,14 @@ def cross_section_of_a_small_uav() -> float:
     ),
 )
 def cross_section_of_a_large_uav() -> float:
-    """The lobes of the large UAV, averaged over the sphere (Gauss-Legendre in the cosine, even in azimuth)."""
+    """The lobes of the large UAV, averaged over the sphere (Gauss-Legendre in the cosine, even in
+    azimuth)."""
     mu, weight = np.polynomial.legendre.leggauss(400)
     phi = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     s = np.sqrt(1 - mu**2)[:, None]
-    u = np.stack([s * np.cos(phi), s * np.sin(phi), np.broadcast_to(mu[:, None], (400, 720))], axis=-1)
+    u = np.stack(
+        [s * np.cos(phi), s * np.sin(phi), np.broadcast_to(mu[:, None], (400, 720))], axis=-1
+    )
     mean = (10 ** (large_uav_db(u, np.zeros((400, 720))) / 10)).mean(axis=1) @ weight / 2
     return abs(10 * np.log10(mean) + 5.85)
 
@@ -446,7 +556,10 @@ def cross_section_of_a_large_uav() -> float:
     truth="the standard deviation asked for",
     unit="sigma",
     bound=4.5,
-    why=("false alarm 7e-6; 300 bodies in 10 aspects 0.8 rad apart and more, taken as one independent draw per body"),
+    why=(
+        "false alarm 7e-6; 300 bodies in 10 aspects 0.8 rad apart and more, taken as one "
+        "independent draw per body"
+    ),
     planted=(
         "propagation/rcs.py",
         "np.sqrt(2 / NUM_WAVES)",
@@ -459,7 +572,12 @@ def fluctuation_of_a_cross_section() -> float:
     u = rng.normal(size=(10, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     of = Rcs(fluctuation_db=3.0)
-    level = np.array([10 * np.log10(CrossSection(of, f"U{i}", 5).square_metres(u, u)) for i in range(300)]) + 12.81
+    level = (
+        np.array(
+            [10 * np.log10(CrossSection(of, f"U{i}", 5).square_metres(u, u)) for i in range(300)]
+        )
+        + 12.81
+    )
     return abs(float((level**2).mean()) / 9 - 1) / np.sqrt(2 / 300)
 
 
@@ -476,10 +594,14 @@ def fluctuation_of_a_cross_section() -> float:
 )
 def elements_radiate_their_power() -> float:
     """The cosine pattern of an element of 5 dBi radiates what it is given."""
-    antennas = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=2e-3, gain=10**0.5, pattern="cosine")
+    antennas = Antennas(
+        tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=2e-3, gain=10**0.5, pattern="cosine"
+    )
 
     def density(angle: float) -> float:
-        return float(antennas.element_gain(np.array([np.sin(angle), np.cos(angle), 0.0]))) * np.sin(angle)
+        return float(antennas.element_gain(np.array([np.sin(angle), np.cos(angle), 0.0]))) * np.sin(
+            angle
+        )
 
     return abs(quad(density, 0, np.pi / 2, epsabs=1e-10)[0] / 2 - 1)
 
@@ -496,7 +618,11 @@ def elements_radiate_their_power() -> float:
     ),
 )
 def thermal_noise() -> float:
-    """Noise of a complex sample over the sampling rate of 20 MHz with a noise figure of 11.3 dB; Gaussian clutter adds in power."""
+    """Noise of a complex sample over the sampling rate of 20 MHz with a noise figure of 11.3 dB;
+    Gaussian clutter adds in power."""
     found = thermal_noise_power(Noise(noise_figure_db=11.3), Waveform())
     rise = noise_rise(Clutter(model="gaussian", clutter_to_noise_db=3.0103))
-    return max(abs(10 * np.log10(found / 1e-3) - (-173.975 + 10 * np.log10(20e6) + 11.3)), abs(rise - 3) / 3)
+    return max(
+        abs(10 * np.log10(found / 1e-3) - (-173.975 + 10 * np.log10(20e6) + 11.3)),
+        abs(rise - 3) / 3,
+    )

@@ -16,7 +16,8 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class Planted:
-    """A bug that makes a case fail: `old` replaced by `new` in `file` of the package. ``tests/mutation.py --planted`` plants each one."""
+    """A bug that makes a case fail: `old` replaced by `new` in `file` of the package.
+    ``tests/mutation.py --planted`` plants each one."""
 
     file: str
     old: str
@@ -38,7 +39,8 @@ class Case:
     measure : returns the error
     quick : whether it belongs to the quick selection
     tracer : whether it needs the ray tracer
-    package : another project's package that it needs, if any; the case is left out where that is not installed
+    package : another project's package that it needs, if any; the case is left out where that is
+        not installed
     """
 
     name: str
@@ -57,7 +59,8 @@ class Case:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case: `passed` is None where it was left out, `note` says why, or with which version of another package."""
+    """What became of a case: `passed` is None where it was left out, `note` says why, or with which
+    version of another package."""
 
     case: Case
     error: float
@@ -77,12 +80,26 @@ def case(
     tracer: bool = False,
     package: str = "",
 ) -> Callable[[Callable[[], float]], Case]:
-    """Make a case of a function that measures an error; its docstring is the claim, its name the name."""
+    """Make a case of a function that measures an error; its docstring is the claim, its name the
+    name."""
 
     def made(measure: Callable[[], float]) -> Case:
         claim = " ".join((measure.__doc__ or "").split())
         name, group = measure.__name__.replace("_", " "), measure.__module__.rpartition(".")[2]
-        return Case(name, group, claim, truth, unit, bound, why, Planted(*planted), measure, quick, tracer, package)
+        return Case(
+            name,
+            group,
+            claim,
+            truth,
+            unit,
+            bound,
+            why,
+            Planted(*planted),
+            measure,
+            quick,
+            tracer,
+            package,
+        )
 
     return made
 
@@ -93,7 +110,8 @@ def cases_of(module: ModuleType) -> list[Case]:
 
 
 def run_case(case: Case) -> Verdict:
-    """Measure one case. An error that is not a number fails; so does an exception, whose text becomes the note."""
+    """Measure one case. An error that is not a number fails; so does an exception, whose text
+    becomes the note."""
     note = ""
     if case.package:
         try:
@@ -108,7 +126,13 @@ def run_case(case: Case) -> Verdict:
     except Skipped as reason:
         return Verdict(case, math.nan, None, time.perf_counter() - begin, str(reason))
     except Exception as problem:
-        return Verdict(case, math.inf, False, time.perf_counter() - begin, f"{type(problem).__name__}: {problem}")
+        return Verdict(
+            case,
+            math.inf,
+            False,
+            time.perf_counter() - begin,
+            f"{type(problem).__name__}: {problem}",
+        )
     return Verdict(case, error, bool(error <= case.bound), time.perf_counter() - begin, note)
 
 

@@ -1,4 +1,5 @@
-"""The same numbers from software that nobody here wrote. Only Sionna RT comes with the program; the others are looked for."""
+"""The same numbers from software that nobody here wrote. Only Sionna RT comes with the program; the
+others are looked for."""
 
 from __future__ import annotations
 
@@ -35,18 +36,26 @@ PLACES = ((-11.37, 2.13, 14.21), (17.93, -3.31, 9.67), (4.41, 1.73, 20.3))
     tracer=True,
 )
 def paths_of_a_canyon_against_sionna() -> float:
-    """The channel of a street canyon, paths sorted by delay: complex amplitudes with the carrier phase."""
+    """The channel of a street canyon, paths sorted by delay: complex amplitudes with the carrier
+    phase."""
     import mitsuba as mi
     import sionna.rt as rt
 
     from isac_rt.world.city.scene import build_scene
 
-    city = load_city(tree.City(source="builtin", name="simple_street_canyon"), ".", truths.CARRIER, (0.31, -0.17, 0.9))
+    city = load_city(
+        tree.City(source="builtin", name="simple_street_canyon"),
+        ".",
+        truths.CARRIER,
+        (0.31, -0.17, 0.9),
+    )
     poses = stage.swarm(*PLACES, moving=False)
     ours = stage.tracer(city, 2).paths(poses, 0.0, [("A", "P")])["A", "P"]
     ours = ours.select(ours.target < 0)
     scene = build_scene(city, truths.CARRIER).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
     local = {n: mi.Point3f(*(poses[n].position - city.origin).tolist()) for n in "AP"}
     scene.add(rt.Transmitter("tx", local["A"]))
     scene.add(rt.Receiver("rx", local["P"]))
@@ -56,7 +65,9 @@ def paths_of_a_canyon_against_sionna() -> float:
     a, tau = a[tau >= 0], tau[tau >= 0]
     if a.size != len(ours):
         return np.inf
-    mine = (ours.gain * np.exp(-2j * np.pi * ((truths.CARRIER * ours.delay) % 1)))[np.argsort(ours.delay)]
+    mine = (ours.gain * np.exp(-2j * np.pi * ((truths.CARRIER * ours.delay) % 1)))[
+        np.argsort(ours.delay)
+    ]
     return stage.relative(mine, a[np.argsort(tau)])
 
 
@@ -74,25 +85,32 @@ def paths_of_a_canyon_against_sionna() -> float:
     quick=False,
 )
 def echoes_against_sionna() -> float:
-    """Echo and ghosts of a target over floor and wall: the same paths with the same complex amplitudes."""
+    """Echo and ghosts of a target over floor and wall: the same paths with the same complex
+    amplitudes."""
     import mitsuba as mi
     import sionna.rt as rt
     from sionna.rt.rcs import ConstantRCSSensingTarget, RCSSolver
 
     from isac_rt.world.city.scene import build_scene
 
-    city = load_city(tree.City(source="builtin", name="floor_wall"), ".", truths.CARRIER, (0.31, -0.17, 0.9))
+    city = load_city(
+        tree.City(source="builtin", name="floor_wall"), ".", truths.CARRIER, (0.31, -0.17, 0.9)
+    )
     poses = stage.swarm((1.13, -0.41, 2.71), (1.71, 0.33, 0.31), (1.31, 0.43, 1.63))
     ours = stage.tracer(city, 2).paths(poses, 0.0, [("A", "P")])["A", "P"]
     ours = ours.select(ours.target == 2)
     scene = build_scene(city, truths.CARRIER).scene
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
     local = {n: mi.Point3f(*(p.position - city.origin).tolist()) for n, p in poses.items()}
     scene.add(rt.Transmitter("tx", local["A"]))
     scene.add(rt.Receiver("rx", local["P"]))
     size = {"length": 0.02, "width": 0.02, "height": 0.02}
     scene.add(ConstantRCSSensingTarget("body", sigma=10**-1.17, position=local["U"], **size))
-    theirs = RCSSolver(deterministic=True)(scene, max_depth=3, buffer_size_per_sp=10_000, samples_per_sp=20_000, refraction=False)
+    theirs = RCSSolver(deterministic=True)(
+        scene, max_depth=3, buffer_size_per_sp=10_000, samples_per_sp=20_000, refraction=False
+    )
     valid = np.asarray(theirs.valid).ravel()
     gain = (np.asarray(theirs.a[0], float) + 1j * np.asarray(theirs.a[1], float)).ravel()[valid]
     order = np.argsort(np.asarray(theirs.tau, float).ravel()[valid])
@@ -123,23 +141,52 @@ def cube_against_mmwrt() -> float:
     row = np.array([(k * 0.5774 * w.wavelength, 0.0, 0.0) for k in range(4)])
     begin = w.chirp_duration - w.sampled_duration
     radar = Radar(
-        transmitter=Transmitter(chirp_start_freq=77e9 + w.slope * begin, chirp_slope=w.slope, chirp_end_time=w.sampled_duration * 1.05,
-                                chirp_period=w.slot_duration, chirp_count=1, frame_count=1, antennas=[Antenna()]),
-        receiver=Receiver(adc_sample_rate=w.sampling_rate, antennas=[Antenna(x=x) for x, _, _ in row], adc_sample_count=w.num_samples),
-    )  # fmt: skip
+        transmitter=Transmitter(
+            chirp_start_freq=77e9 + w.slope * begin,
+            chirp_slope=w.slope,
+            chirp_end_time=w.sampled_duration * 1.05,
+            chirp_period=w.slot_duration,
+            chirp_count=1,
+            frame_count=1,
+            antennas=[Antenna()],
+        ),
+        receiver=Receiver(
+            adc_sample_rate=w.sampling_rate,
+            antennas=[Antenna(x=x) for x, _, _ in row],
+            adc_sample_count=w.num_samples,
+        ),
+    )
     late = 12  # their chirp is not there before it has arrived; their speed of light is 3e8 m/s
-    cube = rt_points([radar], [Scatterer(*p) for p in places], radar, datatype=np.complex128)["adc_cube"]
+    cube = rt_points([radar], [Scatterer(*p) for p in places], radar, datatype=np.complex128)[
+        "adc_cube"
+    ]
     theirs = np.asarray(cube).reshape(4, w.num_samples)[:, late:]
     ours = np.zeros((4, w.num_samples), complex)
     antennas = stage.arrays(w, tx_x=1, tx_z=1)
     here = stage.pose((0, 0, 0))
-    sender = Transmission(name="A", pose=here, antennas=antennas, schedule=np.zeros((1, 2), np.int64), payload=unmodulated(w))
+    sender = Transmission(
+        name="A",
+        pose=here,
+        antennas=antennas,
+        schedule=np.zeros((1, 2), np.int64),
+        payload=unmodulated(w),
+    )
     along = np.array([[0.0, 1.0, 0.0]])
     for i, element in enumerate(row):
         ways = [np.linalg.norm(p) + np.linalg.norm(np.array(p) - element) for p in places]
-        paths = make_paths(gain=np.ones(3), delay=np.array(ways) / 3e8, departure=np.repeat(along, 3, 0), kind=PathKind.TARGET,
-                           arrival=np.repeat(along, 3, 0), epoch=w.frame_duration / 2, tx="A", rx="A")  # fmt: skip
-        centre = stage.synthesise(w, [(sender, paths)], here, "direct", 0.0, stage.arrays(w, tx_x=1, tx_z=1, spacing=1e-9))
+        paths = make_paths(
+            gain=np.ones(3),
+            delay=np.array(ways) / 3e8,
+            departure=np.repeat(along, 3, 0),
+            kind=PathKind.TARGET,
+            arrival=np.repeat(along, 3, 0),
+            epoch=w.frame_duration / 2,
+            tx="A",
+            rx="A",
+        )
+        centre = stage.synthesise(
+            w, [(sender, paths)], here, "direct", 0.0, stage.arrays(w, tx_x=1, tx_z=1, spacing=1e-9)
+        )
         ours[i] = centre[0, 0, 0]
     ours = ours[:, late:]
     turn = (theirs * ours.conj()).sum()
@@ -162,7 +209,11 @@ def cfar_against_mmwrt() -> float:
     """Threshold factor of one channel over 8 and 16 cells of one side, at 1e-2 and 1e-5."""
     from mmWrt.RadarSignalProcessing import cfar_alpha
 
-    return max(abs(greatest_of_factor(rate, 1.0, float(n), 0.0) / cfar_alpha(n, rate) - 1) for n in (8, 16) for rate in (1e-2, 1e-5))
+    return max(
+        abs(greatest_of_factor(rate, 1.0, float(n), 0.0) / cfar_alpha(n, rate) - 1)
+        for n in (8, 16)
+        for rate in (1e-2, 1e-5)
+    )
 
 
 @case(

@@ -35,8 +35,12 @@ BODY = ((9.7, 31.1, 14.9), (3.7, 8.3, -2.2), (2.1, -0.6, 1.7))
 
 
 def _unfolded(planes: tuple, start: Pose, end: Pose) -> Legs:
-    normals = np.array([np.array(n, float) / np.linalg.norm(n) for n, _ in planes]).reshape(1, -1, 3)
-    offsets = np.array([[n @ np.array(p, float) for n, (_, p) in zip(normals[0], planes, strict=True)]]).reshape(1, -1)
+    normals = np.array([np.array(n, float) / np.linalg.norm(n) for n, _ in planes]).reshape(
+        1, -1, 3
+    )
+    offsets = np.array(
+        [[n @ np.array(p, float) for n, (_, p) in zip(normals[0], planes, strict=True)]]
+    ).reshape(1, -1)
     return unfold(normals, offsets, start, end)
 
 
@@ -52,7 +56,9 @@ def _over(planes: tuple, distances: tuple[float, ...] = (1.013, 9.87, 101.3, 997
 
 def _free_space(poses: dict[str, Pose], tx: str, rx: str):
     s = stage.scenario(traced=False)
-    return FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed).paths(poses, 0.0, [(tx, rx)])[tx, rx]
+    return FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed).paths(poses, 0.0, [(tx, rx)])[
+        tx, rx
+    ]
 
 
 def _doppler_error(found: float, length) -> float:
@@ -61,7 +67,10 @@ def _doppler_error(found: float, length) -> float:
 
 
 NANOMETRE = "1e-9 m is 1.6e-6 rad of the carrier; " + LONGEST_ROUNDING
-DIFFERENCE = "4th-order differences over 1 ms leave h^4/30 of the fifth derivative, 1e-9 m/s, which is 3e-7 Hz"
+DIFFERENCE = (
+    "4th-order differences over 1 ms leave h^4/30 of the fifth derivative, 1e-9 m/s, "
+    "which is 3e-7 Hz"
+)
 
 
 @case(
@@ -80,7 +89,15 @@ def delay_of_the_line_of_sight() -> float:
     worst = 0.0
     for d in (1.013, 9.87, 101.3, 997.7):
         end = np.array(TX[0]) + d * np.array([0.61, 0.73, 0.309])
-        worst = max(worst, float(abs(straight(stage.pose(TX[0]), end[None]).length[0] - chain_length((), np.array(TX[0]), end))))
+        worst = max(
+            worst,
+            float(
+                abs(
+                    straight(stage.pose(TX[0]), end[None]).length[0]
+                    - chain_length((), np.array(TX[0]), end)
+                )
+            ),
+        )
     return worst
 
 
@@ -99,7 +116,9 @@ def delay_over_the_ground() -> float:
     """The ground's reflection is the image under the ground, from 1 m to 1 km."""
     worst = 0.0
     for d in (1.013, 9.87, 101.3, 997.7):
-        legs = _unfolded((((0, 0, 1), (3.3, 1.7, 0.41)),), stage.pose((0, 0, 9.87)), stage.pose((d, 0, 4.31)))
+        legs = _unfolded(
+            (((0, 0, 1), (3.3, 1.7, 0.41)),), stage.pose((0, 0, 9.87)), stage.pose((d, 0, 4.31))
+        )
         h = wide([9.87, 4.31]).sum() - 2 * np.longdouble(0.41)
         worst = max(worst, float(abs(legs.length[0] - np.sqrt(np.longdouble(d) ** 2 + h * h))))
     return worst
@@ -165,7 +184,8 @@ def delay_over_three_planes() -> float:
     ),
 )
 def corner_of_three_right_angles() -> float:
-    """A corner of three planes at right angles returns a wave along its own way, twice the distance to the corner."""
+    """A corner of three planes at right angles returns a wave along its own way, twice the distance
+    to the corner."""
     turn, _ = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))
     corner, radar = np.array([31.3, -24.7, 13.9]), np.array([9.3, 13.1, 7.7])
     legs = _unfolded(tuple((n, corner) for n in turn), stage.pose(radar), stage.pose(radar))
@@ -186,7 +206,8 @@ def corner_of_three_right_angles() -> float:
     ),
 )
 def city_100_km_from_the_origin() -> float:
-    """A mesh file whose city lies 100 km from the world's origin keeps its delays after recentring: two walls, from file to length."""
+    """A mesh file whose city lies 100 km from the world's origin keeps its delays after recentring:
+    two walls, from file to length."""
     far = np.array([71003.271, -69012.133, 812.437])
     corners = {
         "front": [(-40, 52, -30), (40, 61, -30), (40, 61, 30), (-40, 52, 30)],
@@ -194,18 +215,32 @@ def city_100_km_from_the_origin() -> float:
     }
     text, planes = "", []
     for i, (name, place) in enumerate(corners.items()):
-        text += f"o {name}\n" + "".join("v " + " ".join(f"{c:.9f}" for c in far + np.array(p)) + "\n" for p in place)
+        text += f"o {name}\n" + "".join(
+            "v " + " ".join(f"{c:.9f}" for c in far + np.array(p)) + "\n" for p in place
+        )
         text += f"f {4 * i + 1} {4 * i + 2} {4 * i + 3}\nf {4 * i + 1} {4 * i + 3} {4 * i + 4}\n"
         a, b, d = (wide(p) for p in np.array(place, float)[[0, 1, 3]])
         planes.append((np.cross(b - a, d - a), a))
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "city.obj").write_text(text)
-        city = load_city(tree.City(source="mesh", file="city.obj"), folder, truths.CARRIER, far + np.array([7.3, 3.1, 1.9]))
+        city = load_city(
+            tree.City(source="mesh", file="city.obj"),
+            folder,
+            truths.CARRIER,
+            far + np.array([7.3, 3.1, 1.9]),
+        )
     normals, offsets = plane_of_each_face(city)
     start, end = np.array([1.37, -2.21, 3.3]), np.array([23.9, 17.3, 8.77])
     truth = chain_length(planes, start, end)
-    order = [int(np.argmax((city.corners + city.origin - far).mean(axis=1) @ n)) for n in ((0, 1, 0), (1, 0, 0))]
-    legs = unfold(normals[order][None], offsets[order][None], *(stage.pose(far + p - city.origin) for p in (start, end)))
+    order = [
+        int(np.argmax((city.corners + city.origin - far).mean(axis=1) @ n))
+        for n in ((0, 1, 0), (1, 0, 0))
+    ]
+    legs = unfold(
+        normals[order][None],
+        offsets[order][None],
+        *(stage.pose(far + p - city.origin) for p in (start, end)),
+    )
     return float(abs(legs.length[0] - truth))
 
 
@@ -255,7 +290,8 @@ def doppler_of_a_moving_receiver() -> float:
     ),
 )
 def doppler_of_a_moving_reflector() -> float:
-    """A mirror in motion is unfolded in its own frame: Doppler of a wall that moves along and across while both ends rest."""
+    """A mirror in motion is unfolded in its own frame: Doppler of a wall that moves along and
+    across while both ends rest."""
     w = np.array([3.3, -5.7, 1.1])
     normal, point = SIDE
     legs = _unfolded((SIDE,), stage.pose(TX[0], -w), stage.pose(RX[0], -w))
@@ -282,7 +318,12 @@ def doppler_of_a_moving_target() -> float:
     poses = {"A": stage.pose(TX[0]), "P": stage.pose(RX[0]), "U": stage.pose(*BODY)}
     paths = _free_space(poses, "A", "P")
     rate = paths.delay_rate[paths.kind == PathKind.TARGET][0]
-    return _doppler_error(rate, lambda t: truths.norm(flown(*BODY, t) - wide(TX[0])) + truths.norm(flown(*BODY, t) - wide(RX[0])))
+    return _doppler_error(
+        rate,
+        lambda t: (
+            truths.norm(flown(*BODY, t) - wide(TX[0])) + truths.norm(flown(*BODY, t) - wide(RX[0]))
+        ),
+    )
 
 
 @case(
@@ -293,11 +334,13 @@ def doppler_of_a_moving_target() -> float:
     planted=(
         "propagation/legs/geometry.py",
         (
-            "rate = (e * w).sum(1)\n    accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)\n    return "
+            "rate = (e * w).sum(1)\n    accel = ((w * w).sum(-1) - rate**2) / length + (e * "
+            "a).sum(1)\n    return "
             "Legs(length, rate, accel, e, -e"
         ),
         (
-            "rate = -(e * w).sum(1)\n    accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)\n    return "
+            "rate = -(e * w).sum(1)\n    accel = ((w * w).sum(-1) - rate**2) / length + (e * "
+            "a).sum(1)\n    return "
             "Legs(length, rate, accel, e, -e"
         ),
     ),
@@ -306,7 +349,12 @@ def doppler_of_a_scatterer() -> float:
     """Doppler over a scatterer at rest when both ends fly: the sum of two legs."""
     point = np.array([-11.3, 24.1, 5.7])
     rate = sum(straight(stage.pose(*end), point[None]).rate[0] for end in (TX, RX)) / C
-    return _doppler_error(rate, lambda t: truths.norm(wide(point) - flown(*TX, t)) + truths.norm(wide(point) - flown(*RX, t)))
+    return _doppler_error(
+        rate,
+        lambda t: (
+            truths.norm(wide(point) - flown(*TX, t)) + truths.norm(wide(point) - flown(*RX, t))
+        ),
+    )
 
 
 @case(
@@ -321,11 +369,19 @@ def doppler_of_a_scatterer() -> float:
     ),
 )
 def doppler_of_everything_at_once() -> float:
-    """Doppler of ghosts, off one wall to the target and off two on the way back, all three bodies in curved flight."""
+    """Doppler of ghosts, off one wall to the target and off two on the way back, all three bodies
+    in curved flight."""
     there, back = (FRONT,), (FLOOR, SIDE)
-    rate = (_unfolded(there, stage.pose(*TX), stage.pose(*BODY)).rate[0] + _unfolded(back, stage.pose(*BODY), stage.pose(*RX)).rate[0]) / C
+    rate = (
+        _unfolded(there, stage.pose(*TX), stage.pose(*BODY)).rate[0]
+        + _unfolded(back, stage.pose(*BODY), stage.pose(*RX)).rate[0]
+    ) / C
     return _doppler_error(
-        rate, lambda t: chain_length(there, flown(*TX, t), flown(*BODY, t)) + chain_length(back, flown(*BODY, t), flown(*RX, t))
+        rate,
+        lambda t: (
+            chain_length(there, flown(*TX, t), flown(*BODY, t))
+            + chain_length(back, flown(*BODY, t), flown(*RX, t))
+        ),
     )
 
 
@@ -333,7 +389,8 @@ def doppler_of_everything_at_once() -> float:
     truth="second derivative of the long-double length",
     unit="m/s^2",
     bound=1e-08,
-    why="4th-order second differences over 1 ms: rounding 1e-18 * 50 m / h^2 and h^4/90 of the sixth derivative",
+    why="4th-order second differences over 1 ms: rounding 1e-18 * 50 m / h^2 and h^4/90 of the "
+    "sixth derivative",
     planted=(
         "propagation/legs/geometry.py",
         "acceleration = acceleration - 2 * (",
@@ -364,7 +421,13 @@ def acceleration_of_an_echo() -> float:
     paths = _free_space(poses, "A", "P")
     found = paths.delay_accel[paths.kind == PathKind.TARGET][0] * C
     return abs(
-        found - derivatives(lambda t: truths.norm(flown(*BODY, t) - flown(*TX, t)) + truths.norm(flown(*BODY, t) - flown(*RX, t)))[1]
+        found
+        - derivatives(
+            lambda t: (
+                truths.norm(flown(*BODY, t) - flown(*TX, t))
+                + truths.norm(flown(*BODY, t) - flown(*RX, t))
+            )
+        )[1]
     )
 
 
@@ -372,7 +435,8 @@ def acceleration_of_an_echo() -> float:
     truth="Fermat: the length is stationary, by moving each point along its wall",
     unit="rad",
     bound=1e-06,
-    why="slope of the length, by differences of 1e-5 m over lengths known to 1e-14 m; curvature cancels",
+    why="slope of the length, by differences of 1e-5 m over lengths known to 1e-14 m; curvature "
+    "cancels",
     planted=(
         "propagation/legs/geometry.py",
         "points[:, b] = target\n",
@@ -380,7 +444,8 @@ def acceleration_of_an_echo() -> float:
     ),
 )
 def mirror_points_obey_fermat() -> float:
-    """The interaction points of a path over three planes are where its length is stationary; they lie on the planes."""
+    """The interaction points of a path over three planes are where its length is stationary; they
+    lie on the planes."""
     planes = (FRONT, FLOOR, SIDE)
     points = _unfolded(planes, stage.pose(TX[0]), stage.pose(RX[0])).points[0]
     worst = 0.0
@@ -409,7 +474,8 @@ def mirror_points_obey_fermat() -> float:
     ),
 )
 def reciprocity_of_folded_paths() -> float:
-    """The way back over the same planes has the same length and rate, and the two directions change places."""
+    """The way back over the same planes has the same length and rate, and the two directions change
+    places."""
     planes = (FRONT, FLOOR, SIDE)
     on = _unfolded(planes, stage.pose(*TX), stage.pose(*RX))
     back = _unfolded(planes[::-1], stage.pose(*RX), stage.pose(*TX))
@@ -421,7 +487,10 @@ def reciprocity_of_folded_paths() -> float:
     truth="images of a box: an integer lattice",
     unit="m",
     bound=3e-06,
-    why=("the scene's file holds its corners as float32 numbers of up to 10 m, half an ulp 5e-7 m, times the bounces"),
+    why=(
+        "the scene's file holds its corners as float32 numbers of up to 10 m, half an ulp 5e-7 m, "
+        "times the bounces"
+    ),
     planted=(
         "propagation/raytrace.py",
         "chain = faces[which][:, :count]",
@@ -431,8 +500,11 @@ def reciprocity_of_folded_paths() -> float:
     quick=False,
 )
 def every_path_of_a_box() -> float:
-    """The ray tracer finds every path in a closed box up to two bounces, once each, and no other: a lattice of images."""
-    city = load_city(tree.City(source="builtin", name="box"), ".", truths.CARRIER, (0.31, -0.17, 0.9))
+    """The ray tracer finds every path in a closed box up to two bounces, once each, and no other: a
+    lattice of images."""
+    city = load_city(
+        tree.City(source="builtin", name="box"), ".", truths.CARRIER, (0.31, -0.17, 0.9)
+    )
     low, high = city.bounds() + city.origin
     a, p = np.array([-1.73, 2.31, 1.91]), np.array([2.93, -1.13, 3.37])
     lattice = []
@@ -440,7 +512,9 @@ def every_path_of_a_box() -> float:
         if np.abs(index).sum() <= 2:
             image = [_image(a[i], low[i], high[i], index[i]) for i in range(3)]
             lattice.append(np.linalg.norm(p - np.array(image)))
-    paths = stage.tracer(city, 2).paths(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [("A", "P")])["A", "P"]
+    paths = stage.tracer(city, 2).paths(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [("A", "P")])[
+        "A", "P"
+    ]
     found = np.sort(C * paths.delay[paths.target < 0])
     return float(np.abs(found - np.sort(lattice)).max()) if found.size == len(lattice) else np.inf
 
@@ -464,10 +538,17 @@ def _image(x: float, low: float, high: float, crossings: int) -> float:
     tracer=True,
 )
 def a_wall_10_km_off_reflects_once() -> float:
-    """Far from the tracer's origin Sionna finds one reflection several times at full amplitude; one is kept."""
+    """Far from the tracer's origin Sionna finds one reflection several times at full amplitude; one
+    is kept."""
     far = np.array([7100.3, -6900.7, 310.1])
-    city = stage.rectangle(far + np.array([31.3, -60, -60]), (5.0, 120, 0), (0, 0, 120), stage.material())
-    poses = stage.swarm(far + np.array([0.3, 1.1, 9.3]), far + np.array([1.7, 17.4, 8.1]), far + np.array([-3.3, -2.2, 7.9]))
+    city = stage.rectangle(
+        far + np.array([31.3, -60, -60]), (5.0, 120, 0), (0, 0, 120), stage.material()
+    )
+    poses = stage.swarm(
+        far + np.array([0.3, 1.1, 9.3]),
+        far + np.array([1.7, 17.4, 8.1]),
+        far + np.array([-3.3, -2.2, 7.9]),
+    )
     paths = stage.tracer(city, 1).paths(poses, 0.0, [("A", "P")])["A", "P"]
     return abs(paths.counts()["specular"] - 1)
 
@@ -484,14 +565,30 @@ def a_wall_10_km_off_reflects_once() -> float:
     ),
 )
 def velocity_along_waypoints() -> float:
-    """Velocity and acceleration of a flight through waypoints are the derivatives of its position, and it passes through them."""
-    points = [(0.0, (34, 54, 21)), (1.7, (46.3, 52.1, 21.5)), (3.6, (60.2, 49.7, 22.5)), (4.4, (63.9, 55.3, 20.1))]
-    flight = Trajectory(tree.Uav.model_validate({"role": "target", "waypoints": [{"time_s": t, "position_m": p} for t, p in points]}))
+    """Velocity and acceleration of a flight through waypoints are the derivatives of its position,
+    and it passes through them."""
+    points = [
+        (0.0, (34, 54, 21)),
+        (1.7, (46.3, 52.1, 21.5)),
+        (3.6, (60.2, 49.7, 22.5)),
+        (4.4, (63.9, 55.3, 20.1)),
+    ]
+    flight = Trajectory(
+        tree.Uav.model_validate(
+            {"role": "target", "waypoints": [{"time_s": t, "position_m": p} for t, p in points]}
+        )
+    )
     worst, h = max(float(np.abs(flight.pose(t).position - p).max()) for t, p in points), 1e-3
     for t in (0.731, 2.27, 3.93):
         before, now, after = (flight.pose(t + d) for d in (-h, 0, h))
-        worst = max(worst, float(np.abs((after.position - before.position) / (2 * h) - now.velocity).max()))
-        worst = max(worst, float(np.abs((after.velocity - before.velocity) / (2 * h) - now.acceleration).max()) * h)
+        worst = max(
+            worst, float(np.abs((after.position - before.position) / (2 * h) - now.velocity).max())
+        )
+        worst = max(
+            worst,
+            float(np.abs((after.velocity - before.velocity) / (2 * h) - now.acceleration).max())
+            * h,
+        )
     return worst
 
 
@@ -507,13 +604,20 @@ def velocity_along_waypoints() -> float:
     ),
 )
 def longitude_and_latitude_to_metres() -> float:
-    """Distances along the meridian through the middle of a footprint file are true to the ellipsoid."""
+    """Distances along the meridian through the middle of a footprint file are true to the
+    ellipsoid."""
     lat, away = 48.137, np.array([-0.0143, 0.0027, 0.0269])
     a, f = 6378137.0, 1 / 298.257223563
     e2 = f * (2 - f)
     found = projection(11.575, lat)(np.column_stack([np.full(3, 11.575), lat + away]))[:, 1]
     arcs = [
-        quad(lambda x: a * (1 - e2) / (1 - e2 * np.sin(x) ** 2) ** 1.5, np.radians(lat), np.radians(lat + d), epsabs=1e-9)[0] for d in away
+        quad(
+            lambda x: a * (1 - e2) / (1 - e2 * np.sin(x) ** 2) ** 1.5,
+            np.radians(lat),
+            np.radians(lat + d),
+            epsabs=1e-9,
+        )[0]
+        for d in away
     ]
     return float(np.abs(found - arcs).max())
 
@@ -530,7 +634,8 @@ def longitude_and_latitude_to_metres() -> float:
     ),
 )
 def buildings_are_closed_and_face_outward() -> float:
-    """The volume of an extruded building with a courtyard, by the divergence theorem over its triangles."""
+    """The volume of an extruded building with a courtyard, by the divergence theorem over its
+    triangles."""
     import shapely
 
     outer = [(0, 0), (31.3, 2.1), (28.7, 19.9), (14.1, 12.3), (-3.3, 17.7)]
@@ -542,7 +647,10 @@ def buildings_are_closed_and_face_outward() -> float:
 
     use = MaterialUse("concrete")
     vertices, faces, *_ = clean(
-        building(shapely.Polygon(outer, [yard]), 1.3, 18.9, use, use, use, "house"), "house", np.array([4.0, 5.0, 6.0]), None
+        building(shapely.Polygon(outer, [yard]), 1.3, 18.9, use, use, use, "house"),
+        "house",
+        np.array([4.0, 5.0, 6.0]),
+        None,
     )
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     truth = (shoelace(outer) - shoelace(yard)) * 17.6

@@ -26,7 +26,9 @@ def counter_based_random_numbers() -> float:
     ones = 0xFFFFFFFF
     counters = np.array([[0, 0], [ones, ones], [0x243F6A88, 0x85A308D3]], np.uint32)
     keys = np.array([[0, 0], [ones, ones], [0x13198A2E, 0x03707344]], np.uint32)
-    answers = np.array([[0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]], np.uint32)
+    answers = np.array(
+        [[0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]], np.uint32
+    )
     return float((_words(counters, keys) != answers).sum())
 
 
@@ -70,7 +72,8 @@ def white_noise() -> float:
     ),
 )
 def noise_does_not_know_the_order_of_work() -> float:
-    """A cube's noise filled in one piece and in pieces, last piece first, is the same bit for bit."""
+    """A cube's noise filled in one piece and in pieces, last piece first, is the same bit for
+    bit."""
     key = seed_sequence(3, "validation order").generate_state(2)
     whole, parts = np.zeros(9973, np.complex64), np.zeros(9973, np.complex64)
     add_white_noise(whole, 1.3, key)

@@ -40,31 +40,46 @@ SHORT = Waveform(num_samples=128)
 
 def _prediction(length: float, rate: float) -> Prediction:
     one = np.ones(1)
-    return Prediction(range=length * one, velocity=rate * one, direction=np.zeros((1, 2)), range_std=one, velocity_std=one, weight=one)
+    return Prediction(
+        range=length * one,
+        velocity=rate * one,
+        direction=np.zeros((1, 2)),
+        range_std=one,
+        velocity_std=one,
+        weight=one,
+    )
 
 
 def _symbols_in_noise(order: int, cell_snr: float, frames: int) -> tuple[int, int, int, int]:
-    """Wrong and all delay symbols, wrong and all transitions, with three receivers at this SNR of a range cell each."""
+    """Wrong and all delay symbols, wrong and all transitions, with three receivers at this SNR of a
+    range cell each."""
     w, schedule, payload = stage.frame(order, 5, SHORT)
     length, rate = 21.37 * w.range_cell(1), 7.3
     clean = stage.cube_of(w, schedule, payload, [(length, rate, 1.0)])
     delay = dpsk = 0
     for seed in range(frames):
-        found = demodulate(stage.noisy(clean, w.num_samples / cell_snr, seed), _prediction(length, rate), order)
+        found = demodulate(
+            stage.noisy(clean, w.num_samples / cell_snr, seed), _prediction(length, rate), order
+        )
         delay += int((found.raw != payload.delay_symbols).sum())
         dpsk += int((found.transitions != payload.transitions).sum())
     return delay, frames * payload.delay_symbols.size, dpsk, frames * payload.transitions.size
 
 
 def _dpsk_theory(order: int, snr: float, branches: int) -> float:
-    """Symbol error rate of D-DPSK with summed branches: twice the chance that a Hermitian form of Gaussians leaves the sector on one
-    side, by inverting its characteristic function (Gil-Pelaez); both sides at once, opposite to the symbol, is left out (1e-9)."""
-    eigenvalues, vectors = np.linalg.eigh(np.array([[0, -0.5j * np.exp(-1j * np.pi / order)], [0.5j * np.exp(1j * np.pi / order), 0]]))
+    """Symbol error rate of D-DPSK with summed branches: twice the chance that a Hermitian form of
+    Gaussians leaves the sector on one side, by inverting its characteristic function (Gil-Pelaez);
+    both sides at once, opposite to the symbol, is left out (1e-9)."""
+    eigenvalues, vectors = np.linalg.eigh(
+        np.array([[0, -0.5j * np.exp(-1j * np.pi / order)], [0.5j * np.exp(1j * np.pi / order), 0]])
+    )
     means = np.abs(vectors.conj().T @ np.full(2, np.sqrt(snr))) ** 2
 
     def density(t: float) -> float:
         root = 1 - 1j * t * eigenvalues
-        return float(((np.exp(1j * t * eigenvalues * means / root) / root).prod() ** branches).imag / t)
+        return float(
+            ((np.exp(1j * t * eigenvalues * means / root) / root).prod() ** branches).imag / t
+        )
 
     return 2 * (0.5 + quad(density, 0, np.inf, limit=2000)[0] / np.pi)
 
@@ -82,7 +97,8 @@ def _dpsk_theory(order: int, snr: float, branches: int) -> float:
     quick=False,
 )
 def dpsk_symbol_errors() -> float:
-    """Symbol error rates of DPSK in white noise with three receivers, D = 8 and 16, at rates of a few percent."""
+    """Symbol error rates of DPSK in white noise with three receivers, D = 8 and 16, at rates of a
+    few percent."""
     worst = 0.0
     for order, snr in ((8, 8.0), (16, 26.0)):
         _, _, wrong, total = _symbols_in_noise(order, snr, 16)
@@ -92,7 +108,8 @@ def dpsk_symbol_errors() -> float:
 
 
 @case(
-    truth="M-ary orthogonal signals with three square-law branches: an integral over the noncentral chi-square law",
+    truth="M-ary orthogonal signals with three square-law branches: an integral over the "
+    "noncentral chi-square law",
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
@@ -104,11 +121,18 @@ def dpsk_symbol_errors() -> float:
     quick=False,
 )
 def delay_symbol_errors() -> float:
-    """Symbol error rate of the delay symbols in white noise with three receivers, 72 cells, at a rate of a few percent."""
+    """Symbol error rate of the delay symbols in white noise with three receivers, 72 cells, at a
+    rate of a few percent."""
     snr, branches, cells = 5.0, 3, SHORT.num_samples // 2 + 8
     wrong, total, _, _ = _symbols_in_noise(8, snr, 16)
     right = quad(
-        lambda x: stats.ncx2.pdf(x, 2 * branches, 2 * branches * snr) * stats.chi2.cdf(x, 2 * branches) ** (cells - 1), 0, 200, limit=500
+        lambda x: (
+            stats.ncx2.pdf(x, 2 * branches, 2 * branches * snr)
+            * stats.chi2.cdf(x, 2 * branches) ** (cells - 1)
+        ),
+        0,
+        200,
+        limit=500,
     )[0]
     rate = 1 - right
     return abs(wrong / total - rate) / np.sqrt(rate * (1 - rate) / total)
@@ -126,14 +150,20 @@ def delay_symbol_errors() -> float:
     ),
 )
 def data_at_the_ends_of_the_velocity() -> float:
-    """Every symbol and bit of a noise-free frame, D = 2 to 16, at -29.4 and +17.3 m/s, a fraction of a cell off the prediction."""
+    """Every symbol and bit of a noise-free frame, D = 2 to 16, at -29.4 and +17.3 m/s, a fraction
+    of a cell off the prediction."""
     wrong = 0
     w = Waveform(num_samples=256)
     for order, rate in itertools.product((2, 4, 8, 16), (-29.4, 17.3)):
         _, schedule, payload = stage.frame(order, 3, w)
-        signal = stage.cube_of(w, schedule, payload, [(71.39, rate, 1j)], FEW, (0.31, -0.22), (-0.17, 0.26))
+        signal = stage.cube_of(
+            w, schedule, payload, [(71.39, rate, 1j)], FEW, (0.31, -0.22), (-0.17, 0.26)
+        )
         found = demodulate(signal, _prediction(71.42, rate + 0.05), order)
-        wrong += int((found.raw != payload.delay_symbols).sum() + (found.transitions != payload.transitions).sum())
+        wrong += int(
+            (found.raw != payload.delay_symbols).sum()
+            + (found.transitions != payload.transitions).sum()
+        )
         wrong += int((found.bits != payload.bits).sum())
     return float(wrong)
 
@@ -145,17 +175,23 @@ def data_at_the_ends_of_the_velocity() -> float:
     why="sidelobes that the resampling may leave (isac_rt.receive.maps)",
     planted=(
         "receive/maps.py",
-        "resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - grid)).T",
+        "resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - "
+        "grid)).T",
         "resample = np.eye(len(times))",
     ),
 )
 def union_of_the_groups() -> float:
-    """One antenna's samples at their true, uneven times give the spectrum of even ones, for tones all over the band."""
+    """One antenna's samples at their true, uneven times give the spectrum of even ones, for tones
+    all over the band."""
     w, schedule, payload = stage.frame(8, 3, SHORT)
     slot = w.slot_duration
     times = np.zeros(w.num_chirps)
     for m, p in zip(*np.nonzero(schedule == 1), strict=True):
-        times[p] = p + (2 * m * w.max_delay + payload.delay_symbols[m, p] * w.max_delay / w.num_samples) / slot
+        times[p] = (
+            p
+            + (2 * m * w.max_delay + payload.delay_symbols[m, p] * w.max_delay / w.num_samples)
+            / slot
+        )
     p, bins = np.arange(w.num_chirps), np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
     worst = -np.inf
     for tone in (-57.3, -31.6, 4.2, 22.5, 56.9):
@@ -201,12 +237,15 @@ def orthogonal_matching_pursuit() -> float:
 
 
 def _greatest_of(factor: float, looks: int, cells: int, snr: float = 0.0) -> float:
-    """Chance that a cell (mean of `looks` powers of amplitude-squared `snr` over the noise) exceeds factor times the greater mean."""
+    """Chance that a cell (mean of `looks` powers of amplitude-squared `snr` over the noise) exceeds
+    factor times the greater mean."""
 
     def density(z: float) -> float:
         side = stats.gamma(looks * cells, scale=1 / (looks * cells))
         above = (
-            stats.ncx2.sf(2 * looks * factor * z, 2 * looks, 2 * looks * snr) if snr else stats.gamma.sf(factor * z, looks, scale=1 / looks)
+            stats.ncx2.sf(2 * looks * factor * z, 2 * looks, 2 * looks * snr)
+            if snr
+            else stats.gamma.sf(factor * z, looks, scale=1 / looks)
         )
         return float(2 * side.pdf(z) * side.cdf(z) * above)
 
@@ -225,12 +264,20 @@ def _greatest_of(factor: float, looks: int, cells: int, snr: float = 0.0) -> flo
     ),
 )
 def false_alarm_factor() -> float:
-    """The threshold's factor gives the false-alarm rate that was asked for, from 1e-2 to 1e-6, one-sided and greatest-of."""
+    """The threshold's factor gives the false-alarm rate that was asked for, from 1e-2 to 1e-6,
+    one-sided and greatest-of."""
     worst = 0.0
     for rate, looks, cells in ((1e-2, 3, 8), (1e-4, 15, 8), (1e-6, 45, 20)):
         one = greatest_of_factor(rate, float(looks), float(cells), 0.0)
         worst = max(worst, abs(stats.f.sf(one, 2 * looks, 2 * looks * cells) / rate - 1))
-        worst = max(worst, abs(_greatest_of(greatest_of_factor(rate, float(looks), cells, cells), looks, cells) / rate - 1))
+        worst = max(
+            worst,
+            abs(
+                _greatest_of(greatest_of_factor(rate, float(looks), cells, cells), looks, cells)
+                / rate
+                - 1
+            ),
+        )
     return worst
 
 
@@ -241,12 +288,17 @@ def false_alarm_factor() -> float:
     why=ONCE_IN_1E5,
     planted=(
         "receive/cfar.py",
-        ("return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, float(looks), before, behind)"),
-        "return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, 1.0, before, behind)",
+        (
+            "return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, "
+            "float(looks), before, behind)"
+        ),
+        "return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, 1.0, "
+        "before, behind)",
     ),
 )
 def false_alarms_along_range() -> float:
-    """False alarms of the one-dimensional CFAR in noise of 15 receivers, 200,000 cells at 1e-3, ends included."""
+    """False alarms of the one-dimensional CFAR in noise of 15 receivers, 200,000 cells at 1e-3,
+    ends included."""
     power = np.random.default_rng(21).gamma(15, 1 / 15, (1000, 200))
     return abs(detect_chirps(power, 15, 1e-3, 3, 8).sum() - 200) / np.sqrt(200)
 
@@ -263,18 +315,23 @@ def false_alarms_along_range() -> float:
     ),
 )
 def detection_probability() -> float:
-    """Share of detections of a steady target of 0 dB per receiver, 15 receivers, false-alarm rate 1e-4."""
+    """Share of detections of a steady target of 0 dB per receiver, 15 receivers, false-alarm rate
+    1e-4."""
     looks, snr, rng = 15, 1.0, np.random.default_rng(9)
     power = rng.gamma(looks, 1 / looks, (100, 4000))
     power[50] = rng.noncentral_chisquare(2 * looks, 2 * looks * snr, 4000) / (2 * looks)
     rate = _greatest_of(greatest_of_factor(1e-4, float(looks), 8, 8), looks, 8, snr)
-    return abs(detect_chirps(power, looks, 1e-4, 3, 8)[50].mean() - rate) / np.sqrt(rate * (1 - rate) / 4000)
+    return abs(detect_chirps(power, looks, 1e-4, 3, 8)[50].mean() - rate) / np.sqrt(
+        rate * (1 - rate) / 4000
+    )
 
 
 def _noise_cube(w: Waveform, seed: int) -> IFCube:
     empty = np.zeros((w.num_groups, 3, w.num_chirps, w.num_samples), np.complex64)
     _, schedule, _ = stage.frame(8, seed, w)
-    return stage.noisy(IFCube(samples=empty, waveform=w, schedule=schedule, start_time=0.0), 1.0, seed)
+    return stage.noisy(
+        IFCube(samples=empty, waveform=w, schedule=schedule, start_time=0.0), 1.0, seed
+    )
 
 
 @case(
@@ -282,7 +339,8 @@ def _noise_cube(w: Waveform, seed: int) -> IFCube:
     unit="relative",
     bound=0.25,
     why=(
-        "windowed neighbours count as fractions of independent cells, an approximation good to a fifth; 1,200 "
+        "windowed neighbours count as fractions of independent cells, an approximation good to a "
+        "fifth; 1,200 "
         "alarms in clusters scatter by 0.06"
     ),
     planted=(
@@ -293,7 +351,8 @@ def _noise_cube(w: Waveform, seed: int) -> IFCube:
     quick=False,
 )
 def false_alarms_of_the_whole_chain() -> float:
-    """Cells above the threshold in noise through data removal, Doppler and accumulation, designed for 5e-3."""
+    """Cells above the threshold in noise through data removal, Doppler and accumulation, designed
+    for 5e-3."""
     w, settings, alarms, cells = Waveform(num_samples=256), Receivers(), 0, 0
     for seed in range(16):
         cube, pilot = _noise_cube(w, seed), unmodulated(w)
@@ -312,7 +371,8 @@ def false_alarms_of_the_whole_chain() -> float:
     unit="of a resolution",
     bound=0.002,
     why=(
-        "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in the cube against spheres in the receiver"
+        "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in "
+        "the cube against spheres in the receiver"
     ),
     planted=(
         "receive/estimate.py",
@@ -322,11 +382,14 @@ def false_alarms_of_the_whole_chain() -> float:
     quick=False,
 )
 def bias_of_an_echo() -> float:
-    """Estimates of a noise-free echo off the grid, data on the chirps, at 31 and 58 m and up to 14.6 m/s; nothing else is seen."""
+    """Estimates of a noise-free echo off the grid, data on the chirps, at 31 and 58 m and up to
+    14.6 m/s; nothing else is seen."""
     worst = 0.0
     w, schedule, payload = stage.frame(w=Waveform(num_samples=512))
     for distance, speed, x, z in ((31.3217, 13.277, -0.52, 0.17), (57.618, -14.62, 0.05, 0.61)):
-        signal = stage.cube_of(w, schedule, payload, [(2 * distance, 2 * speed, 1.0)], FULL, (x, z), (x, z))
+        signal = stage.cube_of(
+            w, schedule, payload, [(2 * distance, 2 * speed, 1.0)], FULL, (x, z), (x, z)
+        )
         d = receive_active(signal, payload, FULL, Receivers()).detections
         if len(d) != 1:
             return np.inf
@@ -336,14 +399,18 @@ def bias_of_an_echo() -> float:
 
 
 def _loss(window: np.ndarray) -> tuple[float, float]:
-    """Variance of the peak's place [cycles per sample]^2 at unit SNR of a sample, with this window and without (the Cramer-Rao bound)."""
+    """Variance of the peak's place [cycles per sample]^2 at unit SNR of a sample, with this window
+    and without (the Cramer-Rao bound)."""
     x = np.arange(window.size) - (window.size - 1) / 2
     bound = 6 / (4 * np.pi**2 * window.size * (window.size**2 - 1))
     return float((window**2 * x**2).sum() / (window * x**2).sum() ** 2 / 2 / (4 * np.pi**2)), bound
 
 
 @case(
-    truth=("Cramer-Rao bound of a tone over channels of unknown phase, with the Hann windows' loss by first-order perturbation"),
+    truth=(
+        "Cramer-Rao bound of a tone over channels of unknown phase, with the Hann windows' loss by "
+        "first-order perturbation"
+    ),
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5 + "; the variance of 100 frames is known to 14 %",
@@ -355,7 +422,8 @@ def _loss(window: np.ndarray) -> tuple[float, float]:
     quick=False,
 )
 def scatter_of_range_and_velocity() -> float:
-    """Estimates of range and velocity in noise scatter as the bound says, 15 dB below the noise of a sample."""
+    """Estimates of range and velocity in noise scatter as the bound says, 15 dB below the noise of
+    a sample."""
     w, schedule, _ = stage.frame(w=Waveform(num_samples=256, num_chirps=60))
     pilot, length, rate, noise, count = unmodulated(w), 41.3, -4.6, 10**1.5, 100
     clean = stage.cube_of(w, schedule, pilot, [(length, rate, 1.0)])
@@ -366,12 +434,16 @@ def scatter_of_range_and_velocity() -> float:
         d = sense(spectra, w, schedule, pilot.delay_symbols, FEW, Receivers(), 1).detections
         best = int(np.argmax(d.snr))
         errors.append([d.range[best] - length, d.velocity[best] - rate])
-    fast = np.sin(np.pi * np.arange(252) / 251.73) ** 4  # Hann in the data and in the template; short by the largest data delay
+    fast = (
+        np.sin(np.pi * np.arange(252) / 251.73) ** 4
+    )  # Hann in the data and in the template; short by the largest data delay
     slow = np.sin(np.pi * (np.arange(60) + 0.5) / 60) ** 2
     channels = 3 * 3
     in_slow = (slow**2).sum() / slow.sum() ** 2 * 60
     in_fast = (fast**2).sum() / fast.sum() ** 2
-    sigma_range = np.sqrt(_loss(fast)[0] * noise * in_slow / 60 / channels) * w.num_samples * w.range_cell(1)
+    sigma_range = (
+        np.sqrt(_loss(fast)[0] * noise * in_slow / 60 / channels) * w.num_samples * w.range_cell(1)
+    )
     sigma_speed = np.sqrt(_loss(slow)[0] * noise * in_fast / channels) * 60 * w.velocity_cell(1)
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / [sigma_range, sigma_speed]
     return float(np.abs(ratio**2 - 1).max() / np.sqrt(2 / count))
@@ -389,19 +461,32 @@ def scatter_of_range_and_velocity() -> float:
     ),
 )
 def scatter_of_directions() -> float:
-    """Direction cosines along both arms, one-way and two-way, scatter as the bound says, without bias."""
+    """Direction cosines along both arms, one-way and two-way, scatter as the bound says, without
+    bias."""
     w, rng, worst, count, noise = Waveform(), np.random.default_rng(14), 0.0, 400, 0.02
-    scale = 2 * np.pi * (77e9 + w.slope * (w.chirp_duration - w.sampled_duration / 2 * (1 + 17 / 1024))) / C
+    scale = (
+        2
+        * np.pi
+        * (77e9 + w.slope * (w.chirp_duration - w.sampled_duration / 2 * (1 + 17 / 1024)))
+        / C
+    )
     for virtual, axis, u in ((True, 0, 0.271), (False, 2, -0.37)):
-        tx, rx = FULL.tx_positions[:, axis] * (u if virtual else 0.4), FULL.rx_positions[:, axis] * u
+        tx, rx = (
+            FULL.tx_positions[:, axis] * (u if virtual else 0.4),
+            FULL.rx_positions[:, axis] * u,
+        )
         clean = np.exp(-1j * scale * (tx[:, None] + rx[None, :]))
         t, _, place = arm(FULL, axis, virtual)
         spread = (
-            ((place - place.mean()) ** 2).sum() if virtual else sum(((place[t == i] - place[t == i].mean()) ** 2).sum() for i in range(3))
+            ((place - place.mean()) ** 2).sum()
+            if virtual
+            else sum(((place[t == i] - place[t == i].mean()) ** 2).sum() for i in range(3))
         )
         errors = []
         for _ in range(count):
-            channels = clean + np.sqrt(noise / 2) * rng.normal(size=(*clean.shape, 2)) @ np.array([1, 1j])
+            channels = clean + np.sqrt(noise / 2) * rng.normal(size=(*clean.shape, 2)) @ np.array(
+                [1, 1j]
+            )
             errors.append(direction_cosine(channels, FULL, w, axis, virtual) - u)
         sigma = np.sqrt(noise / 2 / spread) / scale
         worst = max(worst, abs(np.mean(np.square(errors)) / sigma**2 - 1) / np.sqrt(2 / count))
@@ -413,7 +498,10 @@ def scatter_of_directions() -> float:
     truth="signal and noise of the accumulated map, measured",
     unit="dB",
     bound=0.6,
-    why=("scalloping of a path off the grid, up to 1.4 dB per axis at worst, here 0.2 and 0.1; the window is 1.7 % short"),
+    why=(
+        "scalloping of a path off the grid, up to 1.4 dB per axis at worst, here 0.2 and 0.1; the "
+        "window is 1.7 % short"
+    ),
     planted=(
         "frame/level.py",
         "- 2 * 10 * np.log10(1.5)",
@@ -421,7 +509,8 @@ def scatter_of_directions() -> float:
     ),
 )
 def processing_gain() -> float:
-    """The link budget's gain from a sample to a cell of the map, against a path and noise sent through the receiver."""
+    """The link budget's gain from a sample to a cell of the map, against a path and noise sent
+    through the receiver."""
     w, schedule, _ = stage.frame(w=Waveform(num_samples=256))
     pilot = unmodulated(w)
     clean = stage.cube_of(w, schedule, pilot, [(40.1 * w.range_cell(1), 0.07, 1.0)])
@@ -431,7 +520,9 @@ def processing_gain() -> float:
         return accumulate(channel_maps(spectra, w, schedule, pilot.delay_symbols))
 
     measured = 10 * np.log10(level(clean).max() / level(_noise_cube(w, 3)).mean())
-    claimed = link_budget(("A", "P"), "", 1.0, 1.0, Noise(model="snr", snr_db=0.0), w, FEW).processing_gain_db - 5 * np.log10(9)
+    claimed = link_budget(
+        ("A", "P"), "", 1.0, 1.0, Noise(model="snr", snr_db=0.0), w, FEW
+    ).processing_gain_db - 5 * np.log10(9)
     return abs(float(measured - claimed))
 
 
@@ -454,8 +545,12 @@ def standing_clutter_is_removed() -> float:
     schedule = conventional_schedule(3, 60, 3)
     rng = np.random.default_rng(2)
     p = np.arange(60)
-    still = np.stack([rng.normal(size=(3, 3, 2)) @ np.array([1, 1j]) for _ in range(3)])  # group, rx, tx
-    moving = np.exp(2j * np.pi * 7.0 * p / 20)[None, None, None]  # whole turns over an antenna's chirps: no mean
+    still = np.stack(
+        [rng.normal(size=(3, 3, 2)) @ np.array([1, 1j]) for _ in range(3)]
+    )  # group, rx, tx
+    moving = np.exp(2j * np.pi * 7.0 * p / 20)[
+        None, None, None
+    ]  # whole turns over an antenna's chirps: no mean
     chosen = np.take_along_axis(still, np.broadcast_to(schedule[:, None], (3, 3, 60)), axis=2)
     spectra = np.repeat((100 * chosen)[:, :, None] + moving, 4, axis=2).astype(np.complex64)
     remove_standing(spectra, schedule, None)
@@ -474,7 +569,8 @@ def standing_clutter_is_removed() -> float:
     ),
 )
 def rayleigh_clutter() -> float:
-    """Amplitudes of the paper's clutter are Rayleigh, on average 10 dB over the reference; 40 to 50 cells about 20 to 30 m."""
+    """Amplitudes of the paper's clutter are Rayleigh, on average 10 dB over the reference; 40 to 50
+    cells about 20 to 30 m."""
     rng, clutter = np.random.default_rng(5), Clutter(model="rayleigh")
     draws = [rayleigh_cells(clutter, 0.25, 17.0, rng) for _ in range(300)]
     power = np.abs(np.concatenate([a for _, a in draws])) ** 2 / 10
@@ -483,4 +579,6 @@ def rayleigh_clutter() -> float:
     if min(counts) < 40 or max(counts) > 50 or ranges.min() < 19.8 or ranges.max() > 30.2:
         return np.inf
     law = stats.kstest(power, stats.expon.cdf).pvalue
-    return float(max(abs(power.mean() - 1) * np.sqrt(power.size), stats.norm.isf(max(law, 1e-300) / 2)))
+    return float(
+        max(abs(power.mean() - 1) * np.sqrt(power.size), stats.norm.isf(max(law, 1e-300) / 2))
+    )

@@ -1,4 +1,5 @@
-"""The waveform, the IF signal from mesh to samples, and its fast methods, against chirps mixed in long double."""
+"""The waveform, the IF signal from mesh to samples, and its fast methods, against chirps mixed in
+long double."""
 
 from __future__ import annotations
 
@@ -40,11 +41,20 @@ def numbers_of_the_frame() -> float:
     """Durations, slope, cells, limits and bits of the paper's waveform."""
     w = Waveform()
     pairs = [
-        (w.max_delay, 1.706667e-6), (w.chirp_duration, 54.61333e-6), (w.slot_duration, 64.85333e-6), (w.slope, 1.171875e13),
-        (w.frame_duration, 7.7824e-3), (w.range_cell(2), 0.249827), (w.range_cell(1), 0.499654), (w.bits_per_frame(8), 4293),
-        (w.bits_per_frame(16), 4644), (w.num_resource_blocks, 19), (w.effective_carrier, 77.34e9),
-        (w.velocity_cell(2) * w.effective_carrier / 77e9, 0.250138), (w.max_velocity(1) * w.effective_carrier / 77e9, 30.0170),
-    ]  # fmt: skip
+        (w.max_delay, 1.706667e-6),
+        (w.chirp_duration, 54.61333e-6),
+        (w.slot_duration, 64.85333e-6),
+        (w.slope, 1.171875e13),
+        (w.frame_duration, 7.7824e-3),
+        (w.range_cell(2), 0.249827),
+        (w.range_cell(1), 0.499654),
+        (w.bits_per_frame(8), 4293),
+        (w.bits_per_frame(16), 4644),
+        (w.num_resource_blocks, 19),
+        (w.effective_carrier, 77.34e9),
+        (w.velocity_cell(2) * w.effective_carrier / 77e9, 0.250138),
+        (w.max_velocity(1) * w.effective_carrier / 77e9, 30.0170),
+    ]
     return max(abs(found / truth - 1) for found, truth in pairs)
 
 
@@ -65,7 +75,11 @@ def antenna_schedule() -> float:
     for seed in range(20):
         schedule = pseudo_random_schedule(4, 60, 5, np.random.default_rng(seed))
         wrong += sum(len(set(column)) < 4 for column in schedule.T.tolist())
-        wrong += sum(len(set(cycle)) < 5 for group in schedule.tolist() for cycle in (group[i : i + 5] for i in range(0, 60, 5)))
+        wrong += sum(
+            len(set(cycle)) < 5
+            for group in schedule.tolist()
+            for cycle in (group[i : i + 5] for i in range(0, 60, 5))
+        )
         wrong += not is_latin(schedule, 5)
     return float(wrong)
 
@@ -84,13 +98,21 @@ def antenna_schedule() -> float:
 def bits_on_symbols() -> float:
     """Modulation and demodulation return the bits; neighbouring symbols differ in one bit."""
     w, wrong = Waveform(), 0
-    schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, np.random.default_rng(3))
+    schedule = pseudo_random_schedule(
+        w.num_groups, w.num_chirps, w.num_tx, np.random.default_rng(3)
+    )
     for order in (2, 4, 8, 16):
         bits = np.random.default_rng(order).integers(0, 2, w.bits_per_frame(order), dtype=np.uint8)
         sent = modulate(bits, w, schedule, order)
-        wrong += int((demodulate_bits(sent.delay_symbols, sent.transitions, w, order) != bits).sum())
-        wrong += int(sent.delay_symbols.max() >= w.num_delay_symbols) + int(sent.transitions.max() >= order)
-        neighbour = demodulate_bits(np.minimum(sent.delay_symbols + 1, w.num_delay_symbols - 1), sent.transitions, w, order)
+        wrong += int(
+            (demodulate_bits(sent.delay_symbols, sent.transitions, w, order) != bits).sum()
+        )
+        wrong += int(sent.delay_symbols.max() >= w.num_delay_symbols) + int(
+            sent.transitions.max() >= order
+        )
+        neighbour = demodulate_bits(
+            np.minimum(sent.delay_symbols + 1, w.num_delay_symbols - 1), sent.transitions, w, order
+        )
         moved = int((sent.delay_symbols < w.num_delay_symbols - 1).sum())
         wrong += abs(int((neighbour != bits).sum()) - moved)
     return float(wrong)
@@ -108,7 +130,8 @@ def bits_on_symbols() -> float:
     ),
 )
 def differential_phases() -> float:
-    """The phase of a chirp is that of the same antenna's chirp before it, turned by the symbol between them."""
+    """The phase of a chirp is that of the same antenna's chirp before it, turned by the symbol
+    between them."""
     rng = np.random.default_rng(8)
     schedule = pseudo_random_schedule(3, 30, 3, rng)
     symbols = rng.integers(0, 8, (3, 3, 9))
@@ -126,9 +149,12 @@ def differential_phases() -> float:
 
 
 def _one_path(moving: bool, method: str, data: bool = True) -> float:
-    """Relative error of one line of sight between two arrays, each element its own distance, against mixed chirps."""
+    """Relative error of one line of sight between two arrays, each element its own distance,
+    against mixed chirps."""
     w, rng = stage.SMALL, np.random.default_rng(7)
-    tx_velocity, rx_velocity, rx_acceleration = ((4.3, -7.1, 1.9), (-6.2, 2.9, 3.1), (-1.3, 0.4, 0.9)) if moving else ((0, 0, 0),) * 3
+    tx_velocity, rx_velocity, rx_acceleration = (
+        ((4.3, -7.1, 1.9), (-6.2, 2.9, 3.1), (-1.3, 0.4, 0.9)) if moving else ((0, 0, 0),) * 3
+    )
     tx = stage.pose((1.37, -2.21, 11.3), tx_velocity)
     rx = stage.pose((23.9, 17.3, 8.77), rx_velocity, rx_acceleration, boresight=(-0.7, -1.0, 0.2))
     sender = stage.sender(w, rng, data, pose=tx)
@@ -141,19 +167,36 @@ def _one_path(moving: bool, method: str, data: bool = True) -> float:
     accel = float((motion @ motion - rate**2) / length + u @ rx.acceleration)
     gain = 0.3 - 0.7j
     paths = make_paths(
-        gain=np.array([gain]), delay=np.array([length]) / SPEED_OF_LIGHT, delay_rate=rate / SPEED_OF_LIGHT,
-        delay_accel=accel / SPEED_OF_LIGHT, departure=u[None], arrival=-u[None], tx_radius=length, rx_radius=length,
-        kind=PathKind.LINE_OF_SIGHT, epoch=START + w.frame_duration / 2, tx="A", rx="P",
-    )  # fmt: skip
+        gain=np.array([gain]),
+        delay=np.array([length]) / SPEED_OF_LIGHT,
+        delay_rate=rate / SPEED_OF_LIGHT,
+        delay_accel=accel / SPEED_OF_LIGHT,
+        departure=u[None],
+        arrival=-u[None],
+        tx_radius=length,
+        rx_radius=length,
+        kind=PathKind.LINE_OF_SIGHT,
+        epoch=START + w.frame_duration / 2,
+        tx="A",
+        rx="P",
+    )
     antennas = stage.arrays(w)
     found = stage.synthesise(w, [(sender, paths)], rx, method, START, antennas)
 
     def way(t: np.ndarray, e: np.ndarray, r: np.ndarray) -> np.ndarray:
-        ends = np.stack([flown(rx.position, rx_velocity, rx_acceleration, x) - flown(tx.position, tx_velocity, (0, 0, 0), x) for x in t])
+        ends = np.stack(
+            [
+                flown(rx.position, rx_velocity, rx_acceleration, x)
+                - flown(tx.position, tx_velocity, (0, 0, 0), x)
+                for x in t
+            ]
+        )
         return np.sqrt(((ends + wide(r) - wide(e)) ** 2).sum(axis=1))
 
     send, hear = tx.to_world(sender.antennas.tx_positions), rx.to_world(antennas.rx_positions)
-    return stage.relative(found, if_samples(w, sender.schedule, sender.payload, way, gain, send, hear))
+    return stage.relative(
+        found, if_samples(w, sender.schedule, sender.payload, way, gain, send, hear)
+    )
 
 
 COMPLEX64 = "samples are complex64; two roundings"
@@ -179,7 +222,8 @@ def exact_model_at_rest() -> float:
     truth="chirps mixed sample by sample in long double, every element at its own distance",
     unit="relative",
     bound=0.0005,
-    why="the issue's 0.05 %; what is left is the turning of directions within the frame, 2 pi v r t / (R lambda)",
+    why="the issue's 0.05 %; what is left is the turning of directions within the frame, 2 pi v r "
+    "t / (R lambda)",
     planted=(
         "signal/direct.py",
         "t.delay[k] + t.rate[k] * time",
@@ -187,11 +231,17 @@ def exact_model_at_rest() -> float:
     ),
 )
 def exact_model_in_motion() -> float:
-    """IF samples of a line of sight between two arrays in flight at 12 m/s closing speed, data on the chirps."""
+    """IF samples of a line of sight between two arrays in flight at 12 m/s closing speed, data on
+    the chirps."""
     return _one_path(True, "exact")
 
 
-def _against_exact(method: str, counts: tuple[int, ...], w: Waveform = stage.SMALL, speeds: tuple[float, ...] = (0.0, 3.0, 30.0)) -> float:
+def _against_exact(
+    method: str,
+    counts: tuple[int, ...],
+    w: Waveform = stage.SMALL,
+    speeds: tuple[float, ...] = (0.0, 3.0, 30.0),
+) -> float:
     """Worst relative RMS over numbers of paths, speeds, and with and without data."""
     worst, rx, antennas = 0.0, stage.pose((0, 0, 0), boresight=(0.2, 1.0, 0.3)), stage.arrays(w)
     for i, count in enumerate(counts):
@@ -199,7 +249,10 @@ def _against_exact(method: str, counts: tuple[int, ...], w: Waveform = stage.SMA
             rng = np.random.default_rng([i, int(speed)])
             sender = stage.sender(w, rng, data=bool(i % 2 == 0))
             paths = stage.random_paths(w, rng, count, START + w.frame_duration / 2, speed=speed)
-            found, truth = (stage.synthesise(w, [(sender, paths)], rx, m, START, antennas) for m in (method, "exact"))
+            found, truth = (
+                stage.synthesise(w, [(sender, paths)], rx, m, START, antennas)
+                for m in (method, "exact")
+            )
             worst = max(worst, stage.relative(found, truth))
     return worst
 
@@ -234,7 +287,8 @@ def direct_method() -> float:
     quick=False,
 )
 def gridded_method() -> float:
-    """The gridded method over K = 3, 40 and 200 paths anywhere in the passband, 0 to 30 m/s, with and without data."""
+    """The gridded method over K = 3, 40 and 200 paths anywhere in the passband, 0 to 30 m/s, with
+    and without data."""
     return _against_exact("gridded", (3, 40, 200))
 
 
@@ -258,9 +312,11 @@ def automatic_choice() -> float:
 
 
 def _city_link(moving: bool, ground: bool, target: bool) -> float:
-    """Relative RMS of a link's IF samples, traced in a mesh and made with the default method, against closed forms.
+    """Relative RMS of a link's IF samples, traced in a mesh and made with the default method,
+    against closed forms.
 
-    Point arrays (spacing of a micrometre): the truth then needs positions only. Three bodies over a concrete ground.
+    Point arrays (spacing of a micrometre): the truth then needs positions only. Three bodies over a
+    concrete ground.
     """
     w = Waveform(num_samples=256, num_chirps=24)
     places = {"A": (-9.7, 3.1, 7.3), "P": (13.9, -4.3, 5.9), "U": (3.7, 21.1, 9.3)}
@@ -277,7 +333,9 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
     symbols = np.minimum(sender.payload.delay_symbols, w.num_samples // 2 - 40)
     sender = replace(sender, payload=replace(sender.payload, delay_symbols=symbols))
     found = stage.synthesise(w, [(sender, paths)], flight["P"], "auto", START, point)[:, :1]
-    body = {name: (pose.position, pose.velocity, pose.acceleration) for name, pose in flight.items()}
+    body = {
+        name: (pose.position, pose.velocity, pose.acceleration) for name, pose in flight.items()
+    }
 
     def between(t: np.ndarray, a: str, b: str, mirror: bool = False) -> np.ndarray:
         start, end = (np.stack([flown(*body[n], x) for x in t]) for n in (a, b))
@@ -286,7 +344,10 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
 
     now = np.zeros(1, np.longdouble)
     ways: list[tuple[Callable, complex]] = [
-        (lambda t, e, r: between(t, "A", "P"), WAVELENGTH / (4 * np.pi * float(between(now, "A", "P")[0])))
+        (
+            lambda t, e, r: between(t, "A", "P"),
+            WAVELENGTH / (4 * np.pi * float(between(now, "A", "P")[0])),
+        )
     ]
     if target:
         r1, r2 = (float(between(now, n, "U")[0]) for n in "AP")
@@ -295,12 +356,26 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
     if ground:
         length = float(between(now, "A", "P", True)[0])
         reflection = truths.slab_reflection(5.31, 1.9, 0.1, 13.2 / length)[1]
-        ways.append((lambda t, e, r: between(t, "A", "P", True), reflection * WAVELENGTH / (4 * np.pi * length)))
-    truth = np.sum([if_samples(w, sender.schedule, sender.payload, way, gain, np.zeros((3, 3)), ORIGIN) for way, gain in ways], axis=0)
+        ways.append(
+            (
+                lambda t, e, r: between(t, "A", "P", True),
+                reflection * WAVELENGTH / (4 * np.pi * length),
+            )
+        )
+    truth = np.sum(
+        [
+            if_samples(w, sender.schedule, sender.payload, way, gain, np.zeros((3, 3)), ORIGIN)
+            for way, gain in ways
+        ],
+        axis=0,
+    )
     return stage.relative(found, truth)
 
 
-BEST = "the issue asks for this; the best published is 0.046 % static, 0.24 % moving, 0.7 % with ground"
+BEST = (
+    "the issue asks for this; the best published is 0.046 % static, 0.24 % moving, 0.7 % with "
+    "ground"
+)
 
 
 @case(
@@ -316,7 +391,8 @@ BEST = "the issue asks for this; the best published is 0.046 % static, 0.24 % mo
     tracer=True,
 )
 def mesh_to_if_at_rest() -> float:
-    """An echo from a target at rest, from the mesh through the ray tracer and the default method to samples."""
+    """An echo from a target at rest, from the mesh through the ray tracer and the default method to
+    samples."""
     return _city_link(False, False, True)
 
 
@@ -350,7 +426,8 @@ def mesh_to_if_in_motion() -> float:
     tracer=True,
 )
 def mesh_to_if_two_rays_in_motion() -> float:
-    """Line of sight and ground ray over concrete between two moving platforms, from the mesh to samples."""
+    """Line of sight and ground ray over concrete between two moving platforms, from the mesh to
+    samples."""
     return _city_link(True, True, False)
 
 
@@ -358,17 +435,33 @@ def mesh_to_if_two_rays_in_motion() -> float:
 
 
 def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
-    """Fast-time frequency and slow-time frequency [Hz] of one unmodulated path by the phase between neighbours."""
+    """Fast-time frequency and slow-time frequency [Hz] of one unmodulated path by the phase between
+    neighbours."""
     w = Waveform(num_groups=1, num_tx=1, num_chirps=40)
     antennas = stage.arrays(w, tx_x=1, tx_z=1)
     schedule = np.zeros((1, 40), np.int64)
-    sender = Transmission(name="A", pose=stage.pose((0, 0, 0)), antennas=antennas, schedule=schedule, payload=unmodulated(w))
+    sender = Transmission(
+        name="A",
+        pose=stage.pose((0, 0, 0)),
+        antennas=antennas,
+        schedule=schedule,
+        payload=unmodulated(w),
+    )
     along = stage.pose((0, 0, 0)).rotation[:, 1][None]
     paths = make_paths(
-        gain=np.ones(1), delay=np.array([length]) / SPEED_OF_LIGHT, delay_rate=rate / SPEED_OF_LIGHT, departure=along, arrival=along,
-        kind=PathKind.TARGET, epoch=START + w.frame_duration / 2, tx="A", rx="A",
-    )  # fmt: skip
-    s = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), "direct", START, antennas)[0, 0]
+        gain=np.ones(1),
+        delay=np.array([length]) / SPEED_OF_LIGHT,
+        delay_rate=rate / SPEED_OF_LIGHT,
+        departure=along,
+        arrival=along,
+        kind=PathKind.TARGET,
+        epoch=START + w.frame_duration / 2,
+        tx="A",
+        rx="A",
+    )
+    s = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), "direct", START, antennas)[
+        0, 0
+    ]
     fast = np.angle((s[:, 1:] * s[:, :-1].conj()).sum()) / (2 * np.pi) * w.sampling_rate
     slow = np.angle((s[1:] * s[:-1].conj()).sum()) / (2 * np.pi) / w.slot_duration
     return float(fast), float(slow)
@@ -378,7 +471,8 @@ def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
     truth="beat alpha tau + f_c dtau/dt and Doppler f_c v / c, by hand",
     unit="relative",
     bound=0.01,
-    why="the mean over the chirp shifts both by the sweep, 0.4 %, and by the range-Doppler coupling",
+    why="the mean over the chirp shifts both by the sweep, 0.4 %, and by the range-Doppler "
+    "coupling",
     planted=(
         "signal/if_signal.py",
         '"rate": s.delay_rate + s.delay_accel * later + t.clock_drift',
@@ -390,7 +484,12 @@ def signs() -> float:
     beat = 640e6 / 54.61333e-6 * 121.3 / 299_792_458.0
     closing, receding = _spectrum_peak(121.3, -6.1), _spectrum_peak(121.3, 6.1)
     doppler = 6.1 / 299_792_458.0 * 77.34e9
-    return max(abs(closing[0] / beat - 1), abs(receding[0] / beat - 1), abs(closing[1] / -doppler - 1), abs(receding[1] / doppler - 1))
+    return max(
+        abs(closing[0] / beat - 1),
+        abs(receding[0] / beat - 1),
+        abs(closing[1] / -doppler - 1),
+        abs(receding[1] / doppler - 1),
+    )
 
 
 @case(
@@ -405,11 +504,16 @@ def signs() -> float:
     ),
 )
 def filter_skirts() -> float:
-    """Amplitude inside the passband, a third and a half into either skirt, and outside; the neighbouring group is not heard."""
+    """Amplitude inside the passband, a third and a half into either skirt, and outside; the
+    neighbouring group is not heard."""
     w = Waveform(num_groups=1, num_tx=1, num_chirps=4, num_samples=64)
     antennas, worst = stage.arrays(w, tx_x=1, tx_z=1), 0.0
     sender = Transmission(
-        name="A", pose=stage.pose((0, 0, 0)), antennas=antennas, schedule=np.zeros((1, 4), np.int64), payload=unmodulated(w)
+        name="A",
+        pose=stage.pose((0, 0, 0)),
+        antennas=antennas,
+        schedule=np.zeros((1, 4), np.int64),
+        payload=unmodulated(w),
     )
     along = np.array([[0.0, 1.0, 0.0]])
     for beat, truth in (
@@ -419,10 +523,20 @@ def filter_skirts() -> float:
         (-stage.SKIRT / 2, 0.5),
         (20e6 + stage.SKIRT * 1.01, 0.0),
     ):
-        paths = make_paths(gain=np.ones(1), delay=np.array([beat / w.slope]), departure=along, arrival=along, kind=PathKind.TARGET,
-                           epoch=START + w.frame_duration / 2, tx="A", rx="A")  # fmt: skip
+        paths = make_paths(
+            gain=np.ones(1),
+            delay=np.array([beat / w.slope]),
+            departure=along,
+            arrival=along,
+            kind=PathKind.TARGET,
+            epoch=START + w.frame_duration / 2,
+            tx="A",
+            rx="A",
+        )
         for method in ("exact", "direct"):
-            found = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), method, START, antennas)
+            found = stage.synthesise(
+                w, [(sender, paths)], stage.pose((0, 0, 0)), method, START, antennas
+            )
             worst = max(worst, abs(float(np.sqrt((np.abs(found) ** 2).mean())) - truth))
     return worst
 
@@ -431,21 +545,46 @@ def filter_skirts() -> float:
     truth="distances to a point half a metre away",
     unit="rad",
     bound=0.002,
-    why=("the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but for its change over the window"),
-    planted=("signal/if_signal.py", "square - 2 * far * along[some]", "0 * square - 2 * far * along[some]"),
+    why=(
+        "the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but "
+        "for its change over the window"
+    ),
+    planted=(
+        "signal/if_signal.py",
+        "square - 2 * far * along[some]",
+        "0 * square - 2 * far * along[some]",
+    ),
 )
 def spherical_waves() -> float:
     """Phases over the full array of a scatterer at 0.5 m follow the elements' own distances."""
     w = Waveform(num_groups=1, num_tx=1, num_chirps=2, num_samples=64)
     antennas, here = stage.arrays(w, tx_x=1, tx_z=1, rx_x=8, rx_z=8), stage.pose((0, 0, 0))
-    sender = Transmission(name="A", pose=here, antennas=antennas, schedule=np.zeros((1, 2), np.int64), payload=unmodulated(w))
+    sender = Transmission(
+        name="A",
+        pose=here,
+        antennas=antennas,
+        schedule=np.zeros((1, 2), np.int64),
+        payload=unmodulated(w),
+    )
     u = here.to_world(np.array([[0.41, 0.85, 0.0]]) / np.hypot(0.41, 0.85))
-    paths = make_paths(gain=np.ones(1), delay=np.array([1.0]) / SPEED_OF_LIGHT, departure=u, arrival=u, tx_radius=0.5, rx_radius=0.5,
-                       kind=PathKind.TARGET, epoch=START + w.frame_duration / 2, tx="A", rx="A")  # fmt: skip
+    paths = make_paths(
+        gain=np.ones(1),
+        delay=np.array([1.0]) / SPEED_OF_LIGHT,
+        departure=u,
+        arrival=u,
+        tx_radius=0.5,
+        rx_radius=0.5,
+        kind=PathKind.TARGET,
+        epoch=START + w.frame_duration / 2,
+        tx="A",
+        rx="A",
+    )
     s = stage.synthesise(w, [(sender, paths)], here, "direct", START, antennas)[0, :, 0, 32]
     elements = here.to_world(antennas.rx_positions)
     extra = np.linalg.norm(0.5 * u - elements, axis=1) - 0.5
-    frequency = 77e9 + w.slope * (w.chirp_duration - w.sampled_duration + 32 / w.sampling_rate - 1.0 / 299_792_458.0)
+    frequency = 77e9 + w.slope * (
+        w.chirp_duration - w.sampled_duration + 32 / w.sampling_rate - 1.0 / 299_792_458.0
+    )
     return float(
         np.abs(
             np.angle(
@@ -472,12 +611,19 @@ def spherical_waves() -> float:
 def clock_errors() -> float:
     """A transmitter's clock that is late and slow lengthens every delay and its rate."""
     w, rng = stage.SMALL, np.random.default_rng(9)
-    paths, rx, antennas = stage.random_paths(w, rng, 5, START + w.frame_duration / 2, reach=0.5), stage.pose((0, 0, 0)), stage.arrays(w)
+    paths, rx, antennas = (
+        stage.random_paths(w, rng, 5, START + w.frame_duration / 2, reach=0.5),
+        stage.pose((0, 0, 0)),
+        stage.arrays(w),
+    )
     sender = stage.sender(w, rng)
     off, drift = 3.17e-8, 2.3e-9
     late = replace(sender, clock_offset=off, clock_drift=drift)
     longer = replace(paths, delay=paths.delay + off, delay_rate=paths.delay_rate + drift)
-    found, truth = (stage.synthesise(w, [link], rx, "direct", START, antennas) for link in ((late, paths), (sender, longer)))
+    found, truth = (
+        stage.synthesise(w, [link], rx, "direct", START, antennas)
+        for link in ((late, paths), (sender, longer))
+    )
     return stage.relative(found, truth)
 
 
@@ -498,10 +644,14 @@ def births_and_deaths() -> float:
     sender, rx = stage.sender(w, rng, data=False), stage.pose((0, 0, 0))
     paths = stage.random_paths(w, rng, 1, START + w.frame_duration / 2, reach=0.4, speed=0.0)
     slot = w.slot_duration
-    cut = 3 * slot - w.frame_duration / 2 - slot / 50  # in the gap before the fourth chirp of the first group
+    cut = (
+        3 * slot - w.frame_duration / 2 - slot / 50
+    )  # in the gap before the fourth chirp of the first group
     worst = 0.0
     for method in ("exact", "direct", "gridded"):
-        s = stage.synthesise(w, [(sender, replace(paths, end=np.array([cut])))], rx, method, START, stage.arrays(w))
+        s = stage.synthesise(
+            w, [(sender, replace(paths, end=np.array([cut])))], rx, method, START, stage.arrays(w)
+        )
         energy = (np.abs(s[0]) ** 2).sum(axis=(0, 2))
         worst = max(
             worst,
@@ -523,13 +673,18 @@ def births_and_deaths() -> float:
     ),
 )
 def data_are_taken_out() -> float:
-    """A modulated frame with its data removed equals the unmodulated frame, at whole and fractional cells."""
+    """A modulated frame with its data removed equals the unmodulated frame, at whole and fractional
+    cells."""
     w, schedule, payload = stage.frame(w=Waveform(num_samples=256, num_chirps=30))
     pilot, worst = unmodulated(w), 0.0
     for cell in (0.61, 22.5, 87.28, 100.93):
         path = [(cell * w.range_cell(1), 0.0, 0.7 - 0.4j)]
-        one = clean_spectrum(stage.cube_of(w, schedule, payload, path), payload.delay_symbols, payload.phases, 128)
-        other = clean_spectrum(stage.cube_of(w, schedule, pilot, path), pilot.delay_symbols, pilot.phases, 128)
+        one = clean_spectrum(
+            stage.cube_of(w, schedule, payload, path), payload.delay_symbols, payload.phases, 128
+        )
+        other = clean_spectrum(
+            stage.cube_of(w, schedule, pilot, path), pilot.delay_symbols, pilot.phases, 128
+        )
         worst = max(worst, float(np.abs(one - other).max() / np.abs(other).max()))
     return worst
 
@@ -546,7 +701,8 @@ def data_are_taken_out() -> float:
     ),
 )
 def resource_blocks() -> float:
-    """A receiver whose reference stands one block later than the sender's hears the sender's later groups, shifted by one."""
+    """A receiver whose reference stands one block later than the sender's hears the sender's later
+    groups, shifted by one."""
     w, rng = stage.SMALL, np.random.default_rng(12)
     sender, rx, antennas = stage.sender(w, rng), stage.pose((0, 0, 0)), stage.arrays(w)
     paths = stage.random_paths(w, rng, 6, START + w.frame_duration / 2, reach=0.45, speed=0.0)

@@ -24,7 +24,12 @@ Triple = Sequence[float] | np.ndarray
 SKIRT = 0.43e6
 
 
-def pose(position: Triple, velocity: Triple = (0, 0, 0), acceleration: Triple = (0, 0, 0), boresight: Triple = (0.3, 1.0, 0.1)) -> Pose:
+def pose(
+    position: Triple,
+    velocity: Triple = (0, 0, 0),
+    acceleration: Triple = (0, 0, 0),
+    boresight: Triple = (0.3, 1.0, 0.1),
+) -> Pose:
     place, speed, change = (np.array(v, float) for v in (position, velocity, acceleration))
     return Pose(place, speed, change, attitude(np.array(boresight, float)))
 
@@ -41,15 +46,22 @@ def swarm(a: Triple, p: Triple, u: Triple, moving: bool = True) -> dict[str, Pos
 
 
 def scenario(traced: bool = True, **changes: Any) -> Scenario:
-    """A scenario of the swarm A (active), P (passive), U (target) with isotropic elements of 0 dBi; `changes` of its keys."""
+    """A scenario of the swarm A (active), P (passive), U (target) with isotropic elements of 0 dBi;
+    `changes` of its keys."""
     rcs = {"model": "constant", "value_dbsm": -11.7}
     roles = {"A": "active", "P": "passive", "U": "target"}
     tree: dict[str, Any] = {
-        "swarm": {name: {"role": role, "position_m": [float(i), 0, 0], "rcs": rcs} for i, (name, role) in enumerate(roles.items())},
+        "swarm": {
+            name: {"role": role, "position_m": [float(i), 0, 0], "rcs": rcs}
+            for i, (name, role) in enumerate(roles.items())
+        },
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
     }
     if traced:
-        tree |= {"city": {"source": "canyon"}, "propagation": {"model": "ray_traced", "leakage": {"enabled": False}}}
+        tree |= {
+            "city": {"source": "canyon"},
+            "propagation": {"model": "ray_traced", "leakage": {"enabled": False}},
+        }
     for key, value in changes.items():
         tree[key] = tree.get(key, {}) | value if isinstance(value, dict) else value
     return Scenario.model_validate(tree)
@@ -62,26 +74,56 @@ def tracer(mesh: City, bounces: int = 2, **changes: Any) -> Propagation:
     return make_propagation(s, w, antennas_of(s, w), mesh)
 
 
-def material(permittivity: float = 5.31, conductivity: float = 1.9, scattering: float = 0.0, thickness: float = 0.1) -> Material:
-    return Material("slab", permittivity, conductivity, scattering, "lambertian", 1, thickness, "validation")
+def material(
+    permittivity: float = 5.31,
+    conductivity: float = 1.9,
+    scattering: float = 0.0,
+    thickness: float = 0.1,
+) -> Material:
+    return Material(
+        "slab", permittivity, conductivity, scattering, "lambertian", 1, thickness, "validation"
+    )
 
 
 METAL = 1e7
-"""Conductivity of the tracer's perfect conductor [S/m]; at 77 GHz it reflects 0.9991 of the amplitude."""
+"""Conductivity of the tracer's perfect conductor [S/m]; at 77 GHz it reflects 0.9991 of the
+amplitude."""
 
 
-def rectangle(corner: Triple, along: Triple, across: Triple, of: Material, origin: Triple = (0.0, 0.0, 0.0)) -> City:
+def rectangle(
+    corner: Triple, along: Triple, across: Triple, of: Material, origin: Triple = (0.0, 0.0, 0.0)
+) -> City:
     """One flat wall of two triangles; world coordinates."""
     p, a, b = (np.array(v, float) for v in (corner, along, across))
     vertices = np.array([p, p + a, p + a + b, p + b]) - np.array(origin)
-    return City("wall", vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16), (of,), np.array(origin, float))
+    return City(
+        "wall",
+        vertices,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.zeros(2, np.int16),
+        (of,),
+        np.array(origin, float),
+    )
 
 
-SMALL = Waveform(bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3)
+SMALL = Waveform(
+    bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3
+)
 
 
 def arrays(w: Waveform, **change: Any) -> Antennas:
-    return Antennas(**({"tx_x": 2, "tx_z": w.num_tx - 1, "rx_x": 3, "rx_z": 2, "spacing": 0.5774 * w.wavelength} | change))
+    return Antennas(
+        **(
+            {
+                "tx_x": 2,
+                "tx_z": w.num_tx - 1,
+                "rx_x": 3,
+                "rx_z": 2,
+                "spacing": 0.5774 * w.wavelength,
+            }
+            | change
+        )
+    )
 
 
 FEW = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5774 * SPEED_OF_LIGHT / 77e9)
@@ -101,44 +143,74 @@ def sender(w: Waveform, rng: np.random.Generator, data: bool = True, **change: A
     return Transmission(**({"name": "A"} | fields | change))
 
 
-def random_paths(w: Waveform, rng: np.random.Generator, count: int, epoch: float, *, reach: float = 0.9, speed: float = 30.0) -> PathSet:
-    """Paths all over the passband with generic directions, radii, rates up to 2 speed and accelerations."""
+def random_paths(
+    w: Waveform,
+    rng: np.random.Generator,
+    count: int,
+    epoch: float,
+    *,
+    reach: float = 0.9,
+    speed: float = 30.0,
+) -> PathSet:
+    """Paths all over the passband with generic directions, radii, rates up to 2 speed and
+    accelerations."""
 
     def directions() -> np.ndarray:
         d = rng.normal(size=(count, 3))
         return d / np.linalg.norm(d, axis=1)[:, None]
 
     return make_paths(
-        gain=rng.normal(size=count) + 1j * rng.normal(size=count), delay=rng.uniform(0.01, reach, count) * w.max_delay,
-        delay_rate=2 * rng.uniform(-speed, speed, count) / SPEED_OF_LIGHT, delay_accel=rng.normal(size=count) * 20 / SPEED_OF_LIGHT,
-        departure=directions(), arrival=directions(), tx_radius=rng.uniform(7, 70, count),
-        rx_radius=np.where(np.arange(count) % 3, rng.uniform(7, 70, count), np.inf), kind=PathKind.DIFFUSE, epoch=epoch, tx="A", rx="P",
-    )  # fmt: skip
+        gain=rng.normal(size=count) + 1j * rng.normal(size=count),
+        delay=rng.uniform(0.01, reach, count) * w.max_delay,
+        delay_rate=2 * rng.uniform(-speed, speed, count) / SPEED_OF_LIGHT,
+        delay_accel=rng.normal(size=count) * 20 / SPEED_OF_LIGHT,
+        departure=directions(),
+        arrival=directions(),
+        tx_radius=rng.uniform(7, 70, count),
+        rx_radius=np.where(np.arange(count) % 3, rng.uniform(7, 70, count), np.inf),
+        kind=PathKind.DIFFUSE,
+        epoch=epoch,
+        tx="A",
+        rx="P",
+    )
 
 
 def cube_of(
-    w: Waveform, schedule: np.ndarray, payload: Payload, paths: list[tuple[float, float, complex]], antennas: Antennas = FEW,
-    arrival: tuple[float, float] = (0.0, 0.0), departure: tuple[float, float] = (0.0, 0.0),
-) -> IFCube:  # fmt: skip
-    """Noise-free cube of plane waves (length [m], rate [m/s], amplitude) at mid-frame, from the equation of the IF phase in float64."""
+    w: Waveform,
+    schedule: np.ndarray,
+    payload: Payload,
+    paths: list[tuple[float, float, complex]],
+    antennas: Antennas = FEW,
+    arrival: tuple[float, float] = (0.0, 0.0),
+    departure: tuple[float, float] = (0.0, 0.0),
+) -> IFCube:
+    """Noise-free cube of plane waves (length [m], rate [m/s], amplitude) at mid-frame, from the
+    equation of the IF phase in float64."""
     out = np.zeros((w.num_groups, antennas.num_rx, w.num_chirps, w.num_samples), np.complex64)
     window = w.num_samples / w.sampling_rate
     longest = w.sampling_rate * window / (w.bandwidth - 2 * w.sampling_rate)
     slope, slot = w.bandwidth / (window + 2 * longest), window + 2 * (1 + w.num_tx) * longest
     u = np.arange(w.num_samples) / w.sampling_rate + 2 * longest
     for m in range(w.num_groups):
-        t = u + (np.arange(w.num_chirps) * slot + 2 * m * longest - w.num_chirps * slot / 2)[:, None]
+        t = (
+            u
+            + (np.arange(w.num_chirps) * slot + 2 * m * longest - w.num_chirps * slot / 2)[:, None]
+        )
         symbol = payload.delay_symbols[m][:, None] / (slope * window)
         sent = antennas.tx_positions[schedule[m]][:, [0, 2]] @ np.array(departure)
         for rx, place in enumerate(antennas.rx_positions[:, [0, 2]] @ np.array(arrival)):
             for length, rate, amplitude in paths:
                 tau = (length + rate * t - sent[:, None] - place) / 299_792_458.0 + symbol
                 cycles = (w.carrier_frequency * tau) % 1 + slope * tau * (u - tau / 2)
-                out[m, rx] += amplitude * payload.phases[m][:, None] * np.exp(2j * np.pi * (cycles % 1))
+                out[m, rx] += (
+                    amplitude * payload.phases[m][:, None] * np.exp(2j * np.pi * (cycles % 1))
+                )
     return IFCube(samples=out, waveform=w, schedule=schedule, start_time=0.0)
 
 
-def frame(order: int = 8, seed: int = 3, w: Waveform | None = None) -> tuple[Waveform, np.ndarray, Payload]:
+def frame(
+    order: int = 8, seed: int = 3, w: Waveform | None = None
+) -> tuple[Waveform, np.ndarray, Payload]:
     """Waveform, a pseudo-random schedule and a random payload."""
     w, rng = w or Waveform(), np.random.default_rng(seed)
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
@@ -149,11 +221,26 @@ def noisy(clean: IFCube, power: float, seed: int) -> IFCube:
     """A copy with the program's own white noise, which has cases of its own."""
     samples = clean.samples.copy()
     add_white_noise(samples, power, seed_sequence(seed, "validation").generate_state(2))
-    return IFCube(samples=samples, waveform=clean.waveform, schedule=clean.schedule, start_time=clean.start_time)
+    return IFCube(
+        samples=samples,
+        waveform=clean.waveform,
+        schedule=clean.schedule,
+        start_time=clean.start_time,
+    )
 
 
-def synthesise(w: Waveform, links: list, rx: Pose, method: Any, start: float, antennas: Antennas, **options: Any) -> np.ndarray:
-    return if_signal(w, links, rx, antennas, start_time=start, filter_transition=SKIRT, method=method, **options).samples
+def synthesise(
+    w: Waveform,
+    links: list,
+    rx: Pose,
+    method: Any,
+    start: float,
+    antennas: Antennas,
+    **options: Any,
+) -> np.ndarray:
+    return if_signal(
+        w, links, rx, antennas, start_time=start, filter_transition=SKIRT, method=method, **options
+    ).samples
 
 
 def relative(found: np.ndarray, truth: np.ndarray) -> float:

@@ -16,16 +16,28 @@ STATES = {True: "passes", False: "FAILS", None: "left out"}
 
 
 def as_data(verdicts: Sequence[Verdict]) -> dict[str, object]:
-    """All of the table as plain data, with what it was made by; an error that is no finite number is null."""
+    """All of the table as plain data, with what it was made by; an error that is no finite number
+    is null."""
     rows = []
     for v in verdicts:
         c = v.case
         planted = {"file": c.planted.file, "old": c.planted.old, "new": c.planted.new}
         rows.append(
-            {"name": c.name, "group": c.group, "claim": c.claim, "truth": c.truth, "error": v.error if math.isfinite(v.error) else None,
-             "bound": c.bound, "unit": c.unit, "why": c.why, "state": STATES[v.passed], "seconds": round(v.seconds, 3), "note": v.note,
-             "planted": planted}
-        )  # fmt: skip
+            {
+                "name": c.name,
+                "group": c.group,
+                "claim": c.claim,
+                "truth": c.truth,
+                "error": v.error if math.isfinite(v.error) else None,
+                "bound": c.bound,
+                "unit": c.unit,
+                "why": c.why,
+                "state": STATES[v.passed],
+                "seconds": round(v.seconds, 3),
+                "note": v.note,
+                "planted": planted,
+            }
+        )
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "program": program_fingerprint(),
@@ -48,27 +60,52 @@ def shown(value: float) -> str:
 
 
 def as_markdown(verdicts: Sequence[Verdict]) -> str:
-    """A table per group: claim, truth, error, bound and why; then how each case has been seen to fail."""
+    """A table per group: claim, truth, error, bound and why; then how each case has been seen to
+    fail."""
     data = as_data(verdicts)
     counts = f"{data['passed']} cases pass, {data['failed']} fail, {data['left_out']} were left out"
     lines = [f"{counts} ({data['date']}, {data['program']}).", ""]
     for group in dict.fromkeys(v.case.group for v in verdicts):
-        lines += [f"### {group}", "", "| case | claim | truth | error | bound | why that bound | s |", "|---|---|---|---|---|---|---|"]
+        lines += [
+            f"### {group}",
+            "",
+            "| case | claim | truth | error | bound | why that bound | s |",
+            "|---|---|---|---|---|---|---|",
+        ]
         for v in verdicts:
             c = v.case
             if c.group == group:
                 found = shown(v.error) if v.passed is not None else f"left out: {v.note}"
                 note = f" ({v.note})" if v.note and v.passed is not None else ""
                 failed = "**FAILS** " if v.passed is False else ""
-                cells = (c.name, c.claim + note, c.truth, failed + found, f"{shown(c.bound)} {c.unit}", c.why, f"{v.seconds:.1f}")
+                cells = (
+                    c.name,
+                    c.claim + note,
+                    c.truth,
+                    failed + found,
+                    f"{shown(c.bound)} {c.unit}",
+                    c.why,
+                    f"{v.seconds:.1f}",
+                )
                 lines.append("| " + " | ".join(_cell(str(x)) for x in cells) + " |")
         lines.append("")
     lines += ["### Planted bugs", ""]
-    lines += ["The bug with which a case is to fail; `python tests/mutation.py --planted` plants them and looks.", ""]
+    lines += [
+        "The bug with which a case is to fail; `python tests/mutation.py --planted` plants them "
+        "and looks.",
+        "",
+    ]
     lines += ["| case | file | instead of | planted |", "|---|---|---|---|"]
     for v in verdicts:
         p = v.case.planted
-        lines.append("| " + " | ".join(_cell(x) for x in (v.case.name, p.file, f"`{_one_line(p.old)}`", f"`{_one_line(p.new)}`")) + " |")
+        lines.append(
+            "| "
+            + " | ".join(
+                _cell(x)
+                for x in (v.case.name, p.file, f"`{_one_line(p.old)}`", f"`{_one_line(p.new)}`")
+            )
+            + " |"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -11,7 +11,15 @@ from scipy import stats
 from isac_rt.results.metrics import binomial_interval, gospa
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.case import case
-from isac_rt.terminal.filter import BIRTH_SPEED_STD, birth, bistatic_distance, jacobian, measure, predict, update
+from isac_rt.terminal.filter import (
+    BIRTH_SPEED_STD,
+    birth,
+    bistatic_distance,
+    jacobian,
+    measure,
+    predict,
+    update,
+)
 from isac_rt.world.swarm import Pose
 
 ONCE_IN_1E5 = "false alarm 7e-6"
@@ -40,7 +48,9 @@ def jacobians_of_the_tracker() -> float:
     """Derivative of range, rate and direction with respect to the state, one-way and bistatic."""
     worst = 0.0
     for transmitter in (None, AT):
-        truth = np.stack([measure(BODY + 1e-30j * d, OWN, transmitter).imag / 1e-30 for d in np.eye(6)], axis=1)
+        truth = np.stack(
+            [measure(BODY + 1e-30j * d, OWN, transmitter).imag / 1e-30 for d in np.eye(6)], axis=1
+        )
         worst = max(worst, float(np.abs(jacobian(BODY, OWN, transmitter) - truth).max()))
     return worst
 
@@ -70,18 +80,25 @@ def bistatic_range() -> float:
 
 @lru_cache(maxsize=1)
 def _tracked(runs: int = 100, steps: int = 15) -> tuple[np.ndarray, np.ndarray]:
-    """NEES of the last state (6 degrees of freedom) and NIS of the last innovation (4) over independent runs."""
+    """NEES of the last state (6 degrees of freedom) and NIS of the last innovation (4) over
+    independent runs."""
     rng, sigma, interval = np.random.default_rng(17), 1.7, 0.05
     nees, nis = [], []
     for _ in range(runs):
-        x = np.concatenate([BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)])
+        x = np.concatenate(
+            [BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)]
+        )
         own = OWN
         g = birth(measure(x, own) + STD * rng.standard_normal(4), STD, own)
         assert g is not None
         for _ in range(steps):
             a = sigma * rng.standard_normal(3)
-            x = np.concatenate([x[:3] + interval * x[3:] + interval**2 / 2 * a, x[3:] + interval * a])
-            own = Pose(own.position + interval * own.velocity, own.velocity, own.acceleration, own.rotation)
+            x = np.concatenate(
+                [x[:3] + interval * x[3:] + interval**2 / 2 * a, x[3:] + interval * a]
+            )
+            own = Pose(
+                own.position + interval * own.velocity, own.velocity, own.acceleration, own.rotation
+            )
             g = predict(g, interval, sigma)
             z, R = measure(x, own) + STD * rng.standard_normal(4), np.diag(STD**2)
             H = jacobian(g.mean, own)
@@ -107,7 +124,8 @@ def _tracked(runs: int = 100, steps: int = 15) -> tuple[np.ndarray, np.ndarray]:
     quick=False,
 )
 def consistency_of_states() -> float:
-    """Normalised estimation error squared (NEES) of tracks born from one detection, over 100 independent runs."""
+    """Normalised estimation error squared (NEES) of tracks born from one detection, over 100
+    independent runs."""
     return float(abs(_tracked()[0].mean() - 6) / np.sqrt(12 / 100))
 
 
@@ -151,7 +169,10 @@ def gospa_metric() -> float:
         for size in range(min(n, m) + 1):
             for rows in itertools.combinations(range(n), size):
                 for columns in itertools.permutations(range(m), size):
-                    square = sum(float(((x[i] - y[j]) ** 2).sum()) for i, j in zip(rows, columns, strict=True))
+                    square = sum(
+                        float(((x[i] - y[j]) ** 2).sum())
+                        for i, j in zip(rows, columns, strict=True)
+                    )
                     best = min(best, square + cutoff**2 / 2 * (n + m - 2 * size))
         worst = max(worst, abs(gospa(x, y, cutoff).distance - np.sqrt(best)))
     return worst
@@ -169,9 +190,14 @@ def gospa_metric() -> float:
     ),
 )
 def binomial_intervals() -> float:
-    """At either end of a Clopper-Pearson interval the outcome, or one farther out, has a chance of 2.5 %."""
+    """At either end of a Clopper-Pearson interval the outcome, or one farther out, has a chance of
+    2.5 %."""
     worst = 0.0
     for k, n in ((1, 20), (7, 31), (30, 31)):
         low, high = binomial_interval(k, n)
-        worst = max(worst, abs(1 - stats.binom.cdf(k - 1, n, low) - 0.025), abs(stats.binom.cdf(k, n, high) - 0.025))
+        worst = max(
+            worst,
+            abs(1 - stats.binom.cdf(k - 1, n, low) - 0.025),
+            abs(stats.binom.cdf(k, n, high) - 0.025),
+        )
     return float(worst)

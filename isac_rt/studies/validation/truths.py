@@ -1,4 +1,5 @@
-"""Truths in long double and closed form. Nothing here is taken from the modules that are validated, not even constants."""
+"""Truths in long double and closed form. Nothing here is taken from the modules that are validated,
+not even constants."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def mirrored(planes: Sequence[Plane], start: np.ndarray) -> np.ndarray:
     for normal, point in planes:
         n = wide(normal)
         n = n / norm(n)
-        image = (np.eye(3, dtype=np.longdouble) - 2 * np.outer(n, n)) @ (image - wide(point)) + wide(point)
+        image = (np.eye(3, dtype=np.longdouble) - 2 * np.outer(n, n)) @ (
+            image - wide(point)
+        ) + wide(point)
     return image
 
 
@@ -53,13 +56,19 @@ def derivatives(length: Callable[[np.longdouble], np.longdouble]) -> tuple[float
     return float(first), float(second)
 
 
-def slab_reflection(permittivity: float, conductivity: float, thickness: float, cosine: float) -> tuple[complex, complex]:
-    """Reflection (TE, TM) of a slab by adding up its inner echoes from Fresnel's equations; TM as the electric field in its plane."""
+def slab_reflection(
+    permittivity: float, conductivity: float, thickness: float, cosine: float
+) -> tuple[complex, complex]:
+    """Reflection (TE, TM) of a slab by adding up its inner echoes from Fresnel's equations; TM as
+    the electric field in its plane."""
     eta = permittivity - 1j * conductivity / (2 * np.pi * CARRIER * EPSILON_0)
     inside = np.sqrt(1 - (1 - cosine**2) / eta)  # cosine of the refracted angle
     n, turn = np.sqrt(eta), np.exp(-2j * np.pi * thickness / WAVELENGTH * np.sqrt(eta) * inside)
     out = []
-    for first in ((cosine - n * inside) / (cosine + n * inside), (n * cosine - inside) / (n * cosine + inside)):
+    for first in (
+        (cosine - n * inside) / (cosine + n * inside),
+        (n * cosine - inside) / (n * cosine + inside),
+    ):
         total, echo = first, (1 - first**2) * -first * turn**2
         for _ in range(400):
             total, echo = total + echo, echo * first**2 * turn**2
@@ -67,8 +76,11 @@ def slab_reflection(permittivity: float, conductivity: float, thickness: float, 
     return out[0], out[1]
 
 
-def lambertian_wall(a: np.ndarray, p: np.ndarray, coefficient: float, y: float, half: tuple[float, float]) -> float:
-    """Power from a to p, isotropic ends, over a perfectly reflecting Lambertian wall |x| < half[0], |z| < half[1] at y."""
+def lambertian_wall(
+    a: np.ndarray, p: np.ndarray, coefficient: float, y: float, half: tuple[float, float]
+) -> float:
+    """Power from a to p, isotropic ends, over a perfectly reflecting Lambertian wall |x| < half[0],
+    |z| < half[1] at y."""
 
     def density(z: float, x: float) -> float:
         r = np.array([x, y, z])
@@ -95,7 +107,8 @@ class Chirps:
         self.step = 1 / (self.slope * window)
 
     def beat(self, tau: np.ndarray) -> np.ndarray:
-        """exp(j phase) of the reference chirp times the conjugate of the one that comes tau later, by subtracting their phases."""
+        """exp(j phase) of the reference chirp times the conjugate of the one that comes tau later,
+        by subtracting their phases."""
 
         def oscillator(since: np.ndarray) -> np.ndarray:
             return self.carrier * since + self.slope * since * since / 2
@@ -104,12 +117,16 @@ class Chirps:
         return np.exp(2j * np.pi * (turn - np.floor(turn)).astype(float))
 
 
-def if_samples(w, schedule, payload, length: Callable, gain: complex, send: np.ndarray, hear: np.ndarray) -> np.ndarray:
-    """IF samples (M, L_rx, P, N) of one path by mixing chirps in long double, as if no filter were there.
+def if_samples(
+    w, schedule, payload, length: Callable, gain: complex, send: np.ndarray, hear: np.ndarray
+) -> np.ndarray:
+    """IF samples (M, L_rx, P, N) of one path by mixing chirps in long double, as if no filter were
+    there.
 
     Parameters
     ----------
-    length : of the way [m] from a transmit element to a receive element as a function of (time since mid-frame, element, element)
+    length : of the way [m] from a transmit element to a receive element as a function of (time
+        since mid-frame, element, element)
     gain : complex, constant over the frame
     send, hear : element positions that `length` is called with
     """
@@ -117,6 +134,9 @@ def if_samples(w, schedule, payload, length: Callable, gain: complex, send: np.n
     out = np.zeros((len(schedule), len(hear), w.num_chirps, w.num_samples), np.complex128)
     for m, r, p in np.ndindex(*out.shape[:3]):
         t = c.fast + p * c.slot + 2 * m * c.longest - c.frame / 2
-        tau = length(t, send[schedule[m, p]], hear[r]) / LIGHT + int(payload.delay_symbols[m, p]) * c.step
+        tau = (
+            length(t, send[schedule[m, p]], hear[r]) / LIGHT
+            + int(payload.delay_symbols[m, p]) * c.step
+        )
         out[m, r, p] = np.conj(gain * np.conj(payload.phases[m, p])) * c.beat(tau)
     return out

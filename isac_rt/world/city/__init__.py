@@ -1,4 +1,5 @@
-"""The city: where its mesh comes from, what it is made of, and its ray-traced twin (`isac_rt.world.city.scene`, which needs Sionna)."""
+"""The city: where its mesh comes from, what it is made of, and its ray-traced twin
+(`isac_rt.world.city.scene`, which needs Sionna)."""
 
 from isac_rt.world.city.materials import CityError, Material
 from isac_rt.world.city.mesh import City

@@ -1,4 +1,5 @@
-"""CityJSON 1.x and 2.0: the surfaces of the highest level of detail, or footprints where there is nothing above level 0."""
+"""CityJSON 1.x and 2.0: the surfaces of the highest level of detail, or footprints where there is
+nothing above level 0."""
 
 from __future__ import annotations
 
@@ -16,8 +17,23 @@ from isac_rt.world.city.extrude import triangulate
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 
-_GROUND_TYPES = ("TINRelief", "LandUse", "Road", "Railway", "WaterBody", "PlantCover", "TransportSquare", "Waterway")
-_DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
+_GROUND_TYPES = (
+    "TINRelief",
+    "LandUse",
+    "Road",
+    "Railway",
+    "WaterBody",
+    "PlantCover",
+    "TransportSquare",
+    "Waterway",
+)
+_DEPTH = {
+    "MultiSurface": 0,
+    "CompositeSurface": 0,
+    "Solid": 1,
+    "MultiSolid": 2,
+    "CompositeSolid": 2,
+}
 """How many lists lie around the list of surfaces."""
 
 
@@ -43,7 +59,8 @@ class CityModel:
 
 
 def parse_height(value: Any, what: str) -> float | None:
-    """A height property as metres: a number, or text such as ``12.5`` or ``12.5 m``; None if there is none.
+    """A height property as metres: a number, or text such as ``12.5`` or ``12.5 m``; None if there
+    is none.
 
     Raises
     ------
@@ -56,8 +73,15 @@ def parse_height(value: Any, what: str) -> float | None:
         try:
             number = float(value.strip().removesuffix("m").strip())
         except ValueError:
-            raise CityError(f"{what}: height {value!r} is not a number of metres; correct it") from None
-    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or number <= 0:
+            raise CityError(
+                f"{what}: height {value!r} is not a number of metres; correct it"
+            ) from None
+    if (
+        isinstance(number, bool)
+        or not isinstance(number, int | float)
+        or not math.isfinite(number)
+        or number <= 0
+    ):
         raise CityError(f"{what}: height {value!r} is not a positive number of metres; correct it")
     return float(number)
 
@@ -67,9 +91,14 @@ def _vertices(document: dict[str, Any], name: str) -> NDArray[np.float64]:
         vertices = np.array(document["vertices"], dtype=np.float64).reshape(-1, 3)
         transform = document.get("transform")
         if transform is not None:
-            vertices = vertices * np.array(transform["scale"], dtype=np.float64) + np.array(transform["translate"], dtype=np.float64)
+            vertices = vertices * np.array(transform["scale"], dtype=np.float64) + np.array(
+                transform["translate"], dtype=np.float64
+            )
     except (KeyError, TypeError, ValueError) as error:
-        raise CityError(f"{name}: `vertices` or `transform` cannot be read ({error}); check the file with a CityJSON validator") from None
+        raise CityError(
+            f"{name}: `vertices` or `transform` cannot be read ({error}); check the file with a "
+            "CityJSON validator"
+        ) from None
     return vertices
 
 
@@ -84,7 +113,8 @@ def _flat(boundaries: list, values: Any, depth: int) -> Iterator[tuple[list, int
 
 
 def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
-    """Triangles of a planar polygon in space, with holes, in its own plane, keeping its orientation.
+    """Triangles of a planar polygon in space, with holes, in its own plane, keeping its
+    orientation.
 
     Parameters
     ----------
@@ -97,7 +127,9 @@ def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
         Indices into the concatenated rings; none if the outer ring has no area.
     """
     outer = rings[0] - rings[0][0]
-    normal = np.cross(outer, np.roll(outer, -1, axis=0)).sum(axis=0) / 2  # Newell: twice the area vector, halved
+    normal = (
+        np.cross(outer, np.roll(outer, -1, axis=0)).sum(axis=0) / 2
+    )  # Newell: twice the area vector, halved
     area = np.linalg.norm(normal)
     if not area > 0:
         return np.zeros((0, 3), dtype=np.int64)
@@ -111,16 +143,26 @@ def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
 def _material(city: scenario.City, semantic: str | None, object_type: str) -> str:
     if object_type in _GROUND_TYPES or semantic in ("GroundSurface", "OuterFloorSurface"):
         return city.ground_material
-    return city.roof_material if semantic in ("RoofSurface", "OuterCeilingSurface") else city.wall_material
+    return (
+        city.roof_material
+        if semantic in ("RoofSurface", "OuterCeilingSurface")
+        else city.wall_material
+    )
 
 
 def _surfaces(
-    geometry: dict[str, Any], vertices: NDArray[np.float64], city: scenario.City, object_type: str, what: str
+    geometry: dict[str, Any],
+    vertices: NDArray[np.float64],
+    city: scenario.City,
+    object_type: str,
+    what: str,
 ) -> list[Surface]:
     semantics = geometry.get("semantics") or {}
     kinds = [s.get("type") for s in semantics.get("surfaces", [])]
     found = []
-    for rings, value in _flat(geometry["boundaries"], semantics.get("values"), _DEPTH[geometry["type"]]):
+    for rings, value in _flat(
+        geometry["boundaries"], semantics.get("values"), _DEPTH[geometry["type"]]
+    ):
         corners = [vertices[np.array(ring, dtype=np.int64)] for ring in rings if len(ring) >= 3]
         if not corners:
             continue
@@ -132,7 +174,9 @@ def _surfaces(
     return found
 
 
-def _footprint(geometry: dict[str, Any], vertices: NDArray[np.float64]) -> tuple[shapely.Geometry, float]:
+def _footprint(
+    geometry: dict[str, Any], vertices: NDArray[np.float64]
+) -> tuple[shapely.Geometry, float]:
     polygons, lowest = [], np.inf
     for rings, _ in _flat(geometry["boundaries"], None, 0):
         corners = [vertices[np.array(ring, dtype=np.int64)] for ring in rings]
@@ -145,7 +189,9 @@ def _level(geometry: dict[str, Any]) -> float:
     return float(geometry.get("lod", 0))
 
 
-def read_cityjson(document: dict[str, Any], city: scenario.City, name: str, notes: list[str]) -> CityModel:
+def read_cityjson(
+    document: dict[str, Any], city: scenario.City, name: str, notes: list[str]
+) -> CityModel:
     """The surfaces and footprints of a CityJSON file.
 
     Parameters
@@ -161,7 +207,11 @@ def read_cityjson(document: dict[str, Any], city: scenario.City, name: str, note
     """
     vertices, model, skipped = _vertices(document, name), CityModel(), 0
     objects = document.get("CityObjects", {})
-    detailed = {key for key, item in objects.items() if any(_level(g) >= 1 for g in item.get("geometry", []))}
+    detailed = {
+        key
+        for key, item in objects.items()
+        if any(_level(g) >= 1 for g in item.get("geometry", []))
+    }
     for key, item in objects.items():
         what, kind = f"{name}: object {key}", str(item.get("type"))
         usable = [g for g in item.get("geometry", []) if g.get("type") in _DEPTH]
@@ -175,12 +225,17 @@ def read_cityjson(document: dict[str, Any], city: scenario.City, name: str, note
                 model.terrain |= kind == "TINRelief"
             elif not detailed.intersection(item.get("children", [])):
                 attributes = item.get("attributes") or {}
-                height = parse_height(attributes.get(city.height_property, attributes.get("measuredHeight")), what)
+                height = parse_height(
+                    attributes.get(city.height_property, attributes.get("measuredHeight")), what
+                )
                 shape, base = _footprint(best, vertices)
                 model.outlines.append((shape, height, what))
                 model.bases.append(base)
         except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise CityError(f"{what}: its geometry cannot be read ({error}); check the file with a CityJSON validator") from None
+            raise CityError(
+                f"{what}: its geometry cannot be read ({error}); check the file with a CityJSON "
+                "validator"
+            ) from None
     if skipped:
         notes.append(f"{skipped} CityJSON geometries that are no surfaces left out")
     return model

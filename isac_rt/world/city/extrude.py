@@ -24,8 +24,15 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
         why = shapely.is_valid_reason(geometry)
         geometry = shapely.make_valid(geometry)
         if not geometry.area > 0:
-            raise CityError(f"{what}: the polygon is not valid ({why}) and repair leaves no area; redraw or remove it")
-    parts = [p for p in shapely.get_parts(geometry, return_index=False) if p.geom_type in ("Polygon", "MultiPolygon")]
+            raise CityError(
+                f"{what}: the polygon is not valid ({why}) and repair leaves no area; redraw or "
+                "remove it"
+            )
+    parts = [
+        p
+        for p in shapely.get_parts(geometry, return_index=False)
+        if p.geom_type in ("Polygon", "MultiPolygon")
+    ]
     polygons = [q for p in parts for q in shapely.get_parts(p) if q.area > 0]
     if not polygons:
         raise CityError(f"{what}: the polygon has no area; redraw or remove it")
@@ -33,9 +40,11 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
 
 
 def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Counter-clockwise triangles of a polygon over the corners `plan` of its rings, using every one of them.
+    """Counter-clockwise triangles of a polygon over the corners `plan` of its rings, using every
+    one of them.
 
-    Constrained Delaunay: ear clipping may pass over a corner on a straight edge, and the roof would not meet the wall there.
+    Constrained Delaunay: ear clipping may pass over a corner on a straight edge, and the roof would
+    not meet the wall there.
     """
     pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = np.array([shapely.get_coordinates(t)[:3] for t in pieces])
@@ -69,14 +78,22 @@ def triangulate(rings: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
     points = np.concatenate(rings)
     ends = np.cumsum([len(r) for r in rings]).astype(np.uint32)
     centred = np.ascontiguousarray(points - points.mean(axis=0))
-    triangles = np.asarray(mapbox_earcut.triangulate_float64(centred, ends), dtype=np.int64).reshape(-1, 3)
+    triangles = np.asarray(
+        mapbox_earcut.triangulate_float64(centred, ends), dtype=np.int64
+    ).reshape(-1, 3)
     flipped = _turn(centred[triangles]) < 0
     triangles[flipped] = triangles[flipped][:, ::-1]
     return triangles
 
 
 def building(
-    polygon: shapely.Polygon, base: float, top: float, wall: MaterialUse, roof: MaterialUse, floor: MaterialUse, what: str
+    polygon: shapely.Polygon,
+    base: float,
+    top: float,
+    wall: MaterialUse,
+    roof: MaterialUse,
+    floor: MaterialUse,
+    what: str,
 ) -> list[Surface]:
     """A closed prism over a polygon: walls, roof and floor, normals outward.
 
@@ -90,7 +107,9 @@ def building(
     what : str
         For messages.
     """
-    polygon = shapely.geometry.polygon.orient(polygon)  # outer ring counter-clockwise, holes clockwise
+    polygon = shapely.geometry.polygon.orient(
+        polygon
+    )  # outer ring counter-clockwise, holes clockwise
     rings = [shapely.get_coordinates(r)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     plan = np.concatenate(rings)
     num = len(plan)
@@ -98,15 +117,32 @@ def building(
     cap = _cap(polygon, plan)
     covered = _turn(plan[cap]).sum() / 2
     if abs(covered - polygon.area) > 1e-6 * polygon.area:
-        raise CityError(f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 covered); simplify the outline")
+        raise CityError(
+            f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 "
+            "covered); simplify the outline"
+        )
     start = np.cumsum([0] + [len(r) for r in rings[:-1]])
     here = np.arange(num)
-    nxt = np.concatenate([s + np.roll(np.arange(len(r)), -1) for s, r in zip(start, rings, strict=True)])
-    walls = np.concatenate([np.column_stack([here, nxt, nxt + num]), np.column_stack([here, nxt + num, here + num])])
-    return [Surface(vertices, walls, wall), Surface(vertices, cap + num, roof), Surface(vertices, cap[:, ::-1], floor)]
+    nxt = np.concatenate(
+        [s + np.roll(np.arange(len(r)), -1) for s, r in zip(start, rings, strict=True)]
+    )
+    walls = np.concatenate(
+        [np.column_stack([here, nxt, nxt + num]), np.column_stack([here, nxt + num, here + num])]
+    )
+    return [
+        Surface(vertices, walls, wall),
+        Surface(vertices, cap + num, roof),
+        Surface(vertices, cap[:, ::-1], floor),
+    ]
 
 
-def ground(low: NDArray[np.float64], high: NDArray[np.float64], margin: float, height: float, material: MaterialUse) -> Surface:
+def ground(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    margin: float,
+    height: float,
+    material: MaterialUse,
+) -> Surface:
     """A rectangle under everything, facing up.
 
     Parameters
@@ -120,5 +156,7 @@ def ground(low: NDArray[np.float64], high: NDArray[np.float64], margin: float, h
     material : MaterialUse
     """
     (x_0, y_0), (x_1, y_1) = low - margin, high + margin
-    vertices = np.array([[x_0, y_0, height], [x_1, y_0, height], [x_1, y_1, height], [x_0, y_1, height]])
+    vertices = np.array(
+        [[x_0, y_0, height], [x_1, y_0, height], [x_1, y_1, height], [x_0, y_1, height]]
+    )
     return Surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), material)

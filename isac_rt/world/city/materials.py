@@ -1,24 +1,30 @@
 """What the city's surfaces are made of, at the carrier.
 
-Dielectric constants follow ITU-R P.2040 [1]_ where it has a fit at the carrier. Where it has none, the rule by which a value
-is reached is stated in the material's `source`: interpolated between two fits, continued beyond a fit, or taken from another
-model. P.2040 calls its frequency ranges indicative, except those of the three grounds; these are replaced above 10 GHz.
+Dielectric constants follow ITU-R P.2040 [1]_ where it has a fit at the carrier. Where it has none,
+the rule by which a value is reached is stated in the material's `source`: interpolated between two
+fits, continued beyond a fit, or taken from another model. P.2040 calls its frequency ranges
+indicative, except those of the three grounds; these are replaced above 10 GHz.
 
-Scattering coefficients are the field's weakest numbers: measured ones lie between 0.2 and 0.4 for facades at UHF and
-microwaves [2]_, and nothing comparable is agreed at 77 GHz. The defaults here stay in that range, ordered by roughness;
-`materials:` of the scenario overrides each.
+Scattering coefficients are the field's weakest numbers: measured ones lie between 0.2 and 0.4 for
+facades at UHF and microwaves [2]_, and nothing comparable is agreed at 77 GHz. The defaults here
+stay in that range, ordered by roughness; `materials:` of the scenario overrides each.
 
 References
 ----------
-.. [1] Recommendation ITU-R P.2040, "Effects of building materials and structures on radiowave propagation above about
+.. [1] Recommendation ITU-R P.2040, "Effects of building materials and structures on radiowave
+propagation above about
    100 MHz", Table 3 (rows of revision 3).
-.. [2] V. Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans. Antennas Propag. 55(1),
+.. [2] V. Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE
+Trans. Antennas Propag. 55(1),
    2007, doi:10.1109/TAP.2006.888422.
-.. [3] M. C. Dobson et al., "Microwave dielectric behavior of wet soil - Part II", IEEE Trans. Geosci. Remote Sens. GE-23(1),
+.. [3] M. C. Dobson et al., "Microwave dielectric behavior of wet soil - Part II", IEEE Trans.
+Geosci. Remote Sens. GE-23(1),
    1985, doi:10.1109/TGRS.1985.289498; adopted, to 1000 GHz, by Recommendation ITU-R P.527.
-.. [4] H. J. Liebe, G. A. Hufford, T. Manabe, "A model for the complex permittivity of water at frequencies below 1 THz",
+.. [4] H. J. Liebe, G. A. Hufford, T. Manabe, "A model for the complex permittivity of water at
+frequencies below 1 THz",
    Int. J. Infrared Millim. Waves 12, 1991, doi:10.1007/BF01008897.
-.. [5] C. Mätzler, "Microwave (1-100 GHz) dielectric model of leaves", IEEE Trans. Geosci. Remote Sens. 32(4), 1994,
+.. [5] C. Mätzler, "Microwave (1-100 GHz) dielectric model of leaves", IEEE Trans. Geosci. Remote
+Sens. 32(4), 1994,
    doi:10.1109/36.298024.
 """
 
@@ -39,7 +45,8 @@ VACUUM_PERMITTIVITY = 8.8541878128e-12
 
 
 class CityError(Exception):
-    """The city cannot be built from what the scenario says; the text says what, where and what to do."""
+    """The city cannot be built from what the scenario says; the text says what, where and what to
+    do."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,14 @@ class Material:
     relative_permittivity : float
         Real part. [-]
     conductivity : float
-        Everything that loses: the imaginary part of the permittivity is conductivity / (2 pi f eps_0). [S/m]
+        Everything that loses: the imaginary part of the permittivity is conductivity / (2 pi f
+        eps_0). [S/m]
     scattering_coefficient : float
         S: the share S^2 of the reflected power leaves diffusely. [-]
     scattering_pattern : {'lambertian', 'directive', 'backscattering'}
     pattern_exponent : int
-        Of both lobes of the last two patterns; the backscattering pattern has half its power in each lobe.
+        Of both lobes of the last two patterns; the backscattering pattern has half its power in
+        each lobe.
     thickness : float
         Of the slab that a face stands for. [m]
     source : str
@@ -76,9 +85,11 @@ class Material:
 
 @dataclass(frozen=True)
 class MaterialUse:
-    """What a source says of a surface's material: a name of the table, perhaps a thickness, or the material itself.
+    """What a source says of a surface's material: a name of the table, perhaps a thickness, or the
+    material itself.
 
-    `defined` is a material that a Mitsuba file spells out in numbers; its name need not be in the table.
+    `defined` is a material that a Mitsuba file spells out in numbers; its name need not be in the
+    table.
     """
 
     name: str
@@ -126,25 +137,55 @@ SOIL_MOISTURE = {"very_dry_ground": 0.02, "medium_dry_ground": 0.15, "wet_ground
 """Our choice of volumetric moisture for the names that P.2040 gives without one."""
 LEAF_DRY_MATTER = 0.3
 
-# S by roughness (see the module's text), and the slab that a face stands for: what is thick and lossy is a half-space at 77 GHz.
+# S by roughness (see the module's text), and the slab that a face stands for: what is thick and
+# lossy is a half-space at 77 GHz.
 _SCATTERING = {
-    "vacuum": 0.0, "concrete": 0.3, "brick": 0.4, "plasterboard": 0.2, "wood": 0.3, "glass": 0.1, "ceiling_board": 0.3,
-    "chipboard": 0.3, "plywood": 0.2, "marble": 0.2, "floorboard": 0.2, "vinyl_tile": 0.1, "carpet_tile": 0.4, "asphalt": 0.4,
-    "metal": 0.1, "very_dry_ground": 0.4, "medium_dry_ground": 0.4, "wet_ground": 0.4, "vegetation": 0.9,
-}  # fmt: skip
-_THICKNESS = {"glass": 0.012, "plasterboard": 0.0125, "metal": 0.01, "plywood": 0.02, "vegetation": 0.0003}
+    "vacuum": 0.0,
+    "concrete": 0.3,
+    "brick": 0.4,
+    "plasterboard": 0.2,
+    "wood": 0.3,
+    "glass": 0.1,
+    "ceiling_board": 0.3,
+    "chipboard": 0.3,
+    "plywood": 0.2,
+    "marble": 0.2,
+    "floorboard": 0.2,
+    "vinyl_tile": 0.1,
+    "carpet_tile": 0.4,
+    "asphalt": 0.4,
+    "metal": 0.1,
+    "very_dry_ground": 0.4,
+    "medium_dry_ground": 0.4,
+    "wet_ground": 0.4,
+    "vegetation": 0.9,
+}
+_THICKNESS = {
+    "glass": 0.012,
+    "plasterboard": 0.0125,
+    "metal": 0.01,
+    "plywood": 0.02,
+    "vegetation": 0.0003,
+}
 DEFAULT_SCATTERING = 0.3
 DEFAULT_THICKNESS = 0.1
 DEFAULT_EXPONENT = 4
-"""The width of the directive lobe that fitted the rural and suburban buildings of Degli-Esposti (2007)."""
+"""The width of the directive lobe that fitted the rural and suburban buildings of Degli-Esposti
+(2007)."""
 
-_ALIASES = {"asphalt_concrete": "asphalt", "ground": "medium_dry_ground", "soil": "medium_dry_ground", "stone": "marble"}
+_ALIASES = {
+    "asphalt_concrete": "asphalt",
+    "ground": "medium_dry_ground",
+    "soil": "medium_dry_ground",
+    "stone": "marble",
+}
 _PREFIXES = ("mat-", "itu_", "itu-")
 KNOWN_MATERIALS = tuple(sorted(_SCATTERING))
 
 
 def canonical_name(name: str) -> str | None:
-    """The table's name for a name as it stands in a file (``mat-itu_Concrete`` -> ``concrete``); None if there is none."""
+    """The table's name for a name as it stands in a file (``mat-itu_Concrete`` -> ``concrete``);
+    None if there is none."""
     short = name.strip().lower()
     for prefix in _PREFIXES:
         short = short.removeprefix(prefix)
@@ -154,7 +195,8 @@ def canonical_name(name: str) -> str | None:
 
 
 def water_permittivity(frequency: float, temperature_c: float = 20.0) -> complex:
-    """Relative permittivity eps' - j eps'' of fresh water: double Debye model of Liebe et al. [4]_, below 1 THz.
+    """Relative permittivity eps' - j eps'' of fresh water: double Debye model of Liebe et al. [4]_,
+    below 1 THz.
 
     Parameters
     ----------
@@ -173,7 +215,8 @@ def water_permittivity(frequency: float, temperature_c: float = 20.0) -> complex
 
 
 def soil_permittivity(frequency: float, moisture: float) -> complex:
-    """Relative permittivity eps' - j eps'' of a sandy loam at 20 degrees Celsius: mixing model of Dobson et al. [3]_.
+    """Relative permittivity eps' - j eps'' of a sandy loam at 20 degrees Celsius: mixing model of
+    Dobson et al. [3]_.
 
     Parameters
     ----------
@@ -187,15 +230,20 @@ def soil_permittivity(frequency: float, moisture: float) -> complex:
     beta_imag = 1.33797 - 0.603 * sand - 0.166 * clay
     ions = -1.645 + 1.939 * bulk - 2.25622 * sand + 1.594 * clay
     water = water_permittivity(frequency)
-    water_imag = -water.imag + ions / (2 * np.pi * frequency * VACUUM_PERMITTIVITY) * (solid - bulk) / (solid * moisture)
+    water_imag = -water.imag + ions / (2 * np.pi * frequency * VACUUM_PERMITTIVITY) * (
+        solid - bulk
+    ) / (solid * moisture)
     solids = (1.01 + 0.44 * solid) ** 2 - 0.062
-    real = (1 + bulk / solid * (solids**alpha - 1) + moisture**beta_real * water.real**alpha - moisture) ** (1 / alpha)
+    real = (
+        1 + bulk / solid * (solids**alpha - 1) + moisture**beta_real * water.real**alpha - moisture
+    ) ** (1 / alpha)
     imag = (moisture**beta_imag * water_imag**alpha) ** (1 / alpha)
     return complex(real, -imag)
 
 
 def leaf_permittivity(frequency: float, dry_matter: float) -> complex:
-    """Relative permittivity eps' - j eps'' of a leaf: Mätzler's model [5]_, 1-100 GHz, without the salt of the sap.
+    """Relative permittivity eps' - j eps'' of a leaf: Mätzler's model [5]_, 1-100 GHz, without the
+    salt of the sap.
 
     Parameters
     ----------
@@ -204,7 +252,9 @@ def leaf_permittivity(frequency: float, dry_matter: float) -> complex:
     dry_matter : float
         Mass fraction of dry matter, 0.1-0.5. [-]
     """
-    return 0.522 * (1 - 1.32 * dry_matter) * water_permittivity(frequency) + 0.51 + 3.84 * dry_matter
+    return (
+        0.522 * (1 - 1.32 * dry_matter) * water_permittivity(frequency) + 0.51 + 3.84 * dry_matter
+    )
 
 
 def _constants(permittivity: complex, frequency: float) -> tuple[float, float]:
@@ -212,15 +262,21 @@ def _constants(permittivity: complex, frequency: float) -> tuple[float, float]:
 
 
 def itu_constants(name: str, frequency: float) -> tuple[float, float, str]:
-    """Permittivity [-], conductivity [S/m] and where they come from, for a name of the table at `frequency` [Hz].
+    """Permittivity [-], conductivity [S/m] and where they come from, for a name of the table at
+    `frequency` [Hz].
 
-    Inside a fit of P.2040: the fit. Between two fits: both constants interpolated over log f (the conductivity in its
-    logarithm) between the fits' near ends. Beyond the fits: the nearest one continued.
+    Inside a fit of P.2040: the fit. Between two fits: both constants interpolated over log f (the
+    conductivity in its logarithm) between the fits' near ends. Beyond the fits: the nearest one
+    continued.
     """
     f = frequency / 1e9
     if name == "vegetation":
         eps, sigma = _constants(leaf_permittivity(frequency, LEAF_DRY_MATTER), frequency)
-        return eps, sigma, f"Mätzler 1994 leaf model, dry matter {LEAF_DRY_MATTER:g}, salt neglected"
+        return (
+            eps,
+            sigma,
+            f"Mätzler 1994 leaf model, dry matter {LEAF_DRY_MATTER:g}, salt neglected",
+        )
     fits = ITU_FITS[name]
     for fit in fits:
         if fit.low <= f <= fit.high:
@@ -228,16 +284,26 @@ def itu_constants(name: str, frequency: float) -> tuple[float, float, str]:
     if name in SOIL_MOISTURE and f > fits[-1].high:
         eps, sigma = _constants(soil_permittivity(frequency, SOIL_MOISTURE[name]), frequency)
         moisture = SOIL_MOISTURE[name]
-        return eps, sigma, f"Dobson 1985 soil model (ITU-R P.527), sandy loam, {100 * moisture:g} % water; P.2040 ends at 10 GHz"
+        return (
+            eps,
+            sigma,
+            f"Dobson 1985 soil model (ITU-R P.527), sandy loam, {100 * moisture:g} % water; P.2040 "
+            "ends at 10 GHz",
+        )
     for below, above in itertools.pairwise(fits):
         if below.high < f < above.low:
             (eps_0, sigma_0), (eps_1, sigma_1) = below.at(below.high), above.at(above.low)
             w = np.log(f / below.high) / np.log(above.low / below.high)
             sigma = float(np.exp((1 - w) * np.log(sigma_0) + w * np.log(sigma_1)))
-            text = f"interpolated over log f between the ITU-R P.2040-3 fits at {below.high:g} and {above.low:g} GHz"
+            text = (
+                f"interpolated over log f between the ITU-R P.2040-3 fits at {below.high:g} and "
+                f"{above.low:g} GHz"
+            )
             return float((1 - w) * eps_0 + w * eps_1), sigma, text
     nearest = fits[0] if f < fits[0].low else fits[-1]
-    return *nearest.at(f), f"ITU-R P.2040-3 fit for {nearest.low:g}-{nearest.high:g} GHz continued to {f:g} GHz"
+    return *nearest.at(
+        f
+    ), f"ITU-R P.2040-3 fit for {nearest.low:g}-{nearest.high:g} GHz continued to {f:g} GHz"
 
 
 def material_at(name: str, carrier_frequency: float) -> Material:
@@ -256,13 +322,21 @@ def material_at(name: str, carrier_frequency: float) -> Material:
     """
     known = canonical_name(name)
     if known is None:
-        raise CityError(f"material {name!r} is unknown; known are {', '.join(KNOWN_MATERIALS)}; "
-                        "or define it in city.materials with relative_permittivity and conductivity_s_per_m")  # fmt: skip
+        raise CityError(
+            f"material {name!r} is unknown; known are {', '.join(KNOWN_MATERIALS)}; "
+            "or define it in city.materials with relative_permittivity and conductivity_s_per_m"
+        )
     eps, sigma, source = itu_constants(known, carrier_frequency)
     return Material(
-        known, float(eps), float(sigma), _SCATTERING[known], "lambertian", DEFAULT_EXPONENT,
-        _THICKNESS.get(known, DEFAULT_THICKNESS), source + "; scattering: default by roughness",
-    )  # fmt: skip
+        known,
+        float(eps),
+        float(sigma),
+        _SCATTERING[known],
+        "lambertian",
+        DEFAULT_EXPONENT,
+        _THICKNESS.get(known, DEFAULT_THICKNESS),
+        source + "; scattering: default by roughness",
+    )
 
 
 def _override(material: Material, change: MaterialOverride) -> Material:
@@ -285,12 +359,26 @@ def _base(use: MaterialUse, carrier_frequency: float, change: MaterialOverride |
         return use.defined
     if canonical_name(use.name) is None and change is not None:
         if change.relative_permittivity is None or change.conductivity_s_per_m is None:
-            raise CityError(f"city.materials.{use.name}: {use.name!r} is not in the table, so relative_permittivity and "
-                            "conductivity_s_per_m must both be given")  # fmt: skip
-        return Material(use.name, 1.0, 0.0, DEFAULT_SCATTERING, "lambertian", DEFAULT_EXPONENT, DEFAULT_THICKNESS, "scenario")
+            raise CityError(
+                f"city.materials.{use.name}: {use.name!r} is not in the table, so "
+                "relative_permittivity and "
+                "conductivity_s_per_m must both be given"
+            )
+        return Material(
+            use.name,
+            1.0,
+            0.0,
+            DEFAULT_SCATTERING,
+            "lambertian",
+            DEFAULT_EXPONENT,
+            DEFAULT_THICKNESS,
+            "scenario",
+        )
     material = material_at(use.name, carrier_frequency)
     if use.thickness is not None:
-        return replace(material, thickness=use.thickness, source=material.source + "; thickness: scene file")
+        return replace(
+            material, thickness=use.thickness, source=material.source + "; thickness: scene file"
+        )
     return material
 
 
@@ -313,7 +401,8 @@ def resolve_materials(
     index : list of int
         Of each use's material.
     materials : tuple of Material
-        One name that occurs with several thicknesses becomes several materials; the later ones carry theirs in the name.
+        One name that occurs with several thicknesses becomes several materials; the later ones
+        carry theirs in the name.
 
     Raises
     ------

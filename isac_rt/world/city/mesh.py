@@ -1,4 +1,5 @@
-"""The city as one triangle mesh in float64, with what is derived from it: normals, planes, areas."""
+"""The city as one triangle mesh in float64, with what is derived from it: normals, planes,
+areas."""
 
 from __future__ import annotations
 
@@ -75,7 +76,8 @@ class City:
     def __repr__(self) -> str:
         size = np.ptp(self.vertices, axis=0) if self.num_faces else np.zeros(3)
         return (
-            f"<City {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} m, {len(self.materials)} materials>"
+            f"<City {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x "
+            f"{size[2]:.0f} m, {len(self.materials)} materials>"
         )
 
     @property
@@ -100,7 +102,8 @@ class City:
 
     @cached_property
     def normals(self) -> NDArray[np.float64]:
-        """(F, 3) unit normals, by the right-hand rule over the corners; outward where the source is oriented."""
+        """(F, 3) unit normals, by the right-hand rule over the corners; outward where the source is
+        oriented."""
         return _read_only(self._cross / np.linalg.norm(self._cross, axis=1, keepdims=True))
 
     @cached_property
@@ -112,19 +115,30 @@ class City:
     def plane_of_face(self) -> NDArray[np.int64]:
         """(F,) id of the face's plane; faces in one plane share it, whichever way they face.
 
-        Faces are taken from the largest down; each one not yet in a plane founds one and takes in all faces whose three
-        corners lie within `plane_tolerance` of it. So a face's plane is never worse known than the face itself.
+        Faces are taken from the largest down; each one not yet in a plane founds one and takes in
+        all faces whose three corners lie within `plane_tolerance` of it. So a face's plane is never
+        worse known than the face itself.
         """
         if not self.num_faces:
             return _read_only(np.zeros(0, dtype=np.int64))
         order = np.argsort(-self.areas, kind="stable")
         planes = np.empty(self.num_faces, dtype=np.int64)
-        planes[order] = _group_planes(self.corners[order], self.normals[order], self.plane_offsets[order], self.plane_tolerance)
+        planes[order] = _group_planes(
+            self.corners[order],
+            self.normals[order],
+            self.plane_offsets[order],
+            self.plane_tolerance,
+        )
         return _read_only(planes)
 
     def within(self, radius: float) -> City:
-        """The faces that come as near to the origin as `radius` [m], whole; this very city if all do."""
-        near = distance_to_triangles(self.corners, np.zeros(3)) <= radius if np.isfinite(radius) and self.num_faces else np.True_
+        """The faces that come as near to the origin as `radius` [m], whole; this very city if all
+        do."""
+        near = (
+            distance_to_triangles(self.corners, np.zeros(3)) <= radius
+            if np.isfinite(radius) and self.num_faces
+            else np.True_
+        )
         if np.all(near):
             return self
         faces, face_material = self.faces[near], self.face_material[near]
@@ -152,12 +166,18 @@ def _read_only(array: NDArray) -> NDArray:
 
 
 @numba.njit(cache=True)
-def _group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, tolerance: float) -> NDArray:
+def _group_planes(
+    corners: NDArray, normals: NDArray, offsets: NDArray, tolerance: float
+) -> NDArray:
     """Plane id per face; faces come sorted by falling area."""
     count = len(corners)
     plane = np.full(count, -1, dtype=np.int64)
     left = np.arange(count)
-    x, y, z = corners[:, 0, 0].copy(), corners[:, 0, 1].copy(), corners[:, 0, 2].copy()  # of what is left: one corner decides most
+    x, y, z = (
+        corners[:, 0, 0].copy(),
+        corners[:, 0, 1].copy(),
+        corners[:, 0, 2].copy(),
+    )  # of what is left: one corner decides most
     num_left, num_planes = count, 0
     while num_left > 0:
         seed = left[0]
@@ -169,7 +189,12 @@ def _group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, toleranc
             inside = abs(nx * x[i] + ny * y[i] + nz * z[i] - d) <= tolerance
             if inside:
                 for k in range(1, 3):
-                    distance = nx * corners[face, k, 0] + ny * corners[face, k, 1] + nz * corners[face, k, 2] - d
+                    distance = (
+                        nx * corners[face, k, 0]
+                        + ny * corners[face, k, 1]
+                        + nz * corners[face, k, 2]
+                        - d
+                    )
                     inside = inside and abs(distance) <= tolerance
             if inside or face == seed:
                 plane[face] = num_planes
@@ -184,11 +209,18 @@ def _group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, toleranc
 def empty_city(name: str, origin: NDArray[np.float64]) -> City:
     """Free space: a city without faces."""
     return City(
-        name, np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int16), (), np.array(origin, dtype=np.float64)
+        name,
+        np.zeros((0, 3)),
+        np.zeros((0, 3), np.int32),
+        np.zeros(0, np.int16),
+        (),
+        np.array(origin, dtype=np.float64),
     )
 
 
-def distance_to_triangles(corners: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_to_triangles(
+    corners: NDArray[np.float64], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Distance from a point to the nearest point of each triangle.
 
     Parameters
@@ -213,11 +245,15 @@ def _merged(surfaces: Sequence[Surface], name: str) -> tuple[NDArray, NDArray, N
     vertices = np.concatenate([s.vertices for s in surfaces])
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices)).any(axis=1).sum())
-        raise CityError(f"{name}: {bad} of {len(vertices)} vertices are NaN or infinite; repair the file")
+        raise CityError(
+            f"{name}: {bad} of {len(vertices)} vertices are NaN or infinite; repair the file"
+        )
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
     for s in surfaces:
         if len(s.faces) and (s.faces.min() < 0 or s.faces.max() >= len(s.vertices)):
-            raise CityError(f"{name}: a face names vertex {s.faces.max()} of {len(s.vertices)}; repair the file")
+            raise CityError(
+                f"{name}: a face names vertex {s.faces.max()} of {len(s.vertices)}; repair the file"
+            )
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=True)])
     owner = np.repeat(np.arange(len(surfaces)), [len(s.faces) for s in surfaces])
     return vertices, faces, owner
@@ -228,8 +264,8 @@ def clean(
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64], list[str], float]:
     """One recentred mesh from a source's surfaces.
 
-    Equal vertices are merged, zero-area and repeated faces removed (of repeated ones the first stays), and faces beyond
-    `keep_radius` of the centre cut away whole.
+    Equal vertices are merged, zero-area and repeated faces removed (of repeated ones the first
+    stays), and faces beyond `keep_radius` of the centre cut away whole.
 
     Parameters
     ----------
@@ -250,25 +286,32 @@ def clean(
         Index of each face's surface.
     notes : list of str
     plane_tolerance : float
-        `PLANE_TOLERANCE`, or the rounding of float32 coordinates where the source holds no finer ones. [m]
+        `PLANE_TOLERANCE`, or the rounding of float32 coordinates where the source holds no finer
+        ones. [m]
 
     Raises
     ------
     CityError  If there is no face, a vertex is not finite, or nothing is left within the radius.
     """
     if not any(len(s.faces) for s in surfaces):
-        raise CityError(f"{name}: there is no face in it; give a file with a triangle mesh or with polygons")
+        raise CityError(
+            f"{name}: there is no face in it; give a file with a triangle mesh or with polygons"
+        )
     world, faces, owner = _merged(surfaces, name)
     notes = []
     tolerance = PLANE_TOLERANCE
     if np.array_equal(world, world.astype(np.float32)):
         tolerance = max(tolerance, float(np.spacing(np.float32(np.abs(world).max()))))
-    world, index = np.unique(world + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0 and 0 the same point
+    world, index = np.unique(
+        world + 0.0, axis=0, return_inverse=True
+    )  # + 0.0 makes -0 and 0 the same point
     faces, local = index.reshape(-1)[faces], world - centre
     a, b, c = (local[faces[:, k]] for k in range(3))
     twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.max([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    flat = twice_area <= 1e-9 * longest**2  # thinner than a billionth of its length: its normal is rounding
+    flat = (
+        twice_area <= 1e-9 * longest**2
+    )  # thinner than a billionth of its length: its normal is rounding
     if flat.any():
         notes.append(f"{int(flat.sum())} faces without area removed")
     faces, owner = faces[~flat], owner[~flat]
@@ -280,10 +323,18 @@ def clean(
     if keep_radius is not None and len(faces):
         near = distance_to_triangles(local[faces], np.zeros(3)) <= keep_radius
         if not near.all():
-            notes.append(f"{int((~near).sum())} of {len(near)} faces beyond {keep_radius:g} m left out")
+            notes.append(
+                f"{int((~near).sum())} of {len(near)} faces beyond {keep_radius:g} m left out"
+            )
         faces, owner = faces[near], owner[near]
     if not len(faces):
-        within = "" if keep_radius is None else f" within keep_radius_m {keep_radius:g} of {np.array2string(centre, precision=1)}"
-        raise CityError(f"{name}: no face with an area is left{within}; move the swarm, or widen the radius")
+        within = (
+            ""
+            if keep_radius is None
+            else f" within keep_radius_m {keep_radius:g} of {np.array2string(centre, precision=1)}"
+        )
+        raise CityError(
+            f"{name}: no face with an area is left{within}; move the swarm, or widen the radius"
+        )
     used, index = np.unique(faces, return_inverse=True)
     return local[used], index.reshape(-1, 3).astype(np.int32), owner, notes, tolerance

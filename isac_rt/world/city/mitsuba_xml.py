@@ -1,4 +1,5 @@
-"""Mitsuba scene files, among them those that ship with Sionna RT, read without Mitsuba and kept in float64."""
+"""Mitsuba scene files, among them those that ship with Sionna RT, read without Mitsuba and kept in
+float64."""
 
 from __future__ import annotations
 
@@ -12,16 +13,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isac_rt import scenario
-from isac_rt.world.city.materials import DEFAULT_EXPONENT, DEFAULT_THICKNESS, CityError, Material, MaterialUse, canonical_name
+from isac_rt.world.city.materials import (
+    DEFAULT_EXPONENT,
+    DEFAULT_THICKNESS,
+    CityError,
+    Material,
+    MaterialUse,
+    canonical_name,
+)
 from isac_rt.world.city.mesh import Surface
 from isac_rt.world.city.meshfiles import read_triangles
 
-_RECTANGLE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+_RECTANGLE = (
+    np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
+    np.array([[0, 1, 2], [0, 2, 3]]),
+)
 _CUBE = (
     np.array([[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)]),
-    np.array([[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4],
-              [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5]]),
-)  # fmt: skip
+    np.array(
+        [
+            [0, 2, 3],
+            [0, 3, 1],
+            [4, 5, 7],
+            [4, 7, 6],
+            [0, 1, 5],
+            [0, 5, 4],
+            [2, 6, 7],
+            [2, 7, 3],
+            [0, 4, 6],
+            [0, 6, 2],
+            [1, 3, 7],
+            [1, 7, 5],
+        ]
+    ),
+)
 
 
 @dataclass
@@ -46,12 +71,17 @@ class _Reader:
 
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", known, value)
 
-    def numbers(self, element: ET.Element, key: str = "value", otherwise: str | None = None) -> NDArray[np.float64]:
+    def numbers(
+        self, element: ET.Element, key: str = "value", otherwise: str | None = None
+    ) -> NDArray[np.float64]:
         value = self.text(element, key, otherwise)
         try:
             return np.array([float(v) for v in re.split(r"[\s,]+", (value or "").strip())])
         except ValueError:
-            raise CityError(f"{self.path.name}: <{element.tag} {key}={value!r}> is not a list of numbers; correct it") from None
+            raise CityError(
+                f"{self.path.name}: <{element.tag} {key}={value!r}> is not a list of numbers; "
+                "correct it"
+            ) from None
 
     def scalar(self, element: ET.Element, name: str) -> float | None:
         found = element.find(f"float[@name='{name}']")
@@ -72,7 +102,8 @@ def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 
 
 def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
-    """(4, 4) `to_world` of a shape: its parts in the order in which they stand, each after the ones before."""
+    """(4, 4) `to_world` of a shape: its parts in the order in which they stand, each after the ones
+    before."""
     total = np.eye(4)
     node = shape.find("transform[@name='to_world']")
     for part in [] if node is None else node:
@@ -89,7 +120,10 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
             size = round(values.size**0.5)
             step[:size, :size] = values.reshape(size, size)
         else:
-            raise CityError(f"{reader.path.name}: <{part.tag}> in a transform is not read here; write it as <matrix>")
+            raise CityError(
+                f"{reader.path.name}: <{part.tag}> in a transform is not read here; write it as "
+                "<matrix>"
+            )
         total = step @ total
     return total
 
@@ -100,12 +134,21 @@ def _material(reader: _Reader, bsdf: ET.Element) -> MaterialUse:
         return MaterialUse(reader.city.material_map[name])
     thickness = reader.scalar(bsdf, "thickness")
     if bsdf.get("type") == "radio-material":
-        eps, sigma = reader.scalar(bsdf, "relative_permittivity"), reader.scalar(bsdf, "conductivity")
+        eps, sigma = (
+            reader.scalar(bsdf, "relative_permittivity"),
+            reader.scalar(bsdf, "conductivity"),
+        )
         scattering = reader.scalar(bsdf, "scattering_coefficient")
         defined = Material(
-            name, 1.0 if eps is None else eps, sigma or 0.0, scattering or 0.0, "lambertian", DEFAULT_EXPONENT,
-            DEFAULT_THICKNESS if thickness is None else thickness, f"numbers in {reader.path.name}",
-        )  # fmt: skip
+            name,
+            1.0 if eps is None else eps,
+            sigma or 0.0,
+            scattering or 0.0,
+            "lambertian",
+            DEFAULT_EXPONENT,
+            DEFAULT_THICKNESS if thickness is None else thickness,
+            f"numbers in {reader.path.name}",
+        )
         return MaterialUse(name, defined=defined)
     kind = bsdf.find("string[@name='type']")
     wanted = name if kind is None else reader.text(kind, "value") or name
@@ -131,27 +174,39 @@ def _geometry(reader: _Reader, shape: ET.Element) -> tuple[NDArray[np.float64], 
     if kind in ("ply", "obj", "stl"):
         node = shape.find("string[@name='filename']")
         if node is None:
-            raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} has no filename; give it one")
+            raise CityError(
+                f"{reader.path.name}: shape {shape.get('id')!r} has no filename; give it one"
+            )
         folder = reader.path.parent.resolve()
         file = (folder / (reader.text(node, "value") or "")).resolve()
         if not file.is_relative_to(folder):
             name = reader.text(node, "value")
-            raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} wants {name}, outside the scene's folder; copy it there")
+            raise CityError(
+                f"{reader.path.name}: shape {shape.get('id')!r} wants {name}, outside the scene's "
+                "folder; copy it there"
+            )
         if not file.is_file():
-            raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} wants {reader.text(node, 'value')}, which is missing")
+            raise CityError(
+                f"{reader.path.name}: shape {shape.get('id')!r} wants "
+                f"{reader.text(node, 'value')}, which is missing"
+            )
         return read_triangles(file)
     if kind == "rectangle":
         return _RECTANGLE
     if kind == "cube":
         return _CUBE
-    raise CityError(f"{reader.path.name}: shape {shape.get('id')!r} is of type {kind!r}; ply, obj, stl, rectangle and cube are read here")
+    raise CityError(
+        f"{reader.path.name}: shape {shape.get('id')!r} is of type {kind!r}; ply, obj, stl, "
+        "rectangle and cube are read here"
+    )
 
 
 def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
-    """The surfaces of a Mitsuba scene file in world coordinates; lights, cameras and integrators are not looked at.
+    """The surfaces of a Mitsuba scene file in world coordinates; lights, cameras and integrators
+    are not looked at.
 
-    Materials go by the `type` of an ITU radio material, else by the bsdf's id; a `radio-material` keeps its numbers;
-    `material_map` by bsdf id comes first.
+    Materials go by the `type` of an ITU radio material, else by the bsdf's id; a `radio-material`
+    keeps its numbers; `material_map` by bsdf id comes first.
 
     Raises
     ------
@@ -186,7 +241,9 @@ def builtin_path(name: str) -> Path:
     """
     package = importlib.util.find_spec("sionna")
     if package is None or not package.submodule_search_locations:
-        raise CityError("the built-in cities come with Sionna RT, which is not installed; run make setup")
+        raise CityError(
+            "the built-in cities come with Sionna RT, which is not installed; run make setup"
+        )
     folder = Path(package.submodule_search_locations[0]) / "rt" / "scenes"
     known = sorted(p.parent.name for p in folder.glob("*/*.xml") if p.stem == p.parent.name)
     if name not in known:

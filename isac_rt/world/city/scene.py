@@ -1,4 +1,5 @@
-"""The city as a Sionna RT scene of our own making: one shape per material, so that every hit maps back to a face of the float64 mesh.
+"""The city as a Sionna RT scene of our own making: one shape per material, so that every hit maps
+back to a face of the float64 mesh.
 
 Import only after `isac_rt.runtime.activate()`: Sionna and Mitsuba start the JIT.
 """
@@ -26,16 +27,19 @@ class SceneHandle:
     Attributes
     ----------
     scene : sionna.rt.Scene at the carrier
-    faces_of_object : for each object id the faces of the mesh that it holds, in the order of its primitives
+    faces_of_object : for each object id the faces of the mesh that it holds, in the order of its
+        primitives
     """
 
     scene: rt.Scene
     faces_of_object: dict[int, NDArray[np.int64]]
 
     def face_index(self, objects: NDArray, primitives: NDArray) -> NDArray[np.int64]:
-        """Faces of the mesh for Sionna's object and primitive numbers (any shape); -1 where there was no hit.
+        """Faces of the mesh for Sionna's object and primitive numbers (any shape); -1 where there
+        was no hit.
 
-        Of surfaces only: at a SENSING interaction Sionna stores a target's index in place of an object number.
+        Of surfaces only: at a SENSING interaction Sionna stores a target's index in place of an
+        object number.
         """
         out = np.full(objects.shape, NO_FACE, np.int64)
         for number, faces in self.faces_of_object.items():
@@ -48,8 +52,9 @@ _latest: tuple[weakref.ref[City], float, SceneHandle] | None = None
 
 
 def shared_scene(city: City, carrier_frequency: float) -> SceneHandle:
-    """As `build_scene`, but the one built last is handed out again for the same city object, to tracers that place and clear away
-    their own terminals: compilation is paid once in a worker that runs many points of a sweep."""
+    """As `build_scene`, but the one built last is handed out again for the same city object, to
+    tracers that place and clear away their own terminals: compilation is paid once in a worker that
+    runs many points of a sweep."""
     global _latest
     if _latest is None or _latest[0]() is not city or _latest[1] != carrier_frequency:
         _latest = weakref.ref(city), carrier_frequency, build_scene(city, carrier_frequency)
@@ -59,7 +64,8 @@ def shared_scene(city: City, carrier_frequency: float) -> SceneHandle:
 def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
     """Sionna scene of a city, new.
 
-    Materials carry their constants at the carrier, so that none can be undefined there; they are set before the frequency.
+    Materials carry their constants at the carrier, so that none can be undefined there; they are
+    set before the frequency.
     """
     scene = rt.load_scene()
     shapes, faces = [], []
@@ -67,7 +73,13 @@ def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
         chosen = np.flatnonzero(city.face_material == index)
         if chosen.size:
             name = f"surface-{index}"
-            shapes.append(rt.SceneObject(mi_mesh=_shape(city, chosen, name), name=name, radio_material=_radio(material, name)))
+            shapes.append(
+                rt.SceneObject(
+                    mi_mesh=_shape(city, chosen, name),
+                    name=name,
+                    radio_material=_radio(material, name),
+                )
+            )
             faces.append(chosen)
     if shapes:
         scene.edit(add=shapes)

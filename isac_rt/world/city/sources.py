@@ -19,17 +19,24 @@ from isac_rt.world.city.parametric import blocks, canyon
 
 def _file(city: scenario.City, folder: Path) -> Path:
     if not city.file:
-        raise CityError(f"city.source {city.source} needs city.file: a path, relative to the scenario's folder")
+        raise CityError(
+            f"city.source {city.source} needs city.file: a path, relative to the scenario's folder"
+        )
     path = folder / city.file
     if not path.is_file():
-        raise CityError(f"city.file {city.file!r} does not exist in {folder}; paths are relative to the scenario's folder")
+        raise CityError(
+            f"city.file {city.file!r} does not exist in {folder}; paths are relative to the "
+            "scenario's folder"
+        )
     return path
 
 
 def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], list[str]]:
     if city.source == "builtin":
         if not city.name:
-            raise CityError("city.source builtin needs city.name, such as munich or simple_street_canyon")
+            raise CityError(
+                "city.source builtin needs city.name, such as munich or simple_street_canyon"
+            )
         return city.name, *mitsuba_file(city, builtin_path(city.name))
     if city.source == "canyon":
         return city.name or "canyon", canyon(city), []
@@ -40,7 +47,9 @@ def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], li
     return path.name, *read(city, path)
 
 
-def load_city(city: scenario.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike) -> City:
+def load_city(
+    city: scenario.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike
+) -> City:
     """The city of a scenario as one float64 mesh about `centre`.
 
     Parameters
@@ -52,7 +61,8 @@ def load_city(city: scenario.City | None, folder: Path | str, carrier_frequency:
     carrier_frequency : float
         At which the materials are evaluated. [Hz]
     centre : (3,) array-like
-        World point that becomes the local origin; keep it within 500 m of whatever flies (Sionna traces in float32). [m]
+        World point that becomes the local origin; keep it within 500 m of whatever flies (Sionna
+        traces in float32). [m]
 
     Returns
     -------
@@ -69,10 +79,21 @@ def load_city(city: scenario.City | None, folder: Path | str, carrier_frequency:
     if city is None:
         return empty_city("free space", origin)
     name, surfaces, notes = _surfaces(city, Path(folder))
-    uses, materials = resolve_materials([s.material for s in surfaces], carrier_frequency, city.materials)
+    uses, materials = resolve_materials(
+        [s.material for s in surfaces], carrier_frequency, city.materials
+    )
     vertices, faces, owner, cleaning, tolerance = clean(surfaces, name, origin, city.keep_radius_m)
     in_use, face_material = np.unique(np.array(uses)[owner], return_inverse=True)
-    counted = [text if n == 1 else f"{text} ({n} times)" for text, n in Counter(notes + cleaning).items()]
+    counted = [
+        text if n == 1 else f"{text} ({n} times)" for text, n in Counter(notes + cleaning).items()
+    ]
     return City(
-        name, vertices, faces, face_material.astype(np.int16), tuple(materials[i] for i in in_use), origin, tuple(counted), tolerance
+        name,
+        vertices,
+        faces,
+        face_material.astype(np.int16),
+        tuple(materials[i] for i in in_use),
+        origin,
+        tuple(counted),
+        tolerance,
     )
