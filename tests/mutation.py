@@ -148,6 +148,12 @@ EXCUSED = [
 follows is as right."""
 
 
+def test_file(name: str) -> str:
+    """Path of a test module from the root of the checkout, whichever room it stands in."""
+    (file,) = ROOT.glob(f"tests/**/{name}.py")
+    return str(file.relative_to(ROOT))
+
+
 @dataclass(frozen=True)
 class Mutant:
     """One change of a file: `old` at an offset becomes `new`."""
@@ -362,7 +368,7 @@ class Record:
             ]
             environment = copy.environment | {"RECORD": str(out.absolute())}
             subprocess.run(
-                [*command, *(f"tests/{n}.py" for n in names)],
+                [*command, *map(test_file, names)],
                 cwd=copy.folder,
                 env=environment,
                 check=True,
@@ -400,7 +406,7 @@ class Record:
             (name for name, first, last in _functions(source) if first <= mutant.line <= last), ""
         )
         callers = set(self.called.get(f"{mutant.file}:{name}", ())) & set(self.seconds)
-        files = tuple(f"tests/{name}.py::" for name in TESTS_OF[mutant.file].split())
+        files = tuple(f"{test_file(name)}::" for name in TESTS_OF[mutant.file].split())
         order = sorted(
             callers or {t for t in self.seconds if t.startswith(files)},
             key=self.seconds.__getitem__,
@@ -613,8 +619,9 @@ def check_hard(words: str) -> int:
             source, count = copy.source(bug.file), count + 1
             state = "STALE"
             if source.count(bug.old) == 1:
+                name, _, test = bug.test.partition("::")
                 with copy.changed(bug.file, source.replace(bug.old, bug.new)):
-                    state = server.outcome(["tests/" + bug.test.replace("::", ".py::")], LIMIT)[0]
+                    state = server.outcome([f"{test_file(name)}::{test}"], LIMIT)[0]
             wrong += state in ("passed", "STALE")
             print(f"{state:8s} {bug.test}: {bug.file} {bug.new}", flush=True)
         server.end()

@@ -43,7 +43,7 @@ BUGS = (
     ),
     Bug(
         "test_hard_geometry::test_two_bodies_at_one_point_are_refused_before_the_run",
-        "run/preflight.py",
+        "simulation/preflight.py",
         "range(0, scenario.frames, step)",
         "[0]",
     ),
@@ -62,7 +62,7 @@ BUGS = (
     ),
     Bug(
         "test_hard_geometry::test_reflections_are_born_and_die_between_traces",
-        "run/simulate.py",
+        "simulation/simulate.py",
         "self.propagation.paths(poses, epoch,",
         "self.propagation.paths(self.swarm.poses(self.timetable.epoch(max(frame - 1, 0))), epoch,",
     ),
@@ -111,7 +111,7 @@ BUGS = (
     ),
     Bug(
         "test_fuzz::test_what_cannot_run_is_refused_before_it_starts",
-        "run/preflight.py",
+        "simulation/preflight.py",
         "if free is not None and needed > free:",
         "if False:",
     ),
@@ -129,7 +129,7 @@ BUGS = (
     ),
     Bug(
         "test_killed::test_reruns_are_equal_bit_by_bit_whatever_the_threads",
-        "run/simulate.py",
+        "simulation/simulate.py",
         'words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)',
         'words = vars(np).setdefault("_shared", '
         "np.random.default_rng(self.scenario.seed)).integers(2**32, size=2, dtype=np.uint32)",

@@ -70,9 +70,11 @@ def test_tests_that_the_pages_name_are_there():
     found = 0
     for page in (ROOT / "docs").glob("*.md"):
         for file, name in re.findall(
-            r"`(?:tests/)?(test_\w+)(?:\.py)?::(test_\w+)`", page.read_text(encoding="utf-8")
+            r"`(?:tests/)?(?:\w+/)?(test_\w+)(?:\.py)?::(test_\w+)`",
+            page.read_text(encoding="utf-8"),
         ):
-            tests = (ROOT / "tests" / f"{file}.py").read_text(encoding="utf-8")
+            (found_in,) = (ROOT / "tests").rglob(f"{file}.py")
+            tests = found_in.read_text(encoding="utf-8")
             assert re.search(rf"^def {name}\(", tests, re.MULTILINE), f"{page.name}: {name}"
             found += 1
     assert found > 50

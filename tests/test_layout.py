@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
     "runtime randomness scenario kernels world frame propagation signal receive terminal access "
-    "results run sweep views studies cli"
+    "results simulation sweep views studies cli"
 ).split()
 GROUND = {"runtime", "randomness"}
 NEVER = {("receive", "signal"), ("receive", "propagation"), ("world", "frame")}

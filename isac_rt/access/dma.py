@@ -5,8 +5,8 @@ Resource blocks start 2 T_d apart, so that a neighbour of `spacing` blocks beats
 and up to f_s above that, and the IF filter of [0, f_s] keeps it out. `ifsignal` has the filter as a
 gain on every chirp's beat, which is exact for tones that last. Here the oscillators themselves are
 multiplied: chirps begin and end inside the window, the filter rings, and what is left of a
-neighbour in the band is what its edges leave. `tests/test_access_dma.py` asserts the following, for
-the paper's numbers with a skirt of 0.4 MHz and data on every chirp:
+neighbour in the band is what its edges leave. `tests/access/test_access_dma.py` asserts the
+following, for the paper's numbers with a skirt of 0.4 MHz and data on every chirp:
 
 - the neighbours' power over the window is at least 47 dB down at 1, 53 dB at 2 and 56 dB at 3
   blocks, on both sides; it lies at the edges of chirps, so that in Hann-windowed range spectra the
@@ -84,8 +84,10 @@ def mix(
     r"""IF samples of C reference chirps with the chirps that arrive, by multiplying oscillators and
     filtering.
 
-    .. math:: x(u) = \sum_k a_k\, e^{j2\pi[\varphi(u) - \varphi(u - \tau_k)]},\quad \varphi(s) = f_c
-    s + \alpha s^2/2,\ 0 \le s < \tilde T
+    .. math::
+
+        x(u) = \sum_k a_k\, e^{j2\pi[\varphi(u) - \varphi(u - \tau_k)]},\quad \varphi(s) = f_c s +
+        \alpha s^2/2,\ 0 \le s < \tilde T
 
     Parameters
     ----------

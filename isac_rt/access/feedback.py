@@ -145,8 +145,9 @@ def correct(
 ) -> Correction:
     r"""The whole cells by which a passive terminal is off, as the active terminal sees it.
 
-    .. math:: P(s) \propto \exp\left[-\frac{(r_{PT} - r_{AT} - s\,c/\alpha
-    T)^2}{2\sigma^2}\right],\quad
+    .. math::
+
+        P(s) \propto \exp\left[-\frac{(r_{PT} - r_{AT} - s\,c/\alpha T)^2}{2\sigma^2}\right],\quad
         -D_{\min} \le s \le N/2 - 1 - D_{\max}
 
     Parameters

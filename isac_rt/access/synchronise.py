@@ -5,8 +5,10 @@ The transmitter's clock of round 1 (the active terminal's) is ahead or behind by
 the passive terminal's and adds to the delay; in round 2 the same clocks add with the opposite sign
 (signs of `Transmission.clock_offset`). With the path's delay tau(t), t counted from round 1,
 
-.. math:: y_1 = \tau + \delta,\ \dot y_1 = \dot\tau + \dot\delta,\qquad y_2 = \tau(t) - \delta(t),\
-\dot y_2 = \dot\tau(t) - \dot\delta
+.. math::
+
+    y_1 = \tau + \delta,\ \dot y_1 = \dot\tau + \dot\delta,\qquad y_2 = \tau(t) - \delta(t),\ \dot
+    y_2 = \dot\tau(t) - \dot\delta
 
 A drift of 0.01 ppm is 3 m/s of apparent velocity, and a motion of 10 m/s between rounds 8 ms apart
 is 0.08 m of apparent offset: both are solved for, with the path's acceleration as an unknown of

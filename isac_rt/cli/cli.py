@@ -101,10 +101,10 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
     from isac_rt.results.files import check_folder, save
 
     check_folder(folder)
-    from isac_rt.run import simulate
-    from isac_rt.run.content import run_content
-    from isac_rt.run.resume import Unfinished
-    from isac_rt.run.setup import link_budgets, prepare
+    from isac_rt.simulation import simulate
+    from isac_rt.simulation.content import run_content
+    from isac_rt.simulation.resume import Unfinished
+    from isac_rt.simulation.setup import link_budgets, prepare
 
     with _err().status("setting up"):
         setup = prepare(loaded)
@@ -121,7 +121,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
         loaded.frames,
     )
     if check_budget:
-        from isac_rt.run.audit import check
+        from isac_rt.simulation.audit import check
 
         with _err().status("measuring what was left out"):
             results.summary["fidelity"]["checked"] = check(setup)
@@ -148,8 +148,8 @@ def plan(
     few frames only."""
     loaded = _load(scenario, overrides)
     with ending_soon_after_interrupt(Path()), _err().status("tracing a few frames"):
-        from isac_rt.run.audit import make_plan
-        from isac_rt.run.setup import prepare
+        from isac_rt.simulation.audit import make_plan
+        from isac_rt.simulation.setup import prepare
 
         found = make_plan(prepare(loaded), receivers)
     if json:
@@ -161,7 +161,7 @@ def plan(
 
 
 def _print_plan(found: dict[str, Any], frames: int) -> None:
-    """The plan of `isac_rt.run.audit.make_plan`."""
+    """The plan of `isac_rt.simulation.audit.make_plan`."""
     table = _table("", "link", "modelled", "left out", "error", "s/frame", justify="left")
     for item in found["items"]:
         value = item["estimate"]
@@ -200,7 +200,7 @@ def paths(
     loaded = _load(scenario, overrides)
     _check_frame(loaded, frame)
     with ending_soon_after_interrupt(out.parent), _err().status("tracing"):
-        from isac_rt.run.setup import trace
+        from isac_rt.simulation.setup import trace
         from isac_rt.views.interchange import write_ledger
 
         found = trace(loaded, frame)
@@ -233,7 +233,7 @@ def view(
     with ending_soon_after_interrupt(out.parent), _err().status("tracing and drawing"):
         import numpy as np
 
-        from isac_rt.run.setup import prepare, trace
+        from isac_rt.simulation.setup import prepare, trace
         from isac_rt.views.render import view_scene, write_view
 
         setup = prepare(loaded)
@@ -736,7 +736,7 @@ def _user_problems() -> tuple[type[BaseException], ...]:
         "runtime": "RuntimeProblem",
         "results.files": "ResultsError",
         "sweep": "SweepError",
-        "run.resume": "UnfinishedError",
+        "simulation.resume": "UnfinishedError",
     }
     loaded = {name: sys.modules.get(f"isac_rt.{name}") for name in names}
     return (

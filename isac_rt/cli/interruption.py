@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from isac_rt.run.resume import FILE
+from isac_rt.simulation.resume import FILE
 
 _GRACE = 1.2
 """After Ctrl-C a run may tidy up for so long [s]; then the process ends."""

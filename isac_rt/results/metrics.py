@@ -385,8 +385,9 @@ class Gospa(NamedTuple):
 def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
     r"""Generalised optimal sub-pattern assignment with p = 2, alpha = 2.
 
-    .. math:: d^2 = \min_\gamma \sum_{(i,j)\in\gamma} |x_i-y_j|^2 +
-    \tfrac{c^2}{2}(|X|+|Y|-2|\gamma|)
+    .. math::
+
+        d^2 = \min_\gamma \sum_{(i,j)\in\gamma} |x_i-y_j|^2 + \tfrac{c^2}{2}(|X|+|Y|-2|\gamma|)
 
     Parameters
     ----------

@@ -210,7 +210,7 @@ back."""
 
 class Accuracy(Node):
     """How near to the full model a run has to come; what the scene then needs is decided link by
-    link and frame by frame (`isac_rt.run.plan`, `isac-rt plan`).
+    link and frame by frame (`isac_rt.simulation.plan`, `isac-rt plan`).
 
     budget: what the keys below and propagation.weakest_path_db allow is left out. everything:
     nothing is left out, every frame is traced. fastest: plane wavefronts, straight flight within a

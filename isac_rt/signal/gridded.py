@@ -7,9 +7,10 @@ the samples. Further sets of weights on the same grid points carry x and x^2 (x:
 middle of the chirp), so that the quadratic phase of motion and the wideband delay of each receive
 element need no second transform:
 
-.. math:: z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx
-    z\,e^{-j\theta_l\lambda}\,(1 + j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) -
-    c\theta_l^2/2)
+.. math::
+
+    z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx z\,e^{-j\theta_l\lambda}\,(1 +
+    j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
 
 with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the
 frequency sent tau earlier), c the mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa
@@ -70,7 +71,7 @@ DEFAULT = Setting(1.5, 6, True)
 """For runs: error below `GRIDDED_ERROR`."""
 GRIDDED_ERROR = 1e-4
 """Bound of the relative RMS error of `DEFAULT` against the exact model (measured: see
-tests/test_ifsignal.py)."""
+tests/signal/test_ifsignal.py)."""
 PROFILES = Setting(1.25, 6, True)
 """For range cells made directly: error below `GRIDDED_ERROR` under the window, 3e-4 of samples."""
 ACCURATE = Setting(1.5, 8, True, True)

@@ -62,8 +62,10 @@ def if_signal(
 ) -> IFCube:
     r"""Dechirped IF samples of one receiver in one frame, without noise.
 
-    .. math:: s[m,l,p,n] = \sum A \beta_{m'p}\, \bar g\, h(\alpha\tau)\, e^{j2\pi(f_c\tau +
-    \alpha\tau(u-\tau/2))}
+    .. math::
+
+        s[m,l,p,n] = \sum A \beta_{m'p}\, \bar g\, h(\alpha\tau)\, e^{j2\pi(f_c\tau +
+        \alpha\tau(u-\tau/2))}
 
     over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (b' + m' - b -
     m) T_d + element delays (notes, section 2), b' and b the first resource blocks of the

@@ -6,8 +6,10 @@ much narrower needs fewer samples: N' instead of N over the same time. These are
 transform, division by the kernel's response), multiplied by the window and transformed back, with
 the chirp's grid still in the second-level cache:
 
-.. math:: Y_k = \frac{N}{N'} \sum_{i} w(x_i)\, s(x_i)\, e^{-j2\pi k x_i/N}, \qquad x_i =
-\frac{N}{N'} (i - N'/2)
+.. math::
+
+    Y_k = \frac{N}{N'} \sum_{i} w(x_i)\, s(x_i)\, e^{-j2\pi k x_i/N}, \qquad x_i = \frac{N}{N'} (i -
+    N'/2)
 
 x counts samples from the middle of the window, wherever it lies in the chirp. The sum over N
 samples differs by tails of the window's transform at N' - (cells between path and cell), `PAD`

@@ -1,8 +1,10 @@
 r"""The paper's separable IF model, for comparison only: what its receivers assume, not what a
 receiver hears.
 
-.. math:: \beta_p\,\bar g\,e^{j2\pi f_c(\tau_0 + \tau_l)}\,e^{j2\pi n(f_\tau + f_D[p])/N}\,e^{j2\pi
-f_c\dot\tau p\bar T}
+.. math::
+
+    \beta_p\,\bar g\,e^{j2\pi f_c(\tau_0 + \tau_l)}\,e^{j2\pi n(f_\tau + f_D[p])/N}\,e^{j2\pi
+    f_c\dot\tau p\bar T}
 
 with tau_0 the delay at the frame's start, f_tau = alpha T tau_0 and f_D the data in range cells,
 tau_l the elements' delays at the carrier alone. Left out (notes, section 2): Doppler within a

@@ -91,9 +91,9 @@ def run_job(job: Job) -> tuple[str, bool]:
 
 def _simulate(job: Job) -> dict[str, Any]:
     from isac_rt.propagation.store import PathStore
-    from isac_rt.run import simulate
-    from isac_rt.run.setup import prepare
     from isac_rt.scenario.tree import Scenario
+    from isac_rt.simulation import simulate
+    from isac_rt.simulation.setup import prepare
 
     scenario = Scenario.model_validate(job.tree).in_folder(Path(job.scenario_folder))
     store = PathStore(Path(job.folder) / "paths", CACHE_BYTES)

@@ -3,8 +3,10 @@ r"""Diffuse clutter pinned to the mesh: scatterers that stay where they are whil
 Each scatterer stands for one cell of a surface (`cells`) and returns, from one isotropic antenna to
 another,
 
-.. math:: |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A /
-(r_1 r_2)^2,
+.. math::
+
+    |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A / (r_1
+    r_2)^2,
 
 times its own complex-Gaussian amplitude of unit power, so that the mean power over a surface is the
 effective-roughness integral [1]_ that Sionna RT takes by shooting rays, and its speckle is Rayleigh

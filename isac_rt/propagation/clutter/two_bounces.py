@@ -4,8 +4,9 @@ Mirror then scatter, and scatter then mirror. The scatterers are those of one bo
 amplitudes; the terminal at the mirror's side is its image, so that delay, rate, acceleration and
 directions are closed forms in float64. From one isotropic antenna to another
 
-.. math:: |a|^2 = (\lambda/4\pi)^2\, M^2\, S^2\, \Gamma^2 f_s(k_i, k_o) \cos\theta_i\, A / (r_1
-r_2)^2
+.. math::
+
+    |a|^2 = (\lambda/4\pi)^2\, M^2\, S^2\, \Gamma^2 f_s(k_i, k_o) \cos\theta_i\, A / (r_1 r_2)^2
 
 with the unfolded r_1 or r_2, and M^2 the mirror's (1 - S^2) times its slab's reflection at the
 angle there. The electric field is followed as a vector through the mirror, whose phase is in the

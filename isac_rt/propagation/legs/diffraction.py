@@ -46,9 +46,10 @@ def disc(nu: np.ndarray, radius: np.ndarray) -> np.ndarray:
     r"""Factor of an opaque disc across the path, by its boundary wave ([2]_, section 8.9, in the
     Fresnel approximation):
 
-    .. math:: 1 - \frac{1}{2\pi}\oint \left(1 - e^{-j\pi\rho^2/2}\right) \frac{\alpha^2 +
-    \alpha\nu\cos\phi}{\rho^2}\,d\phi,
-        \quad \rho^2 = \nu^2 + \alpha^2 + 2\alpha\nu\cos\phi.
+    .. math::
+
+        1 - \frac{1}{2\pi}\oint \left(1 - e^{-j\pi\rho^2/2}\right) \frac{\alpha^2 +
+        \alpha\nu\cos\phi}{\rho^2}\,d\phi, \quad \rho^2 = \nu^2 + \alpha^2 + 2\alpha\nu\cos\phi.
 
     Parameters
     ----------

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.run.audit import tracer_of
-from isac_rt.run.plan import faintest
-from isac_rt.run.setup import Setup, prepare
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.simulation.audit import tracer_of
+from isac_rt.simulation.plan import faintest
+from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.scenes import alone
 from isac_rt.world.swarm import Pose

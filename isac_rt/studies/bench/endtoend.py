@@ -16,11 +16,11 @@ from statistics import median
 import numpy as np
 
 from isac_rt.frame.timetable import Link
-from isac_rt.run.setup import Setup, prepare
-from isac_rt.run.simulate import summarise
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.simulation.setup import Setup, prepare
+from isac_rt.simulation.simulate import summarise
 from isac_rt.studies.bench.measure import floor_seconds
 
 PRESETS = ("fastest", "budget", "everything")

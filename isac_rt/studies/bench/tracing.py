@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from isac_rt.propagation.pathset import PathSet
-from isac_rt.run.audit import present, tracer_of
-from isac_rt.run.setup import Setup, prepare
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.audit import present, tracer_of
+from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.scenes import town
 

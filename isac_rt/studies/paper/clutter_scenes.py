@@ -19,9 +19,9 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator, seed_sequence
-from isac_rt.run.setup import Setup, prepare
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.world.swarm import Pose, attitude
 
 SPEED = 10.0

@@ -14,9 +14,9 @@ import xarray as xr
 
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.run import simulate
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation import simulate
 from isac_rt.studies.paper.outcome import Progress
 from isac_rt.world.swarm import Pose, Swarm
 

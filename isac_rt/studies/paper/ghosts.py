@@ -22,10 +22,10 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.randomness import generator
 from isac_rt.results.metrics import resolutions
-from isac_rt.run import simulate
-from isac_rt.run.setup import Setup, prepare
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation import simulate
+from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.studies.paper.flight import SCENES
 from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, proportion
 from isac_rt.terminal.ghosts import Suspicion, Walls, suspicion

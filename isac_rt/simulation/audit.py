@@ -1,0 +1,495 @@
+"""The budget before a run and after it: what will be left out, estimated from a few frames, and
+what was, against the full model.
+
+Estimates come from `PILOT_FRAMES` frames of the run, spread over it, with a margin for the others
+and the plan's own limits as ceilings. The truth is measured on other frames, drawn at random: every
+one of them is traced in full, with spherical wavefronts of all elements, with every body where its
+trajectory puts it at the ends of the frame, and with the direct synthesis.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.timetable import Link
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.randomness import generator
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.simulation.plan import (
+    Use,
+    decibels,
+    decisions,
+    extent,
+    frame_reach,
+    mechanisms,
+    missed_chains,
+    standing,
+)
+from isac_rt.simulation.setup import Setup
+from isac_rt.simulation.simulate import stage_seconds
+from isac_rt.world.city.mesh import City
+from isac_rt.world.swarm import Pose
+
+PILOT_FRAMES = 5
+PILOT_INTERVALS = 3
+POWER_MARGIN = 10.0
+"""Of estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
+PHASE_MARGIN = 2.0
+MOST_COMPARED = 150
+"""Paths of a frame whose synthesis is compared with the direct one."""
+SAME_DELAY = 1e-14
+"""Paths of two traces that are one [s]: 3 um, 5 mrad at 77 GHz."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One line of the plan.
+
+    Attributes
+    ----------
+    link : "TX->RX", or "all"
+    modelled, left_out : in words
+    estimate : of the error, None where there is none
+    unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative",
+        "chains/frame" or "of the power radiated"
+    seconds : per frame, None where it has no time of its own
+    """
+
+    what: str
+    link: str
+    modelled: str
+    left_out: str
+    estimate: float | None
+    unit: str
+    seconds: float | None = None
+
+
+def tracer_of(setup: Setup) -> Any:
+    """The ray tracer of a set-up; None in free space."""
+    model = getattr(setup.propagation, "_model", setup.propagation)
+    return model if hasattr(model, "between") else None
+
+
+def _spread(values: Sequence[int], count: int) -> list[int]:
+    """At most `count` of some values, evenly spread, first and last among them."""
+    index = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
+    return [values[i] for i in index]
+
+
+def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
+    """The plan of a run: decisions, one item per line, and the seconds of each stage per frame.
+
+    Traces a few frames of the run and makes the samples of one; with `receive` its receivers work
+    on them too.
+    """
+    plan, tracer = setup.plan, tracer_of(setup)
+    frames = _spread(plan.traced_frames, PILOT_FRAMES)
+    uses: dict[Link, list[Use]] = {}
+    trace, phases = (
+        [],
+        {"directions that turn within the frame": 0.0, "motion during the flight of light": 0.0},
+    )
+    for frame in frames:
+        begin = time.perf_counter()
+        poses, found = setup.find(frame)
+        trace.append(time.perf_counter() - begin)
+        fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
+        kept = {
+            link: plan.apply(paths, setup.noise_power(poses, link)) for link, paths in found.items()
+        }
+        for link, (_, use) in kept.items():
+            uses.setdefault(link, []).append(use)
+            for what, value in standing(
+                found[link].select(found[link].power > 0), setup.antennas, setup.waveform, fastest
+            ).items():
+                phases[what] = max(phases[what], value)
+        last = frame, poses, {link: paths for link, (paths, _) in kept.items()}
+    stages = stage_seconds(setup, *last, receive=receive)
+    advance, missed = _advance(setup)
+    share = len(plan.traced_frames) / plan.scenario.frames
+    traced = float(np.median(trace))
+    items = [_tracing_item(setup, share, missed, traced * share + advance * (1 - share))]
+    items += _scene_items(setup)
+    for link, of_link in uses.items():
+        items += _link_items(setup, link, of_link, stages.get(link))
+    items += [Item(what, "all", "no", "always", value, "rad") for what, value in phases.items()]
+    seconds = {
+        "trace": traced * share + advance * (1 - share),
+        "synthesis": sum(s["synthesis"] for s in stages.values()),
+    }
+    if receive:
+        seconds["receive"] = sum(s["receive"] for s in stages.values())
+    return {
+        **mechanisms(plan.scenario),
+        **decisions(plan),
+        **extent(setup.city, setup.propagation, setup.scenario.clutter),
+        "traced_share": share if tracer is not None else 0.0,
+        "pilot_frames": frames,
+        "items": [asdict(item) for item in items],
+        "seconds_per_frame": seconds,
+    }
+
+
+def _advance(setup: Setup) -> tuple[float, float]:
+    """Seconds of a frame between two traced instants, and chains missed in it, from a few
+    intervals; zeros where all are traced."""
+    tracer, traced = tracer_of(setup), setup.plan.traced_frames
+    gaps = [a for a, b in itertools.pairwise(traced) if b - a > 1]
+    if tracer is None or tracer.between is None or not gaps:
+        return 0.0, 0.0
+    seconds = []
+    for a in _spread(gaps, PILOT_INTERVALS):
+        setup.find(a + 1)  # traces both ends
+        begin = time.perf_counter()
+        setup.find(a + 1)
+        seconds.append(time.perf_counter() - begin)
+    return float(np.median(seconds)), missed_per_frame(tracer.between)
+
+
+def missed_per_frame(between: Any) -> float:
+    """Chains missed in a frame between traced instants, all pairs of bodies together, from the
+    births and deaths seen so far."""
+    total = [
+        float(sum(values))
+        for values in (between.num_chains.values(), *zip(*between.changes.values(), strict=True))
+    ]
+    count = len(between.changes)
+    return missed_chains(*(value / count for value in total)) if count else 0.0
+
+
+def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> Item:
+    if tracer_of(setup) is None:
+        return Item("propagation", "all", "closed forms", "the city", None, "", seconds)
+    number = len(setup.plan.traced_frames)
+    if share == 1:
+        return Item("tracing", "all", f"all {number} frames", "nothing", None, "", seconds)
+    said = f"{number} of {setup.scenario.frames} frames traced, unfolded in between"
+    return Item(
+        "tracing",
+        "all",
+        said,
+        "chains that live between two traces",
+        missed,
+        "chains/frame",
+        seconds,
+    )
+
+
+def _scene_items(setup: Setup) -> list[Item]:
+    """Lines of the mesh and of its scatterers, with the reason for each count."""
+    out, record = [], extent(setup.city, setup.propagation, setup.scenario.clutter)
+    if record["city_faces"] + record["city_faces_beyond_reach"]:
+        gone = record["city_faces_beyond_reach"]
+        whole = setup.plan.preset == "everything" or setup.scenario.access.establish
+        why = (
+            "nothing"
+            if whole
+            else f"{gone} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
+        )
+        out.append(Item("mesh", "all", f"{record['city_faces']} faces", why, None, ""))
+    if record["scatterers"] is not None:
+        hidden = record["scatterer_cells"] - record["scatterers"]
+        said = (
+            f"{record['scatterers']} scatterers, one for {record['cell_area_per_metre_m']:.3g} "
+            "m2 and metre from the flights"
+        )
+        why, error = f"{hidden} cells that no transmitter sees", record["clutter_error_db"]
+        out.append(Item("clutter field", "all", said, why, error, "dB of a cell's mean"))
+        out.append(_mirrors_item(record["mirrors"]))
+    return out
+
+
+def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
+    """The line of two-bounce clutter: mirrors by terminal, and what the mirrors left out would have
+    sent on."""
+    if record is None:
+        return Item(
+            "clutter by mirrors",
+            "all",
+            "none: one bounce",
+            "two bounces; clutter.mirrors adds them",
+            None,
+            "",
+        )
+    counts = ", ".join(f"{row['count']} of {name}" for name, row in record.items())
+    shares = [100 * row["share"] for row in record.values()]
+    kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
+    said = (
+        f"mirrors {counts}: scatterers lit or heard by way of one, {kept} % of what a terminal "
+        "radiates"
+    )
+    rest = max(row["share_left_out"] for row in record.values())
+    return Item(
+        "clutter by mirrors",
+        "all",
+        said,
+        "weaker mirrors, more than one on a way",
+        rest,
+        "of the power radiated",
+    )
+
+
+def _link_items(
+    setup: Setup, link: Link, uses: list[Use], stages: dict[str, float] | None
+) -> list[Item]:
+    """Lines of one link."""
+    name, share = "->".join(link), setup.plan.phase_share
+    mean = {
+        key: float(np.mean([getattr(use, key) for use in uses]))
+        for key in ("found", "unheard", "weak", "plane", "straight")
+    }
+    kinds = dict.fromkeys(kind for use in uses for kind in use.kept)
+    kept = ", ".join(
+        f"{np.mean([use.kept.get(k, 0) for use in uses]):.3g} {k.replace('_', ' ')}" for k in kinds
+    )
+    num_kept = max(mean["found"] - mean["unheard"] - mean["weak"], 1.0)
+    left = min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest)
+    depth = max(use.bounces for use in uses)
+    at = stages or {}
+    method = setup.plan.synthesis(int(num_kept))
+    error = decisions(setup.plan)["synthesis_error"] if method != "direct" else 1e-6
+    return [
+        Item(
+            "paths",
+            name,
+            f"{kept or 'none'}; up to {depth} bounces",
+            f"{mean['weak']:.3g} too weak, {mean['unheard']:.3g} out of reach",
+            decibels(left),
+            "dB",
+        ),
+        Item(
+            "wavefronts",
+            name,
+            f"{num_kept - mean['plane']:.3g} spherical",
+            f"{mean['plane']:.3g} taken as plane",
+            _phase(uses, "plane_error", share),
+            "rad",
+        ),
+        Item(
+            "flight in a frame",
+            name,
+            f"{num_kept - mean['straight']:.3g} accelerated",
+            f"{mean['straight']:.3g} taken as straight",
+            _phase(uses, "straight_error", share),
+            "rad",
+        ),
+        Item(
+            "synthesis",
+            name,
+            method,
+            "rounding of the grid",
+            error,
+            "relative",
+            at.get("synthesis"),
+        ),
+    ] + (
+        [Item("reception", name, "all", "nothing", None, "", at["receive"])]
+        if "receive" in at
+        else []
+    )
+
+
+def _phase(uses: list[Use], name: str, share: float) -> float:
+    return float(min(PHASE_MARGIN * max(getattr(use, name) for use in uses), share))
+
+
+def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
+    """The true errors on frames drawn at random, link by link: the largest of them beside the
+    largest bound of the same frames."""
+    rng = generator(setup.scenario.seed, "budget check")
+    chosen = sorted(
+        rng.choice(
+            setup.scenario.frames, min(frames, setup.scenario.frames), replace=False
+        ).tolist()
+    )
+    tracer = tracer_of(setup)
+    out: dict[str, dict[str, Any]] = {}
+    for frame in chosen:
+        poses, used = setup.find(frame)
+        truth = (
+            used
+            if tracer is None or tracer.between is None
+            else _in_full(setup, frame, poses, list(used))
+        )
+        for link, paths in used.items():
+            row = _errors(setup, frame, poses, link, paths, truth[link])
+            into = out.setdefault("->".join(link), {})
+            for key, value in row.items():
+                into[key] = max(into.get(key, 0.0), value)
+    return {"frames": chosen, "links": {name: _in_decibels(row) for name, row in out.items()}}
+
+
+def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
+    powers = ("left_out", "left_out_bound", "missed_strongest")
+    return {
+        (f"{key}_db" if key in powers else key): (decibels(value) if key in powers else value)
+        for key, value in row.items()
+    }
+
+
+def _in_full(
+    setup: Setup, frame: int, poses: dict[str, Pose], links: list[Link]
+) -> dict[Link, PathSet]:
+    full = copy.copy(tracer_of(setup))
+    full.between = None
+    return full.paths(poses, setup.timetable.epoch(frame), links)
+
+
+def _errors(
+    setup: Setup, frame: int, poses: dict[str, Pose], link: Link, found: PathSet, full: PathSet
+) -> dict[str, float]:
+    """True errors of one link and frame; powers are over the noise of a cell."""
+    plan, w = setup.plan, setup.waveform
+    level = setup.noise_power(poses, link)
+    kept, use = plan.apply(found, level)
+    ratio = plan.cell_noise_gain() / level
+    heard, weak, _ = plan.chosen(found, level)
+    missed = ~present(full, found) & (full.delay <= plan.longest_delay)
+    cell = np.floor(np.append(found.delay[weak], full.delay[missed]) / w.delay_step).astype(int)
+    power = np.append(found.power[weak], full.power[missed]) * ratio
+    lost = np.bincount(cell - cell.min(), power) if cell.size else np.zeros(1)
+    raw = found.select(heard & ~weak)
+    return {
+        "left_out": float(lost.max()),
+        "left_out_bound": use.left_out,
+        "missed_chains": float(missed.sum()),
+        "missed_strongest": float((full.power[missed] * ratio).max(initial=0.0)),
+        "plane_rad": _plane_error(setup, poses, link, raw, kept),
+        "plane_bound_rad": use.plane_error,
+        "flight_rad": _flight_error(setup, frame, link, kept),
+        "straight_bound_rad": use.straight_error,
+        "synthesis": _synthesis_error(setup, frame, poses, link, kept, level),
+    }
+
+
+def present(paths: PathSet, among: PathSet) -> np.ndarray:
+    """(K,) whether each path is one of the others: same kind, same UAV, same delay."""
+    out = np.zeros(len(paths), bool)
+    for kind, target in {(int(k), int(t)) for k, t in zip(paths.kind, paths.target, strict=True)}:
+        here = np.flatnonzero((paths.kind == kind) & (paths.target == target))
+        there = np.sort(among.delay[(among.kind == kind) & (among.target == target)])
+        if there.size:
+            at = np.searchsorted(there, paths.delay[here])
+            near = [
+                np.abs(there[np.clip(at + step, 0, there.size - 1)] - paths.delay[here])
+                for step in (-1, 0)
+            ]
+            out[here] = np.minimum(*near) < SAME_DELAY
+    return out
+
+
+def _plane_error(
+    setup: Setup, poses: dict[str, Pose], link: Link, raw: PathSet, kept: PathSet
+) -> float:
+    """Largest phase by which the kept wavefronts that are plane differ from point sources' [rad],
+    both ends added."""
+    plane = np.isinf(kept.rx_radius) & np.isfinite(raw.rx_radius)
+    if not plane.any():
+        return 0.0
+    k = 2 * np.pi * setup.waveform.effective_carrier / SPEED_OF_LIGHT
+    total = np.zeros(int(plane.sum()))
+    raw = raw.select(plane)
+    ends = (
+        (poses[link[0]], setup.antennas.tx_positions, raw.departure, raw.tx_radius),
+        (poses[link[1]], setup.antennas.rx_positions, raw.arrival, raw.rx_radius),
+    )
+    for pose, positions, direction, radius in ends:
+        elements = pose.to_world(positions)
+        along = direction @ elements.T
+        change = (elements**2).sum(1) - 2 * radius[:, None] * along
+        exact = change / (np.sqrt(radius[:, None] ** 2 + change) + radius[:, None])
+        total += np.abs(exact + along).max(axis=1)
+    return float(k * total.max())
+
+
+def _flight_error(setup: Setup, frame: int, link: Link, kept: PathSet) -> float:
+    """Largest phase by which the kept delays differ at the ends of the frame from those over the
+    true positions there [rad]."""
+    reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
+    # clutter by way of a mirror flies like a farther scatterer: one bounce is the worse case
+    there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
+    moving = kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
+    if not len(moving):
+        return 0.0
+    drift = []
+    for t in (0.0, -reach, reach):
+        exact = delays(moving, setup.swarm.poses(epoch + t), setup.city)
+        drift.append(exact - (moving.delay + (moving.delay_rate + moving.delay_accel * t / 2) * t))
+    error = np.maximum(*(np.abs(d - drift[0]) for d in drift[1:]))
+    return float(2 * np.pi * setup.waveform.effective_carrier * error.max())
+
+
+def delays(paths: PathSet, poses: dict[str, Pose], city: City) -> np.ndarray:
+    """(K,) delays of the same chains and scatterers with the bodies elsewhere [s]."""
+    local = {
+        name: replace(pose, position=pose.position - city.origin) for name, pose in poses.items()
+    }
+    start, end = local[paths.tx], local[paths.rx]
+    out = np.zeros(len(paths))
+    scattered = paths.kind == PathKind.DIFFUSE
+    points = paths.points[scattered, 0] - city.origin if scattered.any() else np.zeros((0, 3))
+    out[scattered] = sum(np.linalg.norm(points - body.position, axis=1) for body in (start, end))
+    plain = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.SPECULAR))
+    out[plain] = _lengths(paths.faces[plain], start, end, city)
+    middle = (paths.faces.shape[1] - 1) // 2
+    for number in np.unique(paths.target[paths.target >= 0]):
+        here = (paths.target == number) & np.isin(paths.kind, (PathKind.TARGET, PathKind.GHOST))
+        body = local[paths.target_names[number]]
+        there, back = paths.faces[here, :middle], paths.faces[here, middle + 1 :][:, ::-1]
+        out[here] = _lengths(there, start, body, city) + _lengths(back, end, body, city)
+    return out / SPEED_OF_LIGHT
+
+
+def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: City) -> np.ndarray:
+    """(K,) lengths of unfolded chains (K, B), -1 where a chain is shorter [m]."""
+    out = np.zeros(len(faces))
+    normals, offsets = (
+        plane_of_each_face(city) if city.num_faces else (np.zeros((0, 3)), np.zeros(0))
+    )
+    count = (faces >= 0).sum(axis=1)
+    for bounces in np.unique(count):
+        rows = np.flatnonzero(count == bounces)
+        chain = faces[rows, :bounces]
+        out[rows] = unfold(normals[chain], offsets[chain], start, end).length
+    return out
+
+
+def _synthesis_error(
+    setup: Setup, frame: int, poses: dict[str, Pose], link: Link, kept: PathSet, level: float
+) -> float:
+    """Relative RMS error of the synthesis that the run uses, on some of a frame's paths."""
+    if not len(kept):
+        return 0.0
+    rng = generator(setup.scenario.seed, "synthesis check", *link, frame)
+    some = kept.select(np.sort(rng.choice(len(kept), min(len(kept), MOST_COMPARED), replace=False)))
+    sent: Transmission = setup.transmission(link[0], frame, poses[link[0]])
+    start = setup.timetable.start_time(frame, link[0])
+
+    def cube(method: Any) -> np.ndarray:
+        return if_signal(
+            setup.waveform,
+            [(sent, some)],
+            poses[link[1]],
+            setup.antennas,
+            start_time=start,
+            method=method,
+            filter_transition=setup.scenario.radio.filter_transition_hz,
+            noise_power=level,
+            costs=setup.plan.costs,
+            max_error=setup.plan.synthesis_error,
+            decide_for=len(kept),
+        ).samples
+
+    exact, fast = cube("direct"), cube(setup.plan.synthesis(len(kept)))
+    scale = float(np.linalg.norm(exact))
+    return float(np.linalg.norm(fast - exact)) / scale if scale else 0.0

@@ -1,0 +1,223 @@
+"""Runs that are ended from outside, disks that are full, folders that cannot be written; and runs
+that must not differ by a bit."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from fake_run import fake_run, fake_scenario
+
+from isac_rt.cli.cli import main
+from isac_rt.results import files as results
+from isac_rt.results.files import ResultsError, save
+from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation import simulate
+
+ROOT = Path(__file__).parents[2]
+WHOLE = {"results.nc", "summary.json", "scenario.yaml"}
+WITHOUT_A_NUMBER = {
+    "dask",
+    "distributed",
+    "jinja2",
+    "matplotlib",
+    "pandas",
+    "pyyaml",
+    "rich",
+    "rtree",
+    "threadpoolctl",
+    "typer",
+}
+"""Dependencies that start, show or look up what others compute."""
+
+PROGRAM = """
+import sys, time, types
+import isac_rt.results.files
+from isac_rt.cli.cli import main
+sys.path.insert(0, {tests!r})
+from fake_run import fake_run
+import numpy as np
+from isac_rt.world.city.mesh import empty_city
+from isac_rt.world.swarm import Swarm
+import isac_rt.simulation.setup as setup
+fake = types.ModuleType("isac_rt.simulation.simulate")
+setup.prepare = lambda s: types.SimpleNamespace(
+    city=empty_city("none", np.zeros(3)),
+    swarm=Swarm.from_scenario(s),
+    timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
+)
+setup.link_budgets = lambda setup: []
+fake.run = lambda s, **_: fake_run(s)
+sys.modules["isac_rt.simulation.simulate"] = isac_rt.simulation.simulate = fake
+whole = isac_rt.results.files._atomically
+def slowly(file, write):
+    def writing(temporary):
+        temporary.write_text("half")
+        print(file.name, flush=True)
+        time.sleep(300 if file.name == {when!r} else 0)
+        write(temporary)
+    whole(file, writing)
+isac_rt.results.files._atomically = slowly
+sys.exit(main(["run", {scenario!r}, "--out", {out!r}]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "when"),
+    [
+        (signal.SIGTERM, "results.nc"),
+        pytest.param(signal.SIGKILL, "summary.json", marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, "results.nc", marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, "summary.json", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, "results.nc", marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_that_is_killed_while_it_writes(how, when, tmp_path):
+    """Each file is whole or absent; asked to end (SIGTERM, Ctrl-C) the run takes its unfinished
+    file along, which Python's own answer to SIGTERM would leave."""
+    scenario, out = tmp_path / "s.yaml", tmp_path / "o"
+    scenario.write_text(to_yaml(fake_scenario()))
+    program = PROGRAM.format(
+        tests=str(ROOT / "tests"), scenario=str(scenario), out=str(out), when=when
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.stdout is not None
+    while (line := child.stdout.readline()) and line.strip() != when:
+        pass
+    assert line, child.communicate()
+    time.sleep(0.1)
+    os.kill(child.pid, how)
+    _, said = child.communicate(timeout=60)
+    left = {p.name for p in out.iterdir()}
+    assert child.returncode == (-9 if how == signal.SIGKILL else 128 + how), said
+    assert left - {n for n in left if n.endswith(".tmp")} == (
+        set() if when == "results.nc" else {"results.nc", "scenario.yaml"}
+    )
+    if how != signal.SIGKILL:
+        assert not [n for n in left if n.endswith(".tmp")], left
+        assert "interrupted" in said and "Traceback" not in said
+    for name in left & WHOLE:
+        if name == "results.nc":
+            with xr.open_dataset(out / name, engine="h5netcdf") as dataset:
+                assert dataset.sizes["frame"] == 7
+        else:
+            assert load(out / name).name == "fake"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+def test_a_full_disk_is_one_message_and_leaves_nothing(code, tmp_path, monkeypatch):
+    """Written against: the temporary file left behind."""
+    run = fake_run()
+
+    def full(self, *_, **__):
+        Path(self).touch()
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(ResultsError, match=r"cannot write .*(make room|--out)"):
+        results.write_text(tmp_path / "summary.json", json.dumps(run.summary))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_device_is_one_message():
+    """The kernel's own full device, where there is one."""
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    with pytest.raises(ResultsError, match="No space left"):
+        results.write_bytes(
+            Path("/dev/shm") / f"isac_rt-{os.getpid()}",
+            lambda temporary: Path("/dev/full").write_text("x" * 100_000),
+        )
+
+
+def test_an_unwritable_folder_is_refused_before_the_run(tmp_path, capsys):
+    scenario = tmp_path / "s.yaml"
+    scenario.write_text(to_yaml(fake_scenario()))
+    (tmp_path / "file").touch()
+    assert main(["run", str(scenario), "--out", str(tmp_path / "file" / "o")]) == 2
+    said = capsys.readouterr().err
+    assert "cannot write" in said and len(said.strip().splitlines()) == 1
+
+
+def small() -> Scenario:
+    return Scenario.model_validate(
+        {
+            "frames": 3,
+            "radio": {"samples_per_chirp": 64, "chirps_per_frame": 24},
+            "modulation": {"acquisition_frames": 1},
+            "array": {"rx_x": 2, "rx_z": 2},
+            "noise": {"model": "snr", "snr_db": 5.0},
+            "swarm": {
+                "A": {"role": "active", "position_m": [0, 0, 9]},
+                "P": {"role": "passive", "position_m": [1.3, 8.1, 9.3], "boresight": [0, -1, 0]},
+                "Q": {
+                    "role": "passive",
+                    "position_m": [-2.3, 6.1, 9.3],
+                    "velocity_mps": [1, 2, 0],
+                    "boresight": [0, -1, 0],
+                },
+                "U": {"role": "target", "position_m": [0.4, 4.1, 9.3], "velocity_mps": [0, 1, 0]},
+            },
+        }
+    )
+
+
+def digest(run) -> str:
+    """Of every number of a run, the order of the variables included, but for times taken."""
+    out = hashlib.sha256()
+    for name in sorted(run.dataset.variables):
+        values = run.dataset[name].values
+        out.update(
+            name.encode()
+            + (
+                repr(values.tolist()).encode()
+                if values.dtype == object
+                else np.ascontiguousarray(values).tobytes()
+            )
+        )
+    return out.hexdigest() + json.dumps(
+        {k: v for k, v in run.summary.items() if k != "timing_s"}, sort_keys=True
+    )
+
+
+def test_reruns_are_equal_bit_by_bit_whatever_the_threads():
+    """One, two and five receivers at work at once, and again. Written against: a generator shared
+    by the receivers."""
+    found = {digest(simulate.run(small(), threads=threads)) for threads in (1, 2, 5, 1)}
+    assert len(found) == 1
+    assert digest(simulate.run(small().model_copy(update={"seed": 2}))) not in found
+
+
+def test_versions_stand_in_the_results(tmp_path):
+    """Another version of a package is seen in the file and in the summary. Written against:
+    versions taken when the module is written, and a new dependency that nobody entered."""
+    import importlib.metadata
+
+    run = fake_run()
+    save(run, tmp_path)
+    with xr.open_dataset(tmp_path / "results.nc", engine="h5netcdf") as dataset:
+        kept = json.loads(dataset.attrs["versions"])
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    names = {re.match(r"[\w-]+", line)[0] for line in needed} - WITHOUT_A_NUMBER
+    assert len(names) > 10
+    for name in [*names, "llvmlite"]:  # numba's compiler
+        assert kept[name] == importlib.metadata.version(name) == run.summary["versions"][name]

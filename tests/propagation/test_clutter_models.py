@@ -1,0 +1,180 @@
+"""Statistical clutter against the laws that the paper states, and as a run sees it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from isac_rt.propagation import PathKind
+from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
+from isac_rt.scenario.file import ScenarioError, load
+from isac_rt.scenario.tree import Clutter
+from isac_rt.simulation.setup import prepare, trace
+
+SCENES = Path(__file__).parents[2] / "scenes"
+C = 299_792_458.0
+AT_CELL, PT_CELL = 0.249827, 0.499654  # c T~ / (2 B T) and twice that, of the paper's settings
+DRAWS = 400
+
+
+def draws(range_cell=AT_CELL, reference=11.31, **keys):
+    rng = np.random.default_rng(20)
+    return [
+        rayleigh_cells(Clutter(model="rayleigh", **keys), range_cell, reference, rng)
+        for _ in range(DRAWS)
+    ]
+
+
+def test_amplitudes_are_rayleigh_with_uniform_phase():
+    """Kolmogorov-Smirnov against Rayleigh of mean power 10 and against uniform phases; p under 1e-4
+    fails by chance in one seed of 5000. Planted bug: mean power 20 (no 1/sqrt(2))."""
+    a = np.concatenate([amplitudes for _, amplitudes in draws()])
+    assert stats.kstest(np.abs(a), stats.rayleigh(scale=np.sqrt(10 / 2)).cdf).pvalue > 1e-4
+    assert stats.kstest(np.angle(a), stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("of", "moment"),
+    [
+        ("power", lambda a: np.mean(np.abs(a) ** 2)),
+        ("amplitude", lambda a: np.mean(np.abs(a)) ** 2),
+    ],
+)
+def test_level_is_of_the_mean_that_is_asked_for(of, moment):
+    """6.7 dB; 18,000 draws: the mean power scatters by 1/sqrt(n) = 0.75 %, so 5 sigma are 3.8 %.
+    The two means are 27 % apart. Planted bug: `level_of` ignored."""
+    a = np.concatenate([amplitudes for _, amplitudes in draws(level_db=6.7, level_of=of)])
+    assert moment(a) == pytest.approx(10**0.67, rel=5 / np.sqrt(a.size), abs=0)
+
+
+def test_neighbours_are_correlated_as_asked():
+    """Correlation of the complex amplitudes of neighbouring and second cells is rho and rho^2;
+    statistical, 5/sqrt(n). Planted bug: sqrt(1 - rho) for sqrt(1 - rho^2)."""
+    rows = [amplitudes for _, amplitudes in draws(cell_correlation=0.83, cells=[45, 45])]
+    a = np.array(rows)
+    power = np.mean(np.abs(a) ** 2)
+    assert power == pytest.approx(
+        10, rel=5 * np.sqrt((1 + 0.83**2) / (1 - 0.83**2) / a.size), abs=0
+    )
+    for lag in (1, 2):
+        found = np.mean(a[:, lag:] * a[:, :-lag].conj()) / power
+        assert abs(found - 0.83**lag) < 5 * np.sqrt((1 + 0.83**2) / (1 - 0.83**2) / a.size)
+
+
+def test_extent_and_centre():
+    """40 to 50 consecutive cells, every number with probability 1/11; the centre uniform over
+    20..30 m (half a cell of rounding). Planted bug: `rng.integers(low, high)`, which never draws
+    50."""
+    every = draws()
+    counts = np.array([r.size for r, _ in every])
+    assert set(counts) == set(
+        range(40, 51)
+    )  # 400 draws miss one of 11 with probability 11 (10/11)^400 = 3e-16
+    for r, _ in every:
+        assert np.array_equal(np.diff(np.round(r / AT_CELL)), np.ones(r.size - 1))
+    middle = np.array(
+        [(np.round(r[0] / AT_CELL) + np.round(r[-1] / AT_CELL)) / 2 * AT_CELL for r, _ in every]
+    )
+    assert middle.min() > 20 - AT_CELL
+    assert middle.max() < 30 + AT_CELL
+    assert stats.kstest(middle, stats.uniform(20, 10).cdf).pvalue > 1e-4
+
+
+def test_centre_around_the_reference_and_before_the_first_cell():
+    """Around 11.31 m, within a cell; a run that would begin before cell 1 begins there and keeps
+    its length. Planted bug: cut at 0."""
+    for r, _ in draws(centre="reference", cells=[41, 41], place="grid"):
+        assert r.mean() == pytest.approx(11.31, rel=0, abs=AT_CELL / 2)
+    for r, _ in draws(PT_CELL, centre="reference", cells=[48, 48], place="grid"):
+        assert r.size == 48
+        assert r[0] == PT_CELL
+
+
+def test_places_are_uniform_in_their_cells():
+    """Planted bug: offsets within half of the cell."""
+    offset = np.concatenate([r / AT_CELL - np.round(r / AT_CELL) for r, _ in draws()])
+    assert stats.kstest(offset, stats.uniform(-0.5, 1).cdf).pvalue > 1e-4
+
+
+def scene(*overrides, frames=4):
+    return load(
+        SCENES / "paper_swarm_consistent.yaml",
+        ["clutter.model=rayleigh", *overrides],
+        frames=frames,
+    )
+
+
+def diffuse(scenario, frame, link):
+    paths = trace(scenario, frame)[link]
+    return paths.select(paths.kind == PathKind.DIFFUSE)
+
+
+@pytest.mark.parametrize(("link", "passes"), [(("AT", "AT"), 2), (("AT", "PT1"), 1)])
+def test_paths_of_a_run(link, passes):
+    """In every link: delays of the run, no Doppler whatever flies (exact), level over the reference
+    path's amplitude, directions in view. Planted bug: one pass for an echo."""
+    s = scene("clutter.place=grid", "clutter.centre_m=[24, 24]", "clutter.cells=[45, 45]")
+    setup = prepare(s)
+    poses, every = setup.trace(0)
+    found = every[link]
+    d = found.select(found.kind == PathKind.DIFFUSE)
+    cell = {2: AT_CELL, 1: PT_CELL}[passes]
+    where = d.delay * C / passes
+    assert len(d) == 45
+    assert where.mean() == pytest.approx(24, rel=0, abs=0.5 * cell + 1e-3)
+    assert np.ptp(where) == pytest.approx(44 * cell, rel=1e-5, abs=0)
+    assert not d.delay_rate.any()
+    assert not d.delay_accel.any()
+    power = (np.abs(d.gain) ** 2).mean() / setup.reference.reference_amplitude(poses, *link) ** 2
+    assert power == pytest.approx(
+        10, rel=5 / np.sqrt(45), abs=0
+    )  # mean of 45 exponentials, 5 sigma
+    assert setup.antennas.in_view(poses[link[0]].to_body(d.departure)).all()
+    assert setup.antennas.in_view(poses[link[1]].to_body(d.arrival)).all()
+    assert np.array_equal(d.departure, d.arrival) == (
+        passes == 2
+    )  # an echo comes back from where it was sent to
+
+
+def test_draws_repeat_from_the_seed_and_by_frame_or_once():
+    """Exact. Planted bug: the epoch in the name of the generator of a run drawn once."""
+    link = ("AT", "PT1")
+    anew, again = diffuse(scene(), 1, link), diffuse(scene(), 1, link)
+    assert np.array_equal(anew.gain, again.gain)
+    assert not np.array_equal(anew.delay[:40], diffuse(scene(), 2, link).delay[:40])
+    assert not np.array_equal(anew.delay[:40], diffuse(scene("seed=77"), 1, link).delay[:40])
+    once = [diffuse(scene("clutter.redraw=once"), k, link) for k in (1, 3)]
+    assert np.array_equal(once[0].delay, once[1].delay)
+    turn = (
+        once[0].gain / once[1].gain
+    )  # the level follows the line of sight, the phases stay; rounding
+    assert np.abs(turn.imag).max() < 1e-14
+    assert turn.real == pytest.approx(turn.real.mean(), rel=1e-14, abs=0)
+    one_direction = diffuse(scene("clutter.direction=reference"), 1, link)
+    assert np.ptp(one_direction.arrival, axis=0).max() == 0
+
+
+def test_gaussian_clutter_is_noise_beside_the_noise():
+    """A link's noise power with clutter 3.2 dB over the thermal noise, in both noise models; exact.
+    Planted bug: the clutter instead of the sum."""
+    for model in ("snr", "link_budget"):
+        levels = []
+        for clutter in (
+            ["clutter.model=none"],
+            ["clutter.model=gaussian", "clutter.clutter_to_noise_db=3.2"],
+        ):
+            overrides = [f"noise.model={model}", *clutter]
+            if model == "link_budget":
+                overrides += [f"swarm.{name}.rcs.model=constant" for name in ("AT", "PT1", "PT2")]
+            setup = prepare(load(SCENES / "paper_swarm_consistent.yaml", overrides, frames=4))
+            levels.append(setup.noise_power(setup.swarm.poses(0.0), ("AT", "PT1")))
+        assert levels[0] > 0
+        assert levels[1] / levels[0] == pytest.approx(1 + 10**0.32, rel=1e-12, abs=0)
+
+
+def test_bounds_in_the_wrong_order_are_refused():
+    with pytest.raises(ScenarioError, match=r"cells.*\[40, 50\]"):
+        scene("clutter.cells=[50, 40]")

@@ -1,0 +1,94 @@
+"""How cost grows with what a scenario has more of: counted work where it can be counted, else
+ratios with wide margins."""
+
+from __future__ import annotations
+
+import pytest
+
+from isac_rt.simulation.audit import tracer_of
+from isac_rt.simulation.setup import prepare
+from isac_rt.studies.bench import clutter, synthesis
+from isac_rt.studies.bench.measure import cpu_seconds
+from isac_rt.studies.bench.scenes import alone, town
+
+
+def test_synthesis_grows_no_faster_than_its_paths():
+    """Four times the paths cost at most eight times as much. Planted bug: `_blocks` that lists
+    every path once per hundred paths."""
+    job = synthesis.Job(30)
+    seconds = []
+    for count in (1000, 4000):
+        links = job.paths(count)
+        seconds.append(cpu_seconds(lambda links=links: job.samples(links, "gridded"), 5))
+    assert seconds[1] < 8 * seconds[0]
+
+
+@pytest.mark.sionna
+def test_tracing_grows_slower_than_the_triangles():
+    """More than four times the triangles: less than four times the cost, since rays go through a
+    hierarchy. All of what is not rays (unfolding, edges) is in the cost."""
+    faces, seconds = [], []
+    for blocks in (2, 6):
+        setup = prepare(town(3, blocks, accuracy={"preset": "everything"}))
+        poses, found = setup.find(1)
+        when = setup.timetable.epoch(1)
+        faces.append(setup.city.num_faces)
+        seconds.append(
+            cpu_seconds(
+                lambda s=setup, p=poses, t=when, of=list(found): s.propagation.paths(p, t, of), 3
+            )
+        )
+    assert faces[1] >= 4 * faces[0]
+    assert seconds[1] < 4 * seconds[0]
+
+
+@pytest.mark.sionna
+@pytest.mark.parametrize("uavs", [3, 7])
+def test_legs_are_traced_from_terminals_only(uavs):
+    """Legs run from the two terminals to every UAV: 2 N pairs in one solve, not N^2."""
+    setup = prepare(town(uavs, accuracy={"preset": "everything"}))
+    tracer, solved = tracer_of(setup), []
+    solve = tracer._solve
+
+    def counted(sources, sinks, *args, **options):
+        solved.append(([n for n in sources], [n for n in sinks if n in setup.scenario.swarm]))
+        return solve(sources, sinks, *args, **options)
+
+    tracer._solve = counted
+    setup.find(1)
+    assert [(len(sources), len(sinks)) for sources, sinks in solved] == [(2, uavs)]
+
+
+@pytest.mark.sionna
+def test_frames_between_traced_ones_trace_nothing():
+    """Twenty frames, two of them traced: the ray tracer is called twice."""
+    setup = prepare(town(3, frames=20))
+    tracer, calls = tracer_of(setup), []
+    solve = tracer._solve
+    tracer._solve = lambda *args, **options: (calls.append(1), solve(*args, **options))[1]
+    for frame in range(20):
+        setup.find(frame)
+    assert len(setup.plan.traced_frames) == 2
+    assert len(calls) == 2
+
+
+@pytest.mark.sionna
+def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
+    """Frames that follow each other share their tests of sight: a test every half metre of flight,
+    however many frames."""
+    tests = []
+    for per_metre in (5, 20):
+        speed = 5.315  # of the active terminal [m/s]
+        setup = prepare(
+            alone(
+                frames=3 * per_metre,
+                frame_interval_s=1 / speed / per_metre,
+                clutter={"model": "field", "cell_area_per_metre_m": 1.0},
+            )
+        )
+        sight = tracer_of(setup).field.sight
+        sees, calls = sight.shadows.sees, []
+        sight.shadows.sees = lambda *args, sees=sees, calls=calls: (calls.append(1), sees(*args))[1]
+        clutter.advance(setup, range(3 * per_metre))
+        tests.append(len(calls))
+    assert 0 < tests[1] <= tests[0] + 2

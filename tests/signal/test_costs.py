@@ -1,0 +1,188 @@
+"""The cost model of `auto`: predicted ranking against measured, errors of what it chooses, and its
+files."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isac_rt.cli.cli import main
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.scenario.file import ScenarioError, load, to_yaml
+from isac_rt.signal.choice import (
+    CANDIDATES,
+    DIRECT,
+    NAMES,
+    SHIPPED,
+    CostModel,
+    choose,
+    read,
+    speed_of,
+)
+from isac_rt.signal.gridded import DEFAULT
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.simulation.plan import decisions
+from isac_rt.simulation.setup import prepare
+from isac_rt.studies.bench.fit import fit
+from isac_rt.studies.bench.measure import cpu_seconds
+from isac_rt.studies.bench.synthesis import Job, relative
+
+SCENES = Path(__file__).parents[2] / "scenes"
+SHAPE = (3, 15, 120, 1024)
+STILL = {"noise_power": np.inf, "max_error": 1e-4, "max_direct": 16}
+
+
+def decide(
+    count: int, *, model: CostModel | None = None, power: float = 1.0, speed: float = 7.0, **more
+):
+    """What is chosen for `count` equal paths."""
+    one = np.ones(count)
+    return choose(
+        model or read(SHIPPED),
+        SHAPE,
+        power * one,
+        speed * one,
+        np.zeros(count, bool),
+        **(STILL | more),
+    )
+
+
+@pytest.mark.parametrize("size", [2, 40, 400])
+def test_what_is_predicted_twice_as_dear_is_dearer(size):
+    """Direct and every setting, medians of three. Planted bug: the elements left out of the direct
+    method's cost."""
+    job, model = Job(12), read(SHIPPED)
+    links, shape = job.paths(size), (3, 15, 12, 1024)
+    predicted = {name: model.seconds(name, shape, size) for name in NAMES}
+    works = {c.name: (lambda c=c: job.samples(links, "gridded", c.setting)) for c in CANDIDATES}
+    works[DIRECT] = lambda: job.samples(links, "direct")
+    measured = {name: cpu_seconds(work, 3) for name, work in works.items()}
+    clear = [(a, b) for a, b in itertools.permutations(NAMES, 2) if predicted[a] > 2 * predicted[b]]
+    assert clear or size == 2
+    assert [(a, b) for a, b in clear if measured[a] <= measured[b]] == []
+
+
+@pytest.mark.parametrize("speed", [0.0, 15.0, 70.0, 180.0])
+def test_the_choice_keeps_the_stated_error(speed):
+    """40 paths as of 20,000, against the exact model; the settings' own bounds are above the truth,
+    and by ten times at the most. Planted bug: `error > max_error` left out, so that fast paths are
+    gridded (2e-4 where 1e-4 is stated)."""
+    job = Job(3, speed=speed)
+    links = job.paths(40)
+    truth = job.samples(links, "exact")
+    for stated in (1e-2, 3.5e-4, 1e-4, 1e-5, 1e-6):
+        found = if_signal(
+            job.waveform,
+            links,
+            job.pose,
+            job.antennas,
+            start_time=0.0,
+            filter_transition=0.4e6,
+            noise_power=np.inf,
+            max_error=stated,
+            decide_for=20_000,
+        ).samples
+        assert relative(found, truth) < stated
+    for candidate in CANDIDATES:
+        error = relative(job.samples(links, "gridded", candidate.setting), truth)
+        assert error < candidate.error_at(np.array(speed)) < 10 * error
+
+
+def test_few_paths_go_direct_and_many_are_gridded():
+    """Planted bug: the costs of both compared the other way round."""
+    assert decide(3)[1].all()
+    setting, alone = decide(1000)
+    assert setting == DEFAULT
+    assert not alone.any()
+    coarse, _ = decide(100_000, max_error=1e-3)
+    assert coarse == CANDIDATES[0].setting  # width 4 for very many
+    assert (
+        decide(300, max_error=1e-3)[0] == CANDIDATES[1].setting
+    )  # the smallest grid for some hundreds
+
+
+def test_sights_fast_and_strong_paths_go_direct():
+    """One of each among 500. Planted bug: `strong` and `sight` joined by `and`."""
+    power, speed, sight = np.full(500, 1e-12), np.full(500, 3.0), np.zeros(500, bool)
+    power[[7, 8, 9]], speed[20], sight[30] = (1.0, 2.0, 3.0), 300.0, True
+    _, alone = choose(
+        read(SHIPPED), SHAPE, power, speed, sight, noise_power=1e-6, max_error=1e-4, max_direct=2
+    )
+    assert np.flatnonzero(alone).tolist() == [8, 9, 20, 30]
+
+
+def test_the_costs_decide():
+    """With a made-up model whose direct method costs next to nothing. Planted bug: shipped costs
+    whatever is given."""
+    shipped = read(SHIPPED)
+    free = CostModel("made up", shipped.chirp_ns | {DIRECT: 0.1}, shipped.path_ns | {DIRECT: 1e-3})
+    assert decide(1000, model=free)[1].all()
+    assert decide(1000, num_paths=3)[1].all()
+    job = Job(3)
+    links, options = (
+        job.paths(30),
+        {"start_time": 0.0, "filter_transition": 0.4e6, "noise_power": np.inf},
+    )
+    found = if_signal(job.waveform, links, job.pose, job.antennas, costs=free, **options).samples
+    np.testing.assert_array_equal(found, job.samples(links, "direct"))
+
+
+def test_speed_is_the_largest_in_the_frame():
+    """v = 11.3 m/s there and back, 40 m/s^2 over half of 7.2 ms. Planted bug: one way taken for
+    two."""
+    rate, accel = np.array([-2 * 11.3 / SPEED_OF_LIGHT]), np.array([2 * 40 / SPEED_OF_LIGHT])
+    assert speed_of(rate, accel, 7.2e-3)[0] == pytest.approx(11.3 + 40 * 3.6e-3, rel=1e-12)
+
+
+def test_a_fit_is_a_model(tmp_path, capsys, monkeypatch):
+    """Thirty chirps, three times: the file is read, and 1000 paths are dearer one by one (35
+    times). A run names it, by a path from where its scenario is saved. Planted bug: `record` of the
+    shipped model whatever the scenario names."""
+    monkeypatch.setattr("isac_rt.studies.bench.fit.fit", lambda progress: fit(30, 3, progress))
+    file = tmp_path / "here" / "mine.json"
+    assert main(["bench", "--fit", str(file)]) == 0
+    assert "mine.json" in capsys.readouterr().out
+    model = read(file)
+    assert model.seconds(DIRECT, SHAPE, 1000) > model.seconds(CANDIDATES[2].name, SHAPE, 1000)
+    (tmp_path / "s.yaml").write_text(
+        (SCENES / "paper_swarm_consistent.yaml").read_text()
+        + "\naccuracy:\n  cost_model: here/mine.json\n"
+    )
+    scenario = load(tmp_path / "s.yaml")
+    record = decisions(prepare(scenario).plan)["cost_model"]
+    assert record == model.record()
+    assert record["source"] == "mine.json"
+    assert "cost_model: ../here/mine.json" in to_yaml(scenario, tmp_path / "out")
+    assert (
+        decisions(prepare(load(SCENES / "paper_swarm_consistent.yaml")).plan)["cost_model"]
+        == read(SHIPPED).record()
+    )
+
+
+def test_files_that_are_no_model(tmp_path):
+    """Missing: told with the line of the key. Not JSON, another format, a cost of 0, a method
+    missing: told with the file. Planted bug: `values > 0` left out."""
+    text = (
+        SCENES / "paper_swarm_consistent.yaml"
+    ).read_text() + "\naccuracy:\n  cost_model: mine.json\n"
+    (tmp_path / "s.yaml").write_text(text)
+    with pytest.raises(ScenarioError, match=r"s\.yaml:\d+.*cost_model.*no such file"):
+        load(tmp_path / "s.yaml")
+    good = json.loads(SHIPPED.read_text())
+    bad = [
+        good | {"format": "other"},
+        good | {"methods": good["methods"] | {DIRECT: {"chirp_ns": 1.0, "path_ns": 0.0}}},
+    ]
+    bad.append(good | {"methods": {k: v for k, v in good["methods"].items() if k != NAMES[2]}})
+    for number, content in enumerate([*map(json.dumps, bad), "no JSON"]):
+        file = tmp_path / f"{number}.json"
+        file.write_text(content)
+        with pytest.raises(ValueError, match=rf"{number}\.json.*isac-rt bench --fit"):
+            read(file)
+    (tmp_path / "mine.json").write_text("[]")
+    with pytest.raises(ScenarioError, match=r"accuracy\.cost_model.*is no cost model"):
+        prepare(load(tmp_path / "s.yaml"))

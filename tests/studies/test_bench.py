@@ -1,0 +1,142 @@
+"""How cost grows, never how long anything takes; and that the report says what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from isac_rt.cli.cli import main
+from isac_rt.simulation.plan import faintest
+from isac_rt.simulation.setup import prepare
+from isac_rt.studies.bench import REQUIRED, report
+from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
+from isac_rt.studies.bench.scenes import town
+
+# measured exponents scatter by 0.1 to 0.2 on a busy machine; n log n is 1.1 here, n^2 would be 2
+LINEAR = 1.3
+
+
+def test_an_exponent_is_found_from_its_own_curve():
+    """Planted bug: sizes and costs exchanged."""
+    sizes = np.array([3, 10, 70, 400])
+    assert report.exponent(sizes, 0.3 * sizes**1.7) == pytest.approx(1.7, rel=1e-9)
+
+
+def test_the_report_holds_every_row(tmp_path):
+    """Tables, figures and JSON of rows that are made up. Planted bug: rows of the first kind
+    only."""
+    rows = [
+        {
+            "kind": kind,
+            "method": method,
+            "size": size,
+            "unit": "paths",
+            "error": error,
+            "cost": size * cost,
+            "floor_s": 0.04,
+            "seconds": size * cost * 0.04,
+            "oracle": error == 0,
+        }
+        for kind in ("synthesis", "tracing")
+        for method, cost, error in (("slow", 0.1, 0.0), ("quick", 0.01, 3e-4))
+        for size in (10, 100)
+    ]
+    assert all(set(REQUIRED) <= set(row) for row in rows)
+    found = {
+        "machine": report.machine(),
+        "quick": True,
+        "rows": rows,
+        "growth": report.growth(rows),
+    }
+    files = report.write(found, tmp_path)
+    assert {file.name for file in files} == {
+        "bench.json",
+        "bench.md",
+        "synthesis.png",
+        "tracing.png",
+    }
+    assert all(file.stat().st_size > 0 for file in files)
+    assert json.loads((tmp_path / "bench.json").read_text())["rows"] == rows
+    text = (tmp_path / "bench.md").read_text()
+    assert text.count("\n| quick |") + text.count("\n| slow |") == 8
+    assert all(row["exponent"] == 1.0 for row in found["growth"])
+    assert found["machine"]["processor"] in text
+
+
+def test_the_floor_grows_with_the_cube():
+    """Planted bug: a floor of a fixed shape."""
+    assert floor_seconds((3, 4, 30, 1024), 3) < floor_seconds((3, 4, 240, 1024), 3)
+
+
+def test_leaving_out_the_faintest_grows_no_faster_than_sorting():
+    """Planted bug: for each path the sum over its whole cell."""
+    rng = np.random.default_rng(3)
+    sizes = (30_000, 300_000)
+    seconds = []
+    for count in sizes:
+        power, cell = rng.exponential(1.0, count), rng.integers(0, 500, count)
+        seconds.append(cpu_seconds(lambda power=power, cell=cell: faintest(power, cell, 3.0), 3))
+    assert report.exponent(sizes, seconds) < LINEAR
+
+
+def test_the_command_measures_the_stages_that_are_asked_for(tmp_path, monkeypatch, capsys):
+    """With measurements that take no time. Planted bug: all stages measured whatever was asked
+    for."""
+    rows = [
+        {
+            "kind": "tracing",
+            "method": "traced",
+            "size": k,
+            "error": 0.0,
+            "cost": 1.5 * k,
+            "floor_s": 0.04,
+        }
+        for k in (2, 4)
+    ]
+    monkeypatch.setattr("isac_rt.studies.bench.tracing.rows", lambda quick: rows)
+    assert (
+        main(
+            [
+                "bench",
+                "trace",
+                "--quick",
+                "--out",
+                str(tmp_path / "out"),
+                "--json",
+                str(tmp_path / "rows.json"),
+            ]
+        )
+        == 0
+    )
+    assert json.loads((tmp_path / "rows.json").read_text())["rows"] == rows
+    assert "tracing: traced" in capsys.readouterr().out
+    assert main(["bench", "nonsense", "--out", str(tmp_path / "out")]) == 2
+    assert "choose from" in capsys.readouterr().err
+
+
+def test_traced_frames_are_as_many_as_the_way_needs():
+    """With frames: twice the frames over the same way are traced as often, so the cost per frame
+    falls. Planted bug: a fixed stride."""
+    counts = []
+    for frames in (60, 120, 240):
+        s = town(
+            3,
+            frames=frames,
+            frame_interval_s=3.0 / frames,
+            accuracy={"max_untraced_m": 1.0},
+            propagation={"model": "free_space"},
+        )
+        plan = prepare(s).plan
+        ray_traced = s.model_copy(
+            update={"propagation": s.propagation.model_copy(update={"model": "ray_traced"})}
+        )
+        counts.append(
+            len(
+                type(plan)(
+                    ray_traced, plan.waveform, plan.antennas, plan.timetable, plan.swarm
+                ).traced_frames
+            )
+        )
+    assert max(counts) - min(counts) <= 0.3 * counts[0]
