@@ -564,6 +564,8 @@ def check_sample(mutants: list[Mutant], copy: Copy, record: Record, report: Path
 def check_planted(words: str) -> int:
     """Plant the bug of every case; print those that do not make it fail by its number."""
     sys.path.insert(0, str(ROOT))  # the cases of this checkout, whichever is installed
+    from planted import OF_CASES
+
     from isac_rt.studies.validation import all_cases
 
     wrong, count = 0, 0
@@ -574,7 +576,7 @@ def check_planted(words: str) -> int:
         for one in all_cases():
             if not any(word in f"{one.group}: {one.name}" for word in words.split(",")):
                 continue
-            p, count = one.planted, count + 1
+            p, count = OF_CASES[one.name], count + 1
             source = copy.source(p.file)
             if source.count(p.old) != 1:
                 wrong += 1
@@ -607,23 +609,23 @@ def check_planted(words: str) -> int:
 def check_hard(words: str) -> int:
     """Plant the bugs that the hard cases are written against; print those that their tests do not
     see."""
-    from planted import BUGS
+    from planted import OF_TESTS
 
     wrong, count = 0, 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
         server = Server(copy)
-        for bug in BUGS:
-            if words not in bug.test:
+        for of, bug in OF_TESTS:
+            if words not in of:
                 continue
             source, count = copy.source(bug.file), count + 1
             state = "STALE"
             if source.count(bug.old) == 1:
-                name, _, test = bug.test.partition("::")
+                name, _, test = of.partition("::")
                 with copy.changed(bug.file, source.replace(bug.old, bug.new)):
                     state = server.outcome([f"{test_file(name)}::{test}"], LIMIT)[0]
             wrong += state in ("passed", "STALE")
-            print(f"{state:8s} {bug.test}: {bug.file} {bug.new}", flush=True)
+            print(f"{state:8s} {of}: {bug.file} {bug.new}", flush=True)
         server.end()
     print(f"{count - wrong} of {count} noticed")
     return 1 if wrong else 0

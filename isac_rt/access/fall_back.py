@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, conventional_schedule
-from isac_rt.frame.timetable import Link
 from isac_rt.receive import Reception
 from isac_rt.scenario.tree import Scenario
 

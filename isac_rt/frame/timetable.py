@@ -9,14 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
 from isac_rt.scenario.tree import Scenario
-
-Link = tuple[str, str]
-"""(transmitter, receiver); twice the same name is an active terminal's own echoes."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,8 @@ class Timetable:
         frame), and from each active terminal to every passive one."""
         active, passive = self.with_role("active", frame), self.with_role("passive", frame)
         own = frame % self.scenario.receivers.active_every_frames == 0
-        return [(a, a) for a in active if own] + [
-            (a, p) for a in active for p in passive if (a, p) not in self.refused
+        return [Link(a, a) for a in active if own] + [
+            Link(a, p) for a in active for p in passive if (a, p) not in self.refused
         ]
 
     @cached_property
@@ -110,9 +108,9 @@ class Timetable:
         found: dict[Link, None] = {}
         for first, roles in self._roles:
             active = self.with_role("active", first)
-            found |= dict.fromkeys((a, a) for a in active)
+            found |= dict.fromkeys(Link(a, a) for a in active)
             found |= dict.fromkeys(
-                (a, p)
+                Link(a, p)
                 for a in active
                 for p, role in roles.items()
                 if role == "passive" and (a, p) not in self.refused
@@ -123,14 +121,15 @@ class Timetable:
     def labels(self) -> dict[Link, str]:
         """A name for each of `all_links`: the receiver's where it has one transmitter in the whole
         run, else "TX->RX"."""
-        receivers = [rx for _, rx in self.all_links]
-        alone = len({tx for tx, _ in self.all_links}) == 1 and len(set(receivers)) == len(receivers)
-        return {(tx, rx): rx if alone else f"{tx}->{rx}" for tx, rx in self.all_links}
+        receivers = [link.rx for link in self.all_links]
+        one_each = len(set(receivers)) == len(receivers)
+        alone = one_each and len({link.tx for link in self.all_links}) == 1
+        return {link: link.rx if alone else str(link) for link in self.all_links}
 
     def groups(self, link: Link) -> tuple[int, ...] | None:
         """Groups whose data are meant for a link's receiver; None: all of them."""
-        chosen = self.scenario.modulation.streams.get(link[1])
-        return None if chosen is None or link[0] == link[1] else tuple(sorted(chosen))
+        chosen = self.scenario.modulation.streams.get(link.rx)
+        return None if chosen is None or link.own else tuple(sorted(chosen))
 
     def payload(self, active: str, frame: int, schedule: Schedule | None = None) -> Payload:
         """What an active terminal's chirps carry in a frame; `schedule`: if it is another than the

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
 from isac_rt.results.dataset import _Builder
 from isac_rt.results.metrics import SensingScore, SymbolCount, pool, summary_block

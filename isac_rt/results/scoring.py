@@ -8,7 +8,8 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import Transmission
-from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.receive import Reception
 from isac_rt.results.metrics import (

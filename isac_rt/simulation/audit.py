@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.cube import Transmission
-from isac_rt.frame.timetable import Link
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet

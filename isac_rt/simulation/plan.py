@@ -33,7 +33,8 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.level import transmit_amplitude
-from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.pathset import PathKind, PathSet

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas, antennas_of
-from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
 from isac_rt.runtime import available_memory
 from isac_rt.scenario.file import ScenarioError, ScenarioWarning
@@ -111,7 +112,7 @@ def aliases(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Iterator[
     poses = [swarm.poses(timetable.epoch(int(frame))) for frame in frames]
     for tx, rx in timetable.all_links:
         passes = 2 if tx == rx else 1
-        limit = _fastest(scenario, w, timetable, (tx, rx))
+        limit = _fastest(scenario, w, timetable, Link(tx, rx))
         for name in [n for n in swarm.uavs if n != tx] if tx == rx else [rx]:
             rates = np.array([_closing(at[tx], at[name], antennas, passes) for at in poses])
             worst = int(np.abs(rates).argmax())

@@ -19,8 +19,9 @@ from isac_rt.frame.level import (
     thermal_noise_power,
     transmit_amplitude,
 )
+from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, schedule_of
-from isac_rt.frame.timetable import Link, Timetable
+from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.propagation import FreeSpace, PathSet, Propagation, make_propagation
 from isac_rt.propagation.store import CachedPropagation, PathStore
@@ -101,7 +102,7 @@ class Setup:
             dict.fromkeys(rx for _, rx in heard),
         )
         return poses, self.propagation.paths(
-            poses, epoch, [(tx, rx) for tx in active for rx in receivers]
+            poses, epoch, [Link(tx, rx) for tx in active for rx in receivers]
         )
 
     def transmission(
@@ -215,7 +216,7 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
         what = "line of sight" if tx != rx else f"echo of {name}"
         rows.append(
             link_budget(
-                (tx, rx),
+                Link(tx, rx),
                 what,
                 distance,
                 amplitude,

@@ -16,7 +16,8 @@ from isac_rt.access import exchange
 from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.level import transmit_amplitude
-from isac_rt.frame.timetable import Link, snapshot_frames
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import snapshot_frames
 from isac_rt.propagation import PathSet
 from isac_rt.receive import Reception
 from isac_rt.receive.types import ExpectedClutter

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import demodulate_bits, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.timetable import Timetable
@@ -103,8 +104,8 @@ def test_streams_hold_the_bits_of_their_groups():
     """Against the mapping of the symbols of these groups alone. Planted bug: the DPSK bits of all
     groups."""
     t = timetable(modulation=Modulation(streams={"PT1": (2, 0)}, dpsk_order=16))
-    assert t.groups(("AT", "PT1")) == (0, 2)
-    assert t.groups(("AT", "PT2")) is None and t.groups(("AT", "AT")) is None
+    assert t.groups(Link("AT", "PT1")) == (0, 2)
+    assert t.groups(Link("AT", "PT2")) is None and t.groups(Link("AT", "AT")) is None
     sent = t.payload("AT", 5)
     mine = [0, 2]
     assert np.array_equal(

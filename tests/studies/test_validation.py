@@ -10,10 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from planted import OF_CASES, OF_TESTS
 
 import isac_rt.studies.validation
 from isac_rt.cli.cli import main
-from isac_rt.studies.validation import Planted, Skipped, all_cases, run_case
+from isac_rt.studies.validation import Skipped, all_cases, run_case
 from isac_rt.studies.validation.case import case
 from isac_rt.studies.validation.table import as_data, as_markdown
 
@@ -21,7 +22,7 @@ PACKAGE = Path(isac_rt.studies.validation.__file__).parent
 CASES = all_cases()
 
 
-@case(truth="zero", unit="m", bound=0.5, why="one half", planted=("frame/waveform.py", "a", "b"))
+@case(truth="zero", unit="m", bound=0.5, why="one half")
 def a_case() -> float:
     """A claim | with a bar."""
     return 0.25
@@ -33,7 +34,6 @@ def test_there_are_enough_cases_each_complete():
     assert len({c.name for c in CASES}) == len(CASES)
     for c in CASES:
         assert c.claim and c.truth and c.unit and c.why and math.isfinite(c.bound), c.name
-        assert c.planted.old != c.planted.new, c.name
 
 
 def test_the_quick_selection_is_a_part_of_every_group():
@@ -137,11 +137,10 @@ def test_quick_cases_without_rays_pass(one):
 
 
 def test_planted_bugs_fit_the_source():
-    """Each stands in its file as it is written, once, so that tests/mutation.py can plant it."""
-    stale = [
-        c.name
-        for c in CASES
-        if (PACKAGE.parent / c.planted.file).read_text().count(c.planted.old) != 1
-    ]
-    assert stale == []
-    assert Planted("a", "b", "c").old == "b"
+    """Each case has one, and each stands in its file as it is written, once, so that
+    tests/mutation.py can plant it."""
+    assert list(OF_CASES) == [c.name for c in CASES]
+    bugs = [*OF_CASES.items(), *OF_TESTS]
+    root = PACKAGE.parents[1]
+    assert [of for of, bug in bugs if (root / bug.file).read_text().count(bug.old) != 1] == []
+    assert [of for of, bug in bugs if bug.old == bug.new] == []

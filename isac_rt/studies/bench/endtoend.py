@@ -15,7 +15,7 @@ from statistics import median
 
 import numpy as np
 
-from isac_rt.frame.timetable import Link
+from isac_rt.frame.link import Link
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal

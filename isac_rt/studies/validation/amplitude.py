@@ -48,11 +48,6 @@ def _free(tx: str, rx: str, gain: float = 1.0):
     unit="dB",
     bound=1e-09,
     why="float64 rounding",
-    planted=(
-        "propagation/free_space.py",
-        "return wavelength / (4 * np.pi * distance)",
-        "return wavelength / (2 * np.pi * distance)",
-    ),
 )
 def friis() -> float:
     """Received power of a line of sight with elements of 3.1 dBi."""
@@ -67,11 +62,6 @@ def friis() -> float:
     unit="dB",
     bound=1e-09,
     why="float64 rounding",
-    planted=(
-        "propagation/free_space.py",
-        "(4 * np.pi) ** 3",
-        "(4 * np.pi) ** 2",
-    ),
 )
 def radar_equation() -> float:
     """Received power of an echo, monostatic and bistatic."""
@@ -113,11 +103,6 @@ def _two_rays(
     unit="of the direct field",
     bound=2e-05,
     why=FLOAT32,
-    planted=(
-        "propagation/raytrace.py",
-        "gain=found.amplitude * element_amplitude",
-        "gain=np.abs(found.amplitude) * element_amplitude",
-    ),
     tracer=True,
 )
 def two_rays_across_the_breakpoint() -> float:
@@ -144,23 +129,6 @@ def two_rays_across_the_breakpoint() -> float:
     unit="relative",
     bound=5e-06,
     why=FLOAT32,
-    planted=(
-        "propagation/raytrace.py",
-        (
-            "delay=legs.length / SPEED_OF_LIGHT,\n            delay_rate=legs.rate / "
-            "SPEED_OF_LIGHT,\n            "
-            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n     "
-            "       "
-            "arrival=legs.arrival,\n            tx_radius=legs.length,"
-        ),
-        (
-            "delay=legs.length / SPEED_OF_LIGHT / 2,\n            delay_rate=legs.rate / "
-            "SPEED_OF_LIGHT,\n            "
-            "delay_accel=legs.accel / SPEED_OF_LIGHT,\n            departure=legs.departure,\n     "
-            "       "
-            "arrival=legs.arrival,\n            tx_radius=legs.length,"
-        ),
-    ),
     tracer=True,
 )
 def conducting_plate() -> float:
@@ -184,11 +152,6 @@ def conducting_plate() -> float:
     unit="relative",
     bound=0.0003,
     why=FLOAT32,
-    planted=(
-        "propagation/raytrace.py",
-        "if depth > 1 else {}",
-        "if depth > 9 else {}",
-    ),
     tracer=True,
 )
 def conducting_corner() -> float:
@@ -230,11 +193,6 @@ def conducting_corner() -> float:
     unit="of the image",
     bound=0.0001,
     why=FLOAT32 + "; the phase of a thin pane turns five times as fast with the angle",
-    planted=(
-        "world/city/scene.py",
-        "conductivity=material.conductivity,",
-        "conductivity=0.0,",
-    ),
     tracer=True,
 )
 def reflection_of_a_slab() -> float:
@@ -261,11 +219,6 @@ def reflection_of_a_slab() -> float:
     unit="relative",
     bound=2e-05,
     why="the truth holds the 0.9991 of the tracer's metal per bounce; " + FLOAT32,
-    planted=(
-        "propagation/raytrace.py",
-        "scatter = np.sqrt(4 * np.pi * section) / self._wavelength",
-        "scatter = np.sqrt(4 * np.pi * section)",
-    ),
     tracer=True,
 )
 def ghosts_over_a_conducting_wall() -> float:
@@ -321,11 +274,6 @@ def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
         "cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 "
         "of the power but for grazing angles"
     ),
-    planted=(
-        "propagation/clutter/field.py",
-        "power *= abs(back) / np.pi",
-        "power *= 1 / np.pi",
-    ),
     tracer=True,
     quick=False,
 )
@@ -357,11 +305,6 @@ def lambertian_wall() -> float:
     bound=0.04,
     why="cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a "
     "vertical wave at these angles, 0.02 dB",
-    planted=(
-        "propagation/clutter/two_bounces.py",
-        "motion[0 if before else 1] = mirror.image(start if before else end)",
-        "motion[0 if before else 1] = motion[0 if before else 1]",
-    ),
     tracer=True,
     quick=False,
 )
@@ -409,11 +352,6 @@ def lambertian_wall_by_way_of_the_ground() -> float:
     unit="of the power",
     bound=1e-09,
     why="400 echoes leave less than float64 resolves; both sides are float64",
-    planted=(
-        "propagation/clutter/field.py",
-        "np.exp(-4j * np.pi * material.thickness",
-        "np.exp(-2j * np.pi * material.thickness",
-    ),
     tracer=True,
 )
 def reflectivity_of_scatterers() -> float:
@@ -436,11 +374,6 @@ def reflectivity_of_scatterers() -> float:
     unit="relative",
     bound=1e-06,
     why="quadrature to 1e-9; the edge of the half-space cuts the lobe",
-    planted=(
-        "propagation/clutter/field.py",
-        "* comb(2 * n, n) / 4.0**n",
-        "* comb(2 * n, n) / 2.0**n",
-    ),
     tracer=True,
 )
 def lobes_radiate_their_power() -> float:
@@ -467,11 +400,6 @@ def lobes_radiate_their_power() -> float:
     unit="relative",
     bound=0.0005,
     why="the truth is written with four digits",
-    planted=(
-        "world/city/materials.py",
-        "return self.a * frequency_ghz**self.b, self.c * frequency_ghz**self.d",
-        "return self.a * frequency_ghz**self.b, self.c * frequency_ghz",
-    ),
 )
 def materials_at_77_ghz() -> float:
     """Permittivity and conductivity of concrete, glass and plasterboard at the carrier."""
@@ -491,11 +419,6 @@ def materials_at_77_ghz() -> float:
     unit="relative",
     bound=0.02,
     why="spread of the handbook values",
-    planted=(
-        "world/city/materials.py",
-        "77.66 + 103.3 * theta",
-        "77.66 - 103.3 * theta",
-    ),
 )
 def water() -> float:
     """Static permittivity and relaxation frequency of water, on which the permittivity of soil and
@@ -510,11 +433,6 @@ def water() -> float:
     unit="dB",
     bound=1e-09,
     why="float64 rounding",
-    planted=(
-        "propagation/rcs.py",
-        "SMALL_MEAN_DBSM - 3 * np.sin(half_bistatic)",
-        "SMALL_MEAN_DBSM - 3 * np.sin(2 * half_bistatic)",
-    ),
 )
 def cross_section_of_a_small_uav() -> float:
     """-12.81 dBsm seen from where it is lit, 3 sin(beta/2) dB less under a bistatic angle beta."""
@@ -533,11 +451,6 @@ def cross_section_of_a_small_uav() -> float:
     unit="dB",
     bound=0.15,
     why="the lobes are read from printed widths of three digits",
-    planted=(
-        "propagation/rcs.py",
-        "np.minimum(12 * (off / width) ** 2, depth)",
-        "np.minimum(12 * (2 * off / width) ** 2, depth)",
-    ),
 )
 def cross_section_of_a_large_uav() -> float:
     """The lobes of the large UAV, averaged over the sphere (Gauss-Legendre in the cosine, even in
@@ -560,11 +473,6 @@ def cross_section_of_a_large_uav() -> float:
         "false alarm 7e-6; 300 bodies in 10 aspects 0.8 rad apart and more, taken as one "
         "independent draw per body"
     ),
-    planted=(
-        "propagation/rcs.py",
-        "np.sqrt(2 / NUM_WAVES)",
-        "np.sqrt(1 / NUM_WAVES)",
-    ),
 )
 def fluctuation_of_a_cross_section() -> float:
     """A fluctuation of 3 dB varies with this standard deviation from body to body."""
@@ -586,11 +494,6 @@ def fluctuation_of_a_cross_section() -> float:
     unit="relative",
     bound=1e-06,
     why="quadrature",
-    planted=(
-        "frame/antennas.py",
-        "exponent = max(self.gain / 2 - 1, 0.0)",
-        "exponent = max(self.gain - 1, 0.0)",
-    ),
 )
 def elements_radiate_their_power() -> float:
     """The cosine pattern of an element of 5 dBi radiates what it is given."""
@@ -611,11 +514,6 @@ def elements_radiate_their_power() -> float:
     unit="dB",
     bound=0.001,
     why="the truth is printed to a thousandth",
-    planted=(
-        "frame/level.py",
-        "BOLTZMANN * noise.temperature_k * waveform.sampling_rate *",
-        "2 * BOLTZMANN * noise.temperature_k * waveform.sampling_rate *",
-    ),
 )
 def thermal_noise() -> float:
     """Noise of a complex sample over the sampling rate of 20 MHz with a noise figure of 11.3 dB;

@@ -15,16 +15,6 @@ class Skipped(Exception):
 
 
 @dataclass(frozen=True)
-class Planted:
-    """A bug that makes a case fail: `old` replaced by `new` in `file` of the package.
-    ``tests/mutation.py --planted`` plants each one."""
-
-    file: str
-    old: str
-    new: str
-
-
-@dataclass(frozen=True)
 class Case:
     """One claim with an independent truth.
 
@@ -35,7 +25,6 @@ class Case:
     truth : what it is held against; shares no code with what is tested
     unit : of error and bound; "sigma" are standard deviations of the estimate itself
     bound, why : largest error that passes, and the reason for it
-    planted : a bug with which the case fails
     measure : returns the error
     quick : whether it belongs to the quick selection
     tracer : whether it needs the ray tracer
@@ -50,7 +39,6 @@ class Case:
     unit: str
     bound: float
     why: str
-    planted: Planted
     measure: Callable[[], float]
     quick: bool
     tracer: bool
@@ -75,7 +63,6 @@ def case(
     unit: str,
     bound: float,
     why: str,
-    planted: tuple[str, str, str],
     quick: bool = True,
     tracer: bool = False,
     package: str = "",
@@ -94,7 +81,6 @@ def case(
             unit,
             bound,
             why,
-            Planted(*planted),
             measure,
             quick,
             tracer,

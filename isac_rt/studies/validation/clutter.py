@@ -116,11 +116,6 @@ def _sum(cell: np.ndarray, waves: np.ndarray, count: int = 1200) -> np.ndarray:
     unit="rad",
     bound=1e-06,
     why="float64 delays of 100 m are good to 1e-10 rad; float32 ones to 1e-2 rad",
-    planted=(
-        "propagation/clutter/field.py",
-        "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
-        "length[row], rate[row], accel[row] = np.float32(r1 + r2), v1 + v2, a1 + a2",
-    ),
     tracer=True,
 )
 def phase_of_scatterers_in_flight() -> float:
@@ -176,11 +171,6 @@ def _separate(flight: Flight, caster: Any, place: np.ndarray) -> np.ndarray:
     bound=0.01,
     why="the separate sum switches at shadow edges, the field crosses them by the knife edge's "
     "factor",
-    planted=(
-        "propagation/clutter/field.py",
-        "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
-        "length[row], rate[row], accel[row] = 1.00001 * (r1 + r2), v1 + v2, a1 + a2",
-    ),
     tracer=True,
     quick=False,
 )
@@ -216,11 +206,6 @@ def coherence_of_the_clutter_field() -> float:
     unit="of the local rms",
     bound=0.15,
     why="asked for; sight that switches changes a cell by all of its scatterer",
-    planted=(
-        "propagation/clutter/sight.py",
-        "penumbra((q - near.where) / near.width)",
-        "1.0 * (q > near.where)",
-    ),
     tracer=True,
     quick=False,
 )
@@ -261,11 +246,6 @@ def sight_alone_changes_no_range_cell_at_once() -> float:
     unit="of the bounds",
     bound=1.0,
     why="sqrt(n) D up to 2.23 is a false-alarm rate of 1e-4; tails within four standard deviations",
-    planted=(
-        "propagation/clutter/cells.py",
-        "np.sqrt(-np.log(uniform[2])) *",
-        "np.ones_like(uniform[2]) *",
-    ),
     tracer=True,
     quick=False,
 )
@@ -303,11 +283,6 @@ def speckle_of_range_doppler_cells() -> float:
     bound=0.02,
     why="a Hann window's main lobe is four cells wide and holds all but 1e-4; speckle may leave "
     "little near the middle",
-    planted=(
-        "propagation/clutter/field.py",
-        "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
-        "length[row], rate[row], accel[row] = 1.5 * (r1 + r2), v1 + v2, a1 + a2",
-    ),
     tracer=True,
     quick=False,
 )
@@ -356,11 +331,6 @@ def _outside(flight: Flight, pulse: float = 1.013e-4, pulses: int = 64) -> float
     unit="of the bounds",
     bound=1.0,
     why="asked for: 0.05 dB for the median and for each total, 0.2 dB for nine cells of ten",
-    planted=(
-        "propagation/clutter/field.py",
-        "power *= abs(back) / np.pi",
-        "power *= 1.03 * abs(back) / np.pi",
-    ),
     tracer=True,
     quick=False,
 )

@@ -28,11 +28,6 @@ PLACES = ((-11.37, 2.13, 14.21), (17.93, -3.31, 9.67), (4.41, 1.73, 20.3))
     unit="of the sum",
     bound=0.05,
     why="their delays and phases are float32: up to 0.05 rad at 40 m",
-    planted=(
-        "propagation/raytrace.py",
-        "return amplitude, valid, faces, points\n\n    def _leg_set",
-        "return np.abs(amplitude), valid, faces, points\n\n    def _leg_set",
-    ),
     tracer=True,
 )
 def paths_of_a_canyon_against_sionna() -> float:
@@ -76,11 +71,6 @@ def paths_of_a_canyon_against_sionna() -> float:
     unit="relative",
     bound=0.01,
     why="what turns horizontal on one leg and back on the other is left out here, 0.23 % at most",
-    planted=(
-        "propagation/raytrace.py",
-        "allowed = bounces <= (self._scenario.propagation.max_bounces",
-        "allowed = bounces < (self._scenario.propagation.max_bounces",
-    ),
     tracer=True,
     quick=False,
 )
@@ -124,11 +114,6 @@ def echoes_against_sionna() -> float:
     unit="relative",
     bound=1e-06,
     why="they take the receive frequency at the sample for the phase: the same at rest; complex64",
-    planted=(
-        "signal/direct.py",
-        "phase = f_c * tau + slope * tau * (u - tau / 2)",
-        "phase = f_c * tau + slope * tau * (u + tau / 2)",
-    ),
     package="mmWrt",
 )
 def cube_against_mmwrt() -> float:
@@ -198,11 +183,6 @@ def cube_against_mmwrt() -> float:
     unit="relative",
     bound=0.0001,
     why="trapezoid over 4001 points",
-    planted=(
-        "receive/cfar.py",
-        "cell = stats.gamma(looks, scale=1 / looks)",
-        "cell = stats.gamma(looks, scale=1.1 / looks)",
-    ),
     package="mmWrt",
 )
 def cfar_against_mmwrt() -> float:
@@ -221,11 +201,6 @@ def cfar_against_mmwrt() -> float:
     unit="m",
     bound=1e-09,
     why="float64 rounding",
-    planted=(
-        "results/metrics.py",
-        "return Gospa(float(np.sqrt(square + missed + false))",
-        "return Gospa(float(np.sqrt(square + missed))",
-    ),
     package="stonesoup",
 )
 def gospa_against_stone_soup() -> float:

@@ -15,11 +15,6 @@ from isac_rt.studies.validation.case import case
     unit="words",
     bound=0,
     why="exact",
-    planted=(
-        "signal/noise.py",
-        "a, b = _mix(a, b, 15)",
-        "a, b = _mix(a, b, 16)",
-    ),
 )
 def counter_based_random_numbers() -> float:
     """The generator behind the noise gives the published words."""
@@ -37,11 +32,6 @@ def counter_based_random_numbers() -> float:
     unit="sigma",
     bound=5.0,
     why="ten statistics, each beyond 5 sigma once in 2e6",
-    planted=(
-        "signal/noise.py",
-        "c = _COS[0] + q * (",
-        "c = _COS[0] + np.float32(0.9) * q * (",
-    ),
 )
 def white_noise() -> float:
     """Power, moments, tail and whiteness of a million samples of noise."""
@@ -65,11 +55,6 @@ def white_noise() -> float:
     unit="samples",
     bound=0,
     why="bit for bit",
-    planted=(
-        "signal/noise.py",
-        "index = first + np.uint64(i)",
-        "index = np.uint64(i)",
-    ),
 )
 def noise_does_not_know_the_order_of_work() -> float:
     """A cube's noise filled in one piece and in pieces, last piece first, is the same bit for

@@ -89,11 +89,6 @@ def _dpsk_theory(order: int, snr: float, branches: int) -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5 + "; neighbouring symbols share a chirp, which at most doubles the variance",
-    planted=(
-        "receive/symbols/powers.py",
-        "product = chains[..., 1:] * chains[..., :-1].conj()",
-        "product = chains[..., 1:] * chains[:, :, :1, :-1].conj()",
-    ),
     quick=False,
 )
 def dpsk_symbol_errors() -> float:
@@ -113,11 +108,6 @@ def dpsk_symbol_errors() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
-    planted=(
-        "receive/symbols/powers.py",
-        "turn = tones(-beats[m] / w.num_samples, w.num_samples)",
-        "turn = tones(-np.floor(beats[m]) / w.num_samples, w.num_samples)",
-    ),
     quick=False,
 )
 def delay_symbol_errors() -> float:
@@ -143,11 +133,6 @@ def delay_symbol_errors() -> float:
     unit="symbols",
     bound=0,
     why="exact without noise",
-    planted=(
-        "receive/symbols/powers.py",
-        "data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay",
-        "data_phase(w, raw)",
-    ),
 )
 def data_at_the_ends_of_the_velocity() -> float:
     """Every symbol and bit of a noise-free frame, D = 2 to 16, at -29.4 and +17.3 m/s, a fraction
@@ -173,12 +158,6 @@ def data_at_the_ends_of_the_velocity() -> float:
     unit="dB over -50 dB",
     bound=0,
     why="sidelobes that the resampling may leave (isac_rt.receive.maps)",
-    planted=(
-        "receive/maps.py",
-        "resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - "
-        "grid)).T",
-        "resample = np.eye(len(times))",
-    ),
 )
 def union_of_the_groups() -> float:
     """One antenna's samples at their true, uneven times give the spectrum of even ones, for tones
@@ -207,11 +186,6 @@ def union_of_the_groups() -> float:
     unit="relative",
     bound=0.0001,
     why="single precision of the result",
-    planted=(
-        "receive/maps.py",
-        'np.einsum("vk,vkp->vp", solution, gram[support].conj())',
-        'np.einsum("vk,vkp->vp", solution, gram[support])',
-    ),
 )
 def orthogonal_matching_pursuit() -> float:
     """Batch OMP in its Gram-matrix form finds what the plain algorithm finds."""
@@ -257,11 +231,6 @@ def _greatest_of(factor: float, looks: int, cells: int, snr: float = 0.0) -> flo
     unit="of the rate",
     bound=0.001,
     why="trapezoid over 4001 points",
-    planted=(
-        "receive/cfar.py",
-        "cumulative = np.prod([s.cdf(z) for s in sides], axis=0)",
-        "cumulative = np.mean([s.cdf(z) for s in sides], axis=0)",
-    ),
 )
 def false_alarm_factor() -> float:
     """The threshold's factor gives the false-alarm rate that was asked for, from 1e-2 to 1e-6,
@@ -286,15 +255,6 @@ def false_alarm_factor() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
-    planted=(
-        "receive/cfar.py",
-        (
-            "return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, "
-            "float(looks), before, behind)"
-        ),
-        "return np.inf if before == behind == 0 else greatest_of_factor(false_alarm_rate, 1.0, "
-        "before, behind)",
-    ),
 )
 def false_alarms_along_range() -> float:
     """False alarms of the one-dimensional CFAR in noise of 15 receivers, 200,000 cells at 1e-3,
@@ -308,11 +268,6 @@ def false_alarms_along_range() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5 + "; factor by the program, whose rate has a case of its own",
-    planted=(
-        "receive/cfar.py",
-        "return power > factor[:, None] * level\n",
-        "return power > 1.1 * factor[:, None] * level\n",
-    ),
 )
 def detection_probability() -> float:
     """Share of detections of a steady target of 0 dB per receiver, 15 receivers, false-alarm rate
@@ -343,11 +298,6 @@ def _noise_cube(w: Waveform, seed: int) -> IFCube:
         "fifth; 1,200 "
         "alarms in clusters scatter by 0.06"
     ),
-    planted=(
-        "receive/cfar.py",
-        "return count**2 / (count + 2 * pairs) if count else 0.0",
-        "return count / 9 if count else 0.0",
-    ),
     quick=False,
 )
 def false_alarms_of_the_whole_chain() -> float:
@@ -373,11 +323,6 @@ def false_alarms_of_the_whole_chain() -> float:
     why=(
         "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in "
         "the cube against spheres in the receiver"
-    ),
-    planted=(
-        "receive/estimate.py",
-        "beat = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration",
-        "beat = (slope * tau - delay_rate * (carrier + slope * (middle - tau))) * duration",
     ),
     quick=False,
 )
@@ -414,11 +359,6 @@ def _loss(window: np.ndarray) -> tuple[float, float]:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5 + "; the variance of 100 frames is known to 14 %",
-    planted=(
-        "receive/estimate.py",
-        "rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)",
-        "rate_unit = w.delay_step, 30.0 / (w.frame_duration * w.effective_carrier)",
-    ),
     quick=False,
 )
 def scatter_of_range_and_velocity() -> float:
@@ -454,11 +394,6 @@ def scatter_of_range_and_velocity() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5 + "; 400 draws",
-    planted=(
-        "receive/estimate.py",
-        "apart = 1j * scale * place[: len(values)]",
-        "apart = 1.02j * scale * place[: len(values)]",
-    ),
 )
 def scatter_of_directions() -> float:
     """Direction cosines along both arms, one-way and two-way, scatter as the bound says, without
@@ -502,11 +437,6 @@ def scatter_of_directions() -> float:
         "scalloping of a path off the grid, up to 1.4 dB per axis at worst, here 0.2 and 0.1; the "
         "window is 1.7 % short"
     ),
-    planted=(
-        "frame/level.py",
-        "- 2 * 10 * np.log10(1.5)",
-        "- 10 * np.log10(1.5)",
-    ),
 )
 def processing_gain() -> float:
     """The link budget's gain from a sample to a cell of the map, against a path and noise sent
@@ -534,11 +464,6 @@ def processing_gain() -> float:
     unit="relative",
     bound=1e-05,
     why="complex64",
-    planted=(
-        "receive/clutter/filter.py",
-        "sent = schedule[m] == tx",
-        "sent = schedule[m] >= tx",
-    ),
 )
 def standing_clutter_is_removed() -> float:
     """The notch takes a standing path away and leaves a moving one, but for its own mean."""
@@ -562,11 +487,6 @@ def standing_clutter_is_removed() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
-    planted=(
-        "propagation/clutter/rayleigh.py",
-        "rng.standard_normal((count, 2)) @ np.array([1, 1j]) / np.sqrt(2)",
-        "rng.standard_normal((count, 2)) @ np.array([1, 1j])",
-    ),
 )
 def rayleigh_clutter() -> float:
     """Amplitudes of the paper's clutter are Rayleigh, on average 10 dB over the reference; 40 to 50

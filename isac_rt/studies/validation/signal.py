@@ -31,11 +31,6 @@ ORIGIN = np.zeros((1, 3))
     unit="relative",
     bound=5e-05,
     why="the settings are printed with five to seven digits",
-    planted=(
-        "frame/waveform.py",
-        "self.sampling_rate * self.sampled_duration / (self.bandwidth - 2 * self.sampling_rate)",
-        "self.sampling_rate * self.sampled_duration / self.bandwidth",
-    ),
 )
 def numbers_of_the_frame() -> float:
     """Durations, slope, cells, limits and bits of the paper's waveform."""
@@ -63,11 +58,6 @@ def numbers_of_the_frame() -> float:
     unit="violations",
     bound=0,
     why="exact",
-    planted=(
-        "frame/antennas.py",
-        "out[:, c] = rng.permutation(num_tx)[square][:num_groups]",
-        "out[:, c] = square[rng.integers(0, num_tx, num_groups)]",
-    ),
 )
 def antenna_schedule() -> float:
     """No antenna sends in two groups at once, and each sends once per cycle in every group."""
@@ -89,11 +79,6 @@ def antenna_schedule() -> float:
     unit="bits",
     bound=0,
     why="exact",
-    planted=(
-        "frame/payload.py",
-        "return symbols ^ (symbols >> 1)",
-        "return symbols ^ (symbols >> 2)",
-    ),
 )
 def bits_on_symbols() -> float:
     """Modulation and demodulation return the bits; neighbouring symbols differ in one bit."""
@@ -123,11 +108,6 @@ def bits_on_symbols() -> float:
     unit="1",
     bound=1e-12,
     why="float64 rounding of exp",
-    planted=(
-        "frame/payload.py",
-        "np.cumsum(transitions, axis=2)]",
-        "np.cumsum(transitions, axis=2)[..., ::-1]]",
-    ),
 )
 def differential_phases() -> float:
     """The phase of a chirp is that of the same antenna's chirp before it, turned by the symbol
@@ -207,11 +187,6 @@ COMPLEX64 = "samples are complex64; two roundings"
     unit="relative",
     bound=0.0001,
     why="the issue's 0.01 %; reached: " + COMPLEX64,
-    planted=(
-        "signal/direct.py",
-        "(w.slope * tau * (w.fast_time - tau / 2)) % 1",
-        "(w.slope * tau * (w.fast_time - tau)) % 1",
-    ),
 )
 def exact_model_at_rest() -> float:
     """IF samples of a line of sight between two arrays at rest, data on the chirps."""
@@ -224,11 +199,6 @@ def exact_model_at_rest() -> float:
     bound=0.0005,
     why="the issue's 0.05 %; what is left is the turning of directions within the frame, 2 pi v r "
     "t / (R lambda)",
-    planted=(
-        "signal/direct.py",
-        "t.delay[k] + t.rate[k] * time",
-        "t.delay[k] - t.rate[k] * time",
-    ),
 )
 def exact_model_in_motion() -> float:
     """IF samples of a line of sight between two arrays in flight at 12 m/s closing speed, data on
@@ -262,11 +232,6 @@ def _against_exact(
     unit="relative",
     bound=2e-07,
     why=COMPLEX64,
-    planted=(
-        "signal/direct.py",
-        "quadratic = (f_c + slope * (u - tau)) * a + slope * b * (ts - b / 2)",
-        "quadratic = (f_c + slope * (u - tau)) * a",
-    ),
     quick=False,
 )
 def direct_method() -> float:
@@ -279,11 +244,6 @@ def direct_method() -> float:
     unit="relative",
     bound=GRIDDED_ERROR,
     why="the error that the method states (isac_rt.signal.gridded.GRIDDED_ERROR)",
-    planted=(
-        "signal/gridded.py",
-        "cycles = element * (carrier - splat(slope / 2) * element)",
-        "cycles = element * (carrier - splat(slope) * element)",
-    ),
     quick=False,
 )
 def gridded_method() -> float:
@@ -297,11 +257,6 @@ def gridded_method() -> float:
     unit="relative",
     bound=GRIDDED_ERROR,
     why="never worse than its parts; the strongest paths and lines of sight go direct",
-    planted=(
-        "signal/if_signal.py",
-        "add_direct(samples, waveform, tones.select(alone), filter_transition,",
-        "add_direct(samples, waveform, tones.select(alone[::-1]), filter_transition,",
-    ),
 )
 def automatic_choice() -> float:
     """The method that runs use by default, over K = 2, 12 and 60 paths."""
@@ -383,11 +338,6 @@ BEST = (
     unit="relative",
     bound=0.0001,
     why=BEST,
-    planted=(
-        "propagation/raytrace.py",
-        "delay=(a.length[i] + b.length[j]) / SPEED_OF_LIGHT",
-        "delay=2 * a.length[i] / SPEED_OF_LIGHT",
-    ),
     tracer=True,
 )
 def mesh_to_if_at_rest() -> float:
@@ -401,11 +351,6 @@ def mesh_to_if_at_rest() -> float:
     unit="relative",
     bound=0.0005,
     why=BEST,
-    planted=(
-        "propagation/raytrace.py",
-        "delay_rate=(a.rate[i] + b.rate[j]) / SPEED_OF_LIGHT",
-        "delay_rate=a.rate[i] / SPEED_OF_LIGHT",
-    ),
     tracer=True,
 )
 def mesh_to_if_in_motion() -> float:
@@ -418,11 +363,6 @@ def mesh_to_if_in_motion() -> float:
     unit="relative",
     bound=0.001,
     why=BEST,
-    planted=(
-        "propagation/legs/geometry.py",
-        "velocity = velocity - 2 * (",
-        "velocity = velocity - 1.9 * (",
-    ),
     tracer=True,
 )
 def mesh_to_if_two_rays_in_motion() -> float:
@@ -473,11 +413,6 @@ def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
     bound=0.01,
     why="the mean over the chirp shifts both by the sweep, 0.4 %, and by the range-Doppler "
     "coupling",
-    planted=(
-        "signal/if_signal.py",
-        '"rate": s.delay_rate + s.delay_accel * later + t.clock_drift',
-        '"rate": -s.delay_rate + s.delay_accel * later + t.clock_drift',
-    ),
 )
 def signs() -> float:
     """A farther target has a higher positive beat; a closing one a negative slow-time frequency."""
@@ -497,11 +432,6 @@ def signs() -> float:
     unit="1",
     bound=0.001,
     why="a beat moves by 1e-4 of the skirt over the chirp",
-    planted=(
-        "signal/direct.py",
-        "outside = max(-beat, beat - w[7]) / w[8]",
-        "outside = max(-beat, beat - w[7]) / (2 * w[8])",
-    ),
 )
 def filter_skirts() -> float:
     """Amplitude inside the passband, a third and a half into either skirt, and outside; the
@@ -548,11 +478,6 @@ def filter_skirts() -> float:
     why=(
         "the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but "
         "for its change over the window"
-    ),
-    planted=(
-        "signal/if_signal.py",
-        "square - 2 * far * along[some]",
-        "0 * square - 2 * far * along[some]",
     ),
 )
 def spherical_waves() -> float:
@@ -602,11 +527,6 @@ def spherical_waves() -> float:
     unit="relative",
     bound=1e-06,
     why=COMPLEX64 + "; a drift of 1e-9 over half a frame",
-    planted=(
-        "signal/if_signal.py",
-        "moved + t.clock_offset",
-        "moved - t.clock_offset",
-    ),
 )
 def clock_errors() -> float:
     """A transmitter's clock that is late and slow lengthens every delay and its rate."""
@@ -632,11 +552,6 @@ def clock_errors() -> float:
     unit="relative",
     bound=1e-06,
     why=COMPLEX64,
-    planted=(
-        "signal/direct.py",
-        "or time >= end[k]",
-        "or time >= end[k] + 1e9",
-    ),
 )
 def births_and_deaths() -> float:
     """A path that dies in mid-frame leaves the later chirps empty."""
@@ -666,11 +581,6 @@ def births_and_deaths() -> float:
     unit="of the peak",
     bound=2e-06,
     why="complex64 samples and transform",
-    planted=(
-        "receive/spectrum.py",
-        "tones(shift[m] / num_samples, num_rows).T",
-        "tones(-shift[m] / num_samples, num_rows).T",
-    ),
 )
 def data_are_taken_out() -> float:
     """A modulated frame with its data removed equals the unmodulated frame, at whole and fractional
@@ -694,11 +604,6 @@ def data_are_taken_out() -> float:
     unit="relative",
     bound=1e-06,
     why=COMPLEX64,
-    planted=(
-        "signal/if_signal.py",
-        "(t.first_block - first_block) * w.group_spacing",
-        "(first_block - t.first_block) * w.group_spacing",
-    ),
 )
 def resource_blocks() -> float:
     """A receiver whose reference stands one block later than the sender's hears the sender's later

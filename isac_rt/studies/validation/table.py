@@ -21,7 +21,6 @@ def as_data(verdicts: Sequence[Verdict]) -> dict[str, object]:
     rows = []
     for v in verdicts:
         c = v.case
-        planted = {"file": c.planted.file, "old": c.planted.old, "new": c.planted.new}
         rows.append(
             {
                 "name": c.name,
@@ -35,7 +34,6 @@ def as_data(verdicts: Sequence[Verdict]) -> dict[str, object]:
                 "state": STATES[v.passed],
                 "seconds": round(v.seconds, 3),
                 "note": v.note,
-                "planted": planted,
             }
         )
     return {
@@ -60,8 +58,7 @@ def shown(value: float) -> str:
 
 
 def as_markdown(verdicts: Sequence[Verdict]) -> str:
-    """A table per group: claim, truth, error, bound and why; then how each case has been seen to
-    fail."""
+    """A table per group: claim, truth, error, bound and why."""
     data = as_data(verdicts)
     counts = f"{data['passed']} cases pass, {data['failed']} fail, {data['left_out']} were left out"
     lines = [f"{counts} ({data['date']}, {data['program']}).", ""]
@@ -89,29 +86,7 @@ def as_markdown(verdicts: Sequence[Verdict]) -> str:
                 )
                 lines.append("| " + " | ".join(_cell(str(x)) for x in cells) + " |")
         lines.append("")
-    lines += ["### Planted bugs", ""]
-    lines += [
-        "The bug with which a case is to fail; `python tests/mutation.py --planted` plants them "
-        "and looks.",
-        "",
-    ]
-    lines += ["| case | file | instead of | planted |", "|---|---|---|---|"]
-    for v in verdicts:
-        p = v.case.planted
-        lines.append(
-            "| "
-            + " | ".join(
-                _cell(x)
-                for x in (v.case.name, p.file, f"`{_one_line(p.old)}`", f"`{_one_line(p.new)}`")
-            )
-            + " |"
-        )
     return "\n".join(lines) + "\n"
-
-
-def _one_line(code: str) -> str:
-    text = " ".join(code.split())
-    return text if len(text) <= 110 else text[:60] + " ... " + text[-40:]
 
 
 def write_json(verdicts: Sequence[Verdict], file: Path) -> None:

@@ -38,11 +38,6 @@ STD = np.array([0.031, 0.083, 0.0047, 0.0061])
     unit="1",
     bound=1e-12,
     why="float64 rounding; a complex step has no error of its own",
-    planted=(
-        "terminal/tracker.py",
-        "turn = (np.eye(3) - np.outer(e, e)) / r",
-        "turn = (np.eye(3) - np.outer(e, e))",
-    ),
 )
 def jacobians_of_the_tracker() -> float:
     """Derivative of range, rate and direction with respect to the state, one-way and bistatic."""
@@ -60,11 +55,6 @@ def jacobians_of_the_tracker() -> float:
     unit="relative",
     bound=1e-09,
     why="float64 rounding, conditioned by 1e4 where the detour is short",
-    planted=(
-        "terminal/tracker.py",
-        "(2 * (length - baseline @ direction))",
-        "(2 * (length + baseline @ direction))",
-    ),
 )
 def bistatic_range() -> float:
     """Distance to a reflector from the path length and the direction of arrival."""
@@ -116,11 +106,6 @@ def _tracked(runs: int = 100, steps: int = 15) -> tuple[np.ndarray, np.ndarray]:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
-    planted=(
-        "terminal/tracker.py",
-        "acceleration_std**2 * G @ G.T",
-        "0.01 * acceleration_std**2 * G @ G.T",
-    ),
     quick=False,
 )
 def consistency_of_states() -> float:
@@ -134,11 +119,6 @@ def consistency_of_states() -> float:
     unit="sigma",
     bound=4.5,
     why=ONCE_IN_1E5,
-    planted=(
-        "terminal/tracker.py",
-        "return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))",
-        "return Gaussian(x, _symmetric(A @ P @ A.T) / 4)",
-    ),
     quick=False,
 )
 def consistency_of_innovations() -> float:
@@ -154,11 +134,6 @@ def consistency_of_innovations() -> float:
     unit="m",
     bound=1e-12,
     why="float64 rounding",
-    planted=(
-        "results/metrics.py",
-        "(len(x) - pairs) * cutoff**2 / 2",
-        "(len(x) - pairs) * cutoff**2",
-    ),
 )
 def gospa_metric() -> float:
     """GOSPA with p = 2, alpha = 2 of up to four truths and five estimates."""
@@ -183,11 +158,6 @@ def gospa_metric() -> float:
     unit="probability",
     bound=1e-09,
     why="float64 rounding",
-    planted=(
-        "results/metrics.py",
-        "beta.ppf(tail, successes, trials - successes + 1)",
-        "beta.ppf(tail, successes + 1, trials - successes + 1)",
-    ),
 )
 def binomial_intervals() -> float:
     """At either end of a Clopper-Pearson interval the outcome, or one farther out, has a chance of

@@ -1,0 +1,32 @@
+"""Who hears whom."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Link(NamedTuple):
+    """From a transmitter to a receiver; twice the same name is an active terminal's own echoes.
+
+    Examples
+    --------
+    >>> Link("AT", "PT1").passes, Link("AT", "AT").passes, str(Link("AT", "PT1"))
+    (1, 2, 'AT->PT1')
+    """
+
+    tx: str
+    rx: str
+
+    @property
+    def own(self) -> bool:
+        """Whether the receiver hears its own chirps."""
+        return self.tx == self.rx
+
+    @property
+    def passes(self) -> int:
+        """How often a wave passes the range that is reported: 2 for echoes, 1 from terminal to
+        terminal."""
+        return 2 if self.own else 1
+
+    def __str__(self) -> str:
+        return f"{self.tx}->{self.rx}"
