@@ -52,7 +52,12 @@ _INSTALL_LLVM = (
 )
 
 
-class RuntimeProblem(Exception):
+class UserError(Exception):
+    """What the user can mend: the text says what, where, the limit and the remedy. The command
+    line prints it alone and exits with 2."""
+
+
+class RuntimeProblem(UserError):
     """The ray tracer cannot run here; the text says why and what to do."""
 
 

@@ -24,6 +24,7 @@ from isac_rt.cli.console import out as _out
 from isac_rt.cli.console import table as _table
 from isac_rt.cli.console import with_progress as _with_progress
 from isac_rt.cli.interruption import Terminated, ending_soon_after_interrupt, say_interrupted
+from isac_rt.runtime import UserError
 
 if TYPE_CHECKING:
     from isac_rt.results.recorder import Results
@@ -49,7 +50,7 @@ Overrides = Annotated[
 FrameNumber = Annotated[int, typer.Option("--frame", min=0, help="Number of the frame.")]
 
 
-class InputProblem(Exception):
+class InputProblem(UserError):
     """A command's arguments do not fit the scenario."""
 
 
@@ -727,24 +728,6 @@ def _print_summary(results: Results) -> None:
     _out().print(f"paths: {found}; {number(results.summary['timing_s']['total'])} s")
 
 
-def _user_problems() -> tuple[type[BaseException], ...]:
-    """What the user can mend. Imported only once something was raised: a module that is not loaded
-    raised nothing."""
-    names = {
-        "scenario.file": "ScenarioError",
-        "world.city.materials": "CityError",
-        "runtime": "RuntimeProblem",
-        "results.files": "ResultsError",
-        "sweep": "SweepError",
-        "simulation.resume": "UnfinishedError",
-    }
-    loaded = {name: sys.modules.get(f"isac_rt.{name}") for name in names}
-    return (
-        InputProblem,
-        *(getattr(module, names[name]) for name, module in loaded.items() if module is not None),
-    )
-
-
 def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:
     if category.__module__.startswith("isac_rt"):
         _err().print(f"[yellow]warning[/] {message}", soft_wrap=True)
@@ -776,7 +759,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if text:
                 sys.stderr.write(f"{text} (see isac-rt --help)\n")
             return int(problem.exit_code)
-        if isinstance(problem, _user_problems()):
+        if isinstance(problem, UserError):
             sys.stderr.write(f"{problem}\n")
             return 2
         sys.stderr.write(

@@ -17,12 +17,13 @@ from pathlib import Path
 import xarray as xr
 
 from isac_rt.results.recorder import Results
+from isac_rt.runtime import UserError
 from isac_rt.scenario.file import to_yaml
 
 FILE = "results.nc"
 
 
-class ResultsError(Exception):
+class ResultsError(UserError):
     """Results cannot be written or read; the text says why and what to do."""
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from isac_rt.runtime import UserError
 from isac_rt.scenario.node import Key, Node, Problem, dotted
 from isac_rt.scenario.tree import Scenario
 
@@ -30,7 +31,7 @@ MAX_NODES = 200_000
 MAX_DEPTH = 40
 
 
-class ScenarioError(Exception):
+class ScenarioError(UserError):
     """The scenario cannot be used; the text is meant for the person who wrote it, one line per
     problem."""
 

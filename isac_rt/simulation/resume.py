@@ -20,6 +20,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from isac_rt.runtime import UserError
+
 FILE = "unfinished.frames"
 EVERY = 5.0
 """Least time between two entries: what a stop can cost, beside the frame at work. [s]"""
@@ -34,7 +36,7 @@ _ARRAYS = {
 }
 
 
-class UnfinishedError(Exception):
+class UnfinishedError(UserError):
     """The file holds what no run of this package wrote."""
 
 

@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from isac_rt.runtime import UserError
 from isac_rt.sweep.definition import Plan, Point
 from isac_rt.sweep.outcomes import Outcomes, pending
 
@@ -36,7 +37,7 @@ Progress = Callable[[int, int, int], None]
 """Called with points done, failed, and in all."""
 
 
-class SweepError(Exception):
+class SweepError(UserError):
     """The sweep cannot start. The text says what to do."""
 
 

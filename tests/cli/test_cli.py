@@ -133,7 +133,7 @@ def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypat
 def test_wrong_input_ends_with_2_and_one_message(
     arguments, words, scenario_file, simulation, capsys, monkeypatch, tmp_path
 ):
-    """Seen to fail with ResultsError left out of the list."""
+    """Planted bug: `class ResultsError(Exception)`."""
     monkeypatch.chdir(tmp_path)
     assert main([a.format(s=scenario_file) for a in arguments]) == 2
     said = capsys.readouterr().err

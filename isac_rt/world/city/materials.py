@@ -37,6 +37,7 @@ from typing import Literal
 
 import numpy as np
 
+from isac_rt.runtime import UserError
 from isac_rt.scenario.environment import MaterialOverride
 
 Pattern = Literal["lambertian", "directive", "backscattering"]
@@ -44,7 +45,7 @@ VACUUM_PERMITTIVITY = 8.8541878128e-12
 """[F/m]"""
 
 
-class CityError(Exception):
+class CityError(UserError):
     """The city cannot be built from what the scenario says; the text says what, where and what to
     do."""
 
