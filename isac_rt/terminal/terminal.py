@@ -2,20 +2,15 @@
 the truth.
 
 A terminal knows its own pose, the waveform, the antennas and their schedule, the transmit power,
-which frames carry data, and, at the active terminal, its own payload. `python -m
-isac_rt.terminal.terminal CAPTURE.npz OUT.npz` runs one on a file that holds nothing else.
+which frames carry data, and, at the active terminal, its own payload.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from enum import IntEnum
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -351,103 +346,3 @@ def _without_reference(reception: Reception) -> Reception:
         raw_delay_symbols=np.zeros((0, reception.raw_delay_symbols.shape[1]), int),
         line_of_sight=False,
     )
-
-
-def save_capture(
-    path: Path | str,
-    cubes: list[IFCube],
-    own_poses: list[Pose],
-    times: list[float],
-    modulated: list[bool],
-    antennas: Antennas,
-    receivers: Receivers,
-    tracking: Tracking,
-    dpsk_order: int,
-    transmit_amplitude: float,
-    payloads: list[Payload] | None = None,
-) -> None:
-    """Samples and public parameters of successive frames of one terminal in one .npz file.
-
-    `payloads` are the terminal's own, at the active terminal; a passive terminal's file has none.
-    """
-    public = {
-        "waveform": asdict(cubes[0].waveform),
-        "antennas": asdict(antennas),
-        "receivers": receivers.model_dump(mode="json"),
-        "tracking": tracking.model_dump(mode="json"),
-        "dpsk_order": dpsk_order,
-        "transmit_amplitude": transmit_amplitude,
-        "active": payloads is not None,
-    }
-    arrays: dict[str, Any] = {
-        "samples": np.stack([c.samples for c in cubes]),
-        "schedule": cubes[0].schedule,
-    }
-    arrays |= {
-        "start": np.array([c.start_time for c in cubes]),
-        "time": np.array(times),
-        "modulated": np.array(modulated),
-    }
-    for name in ("position", "velocity", "acceleration", "rotation"):
-        arrays[f"own_{name}"] = np.stack([getattr(p, name) for p in own_poses])
-    for i, p in enumerate(payloads or []):
-        arrays |= {f"payload{i}_{name}": value for name, value in vars(p).items()}
-    np.savez(path, public=np.array(json.dumps(public)), **arrays)
-
-
-def replay(path: Path | str) -> dict[str, Any]:
-    """Run a terminal on a capture alone: detections, symbols, bits and tracks of every frame, as
-    flat named arrays."""
-    with np.load(path) as file:
-        data = {name: file[name] for name in file.files}
-    public = json.loads(str(data["public"]))
-    w, antennas = Waveform(**public["waveform"]), Antennas(**public["antennas"])
-    receivers, tracking = (
-        Receivers.model_validate(public["receivers"]),
-        Tracking.model_validate(public["tracking"]),
-    )
-    active = ActiveTerminal(w, antennas, receivers, tracking)
-    passive = PassiveTerminal(
-        w, antennas, receivers, tracking, public["dpsk_order"], public["transmit_amplitude"]
-    )
-    out: dict[str, np.ndarray] = {}
-    for i, time in enumerate(data["time"].tolist()):
-        cube = IFCube(
-            samples=data["samples"][i],
-            waveform=w,
-            schedule=data["schedule"],
-            start_time=float(data["start"][i]),
-        )
-        own = Pose(
-            *(
-                data[f"own_{name}"][i]
-                for name in ("position", "velocity", "acceleration", "rotation")
-            )
-        )
-        if public["active"]:
-            names = ("bits", "delay_symbols", "transitions", "phases")
-            payload = Payload(*(data[f"payload{i}_{name}"] for name in names))
-            reception, tracks = active.step(cube, payload, own, time)
-        else:
-            reception, tracks = passive.step(cube, own, time, bool(data["modulated"][i]))
-        out |= flat(i, reception, tracks)
-    return out
-
-
-def flat(frame: int, reception: Reception, tracks: TrackSet) -> dict[str, np.ndarray]:
-    """One frame's outcome as named arrays, for comparing runs bit by bit."""
-    d, names = reception.detections, ("delay_symbols", "transitions", "bits", "delay_confidence")
-    out = {f"{frame}/{name}": np.asarray(getattr(reception, name)) for name in names}
-    out |= {f"{frame}/det_{name}": np.asarray(value) for name, value in vars(d).items()}
-    return out | {
-        f"{frame}/track_{name}": np.asarray(value) for name, value in vars(tracks).items()
-    }
-
-
-def main() -> None:
-    capture, target = sys.argv[1:]
-    np.savez(target, **replay(capture))
-
-
-if __name__ == "__main__":
-    main()

@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import captures
 import numpy as np
 import pytest
+from captures import Step, flat, save_capture
 
 from isac_rt.propagation import PathKind
 from isac_rt.results.files import load as open_results
@@ -17,7 +19,7 @@ from isac_rt.results.files import save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.terminal.terminal import PassiveTerminal, flat, save_capture
+from isac_rt.terminal.terminal import PassiveTerminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FRAMES = {"frames": 6}
@@ -100,46 +102,22 @@ def test_receivers_use_no_truth(tmp_path):
     live = PassiveTerminal(
         setup.waveform, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0
     )
-    cubes, poses, expected = [], [], {}
+    steps, expected = [], {}
     for frame in range(3):
         now, paths = setup.trace(frame)
-        cubes.append(
-            setup.receive_samples(
-                frame, ("AT", "PT1"), {"AT": setup.transmission("AT", frame, now["AT"])}, paths, now
-            )
-        )
-        poses.append(now["PT1"])
-        expected |= flat(
-            frame,
-            *live.step(
-                cubes[-1],
+        sent = {"AT": setup.transmission("AT", frame, now["AT"])}
+        steps.append(
+            Step(
+                setup.receive_samples(frame, ("AT", "PT1"), sent, paths, now),
                 now["PT1"],
                 setup.timetable.epoch(frame),
                 setup.timetable.modulated(frame),
-            ),
+            )
         )
-    times, modulated = (
-        [setup.timetable.epoch(f) for f in range(3)],
-        [setup.timetable.modulated(f) for f in range(3)],
-    )
+        expected |= flat(frame, *live.step(*steps[-1][:4]))
     file, out = tmp_path / "capture.npz", tmp_path / "out.npz"
-    save_capture(
-        file,
-        cubes,
-        poses,
-        times,
-        modulated,
-        setup.antennas,
-        scenario.receivers,
-        scenario.tracking,
-        8,
-        1.0,
-    )
-    subprocess.run(
-        [sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)],
-        check=True,
-        timeout=300,
-    )
+    save_capture(file, steps, setup.antennas, scenario.receivers, scenario.tracking)
+    subprocess.run([sys.executable, captures.__file__, file, out], check=True, timeout=300)
     with np.load(out) as found:
         assert expected["2/bits"].size
         for name, value in expected.items():

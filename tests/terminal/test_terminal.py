@@ -7,21 +7,17 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import captures
 import numpy as np
 import pytest
+from captures import Step, flat, save_capture
 from receiver_cubes import ANTENNAS, Path, cube
 
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.receivers import Receivers, Tracking
-from isac_rt.terminal.terminal import (
-    ActiveTerminal,
-    PassiveTerminal,
-    TerminalState,
-    flat,
-    save_capture,
-)
+from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)
@@ -173,37 +169,22 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
         heard(f, [replace(sight(f), length=scale * sight(f).length, departure=ARRIVAL)], f > 1)
         for f in range(4)
     ]
-    poses, times = [OWN] * 4, [f * INTERVAL for f in range(4)]
     live = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
+    steps = [
+        Step(samples, OWN, f * INTERVAL, f > 1, payload if active else None)
+        for f, (samples, payload) in enumerate(frames)
+    ]
     expected = {}
     for f, (samples, payload) in enumerate(frames):
         if isinstance(live, ActiveTerminal):
-            outcome = live.step(samples, payload, OWN, times[f])
+            outcome = live.step(samples, payload, OWN, f * INTERVAL)
         else:
-            outcome = live.step(samples, OWN, times[f], f > 1)
+            outcome = live.step(samples, OWN, f * INTERVAL, f > 1)
         expected |= flat(f, *outcome)
     assert len(outcome[0].detections)
     file, out = tmp_path / "capture.npz", tmp_path / "out.npz"
-    payloads = [p for _, p in frames] if active else None
-    modulated = [f > 1 for f in range(4)]
-    save_capture(
-        file,
-        [c for c, _ in frames],
-        poses,
-        times,
-        modulated,
-        ANTENNAS,
-        Receivers(),
-        Tracking(),
-        8,
-        1.0,
-        payloads,
-    )
-    subprocess.run(
-        [sys.executable, "-m", "isac_rt.terminal.terminal", str(file), str(out)],
-        check=True,
-        timeout=120,
-    )
+    save_capture(file, steps, ANTENNAS, Receivers(), Tracking())
+    subprocess.run([sys.executable, captures.__file__, file, out], check=True, timeout=120)
     with np.load(out) as found:
         assert sorted(found.files) == sorted(expected)
         for name, value in expected.items():
