@@ -73,6 +73,7 @@ mutation: setup
 	@$(BIN)/python tests/mutation.py --sample 60 --seed 1
 
 lint: venv
+	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 

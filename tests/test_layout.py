@@ -122,10 +122,11 @@ def test_importing_the_package_starts_no_ray_tracer():
     assert done.stdout.strip() == "[]"
 
 
-def test_style():
-    """Planted bug: an unused import."""
+@pytest.mark.parametrize("how", [("check",), ("format", "--check")], ids=" ".join)
+def test_style(how):
+    """Planted bug: an unused import; a line that the formatter would break."""
     done = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "."],
+        [sys.executable, "-m", "ruff", *how, "."],
         capture_output=True,
         text=True,
         cwd=PACKAGE.parent,
