@@ -5,61 +5,89 @@
     results = irt.run(scenario)
 
 Every stage is callable by itself: `trace`, `if_signal`, `receive_active`, `receive_passive`. Names
-are imported on first use, so that `import isac_rt` starts neither Sionna nor the JIT.
+are imported on first use, so that `import isac_rt` starts neither Sionna nor the JIT. Editors and
+type checkers read the imports; at run time `_NAMES` says the same.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-_HOME = {
-    "load": "scenario.file",
-    "to_yaml": "scenario.file",
-    "Scenario": "scenario.tree",
-    "prepare": "simulation.setup",
-    "run": "simulation.simulate",
-    "trace": "simulation.setup",
-    "if_signal": "signal.if_signal",
-    "range_profiles": "signal.if_signal",
-    "add_noise": "signal.if_signal",
-    "Transmission": "frame.cube",
-    "IFCube": "frame.cube",
-    "receive_active": "receive",
-    "receive_passive": "receive",
-    "Reception": "receive",
-    "Detections": "receive",
-    "Prediction": "receive",
-    "ActiveTerminal": "terminal.terminal",
-    "PassiveTerminal": "terminal.terminal",
-    "standard_terminal": "simulation.simulate",
-    "city_of": "world.area",
-    "scene_3d": "views.interactive",
-    "animate": "views.animate",
-    "write_animation": "views.animate",
-    "save_cube": "views.interchange",
-    "load_cube": "views.interchange",
-    "write_sigmf": "views.interchange",
-    "read_sigmf": "views.interchange",
-    "from_sionna": "views.interchange",
-    "stonesoup_detections": "views.interchange",
-    "PathSet": "propagation.pathset",
-    "PathKind": "propagation.pathset",
-    "Results": "results.recorder",
-    "save": "results.files",
-    "open_results": "results.files",
-    "load_sweep": "sweep",
-    "run_sweep": "sweep",
-    "open_sweep": "sweep",
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from isac_rt.frame.cube import IFCube as IFCube
+    from isac_rt.frame.cube import Transmission as Transmission
+    from isac_rt.frame.waveform import Waveform as Waveform
+    from isac_rt.propagation.pathset import PathKind as PathKind
+    from isac_rt.propagation.pathset import PathSet as PathSet
+    from isac_rt.receive import Detections as Detections
+    from isac_rt.receive import Prediction as Prediction
+    from isac_rt.receive import Reception as Reception
+    from isac_rt.receive import receive_active as receive_active
+    from isac_rt.receive import receive_passive as receive_passive
+    from isac_rt.results.files import open_results as open_results
+    from isac_rt.results.files import save as save
+    from isac_rt.results.recorder import Results as Results
+    from isac_rt.scenario.file import load as load
+    from isac_rt.scenario.file import to_yaml as to_yaml
+    from isac_rt.scenario.tree import Scenario as Scenario
+    from isac_rt.signal.if_signal import add_noise as add_noise
+    from isac_rt.signal.if_signal import if_signal as if_signal
+    from isac_rt.signal.if_signal import range_profiles as range_profiles
+    from isac_rt.simulation.setup import prepare as prepare
+    from isac_rt.simulation.setup import trace as trace
+    from isac_rt.simulation.simulate import run as run
+    from isac_rt.simulation.simulate import standard_terminal as standard_terminal
+    from isac_rt.sweep import load_sweep as load_sweep
+    from isac_rt.sweep import open_sweep as open_sweep
+    from isac_rt.sweep import run_sweep as run_sweep
+    from isac_rt.terminal.terminal import ActiveTerminal as ActiveTerminal
+    from isac_rt.terminal.terminal import PassiveTerminal as PassiveTerminal
+    from isac_rt.views.animate import animate as animate
+    from isac_rt.views.animate import write_animation as write_animation
+    from isac_rt.views.interactive import scene_3d as scene_3d
+    from isac_rt.views.interchange import from_sionna as from_sionna
+    from isac_rt.views.interchange import load_cube as load_cube
+    from isac_rt.views.interchange import read_sigmf as read_sigmf
+    from isac_rt.views.interchange import save_cube as save_cube
+    from isac_rt.views.interchange import stonesoup_detections as stonesoup_detections
+    from isac_rt.views.interchange import write_sigmf as write_sigmf
+    from isac_rt.world.area import city_of as city_of
+
+_NAMES = {
+    "frame.cube": "IFCube Transmission",
+    "frame.waveform": "Waveform",
+    "propagation.pathset": "PathKind PathSet",
+    "receive": "Detections Prediction Reception receive_active receive_passive",
+    "results.files": "open_results save",
+    "results.recorder": "Results",
+    "scenario.file": "load to_yaml",
+    "scenario.tree": "Scenario",
+    "signal.if_signal": "add_noise if_signal range_profiles",
+    "simulation.setup": "prepare trace",
+    "simulation.simulate": "run standard_terminal",
+    "sweep": "load_sweep open_sweep run_sweep",
+    "terminal.terminal": "ActiveTerminal PassiveTerminal",
+    "views.animate": "animate write_animation",
+    "views.interactive": "scene_3d",
+    "views.interchange": "from_sionna load_cube read_sigmf save_cube "
+    "stonesoup_detections write_sigmf",
+    "world.area": "city_of",
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = sorted(_HOME)
+__all__ = sorted([*_HOME, "__version__"])
 
 
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module 'isac_rt' has no attribute {name!r}")
-    home = import_module(f"isac_rt.{_HOME[name]}")
-    return getattr(home, "load" if name == "open_results" else name)
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for an object
+
+    def __getattr__(name: str):
+        if name not in _HOME:
+            raise AttributeError(f"module 'isac_rt' has no attribute {name!r}")
+        home = import_module(f"isac_rt.{_HOME[name]}")
+        return getattr(home, name)
 
 
 def __dir__() -> list[str]:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
+import isac_rt
 from isac_rt.cli.console import err as _err
 from isac_rt.cli.console import out as _out
 from isac_rt.cli.console import table as _table
@@ -37,7 +38,6 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Integrated sensing and communication of a UAV swarm over a ray-traced city.",
 )
 
 ScenarioFile = Annotated[
@@ -48,6 +48,29 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Replace a key, as in radio.groups=2."),
 ]
 FrameNumber = Annotated[int, typer.Option("--frame", min=0, help="Number of the frame.")]
+
+
+def _print_versions(wanted: bool) -> None:
+    if wanted:
+        from isac_rt.results.provenance import versions
+
+        under = ", ".join(
+            f"{name} {number}" for name, number in versions().items() if name != "isac_rt"
+        )
+        typer.echo(f"isac-rt {isac_rt.__version__} ({under})")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_versions, is_eager=True, help="Print the versions and end."
+        ),
+    ] = False,
+) -> None:
+    """Integrated sensing and communication of a UAV swarm over a ray-traced city."""
 
 
 class InputProblem(UserError):
@@ -653,9 +676,9 @@ def animate(
     ] = 5.0,
 ) -> None:
     """Draw a run as a moving picture: the swarm with tracks, and a range-Doppler map, in step."""
-    from isac_rt.results.files import load as load_results
+    from isac_rt.results.files import open_results
 
-    results = load_results(folder)
+    results = open_results(folder)
     names = [str(name) for name in results.dataset.observer.values]
     if observer is not None and observer not in names:
         raise InputProblem(

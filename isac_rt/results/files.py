@@ -92,7 +92,7 @@ def check_folder(folder: str | Path) -> None:
     probe.unlink(missing_ok=True)
 
 
-def load(folder: str | Path) -> Results:
+def open_results(folder: str | Path) -> Results:
     """Results that `save` wrote into `folder`.
 
     Raises

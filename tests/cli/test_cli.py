@@ -179,6 +179,13 @@ def test_view_draws_a_picture(scenario_file, simulation, tmp_path):
     assert imread(tmp_path / "v.png")[..., :3].var() > 1e-3
 
 
+def test_version_names_the_program_and_what_is_under_it(capsys):
+    assert main(["--version"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"isac-rt {isac_rt.__version__} (python 3.")
+    assert "sionna-rt" in said and said.count("\n") == 1
+
+
 def test_schema_is_json_schema(capsys):
     assert main(["schema"]) == 0
     assert "swarm" in json.loads(capsys.readouterr().out)["properties"]

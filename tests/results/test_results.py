@@ -15,7 +15,7 @@ from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.results import provenance
 from isac_rt.results.dataset import errors_of
-from isac_rt.results.files import ResultsError, check_folder, load, save
+from isac_rt.results.files import ResultsError, check_folder, open_results, save
 from isac_rt.results.metrics import SensingScore, resolutions
 from isac_rt.results.records import KINDS
 from isac_rt.scenario.file import to_yaml
@@ -66,7 +66,7 @@ def test_round_trip_is_bit_exact(tmp_path, detections):
     ragged dimension."""
     made = fake_run(detections=detections)
     save(made, tmp_path / "a" / "b")
-    back = load(tmp_path / "a" / "b")
+    back = open_results(tmp_path / "a" / "b")
     _same(made.dataset, back.dataset)
     assert back.summary == json.loads(json.dumps(made.summary)) and to_yaml(
         back.scenario
@@ -236,14 +236,14 @@ def test_bad_folders_get_one_message(tmp_path, run):
     for call in (
         lambda: save(run, tmp_path / "file"),
         lambda: check_folder(tmp_path / "file" / "deeper"),
-        lambda: load(tmp_path / "none"),
+        lambda: open_results(tmp_path / "none"),
     ):
         with pytest.raises(ResultsError) as caught:
             call()
         assert "\n" not in str(caught.value)
     (tmp_path / "results.nc").write_text("not a NetCDF file")
     with pytest.raises(ResultsError):
-        load(tmp_path)
+        open_results(tmp_path)
     check_folder(tmp_path / "fine")
     assert not list((tmp_path / "fine").iterdir())
 

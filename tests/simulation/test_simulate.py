@@ -14,8 +14,7 @@ import pytest
 from captures import Step, flat, save_capture
 
 from isac_rt.propagation import PathKind
-from isac_rt.results.files import load as open_results
-from isac_rt.results.files import save
+from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
