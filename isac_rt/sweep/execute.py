@@ -7,6 +7,7 @@ killed takes nothing with it that was finished.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import traceback
@@ -18,7 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from isac_rt.runtime import UserError
+from isac_rt.runtime import UserError, available_memory
 from isac_rt.sweep.definition import Plan, Point
 from isac_rt.sweep.outcomes import Outcomes, pending
 
@@ -118,9 +119,8 @@ def _limit_tracer(threads: int) -> None:
 
 def default_workers() -> int:
     """One for each core, as long as there is memory for them."""
-    import psutil
-
-    return max(1, min(os.cpu_count() or 1, int(psutil.virtual_memory().available / WORKER_BYTES)))
+    free = available_memory() or math.inf
+    return int(max(1, min(os.cpu_count() or 1, free // WORKER_BYTES)))
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,15 @@ class Pose:
     acceleration: np.ndarray
     rotation: np.ndarray
 
+    @classmethod
+    def at_rest(
+        cls,
+        position: Sequence[float] | np.ndarray = (0, 0, 0),
+        boresight: Sequence[float] | np.ndarray = (0, 1, 0),
+    ) -> Pose:
+        """A body that hovers at a place [m], turned towards `boresight` with its roll level."""
+        return cls(np.array(position, float), np.zeros(3), np.zeros(3), attitude(boresight))
+
     def to_body(self, direction: np.ndarray) -> np.ndarray:
         """World vectors (..., 3) in body axes."""
         return direction @ self.rotation
@@ -36,7 +46,7 @@ class Pose:
         return direction @ self.rotation.T
 
 
-def attitude(boresight: np.ndarray) -> np.ndarray:
+def attitude(boresight: Sequence[float] | np.ndarray) -> np.ndarray:
     """Rotation whose Y column is `boresight` and whose Z column is as near to up as it can be.
 
     A vertical boresight leaves the roll open: then X is east.

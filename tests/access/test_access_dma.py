@@ -22,7 +22,7 @@ from isac_rt.world.swarm import Pose
 C = SPEED_OF_LIGHT
 W = Waveform()
 SKIRT = 0.4e6
-STILL = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+STILL = Pose.at_rest()
 
 
 def sight(w, length, speed, gain=1.0, start=0.0):

@@ -125,7 +125,7 @@ def received(w, antennas, forward, time, offset, held, seed, snr):
         tx="A",
         rx="B",
     )
-    still = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+    still = Pose.at_rest()
     s = 1 if forward else -1
     sent = Transmission(
         name="A",

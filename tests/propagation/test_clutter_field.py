@@ -15,11 +15,11 @@ from oracles import splitmix64
 from scipy import stats
 from scipy.integrate import dblquad
 
-from isac_rt import scenario
+from isac_rt import randomness, scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, make_propagation
-from isac_rt.propagation.clutter.cells import Density, _mixed, cut
+from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.randomness import seed_sequence
 from isac_rt.world.city import City, Material, load_city
@@ -125,7 +125,7 @@ def test_hash_of_cells_is_splitmix64():
     assert published == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
     rng = np.random.default_rng(3)
     states, words = rng.integers(2**64, size=(2, 50), dtype=np.uint64)
-    assert _mixed(states, words).tolist() == [
+    assert randomness.splitmix64(states, words).tolist() == [
         splitmix64(int(s), int(w)) for s, w in zip(states, words, strict=True)
     ]
 

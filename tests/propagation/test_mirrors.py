@@ -72,7 +72,7 @@ def facets(normals, offsets, materials) -> City:
 
 
 def still(*position: float) -> Pose:
-    return Pose(np.array(position), np.zeros(3), np.zeros(3), np.eye(3))
+    return Pose.at_rest(position)
 
 
 def amplitude(

@@ -27,7 +27,7 @@ from isac_rt.signal.gridded import (
     add_plain,
 )
 from isac_rt.signal.if_signal import _tones
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 SKIRT = 0.41e6
 SETTINGS = [
@@ -112,7 +112,7 @@ def scene(count, rng, speed=15.0, view=60.0, **change):
     L of 15 elements."""
     w = replace(Waveform(), **({"num_chirps": 6} | change))
     array = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
-    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.1, 1.0, 0.05])))
+    pose = Pose.at_rest(boresight=[0.1, 1.0, 0.05])
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     sender = Transmission(
         name="A",

@@ -18,7 +18,7 @@ from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.direct import exact
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.if_signal import _tones, if_signal
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
 START = 3.217
@@ -40,7 +40,7 @@ def antennas(w, **change):
 
 
 def pose(x, y, z):
-    return Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([x, y, z])))
+    return Pose.at_rest(boresight=[x, y, z])
 
 
 def sender(w, rng, *, data=True, **change):

@@ -22,11 +22,11 @@ from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.simulation.simulate import run
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 SKIRT = 0.41e6
 SCENES = Path(__file__).parents[2] / "scenes"
-POSE = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.1, 1.0, 0.05])))
+POSE = Pose.at_rest(boresight=[0.1, 1.0, 0.05])
 
 
 def sender(w: Waveform, name: str, seed: int, **more) -> Transmission:

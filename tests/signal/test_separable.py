@@ -31,7 +31,7 @@ def misfit(
     w, rng = Waveform(), np.random.default_rng(8)
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, 8, rng) if data else unmodulated(w)
-    still = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+    still = Pose.at_rest()
     sent = Transmission(name="A", pose=still, antennas=ONE, schedule=schedule, payload=payload)
     ahead = np.array([[aside[0], np.sqrt(1 - aside[0] ** 2 - aside[1] ** 2), aside[1]]])
     path = make_paths(

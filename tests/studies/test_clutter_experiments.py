@@ -27,7 +27,7 @@ from isac_rt.studies.paper.clutter import (
 )
 from isac_rt.studies.paper.clutter_statistics import statistics
 from isac_rt.studies.paper.detectors import RATE, Tally, summarise
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 W = Waveform()
 
@@ -65,7 +65,7 @@ def test_symbols_without_clutter_have_the_known_error_rate():
     DPSK decision."""
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * W.wavelength)
     schedule = pseudo_random_schedule(3, 120, 3, np.random.default_rng(2))
-    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
+    pose = Pose.at_rest()
 
     def flying(place: str, speed: float) -> Pose:
         return Pose(pose.position, np.array([0.0, speed, 0.0]), np.zeros(3), pose.rotation)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isac_rt.randomness import seed_sequence
+from isac_rt.randomness import seed_sequence, splitmix64
 from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import City
 
@@ -145,7 +145,7 @@ def cut(
     rows, codes, areas, triangles = (np.concatenate(part) for part in zip(*leaves, strict=True))
     order = np.lexsort([codes, rows])
     rows, codes, areas, triangles = rows[order], codes[order], areas[order], triangles[order]
-    point, amplitude = _draw(_mixed(state[rows], codes), triangles)
+    point, amplitude = _draw(splitmix64(state[rows], codes), triangles)
     return Cells(point, areas.astype(np.float32), amplitude, face[rows].astype(np.int32))
 
 
@@ -181,34 +181,22 @@ def _halves(corners: np.ndarray) -> np.ndarray:
     ).reshape(-1, 3, 3)
 
 
-def _mixed(state: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Hash (N,) uint64 with one more word: the finaliser of splitmix64."""
-    with np.errstate(over="ignore"):
-        state = state + (word + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return state ^ (state >> np.uint64(31))
-
-
 def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
     """(F,) uint64 hash of the seed and the world coordinates of (F, 3, 3) sorted corners."""
     start = seed_sequence(seed, "scatterers").generate_state(1, np.uint64)[0]
     state = np.full(len(corners), start, np.uint64)
     words = np.rint(corners.reshape(-1, 9) / UNIT).astype(np.int64).view(np.uint64)
     for word in words.T:
-        state = _mixed(state, word)
+        state = splitmix64(state, word)
     return state
 
 
 def _draw(state: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A point, uniform in each triangle (N, 3, 3), and a complex Gaussian amplitude of unit
     power."""
-    uniform = [
-        ((_mixed(state, np.full_like(state, k)) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
-        for k in range(4)
-    ]
-    root = np.sqrt(uniform[0])[:, None]
-    share = uniform[1][:, None]
+    words = np.arange(4, dtype=np.uint64)[:, None]
+    uniform = ((splitmix64(state, words) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
+    root, share = np.sqrt(uniform[0])[:, None], uniform[1][:, None]
     a, b, c = np.moveaxis(triangles, 1, 0)
     point = (1 - root) * a + root * ((1 - share) * b + share * c)
     amplitude = np.sqrt(-np.log(uniform[2])) * np.exp(2j * np.pi * uniform[3])

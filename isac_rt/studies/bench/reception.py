@@ -30,7 +30,7 @@ from isac_rt.receive.types import Detections, Prediction
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 SIZES = (1, 4, 8)
 QUICK_SIZES = (4,)
@@ -42,7 +42,7 @@ def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
     of the first."""
     rng, w = np.random.default_rng(count), Waveform()
     antennas = Antennas(tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
-    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
+    pose = Pose.at_rest()
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, _DPSK, rng)
     sender = Transmission(

@@ -28,7 +28,7 @@ from isac_rt.signal.gridded import ACCURATE, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import Method, if_signal, range_profiles
 from isac_rt.signal.noise import add_white_noise
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 SIZES = (3, 30, 1000, 10_000, 50_000, 200_000)
 QUICK_SIZES = (3, 1000)
@@ -65,7 +65,7 @@ class Job:
         self.antennas = Antennas(
             tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength
         )
-        self.pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0.0, 1.0, 0.0])))
+        self.pose = Pose.at_rest()
         schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
         payload = random_payload(w, schedule, 8, rng)
         self.sender = Transmission(

@@ -30,7 +30,7 @@ from isac_rt.studies.paper.outcome import Progress, Verdict, proportion
 from isac_rt.world.swarm import Pose
 
 SKIRT = onepath.FILTER_TRANSITION
-STILL = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+STILL = Pose.at_rest()
 KEPT_DB = 20.0
 """A neighbour this far down counts as kept out."""
 

@@ -23,7 +23,7 @@ from isac_rt.studies.paper.claims_signal import SPACING, prediction
 from isac_rt.studies.paper.outcome import Progress, Verdict, proportion
 from isac_rt.world.swarm import Pose
 
-STILL = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+STILL = Pose.at_rest()
 SNR_DB = 0.0
 CLOSE = 0.1
 """Share of a resolution within which a direction must be found: an alias of the velocity turns the

@@ -165,7 +165,7 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
         tx="AT",
         rx="AT" if case.passes == 2 else "PT",
     )
-    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+    pose = Pose.at_rest()
     sent = Transmission(name="AT", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
     method: Method = "auto" if case.clutter else "direct"
     return if_signal(

@@ -60,7 +60,7 @@ def frame(
         tx="sender",
         rx="receiver",
     )
-    pose = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+    pose = Pose.at_rest()
     sent = Transmission(
         name="sender",
         pose=pose,

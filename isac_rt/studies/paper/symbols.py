@@ -31,7 +31,7 @@ from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import Method, if_signal
 from isac_rt.studies.paper.montecarlo import Counts, Curve, Precision, sample
 from isac_rt.studies.paper.outcome import Progress
-from isac_rt.world.swarm import Pose, attitude
+from isac_rt.world.swarm import Pose
 
 PLACE = np.array([-8.0, 8.0, 0.0])
 """PT1 from the AT in the first frame of Table II [m]."""
@@ -132,8 +132,8 @@ def draw_frame(link: Link, seed: int, index: int) -> Frame:
     payload = Payload(
         np.zeros(0, np.uint8), symbols, np.zeros(shape, int), np.ones((1, w.num_chirps), complex)
     )
-    tx = Pose(np.zeros(3), np.zeros(3), np.zeros(3), attitude(np.array([0, 1, 0])))
-    rx = Pose(length * direction, np.zeros(3), np.zeros(3), attitude(np.array([0, -1, 0])))
+    tx = Pose.at_rest()
+    rx = Pose.at_rest(length * direction, (0, -1, 0))
     sent = Transmission(name="AT", pose=tx, antennas=antennas, schedule=schedule, payload=payload)
     method: Method = "auto" if link.clutter else "direct"
     cube = if_signal(

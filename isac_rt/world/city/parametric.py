@@ -6,19 +6,15 @@ import numpy as np
 import shapely
 
 from isac_rt import scenario
+from isac_rt.randomness import splitmix64
 from isac_rt.world.city.extrude import building, ground
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 
 
 def spread_fraction(i: int, j: int) -> float:
-    """A number in [0, 1) that depends on the index of a building alone, not on a seed: splitmix64
-    of the pair."""
-    mask = (1 << 64) - 1
-    z = (0x9E3779B97F4A7C15 * (1 + (i << 32) + j)) & mask
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
-    return (z ^ (z >> 31)) / 2**64
+    """A number in [0, 1) that depends on the index of a building alone, not on a seed."""
+    return int(splitmix64(np.zeros(1, np.uint64), np.array([(i << 32) + j], np.uint64))[0]) / 2**64
 
 
 def _height(city: scenario.City, i: int, j: int) -> float:
