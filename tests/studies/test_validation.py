@@ -22,7 +22,7 @@ PACKAGE = Path(isac_rt.studies.validation.__file__).parent
 CASES = all_cases()
 
 
-@case(truth="zero", unit="m", bound=0.5, why="one half")
+@case("zero", "0.5 m", "one half")
 def a_case() -> float:
     """A claim | with a bar."""
     return 0.25

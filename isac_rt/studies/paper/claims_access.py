@@ -92,10 +92,8 @@ def blocks(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
             "Blocks 2 T_d apart do not interfere once low-pass filtered",
             "holds" if table.power_db.min() > 40 else "does not hold",
             "power of a neighbour with data after mixing and filtering, below that of the same "
-            f"block, by spacing: {text}; at least "
-            f"{table.peak_db.min():.0f} dB in the strongest cell of a Hann-windowed range "
-            "spectrum. What is left lies at the edges of "
-            "the chirps",
+            f"block, by spacing: {text}; at least {table.peak_db.min():.0f} dB in the strongest "
+            "cell of a Hann-windowed range spectrum. What is left lies at the edges of the chirps",
         ),
         Verdict(
             "A slot holds floor(T/2T_d) resource blocks",
@@ -147,14 +145,12 @@ def tolerance(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]
         Verdict(
             "The interval of 2 T_d tolerates synchronisation errors",
             "holds under a condition",
-            f"a terminal of the next block is received from an error of {texts[0]} T_d on when its "
-            "data and path delays together are "
-            f"{', '.join(f'{c:.0f}' for c in early)} cells of {w.num_samples}, one of the block "
-            f"before from {texts[1]} T_d on "
-            f"(isolation below {KEPT_DB:.0f} dB; steps of {grid[1] - grid[0]:.3f} T_d): towards "
-            "each other T_d plus the delay and "
-            "2 T_d less the delay, so T_d for sure and not 2 T_d; away from each other any error "
-            "until the next occupied block",
+            f"a terminal of the next block is received from an error of {texts[0]} T_d on when "
+            f"its data and path delays together are {', '.join(f'{c:.0f}' for c in early)} cells "
+            f"of {w.num_samples}, one of the block before from {texts[1]} T_d on (isolation below "
+            f"{KEPT_DB:.0f} dB; steps of {grid[1] - grid[0]:.3f} T_d): towards each other T_d "
+            "plus the delay and 2 T_d less the delay, so T_d for sure and not 2 T_d; away from "
+            "each other any error until the next occupied block",
         ),
     )
 
@@ -413,9 +409,8 @@ def stages(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tupl
             "Two rounds of estimation give the synchronisation delay",
             "holds under a condition",
             f"clocks known in {proportion(len(known), total)} links, offset to {rms[0]:.3f} ns "
-            f"({rms[0] * 0.2998:.3f} m) and drift to "
-            f"{rms[1]:.3f} ppb RMS; the rounds must be solved for motion and drift too: 0.01 ppm "
-            "alone looks like 3 m/s",
+            f"({rms[0] * 0.2998:.3f} m) and drift to {rms[1]:.3f} ppb RMS; the rounds must be "
+            "solved for motion and drift too: 0.01 ppm alone looks like 3 m/s",
         ),
     )
 
@@ -477,11 +472,10 @@ def feedback(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tu
             "Periodic feedback corrects errors",
             "holds under a condition" if good else "does not hold",
             f"a slip of 1 or 3 cells makes delay symbols wrong in {suffered}; one feedback undoes "
-            f"it in {proportion(good, total)}, the "
-            f"AT's echo being known to {echo_std:g} m ({echo_std / cell:.2f} cells; worse than "
-            "half a cell it cannot tell). With "
-            f"feedback every 4 frames a slip costs {frames_to_repair(3, 4)} to "
-            f"{frames_to_repair(0, 4)} frames of {bits} delay bits",
+            f"it in {proportion(good, total)}, the AT's echo being known to {echo_std:g} m "
+            f"({echo_std / cell:.2f} cells; worse than half a cell it cannot tell). With feedback "
+            f"every 4 frames a slip costs {frames_to_repair(3, 4)} to {frames_to_repair(0, 4)} "
+            f"frames of {bits} delay bits",
         ),
     )
 

@@ -206,14 +206,12 @@ def antennas(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tu
             "Random order and CS remove the phase errors that motion causes in the angles",
             "holds" if better else "does not hold",
             f"targets at 0.5 to 0.9 of c/(4 T- f), {SNR_DB:g} dB, direction within {CLOSE:g} and "
-            "velocity within one resolution in the "
-            f"schemes of Fig. 5: {text}",
+            f"velocity within one resolution in the schemes of Fig. 5: {text}",
         ),
         Verdict(
             "Differential modulation antenna by antenna needs no compensation of directions",
             "holds" if order[0] == 0 else "does not hold",
-            f"D = 8, random directions, {SNR_DB:g} dB: wrong in {proportion(*order)}; from slot to "
-            "slot the change of antenna alone "
-            f"would spoil {proportion(slips, pairs)}",
+            f"D = 8, random directions, {SNR_DB:g} dB: wrong in {proportion(*order)}; from slot "
+            f"to slot the change of antenna alone would spoil {proportion(slips, pairs)}",
         ),
     )

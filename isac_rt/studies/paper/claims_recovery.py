@@ -131,9 +131,8 @@ def latin(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
             "In every cycle the antennas over blocks and slots form a Latin matrix",
             "holds" if good == total else "does not hold",
             f"cycles that do, L_tx = 1 to 8, M = 1 to L_tx: {proportion(good, total)}; the "
-            "stricter order costs a group nothing: its "
-            f"median coherence is {mu[3]:.3f} in Fig. 5(d) and {mu[1]:.3f} in (b), 200 schedules "
-            "each",
+            f"stricter order costs a group nothing: its median coherence is {mu[3]:.3f} in Fig. "
+            f"5(d) and {mu[1]:.3f} in (b), 200 schedules each",
         ),
     )
 
@@ -181,10 +180,9 @@ def fallback(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]
             "In scenes that are not sparse one switches to Fig. 5(c)",
             "holds under a condition" if ends else "does not hold",
             "the paper gives no rule; here the receiver of sparse samples asks whether as many "
-            "atoms as it recovers dependably explain "
-            "two thirds of what is above the noise. Frames called sparse by paths in a range "
-            f"cell: {text}. With all M = L_tx groups "
-            "at hand no switch is needed (the union)",
+            "atoms as it recovers dependably explain two thirds of what is above the noise. "
+            f"Frames called sparse by paths in a range cell: {text}. With all M = L_tx groups at "
+            "hand no switch is needed (the union)",
         ),
     )
 
@@ -317,12 +315,10 @@ def _verdicts(
             "The sampled DFT satisfies the RIP with very high probability, so that OMP converges",
             "holds under a condition",
             f"of {mu.size} random schedules the coherence is {np.median(mu):.3f} (95 % within "
-            f"{np.quantile(mu, 0.025):.3f} to "
-            f"{np.quantile(mu, 0.975):.3f}; Welch's bound {bound:.3f}, round robin {plain:.0f}): "
-            f"recovery is certain for {guaranteed} "
-            f"tones at most; isometry constants below 1/3 up to sparsity {small}. For supports at "
-            "random OMP is dependable (95 %) up "
-            f"to {text} tones in a range cell",
+            f"{np.quantile(mu, 0.025):.3f} to {np.quantile(mu, 0.975):.3f}; Welch's bound "
+            f"{bound:.3f}, round robin {plain:.0f}): recovery is certain for {guaranteed} tones "
+            f"at most; isometry constants below 1/3 up to sparsity {small}. For supports at "
+            f"random OMP is dependable (95 %) up to {text} tones in a range cell",
         ),
         Verdict(
             "Where the scene is not sparse reconstruction fails",
@@ -335,9 +331,8 @@ def _verdicts(
             "The conventional scheme of Fig. 5(c) needs no sparsity",
             "holds under a condition",
             f"by the union of its groups, whose plain DFT has 60 tones to {rest:.1g} RMS; but so "
-            "has the union of the pseudo-random "
-            "groups of Fig. 5(d). Group by group (c) takes any number of tones, and is ambiguous "
-            "beyond 1/3 of the velocity (Fig. 5)",
+            "has the union of the pseudo-random groups of Fig. 5(d). Group by group (c) takes any "
+            "number of tones, and is ambiguous beyond 1/3 of the velocity (Fig. 5)",
         ),
     )
 

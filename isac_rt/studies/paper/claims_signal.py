@@ -274,15 +274,13 @@ def angles() -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
             "A PT estimates angles of departure",
             "does not hold",
             f"its two transmit elements per axis stand {8 * SPACING:.2f} wavelengths apart: "
-            f"{departure_answers()} answers within the "
-            "field of view",
+            f"{departure_answers()} answers within the field of view",
         ),
         Verdict(
             "UAVs are far-field points",
             "holds",
-            f"2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture * 1e3:.1f} mm; the "
-            "least distance of the flight is "
-            "4 m (wavefronts are spherical here all the same)",
+            f"2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture * 1e3:.1f} mm; "
+            "the least distance of the flight is 4 m (wavefronts are spherical here all the same)",
         ),
     )
 
@@ -369,8 +367,7 @@ def late_clock(quick: bool, seed: int, report) -> tuple[pd.DataFrame, tuple[Verd
     def rates(part: Iterable) -> str:
         return "; ".join(
             f"{r.clock_offset_ns:.0f} ns: delay {proportion(r.delay_errors, r.delay_symbols)}, "
-            "DPSK "
-            f"{proportion(r.dpsk_errors, r.dpsk_symbols)}"
+            f"DPSK {proportion(r.dpsk_errors, r.dpsk_symbols)}"
             for r in part
         )
 
@@ -388,9 +385,8 @@ def late_clock(quick: bool, seed: int, report) -> tuple[pd.DataFrame, tuple[Verd
             "A constant synchronisation delay biases the range and leaves the data alone",
             judged,
             f"the range is off by c times the delay to within {biased * 1e3:.1f} mm; symbol error "
-            f"rates at {LATE_SNR:g} dB, 7 receive "
-            f"antennas: {rates(inside.itertuples())}; on condition that path and clock together "
-            "stay below half of the range: "
+            f"rates at {LATE_SNR:g} dB, 7 receive antennas: {rates(inside.itertuples())}; on "
+            "condition that path and clock together stay below half of the range: "
             f"{rates(table.iloc[len(OFFSETS) :].itertuples())}, and no acquisition",
         ),
     )
@@ -404,6 +400,5 @@ def beyond_half(seed: int) -> Verdict:
         "Range below N/2 cells and data below N/2 cells keep every chirp in its resource block",
         "holds" if inside[0] == inside[1] and outside[0] < outside[1] else "does not hold",
         f"chirps that keep an echo from 120 m: {proportion(*inside)}; from 200 m, beyond the "
-        f"{half:.1f} m: "
-        f"{proportion(*outside)}",
+        f"{half:.1f} m: {proportion(*outside)}",
     )

@@ -516,9 +516,8 @@ def _of_the_model(found: pd.DataFrame) -> list[Verdict]:
             "Urban clutter is about 10 dB over the target",
             _judged(near),
             "median over the cells of 20 to 100 m, place by place, over a small UAV: "
-            f"{span(standing, 'level_over_uav_db')} dB; "
-            f"10th percentiles {span(standing, 'level_p10_db')}, 90th "
-            f"{span(standing, 'level_p90_db')} dB",
+            f"{span(standing, 'level_over_uav_db')} dB; 10th percentiles "
+            f"{span(standing, 'level_p10_db')}, 90th {span(standing, 'level_p90_db')} dB",
         ),
         Verdict(
             "It fills 40 to 50 range cells",
@@ -539,8 +538,7 @@ def _of_the_model(found: pd.DataFrame) -> list[Verdict]:
             f"hovering yes; at {SPEED:g} m/s a cell's power spreads by "
             f"{span(moving, 'doppler_rms_mps', '.2f')} m/s rms over "
             f"{span(moving, 'doppler_cells', '.0f')} Doppler cells, and its amplitude correlates "
-            "from frame to frame by "
-            f"{span(moving, 'frame_correlation', '.3f')} (hovering 1)",
+            f"from frame to frame by {span(moving, 'frame_correlation', '.3f')} (hovering 1)",
         ),
     ]
 
@@ -578,14 +576,12 @@ def _of_the_symbols(symbols: pd.DataFrame) -> Verdict:
         "A passive terminal reads its symbols in urban clutter at +10 dB",
         _judged(plain[0] < 0.01 * plain[1], read[0] < 0.01 * read[1]),
         f"delay symbols at {PT_SNR[-1]:g} dB SNR by the strongest cell: mesh {proportion(*plain)} "
-        f"wrong, Rayleigh {rayleigh[0]}; "
-        f"by the range profile learned one frame before: mesh {proportion(*read)}, Rayleigh "
-        f"{rayleigh[1]}; learned "
-        f"{PILOTS['old profile']} frames before at {SPEED:g} m/s: mesh {proportion(*old)}; at the "
-        "physical level, mesh, by the "
-        f"strongest cell: {proportion(*_share(delay, 'strongest cell', 'physical'))}. DPSK symbols "
-        f"(D = {ORDER}), mesh: by the "
-        f"profile at +10 dB {phases[0]}, at the physical level {phases[1]}",
+        f"wrong, Rayleigh {rayleigh[0]}; by the range profile learned one frame before: mesh "
+        f"{proportion(*read)}, Rayleigh {rayleigh[1]}; learned {PILOTS['old profile']} frames "
+        f"before at {SPEED:g} m/s: mesh {proportion(*old)}; at the physical level, mesh, by the "
+        f"strongest cell: {proportion(*_share(delay, 'strongest cell', 'physical'))}. DPSK "
+        f"symbols (D = {ORDER}), mesh: by the profile at +10 dB {phases[0]}, at the physical "
+        f"level {phases[1]}",
     )
 
 
@@ -608,14 +604,11 @@ def _of_the_hits(hits: pd.DataFrame) -> Verdict:
     return Verdict(
         "The clutter filter gives the active terminal its targets back",
         _judged(*kept),
-        f"hits at {AT_SNR[-1]:g} dB SNR, mesh at +10 dB: hovering {found['none', 0.0]} without and "
-        f"{found['notch', 0.0]} with "
-        f"a zero-Doppler notch; at {SPEED:g} m/s {found['none', SPEED]} without and "
-        f"{found['notch', SPEED]} with it. "
-        f"False alarms per cell, {FALSE_ALARMS:g} by design: hovering "
-        f"{rate['none', 0.0, 'paper']:.1e} and "
+        f"hits at {AT_SNR[-1]:g} dB SNR, mesh at +10 dB: hovering {found['none', 0.0]} without "
+        f"and {found['notch', 0.0]} with a zero-Doppler notch; at {SPEED:g} m/s "
+        f"{found['none', SPEED]} without and {found['notch', SPEED]} with it. False alarms per "
+        f"cell, {FALSE_ALARMS:g} by design: hovering {rate['none', 0.0, 'paper']:.1e} and "
         f"{rate['notch', 0.0, 'paper']:.1e}, at {SPEED:g} m/s {rate['none', SPEED, 'paper']:.1e} "
-        f"and {rate['notch', SPEED, 'paper']:.1e}; "
-        f"at the physical level and {SPEED:g} m/s {rate['none', SPEED, 'physical']:.1e} and "
-        f"{rate['notch', SPEED, 'physical']:.1e}",
+        f"and {rate['notch', SPEED, 'paper']:.1e}; at the physical level and {SPEED:g} m/s "
+        f"{rate['none', SPEED, 'physical']:.1e} and {rate['notch', SPEED, 'physical']:.1e}",
     )

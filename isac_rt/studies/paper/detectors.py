@@ -442,8 +442,7 @@ def _verdicts(table: pd.DataFrame, quick: bool) -> tuple[Verdict, ...]:
                 all(row.pd >= limit.pd - 0.03 and row.pd_strong >= 0.95 for row in (wrong, *alone))
             ),
             f"all three at once, {wrong.detector}: {wrong.pd:.4f} over all, {strong(wrong)} in "
-            "strong clutter, "
-            f"false alarms {rate_text(wrong)}; "
+            f"strong clutter, false alarms {rate_text(wrong)}; "
             + ", ".join(
                 f"{row.detector} alone {row.pd:.4f} and {row.pd_strong:.3f}" for row in alone
             )

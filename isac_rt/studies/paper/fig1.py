@@ -185,15 +185,13 @@ def _verdicts(w: Waveform, payload: Payload, schedule: np.ndarray, cube) -> tupl
             "After modulation the chirp is still a linear frequency modulation of constant modulus",
             "holds" if slope < 1e3 and modulus < 1e-12 else "does not hold",
             f"over {w.num_chirps} chirps the frequency departs from a line of slope alpha by "
-            f"{slope:.2g} Hz at most, "
-            f"of {w.bandwidth / 1e6:.0f} MHz, the modulus by {modulus:.1g}",
+            f"{slope:.2g} Hz at most, of {w.bandwidth / 1e6:.0f} MHz, the modulus by {modulus:.1g}",
         ),
         Verdict(
             "The IF is that of FMCW with the data delay added to the path's",
             "holds" if difference < 1e-3 and beat < 0.1 else "does not hold",
             f"the mixed chirps and the program's signal differ by {difference:.1g} RMS; beats lie "
-            f"within {beat:.2f} cells of symbol "
-            "plus path and Doppler (searched in steps of 1/16)",
+            f"within {beat:.2f} cells of symbol plus path and Doppler (searched in steps of 1/16)",
         ),
         Verdict(
             "It is compatible with the existing estimation algorithms for FMCW",
@@ -203,8 +201,7 @@ def _verdicts(w: Waveform, payload: Payload, schedule: np.ndarray, cube) -> tupl
             if lost > 0.9
             else "does not hold",
             "only once all data phases are removed: the strongest cell of the range-Doppler map "
-            f"then has {kept:.3f} of "
-            f"its power without data, else {lost:.2g}",
+            f"then has {kept:.3f} of its power without data, else {lost:.2g}",
         ),
     )
 

@@ -73,8 +73,7 @@ def _verdicts(found, printed, every: int, grid: tracks.Pairs) -> tuple[Verdict, 
             "The AT stays within PT1's field of view and is tracked",
             tracked,
             f"consistent variant: tracked in {proportion(*followed)} frames after {WARM_UP}; as "
-            f"printed heard in {heard} of "
-            f"{PRINTED_FRAMES}, for the AT is behind PT1",
+            f"printed heard in {heard} of {PRINTED_FRAMES}, for the AT is behind PT1",
         ),
         Verdict(
             "Data demodulation is achieved",
@@ -88,8 +87,7 @@ def _verdicts(found, printed, every: int, grid: tracks.Pairs) -> tuple[Verdict, 
             "PT2 appears between frames 107 and 359",
             "does not hold",
             f"consistent variant: in view in frames {_seen(two.in_view.values, every)}, detected "
-            f"in {seen.sum()} of "
-            f"{int(two.in_view.values.sum())}"
+            f"in {seen.sum()} of {int(two.in_view.values.sum())}"
             + (f", frames {frames.min()} to {frames.max()}" if frames.size else "")
             + "; as printed in "
             f"{int(np.isfinite(printed.sel(uav='PT2').detected_range.values).sum())}",

@@ -226,8 +226,7 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
             if better
             else "does not hold",
             f"for D in {better}; SER {LEVEL} of LoRadar (delay and timing known) comes at "
-            f"{decibels(radar.threshold(LEVEL))}, "
-            f"after DPSK by {finding}",
+            f"{decibels(radar.threshold(LEVEL))}, after DPSK by {finding}",
         ),
         Verdict(
             "A frame carries 4293 bits against LoRadar's 1800",

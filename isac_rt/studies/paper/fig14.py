@@ -192,12 +192,10 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
             "TDM-MIMO FMCW's hit rate is higher, the proposed scheme's slightly lower",
             better,
             f"half hit at {decibels(fmcw.threshold(0.5))} (FMCW), {decibels(at.threshold(0.5))} "
-            "(AT, one group, OMP) and "
-            f"{decibels(half)} (PT); AT without a range window {decibels(plain)}; with three "
-            "groups united "
-            f"{decibels(united)} after FMCW (negative: earlier). FMCW within a third of the "
-            "velocities alone: over all "
-            f"of them {curves['FMCW, full velocity range: hits'].text(-36)}",
+            f"(AT, one group, OMP) and {decibels(half)} (PT); AT without a range window "
+            f"{decibels(plain)}; with three groups united {decibels(united)} after FMCW "
+            "(negative: earlier). FMCW within a third of the velocities alone: over all of them "
+            f"{curves['FMCW, full velocity range: hits'].text(-36)}",
         ),
         _loradar(curves, at),
         Verdict(
@@ -235,10 +233,9 @@ def _clutter(curves: dict[str, Curve]) -> Verdict:
         "Urban clutter degrades the hit rate, which stays favourable",
         judged,
         f"PT1 at rest at -22 dB: {rest.text(-22)} without clutter, {filtered.text(-22)} with the "
-        "paper's filter, "
-        f"{known.text(-22)} with the clutter's profile known; AT at -20 dB with the filter: moving "
-        "targets "
-        f"{moving.text(-20)}, half of them from {decibels(moving.threshold(0.5))} on, at rest "
+        f"paper's filter, {known.text(-22)} with the clutter's profile known; AT at -20 dB with "
+        f"the filter: moving targets {moving.text(-20)}, half of them from "
+        f"{decibels(moving.threshold(0.5))} on, at rest "
         f"{curves['AT, M = 1, clutter, at rest: hits'].text(-20)}",
     )
 

@@ -164,13 +164,11 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
             "often, at high SNR both find it",
             "holds" if crosses else "does not hold",
             "40 pulses each, in the FFT's range and on its grid: half are found at "
-            f"{half[f'{equal}: OMP']} (OMP) and "
-            f"{half[f'{equal}: FFT']} (FFT); OMP is better beyond the intervals at {_list(above)}, "
-            f"worse at {_list(below)}. With all "
-            f"120 pulses OMP needs {half[f'{more}: OMP']}: better at {_list(above_more)}, worse at "
-            f"{_list(below_more)}. Velocities "
-            f"over the full range: better at {_list(above_wide)}, worse at {_list(below_wide)}; "
-            "there the FFT folds and ends at 1/3",
+            f"{half[f'{equal}: OMP']} (OMP) and {half[f'{equal}: FFT']} (FFT); OMP is better "
+            f"beyond the intervals at {_list(above)}, worse at {_list(below)}. With all 120 "
+            f"pulses OMP needs {half[f'{more}: OMP']}: better at {_list(above_more)}, worse at "
+            f"{_list(below_more)}. Velocities over the full range: better at {_list(above_wide)}, "
+            f"worse at {_list(below_wide)}; there the FFT folds and ends at 1/3",
         ),
         Verdict(
             "Pseudo-random pulses keep the full velocity range",

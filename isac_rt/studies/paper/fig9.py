@@ -91,9 +91,8 @@ def _verdicts(runs, printed, grid) -> tuple[Verdict, ...]:
             "The AT tracks PT1 and PT2 at once",
             tracked,
             f"consistent variant: PT1 in {proportion(*one)}, PT2 in {proportion(*two)} of its "
-            "processed frames in view, "
-            f"after {WARM_UP} to confirm a track; as printed PT2 is detected in {there} of "
-            f"{PRINTED_FRAMES}",
+            f"processed frames in view, after {WARM_UP} to confirm a track; as printed PT2 is "
+            f"detected in {there} of {PRINTED_FRAMES}",
         ),
         Verdict(
             "PT2 enters the AT's field of view at about frame 160",

@@ -281,7 +281,6 @@ def _verdicts(terminal: str, tracks: pd.DataFrame) -> tuple[Verdict, ...]:
             f"A geometric test removes ghost tracks of the {terminal} terminal",
             "holds" if fewer else "does not hold",
             f"share of ghosts among confirmed tracks: without it {rate(tracks)}, with it "
-            f"{rate(kept)}; "
-            f"tracks of UAVs that it takes away: {lost}",
+            f"{rate(kept)}; tracks of UAVs that it takes away: {lost}",
         ),
     )

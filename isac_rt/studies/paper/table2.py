@@ -107,8 +107,7 @@ def _verdicts(
             "PT1 has PT2 by way of the AT in frames 107 to 359",
             judge(*here),
             f"as printed: {span(joint[0])}; consistent variant: {span(joint[1])}; 107 also "
-            "contradicts the 160 of the AT, whose field "
-            "of view is needed as well",
+            "contradicts the 160 of the AT, whose field of view is needed as well",
         ),
         Verdict(
             "The radial velocities stay unambiguous",

@@ -120,10 +120,9 @@ def filter_verdict(
         f"The EKF shifts the CDFs of the errors at the {terminal} to the left",
         judged,
         f"estimates on the paper's grids: {_improvement(grid)}; left at every decile: "
-        f"{', '.join(left['grid']) or 'none'}. Estimates "
-        f"between the cells, this program's: {_improvement(refined)}; left at every decile: "
-        f"{', '.join(left['refined']) or 'none'} (the "
-        "filter allows for errors of 1 mm, 1 cm/s and 2e-4, which these are below)",
+        f"{', '.join(left['grid']) or 'none'}. Estimates between the cells, this program's: "
+        f"{_improvement(refined)}; left at every decile: {', '.join(left['refined']) or 'none'} "
+        "(the filter allows for errors of 1 mm, 1 cm/s and 2e-4, which these are below)",
     )
 
 

@@ -1,9 +1,9 @@
 """Every physical and numerical claim of the program as a case with an independent truth: what
 `isac-rt validate` runs."""
 
-from isac_rt.studies.validation.case import Case, Skipped, Verdict, run_case, run_cases
+from isac_rt.studies.validation.case import Case, Measured, Skipped, run_case
 
-__all__ = ["Case", "Skipped", "Verdict", "all_cases", "run_case", "run_cases"]
+__all__ = ["Case", "Measured", "Skipped", "all_cases", "run_case"]
 
 
 def all_cases(quick: bool = False) -> list[Case]:

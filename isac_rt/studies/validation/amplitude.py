@@ -17,7 +17,7 @@ from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.swarm import Rcs
 from isac_rt.scenario.tree import Clutter
 from isac_rt.studies.validation import stage, truths
-from isac_rt.studies.validation.case import case
+from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, slab_reflection
 from isac_rt.world.city import City
 from isac_rt.world.city.materials import Material, resolve_materials, water_permittivity
@@ -43,12 +43,7 @@ def _free(tx: str, rx: str, gain: float = 1.0):
     )[tx, rx]
 
 
-@case(
-    truth="(lambda / 4 pi d)^2 G G",
-    unit="dB",
-    bound=1e-09,
-    why="float64 rounding",
-)
+@case("(lambda / 4 pi d)^2 G G", "1e-9 dB", "float64 rounding")
 def friis() -> float:
     """Received power of a line of sight with elements of 3.1 dBi."""
     gain = 10**0.31
@@ -57,15 +52,9 @@ def friis() -> float:
     return abs(10 * np.log10(power) - (6.2 + 20 * np.log10(WAVELENGTH / (4 * np.pi * _gap(0, 1)))))
 
 
-@case(
-    truth="G G lambda^2 sigma / ((4 pi)^3 r1^2 r2^2)",
-    unit="dB",
-    bound=1e-09,
-    why="float64 rounding",
-)
-def radar_equation() -> float:
+@case("G G lambda^2 sigma / ((4 pi)^3 r1^2 r2^2)", "1e-9 dB", "float64 rounding")
+def radar_equation() -> Errors:
     """Received power of an echo, monostatic and bistatic."""
-    worst = 0.0
     for rx, second in (("A", _gap(0, 2)), ("P", _gap(1, 2))):
         found = _free("A", rx, 10**0.31)
         power = found.power[found.target == 2][0]
@@ -74,8 +63,7 @@ def radar_equation() -> float:
             + 10 * np.log10(WAVELENGTH**2 * SIGMA / (4 * np.pi) ** 3)
             - 20 * np.log10(_gap(0, 2) * second)
         )
-        worst = max(worst, abs(10 * np.log10(power) - truth))
-    return worst
+        yield abs(10 * np.log10(power) - truth)
 
 
 def _ground(conductivity: float, permittivity: float = 5.31) -> City:
@@ -98,38 +86,26 @@ def _two_rays(
     )
 
 
-@case(
-    truth="two rays in long double, Fresnel by inner echoes",
-    unit="of the direct field",
-    bound=2e-05,
-    why=FLOAT32,
-    tracer=True,
-)
-def two_rays_across_the_breakpoint() -> float:
+@traced("two rays in long double, Fresnel by inner echoes", "2e-5 of the direct field", FLOAT32)
+def two_rays_across_the_breakpoint() -> Errors:
     """The sum of direct and ground ray over concrete from well before the breakpoint (at 98 m) to
     well beyond it, vertical polarisation."""
     low, high, eps, sigma = 0.31, 0.307, 5.31, 1.9
-    worst, model = 0.0, stage.tracer(_ground(sigma, eps), 1)
+    model = stage.tracer(_ground(sigma, eps), 1)
     for distance in (7.3, 23.9, 61.7, 97.1, 203.0, 411.0):
         poses = stage.swarm((0, 0, low), (distance, 0, high), (3.0, 40.0, 11.0), moving=False)
         paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
         paths = paths.select(paths.target < 0)
         turn = (truths.CARRIER * (paths.delay - paths.delay[0])) % 1.0
         field = (paths.gain * np.exp(-2j * np.pi * turn)).sum() / np.abs(paths.gain[0])
-        worst = max(
-            worst,
-            abs(field - _two_rays(distance, low, high, eps, sigma)) if len(paths) == 2 else np.inf,
-        )
-    return float(worst)
+        yield abs(field - _two_rays(distance, low, high, eps, sigma)) if len(paths) == 2 else np.inf
 
 
-@case(
-    truth="image of a perfect conductor, lambda / (4 pi 2 d), times Fresnel's 0.9991 of the "
+@traced(
+    "image of a perfect conductor, lambda / (4 pi 2 d), times Fresnel's 0.9991 of the "
     "tracer's metal",
-    unit="relative",
-    bound=5e-06,
-    why=FLOAT32,
-    tracer=True,
+    "5e-6 relative",
+    FLOAT32,
 )
 def conducting_plate() -> float:
     """A large metal plate at right angles returns one image to its radar: amplitude and delay, on
@@ -147,12 +123,10 @@ def conducting_plate() -> float:
     return max(amplitude, abs(299_792_458.0 * paths.delay[0] / 62.8 - 1))
 
 
-@case(
-    truth="image of two perfect conductors, lambda / (4 pi 2 d), times 0.9991 twice",
-    unit="relative",
-    bound=0.0003,
-    why=FLOAT32,
-    tracer=True,
+@traced(
+    "image of two perfect conductors, lambda / (4 pi 2 d), times 0.9991 twice",
+    "0.0003 relative",
+    FLOAT32,
 )
 def conducting_corner() -> float:
     """A vertical edge of two metal walls at right angles returns one image, twice the distance to
@@ -188,17 +162,14 @@ def conducting_corner() -> float:
     )
 
 
-@case(
-    truth="Fresnel's equations with the slab's inner echoes added up",
-    unit="of the image",
-    bound=0.0001,
-    why=FLOAT32 + "; the phase of a thin pane turns five times as fast with the angle",
-    tracer=True,
+@traced(
+    "Fresnel's equations with the slab's inner echoes added up",
+    "0.0001 of the image",
+    FLOAT32 + "; the phase of a thin pane turns five times as fast with the angle",
 )
-def reflection_of_a_slab() -> float:
+def reflection_of_a_slab() -> Errors:
     """Amplitude and phase of the ground's ray off concrete and off a pane, above, near and far
     below Brewster's angle."""
-    worst = 0.0
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (2.7, 0.6, 0.004)):
         mesh = stage.rectangle(
             (-150, -150, 0), (300, 0, 0), (0, 300, 0), stage.material(eps, sigma, 0.0, thickness)
@@ -210,16 +181,13 @@ def reflection_of_a_slab() -> float:
             paths = paths.select(paths.kind == PathKind.SPECULAR)
             length = np.sqrt(23.6**2 + 7.4**2 + (1.7 * h) ** 2)
             truth = slab_reflection(eps, sigma, thickness, 1.7 * h / length)[1]
-            worst = max(worst, abs(paths.gain[0] / (WAVELENGTH / (4 * np.pi * length)) - truth))
-    return float(worst)
+            yield abs(paths.gain[0] / (WAVELENGTH / (4 * np.pi * length)) - truth)
 
 
-@case(
-    truth="image theory: the radar equation with one leg folded",
-    unit="relative",
-    bound=2e-05,
-    why="the truth holds the 0.9991 of the tracer's metal per bounce; " + FLOAT32,
-    tracer=True,
+@traced(
+    "image theory: the radar equation with one leg folded",
+    "2e-5 relative",
+    "the truth holds the 0.9991 of the tracer's metal per bounce; " + FLOAT32,
 )
 def ghosts_over_a_conducting_wall() -> float:
     """Echo and ghosts of a target beside a metal wall: each is a product of a straight and a folded
@@ -266,18 +234,13 @@ def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
     return float((field.seen(tx, rx, poses[tx], poses[rx], 0.0).magnitude ** 2).sum())
 
 
-@case(
-    truth="double integral of Lambert's law over the wall",
-    unit="dB",
-    bound=0.02,
-    why=(
-        "cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 "
-        "of the power but for grazing angles"
-    ),
-    tracer=True,
-    quick=False,
+@slow_traced(
+    "double integral of Lambert's law over the wall",
+    "0.02 dB",
+    "cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 "
+    "of the power but for grazing angles",
 )
-def lambertian_wall() -> float:
+def lambertian_wall() -> Errors:
     """Mean power that the clutter field of a wall of 120 m x 60 m returns, to its radar and to a
     second terminal."""
     city = stage.rectangle(
@@ -290,23 +253,18 @@ def lambertian_wall() -> float:
         "A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)),
         "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0)),
     }
-    worst = 0.0
     for tx, rx in (("A", "A"), ("A", "P")):
         truth = truths.lambertian_wall(
             poses[tx].position, poses[rx].position, 0.43, 50.0, (60.0, 30.0)
         )
-        worst = max(worst, abs(10 * np.log10(_field_power(tx, rx, poses, city) / truth)))
-    return worst
+        yield abs(10 * np.log10(_field_power(tx, rx, poses, city) / truth))
 
 
-@case(
-    truth="double integral of Lambert's law over the wall, one end at its image under the ground",
-    unit="dB",
-    bound=0.04,
-    why="cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a "
+@slow_traced(
+    "double integral of Lambert's law over the wall, one end at its image under the ground",
+    "0.04 dB",
+    "cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a "
     "vertical wave at these angles, 0.02 dB",
-    tracer=True,
-    quick=False,
 )
 def lambertian_wall_by_way_of_the_ground() -> float:
     """Mean power of clutter of two bounces: a metal ground and a wall of 120 m x 60 m on it, in
@@ -347,41 +305,35 @@ def lambertian_wall_by_way_of_the_ground() -> float:
     return worst if count == 2 else np.inf
 
 
-@case(
-    truth="inner echoes added up from Fresnel's equations",
-    unit="of the power",
-    bound=1e-09,
-    why="400 echoes leave less than float64 resolves; both sides are float64",
-    tracer=True,
+@traced(
+    "inner echoes added up from Fresnel's equations",
+    "1e-9 of the power",
+    "400 echoes leave less than float64 resolves; both sides are float64",
 )
-def reflectivity_of_scatterers() -> float:
+def reflectivity_of_scatterers() -> Errors:
     """Power reflectivity of a slab for both polarisations, from grazing to upright incidence, as
     the clutter field uses it."""
     from isac_rt.propagation.clutter.field import slab_reflectivity
 
-    cosines, worst = np.array([0.03, 0.21, 0.5, 0.83, 1.0]), 0.0
+    cosines = np.array([0.03, 0.21, 0.5, 0.83, 1.0])
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (6.31, 1.21, 0.012)):
         found = slab_reflectivity(stage.material(eps, sigma, 0.3, thickness), cosines, WAVELENGTH)
         truth = np.array(
             [[abs(r) ** 2 for r in slab_reflection(eps, sigma, thickness, c)] for c in cosines]
         ).T
-        worst = max(worst, float(np.abs(np.array(found) - truth).max()))
-    return worst
+        yield np.abs(np.array(found) - truth).max()
 
 
-@case(
-    truth="integral of the lobe over the half-space",
-    unit="relative",
-    bound=1e-06,
-    why="quadrature to 1e-9; the edge of the half-space cuts the lobe",
-    tracer=True,
+@traced(
+    "integral of the lobe over the half-space",
+    "1e-6 relative",
+    "quadrature to 1e-9; the edge of the half-space cuts the lobe",
 )
-def lobes_radiate_their_power() -> float:
+def lobes_radiate_their_power() -> Errors:
     """The norm of the directive scattering pattern, for exponents 1, 4 and 7 and directions from
     grazing to upright."""
     from isac_rt.propagation.clutter.field import lobe_norm
 
-    worst = 0.0
     for alpha in (1, 4, 7):
         for cosine in (0.13, 0.6, 1.0):
             sine = np.sqrt(1 - cosine**2)
@@ -391,34 +343,28 @@ def lobes_radiate_their_power() -> float:
 
             truth = dblquad(lobe, 0, 2 * np.pi, 0, 1, epsrel=1e-9)[0]
             of = Material("x", 5.0, 1.0, 0.4, "directive", alpha, 0.1, "validation")
-            worst = max(worst, abs(float(lobe_norm(of, np.array([cosine]))[0]) / truth - 1))
-    return worst
+            yield abs(float(lobe_norm(of, np.array([cosine]))[0]) / truth - 1)
 
 
 @case(
-    truth="Recommendation ITU-R P.2040-3, Table 3, evaluated by hand",
-    unit="relative",
-    bound=0.0005,
-    why="the truth is written with four digits",
+    "Recommendation ITU-R P.2040-3, Table 3, evaluated by hand",
+    "0.0005 relative",
+    "the truth is written with four digits",
 )
-def materials_at_77_ghz() -> float:
+def materials_at_77_ghz() -> Errors:
     """Permittivity and conductivity of concrete, glass and plasterboard at the carrier."""
     truth = {"concrete": (5.24, 1.381), "glass": (6.31, 1.211), "plasterboard": (2.73, 0.5033)}
     _, found = resolve_materials([Use(name) for name in truth], truths.CARRIER, {})
-    worst = 0.0
     for one in found:
         eps, sigma = truth[one.name]
-        worst = max(
-            worst, abs(one.relative_permittivity / eps - 1), abs(one.conductivity / sigma - 1)
-        )
-    return worst
+        yield abs(one.relative_permittivity / eps - 1)
+        yield abs(one.conductivity / sigma - 1)
 
 
 @case(
-    truth="80.1 and 17.3 GHz at 20 degrees (CRC Handbook; Kaatze 1989)",
-    unit="relative",
-    bound=0.02,
-    why="spread of the handbook values",
+    "80.1 and 17.3 GHz at 20 degrees (CRC Handbook; Kaatze 1989)",
+    "0.02 relative",
+    "spread of the handbook values",
 )
 def water() -> float:
     """Static permittivity and relaxation frequency of water, on which the permittivity of soil and
@@ -428,29 +374,19 @@ def water() -> float:
     return max(abs(water_permittivity(1e6).real / 80.1 - 1), abs(peak / 17.3e9 - 1))
 
 
-@case(
-    truth="TR 38.901 v19, table 7.9.2.1-1 and eq. 7.9.2-2",
-    unit="dB",
-    bound=1e-09,
-    why="float64 rounding",
-)
-def cross_section_of_a_small_uav() -> float:
+@case("TR 38.901 v19, table 7.9.2.1-1 and eq. 7.9.2-2", "1e-9 dB", "float64 rounding")
+def cross_section_of_a_small_uav() -> Errors:
     """-12.81 dBsm seen from where it is lit, 3 sin(beta/2) dB less under a bistatic angle beta."""
-    section, worst = CrossSection(Rcs(), "U1", 7), 0.0
+    section = CrossSection(Rcs(), "U1", 7)
     for beta in (0.0, 0.41, 1.57, 2.6):
         u, v = np.array([[1.0, 0, 0]]), np.array([[np.cos(beta), np.sin(beta), 0]])
-        worst = max(
-            worst,
-            abs(10 * np.log10(section.square_metres(u, v)[0]) - (-12.81 - 3 * np.sin(beta / 2))),
-        )
-    return worst
+        yield abs(10 * np.log10(section.square_metres(u, v)[0]) - (-12.81 - 3 * np.sin(beta / 2)))
 
 
 @case(
-    truth="mean over all aspects as printed in TR 38.901 v19, table 7.9.2.1-2: -5.85 dBsm",
-    unit="dB",
-    bound=0.15,
-    why="the lobes are read from printed widths of three digits",
+    "mean over all aspects as printed in TR 38.901 v19, table 7.9.2.1-2: -5.85 dBsm",
+    "0.15 dB",
+    "the lobes are read from printed widths of three digits",
 )
 def cross_section_of_a_large_uav() -> float:
     """The lobes of the large UAV, averaged over the sphere (Gauss-Legendre in the cosine, even in
@@ -466,13 +402,10 @@ def cross_section_of_a_large_uav() -> float:
 
 
 @case(
-    truth="the standard deviation asked for",
-    unit="sigma",
-    bound=4.5,
-    why=(
-        "false alarm 7e-6; 300 bodies in 10 aspects 0.8 rad apart and more, taken as one "
-        "independent draw per body"
-    ),
+    "the standard deviation asked for",
+    "4.5 sigma",
+    "false alarm 7e-6; 300 bodies in 10 aspects 0.8 rad apart and more, taken as one "
+    "independent draw per body",
 )
 def fluctuation_of_a_cross_section() -> float:
     """A fluctuation of 3 dB varies with this standard deviation from body to body."""
@@ -489,12 +422,7 @@ def fluctuation_of_a_cross_section() -> float:
     return abs(float((level**2).mean()) / 9 - 1) / np.sqrt(2 / 300)
 
 
-@case(
-    truth="integral of the gain over the sphere, 4 pi",
-    unit="relative",
-    bound=1e-06,
-    why="quadrature",
-)
+@case("integral of the gain over the sphere, 4 pi", "1e-6 relative", "quadrature")
 def elements_radiate_their_power() -> float:
     """The cosine pattern of an element of 5 dBi radiates what it is given."""
     antennas = Antennas(
@@ -510,10 +438,9 @@ def elements_radiate_their_power() -> float:
 
 
 @case(
-    truth="-173.975 dBm/Hz at 290 K (k by the SI), bandwidth and noise figure in decibels",
-    unit="dB",
-    bound=0.001,
-    why="the truth is printed to a thousandth",
+    "-173.975 dBm/Hz at 290 K (k by the SI), bandwidth and noise figure in decibels",
+    "0.001 dB",
+    "the truth is printed to a thousandth",
 )
 def thermal_noise() -> float:
     """Noise of a complex sample over the sampling rate of 20 MHz with a noise figure of 11.3 dB;

@@ -17,7 +17,7 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import make_propagation
 from isac_rt.scenario.tree import Scenario
 from isac_rt.studies.validation import truths
-from isac_rt.studies.validation.case import case
+from isac_rt.studies.validation.case import Errors, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH
 from isac_rt.world.city import City, load_city
 from isac_rt.world.swarm import Pose, Swarm
@@ -111,30 +111,24 @@ def _sum(cell: np.ndarray, waves: np.ndarray, count: int = 1200) -> np.ndarray:
     return np.bincount(cell, waves.real, count) + 1j * np.bincount(cell, waves.imag, count)
 
 
-@case(
-    truth="distance in long double",
-    unit="rad",
-    bound=1e-06,
-    why="float64 delays of 100 m are good to 1e-10 rad; float32 ones to 1e-2 rad",
-    tracer=True,
+@traced(
+    "distance in long double",
+    "1e-6 rad",
+    "float64 delays of 100 m are good to 1e-10 rad; float32 ones to 1e-2 rad",
 )
-def phase_of_scatterers_in_flight() -> float:
+def phase_of_scatterers_in_flight() -> Errors:
     """Carrier phase of each scatterer in sight, up to 100 mm after a place of the flight."""
-    flight, worst = Flight(STREETS[2], cell_area_per_metre_m=8.0, smallest_cell_m2=2.0), 0.0
+    flight = Flight(STREETS[2], cell_area_per_metre_m=8.0, smallest_cell_m2=2.0)
     for time in (0.13, 1.29):
         for step in STEPS:
             when = time + step / float(np.linalg.norm(flight.pose(time).velocity))
             seen, place = flight.seen(when), truths.wide(flight.pose(when).position)
             span = truths.wide(flight.field.cells.points[seen.index]) - place
-            worst = max(
-                worst,
-                float(
-                    np.abs(
-                        2 * np.pi / WAVELENGTH * (seen.length - 2 * np.sqrt((span * span).sum(1)))
-                    ).max()
-                ),
+            yield (
+                np.abs(
+                    2 * np.pi / WAVELENGTH * (seen.length - 2 * np.sqrt((span * span).sum(1)))
+                ).max()
             )
-    return worst
 
 
 def _separate(flight: Flight, caster: Any, place: np.ndarray) -> np.ndarray:
@@ -165,14 +159,10 @@ def _separate(flight: Flight, caster: Any, place: np.ndarray) -> np.ndarray:
     )
 
 
-@case(
-    truth="float64 sum over the list of scatterers, sight by trimesh's ray caster at every place",
-    unit="of one",
-    bound=0.01,
-    why="the separate sum switches at shadow edges, the field crosses them by the knife edge's "
-    "factor",
-    tracer=True,
-    quick=False,
+@slow_traced(
+    "float64 sum over the list of scatterers, sight by trimesh's ray caster at every place",
+    "0.01 of one",
+    "the separate sum switches at shadow edges, the field crosses them by the knife edge's factor",
 )
 def coherence_of_the_clutter_field() -> float:
     """What the correlation of range profiles lacks of one, after steps of 0.1 to 100 mm from 21
@@ -200,14 +190,11 @@ def coherence_of_the_clutter_field() -> float:
     return 1 - worst
 
 
-@case(
-    truth="the same cell with the sight of one frame before, in a sum of its own; mean power over "
+@slow_traced(
+    "the same cell with the sight of one frame before, in a sum of its own; mean power over "
     "2 m and 15 frames",
-    unit="of the local rms",
-    bound=0.15,
-    why="asked for; sight that switches changes a cell by all of its scatterer",
-    tracer=True,
-    quick=False,
+    "0.15 of the local rms",
+    "asked for; sight that switches changes a cell by all of its scatterer",
 )
 def sight_alone_changes_no_range_cell_at_once() -> float:
     """Largest change that births and deaths make in a range cell from frame to frame, on 50 m up a
@@ -240,14 +227,11 @@ def sight_alone_changes_no_range_cell_at_once() -> float:
     )
 
 
-@case(
-    truth="the exponential law of |sum|^2 over its mean (Kolmogorov and Smirnov), and its tail "
+@slow_traced(
+    "the exponential law of |sum|^2 over its mean (Kolmogorov and Smirnov), and its tail "
     "beyond 5 and 8 times the mean",
-    unit="of the bounds",
-    bound=1.0,
-    why="sqrt(n) D up to 2.23 is a false-alarm rate of 1e-4; tails within four standard deviations",
-    tracer=True,
-    quick=False,
+    "1 of the bounds",
+    "sqrt(n) D up to 2.23 is a false-alarm rate of 1e-4; tails within four standard deviations",
 )
 def speckle_of_range_doppler_cells() -> float:
     """Amplitudes of every cell of range and Doppler that holds 1e-4 of the power, of 12 fields,
@@ -277,16 +261,13 @@ def speckle_of_range_doppler_cells() -> float:
     return max(worst) if sample.size > 3_000 else np.inf
 
 
-@case(
-    truth="2 v.u/lambda of the scatterers' places, two Doppler cells to either side",
-    unit="of a cell's energy",
-    bound=0.02,
-    why="a Hann window's main lobe is four cells wide and holds all but 1e-4; speckle may leave "
+@slow_traced(
+    "2 v.u/lambda of the scatterers' places, two Doppler cells to either side",
+    "0.02 of a cell's energy",
+    "a Hann window's main lobe is four cells wide and holds all but 1e-4; speckle may leave "
     "little near the middle",
-    tracer=True,
-    quick=False,
 )
-def doppler_of_range_cells() -> float:
+def doppler_of_range_cells() -> Errors:
     """Energy of a range cell's spectrum outside the Doppler of its surfaces; a terminal that
     hovers, cruises, climbs and turns."""
     flights = (
@@ -295,12 +276,11 @@ def doppler_of_range_cells() -> float:
         ((0.0, (1.7, -12.2, 6.4)), (0.2, (1.76, -12.02, 7.94))),
         ((0.0, (-1.1, -6.2, 8.1)), (0.1, (-0.7, -5.3, 8.1)), (0.2, (0.3, -4.9, 8.2))),
     )
-    return max(
-        _outside(Flight(way, cell_area_per_metre_m=0.3, smallest_cell_m2=0.2)) for way in flights
-    )
+    for way in flights:
+        yield from _outside(Flight(way, cell_area_per_metre_m=0.3, smallest_cell_m2=0.2))
 
 
-def _outside(flight: Flight, pulse: float = 1.013e-4, pulses: int = 64) -> float:
+def _outside(flight: Flight, pulse: float = 1.013e-4, pulses: int = 64) -> Errors:
     """Largest share of a range cell's energy outside its surfaces' Doppler."""
     first, start, rows = flight.seen(0.09), flight.pose(0.09), []
     points = flight.field.cells.points
@@ -317,22 +297,17 @@ def _outside(flight: Flight, pulse: float = 1.013e-4, pulses: int = 64) -> float
     span = np.linalg.norm(towards, axis=1)
     expected = 2 / WAVELENGTH * (towards / span[:, None]) @ start.velocity * pulse * pulses
     cell, power = (span / CELL).astype(int), first.magnitude.astype(float) ** 2
-    worst = 0.0
     for i in np.flatnonzero(np.bincount(cell, power, 1200) > 1e-3 * power.sum()):
         off = (np.arange(pulses) - expected[cell == i][:, None] + pulses / 2) % pulses - pulses / 2
         inside = (np.abs(off) <= 2.0).any(axis=0)
-        worst = max(worst, float(spectrum[~inside, i].sum() / spectrum[:, i].sum()))
-    return worst
+        yield spectrum[~inside, i].sum() / spectrum[:, i].sum()
 
 
-@case(
-    truth="Sionna RT's diffuse solution with 1e6 rays, over cells of 4 m that hold a thousandth of "
+@slow_traced(
+    "Sionna RT's diffuse solution with 1e6 rays, over cells of 4 m that hold a thousandth of "
     "the power",
-    unit="of the bounds",
-    bound=1.0,
-    why="asked for: 0.05 dB for the median and for each total, 0.2 dB for nine cells of ten",
-    tracer=True,
-    quick=False,
+    "1 of the bounds",
+    "asked for: 0.05 dB for the median and for each total, 0.2 dB for nine cells of ten",
 )
 def mean_power_of_a_street() -> float:
     """Mean power by range in a street of concrete, from two places of a flight to itself and to a

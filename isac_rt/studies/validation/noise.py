@@ -10,12 +10,7 @@ from isac_rt.signal.noise import _words, add_white_noise
 from isac_rt.studies.validation.case import case
 
 
-@case(
-    truth="known answers published with Random123 for Threefry-2x32, 20 rounds",
-    unit="words",
-    bound=0,
-    why="exact",
-)
+@case("known answers published with Random123 for Threefry-2x32, 20 rounds", "0 words", "exact")
 def counter_based_random_numbers() -> float:
     """The generator behind the noise gives the published words."""
     ones = 0xFFFFFFFF
@@ -28,10 +23,9 @@ def counter_based_random_numbers() -> float:
 
 
 @case(
-    truth="moments and tail of the complex Gaussian law",
-    unit="sigma",
-    bound=5.0,
-    why="ten statistics, each beyond 5 sigma once in 2e6",
+    "moments and tail of the complex Gaussian law",
+    "5 sigma",
+    "ten statistics, each beyond 5 sigma once in 2e6",
 )
 def white_noise() -> float:
     """Power, moments, tail and whiteness of a million samples of noise."""
@@ -50,12 +44,7 @@ def white_noise() -> float:
     return float(max(scores))
 
 
-@case(
-    truth="the samples of another partition and another number of threads",
-    unit="samples",
-    bound=0,
-    why="bit for bit",
-)
+@case("the samples of another partition and another number of threads", "0 samples", "bit for bit")
 def noise_does_not_know_the_order_of_work() -> float:
     """A cube's noise filled in one piece and in pieces, last piece first, is the same bit for
     bit."""

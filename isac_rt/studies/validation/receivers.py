@@ -27,7 +27,7 @@ from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Clutter
 from isac_rt.studies.validation import stage
-from isac_rt.studies.validation.case import case
+from isac_rt.studies.validation.case import Errors, case, slow
 from isac_rt.studies.validation.stage import FEW, FULL
 
 C = 299_792_458.0
@@ -84,31 +84,25 @@ def _dpsk_theory(order: int, snr: float, branches: int) -> float:
     return 2 * (0.5 + quad(density, 0, np.inf, limit=2000)[0] / np.pi)
 
 
-@case(
-    truth="characteristic function of the detector's Hermitian form, inverted",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5 + "; neighbouring symbols share a chirp, which at most doubles the variance",
-    quick=False,
+@slow(
+    "characteristic function of the detector's Hermitian form, inverted",
+    "4.5 sigma",
+    ONCE_IN_1E5 + "; neighbouring symbols share a chirp, which at most doubles the variance",
 )
-def dpsk_symbol_errors() -> float:
+def dpsk_symbol_errors() -> Errors:
     """Symbol error rates of DPSK in white noise with three receivers, D = 8 and 16, at rates of a
     few percent."""
-    worst = 0.0
     for order, snr in ((8, 8.0), (16, 26.0)):
         _, _, wrong, total = _symbols_in_noise(order, snr, 16)
         rate = _dpsk_theory(order, snr, 3)
-        worst = max(worst, abs(wrong / total - rate) / np.sqrt(2 * rate * (1 - rate) / total))
-    return worst
+        yield abs(wrong / total - rate) / np.sqrt(2 * rate * (1 - rate) / total)
 
 
-@case(
-    truth="M-ary orthogonal signals with three square-law branches: an integral over the "
+@slow(
+    "M-ary orthogonal signals with three square-law branches: an integral over the "
     "noncentral chi-square law",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5,
-    quick=False,
+    "4.5 sigma",
+    ONCE_IN_1E5,
 )
 def delay_symbol_errors() -> float:
     """Symbol error rate of the delay symbols in white noise with three receivers, 72 cells, at a
@@ -128,12 +122,7 @@ def delay_symbol_errors() -> float:
     return abs(wrong / total - rate) / np.sqrt(rate * (1 - rate) / total)
 
 
-@case(
-    truth="the symbols and bits that were sent",
-    unit="symbols",
-    bound=0,
-    why="exact without noise",
-)
+@case("the symbols and bits that were sent", "0 symbols", "exact without noise")
 def data_at_the_ends_of_the_velocity() -> float:
     """Every symbol and bit of a noise-free frame, D = 2 to 16, at -29.4 and +17.3 m/s, a fraction
     of a cell off the prediction."""
@@ -154,12 +143,11 @@ def data_at_the_ends_of_the_velocity() -> float:
 
 
 @case(
-    truth="Fourier transform by a plain sum over uniform samples",
-    unit="dB over -50 dB",
-    bound=0,
-    why="sidelobes that the resampling may leave (isac_rt.receive.maps)",
+    "Fourier transform by a plain sum over uniform samples",
+    "0 dB over -50 dB",
+    "sidelobes that the resampling may leave (isac_rt.receive.maps)",
 )
-def union_of_the_groups() -> float:
+def union_of_the_groups() -> Errors:
     """One antenna's samples at their true, uneven times give the spectrum of even ones, for tones
     all over the band."""
     w, schedule, payload = stage.frame(8, 3, SHORT)
@@ -172,28 +160,25 @@ def union_of_the_groups() -> float:
             / slot
         )
     p, bins = np.arange(w.num_chirps), np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
-    worst = -np.inf
     for tone in (-57.3, -31.6, 4.2, 22.5, 56.9):
         found = union_operator(w, times) @ np.exp(2j * np.pi * tone * times / w.num_chirps)
         even = np.exp(2j * np.pi * tone * (p + (times - p).mean()) / w.num_chirps)
         truth = np.exp(-2j * np.pi * np.outer(bins, p) / w.num_chirps) @ (slow_window(w) * even)
-        worst = max(worst, 20 * np.log10(np.abs(found - truth).max() / np.abs(truth).max()) + 50)
-    return float(worst)
+        yield 20 * np.log10(np.abs(found - truth).max() / np.abs(truth).max()) + 50
 
 
 @case(
-    truth="least squares on a support that grows atom by atom",
-    unit="relative",
-    bound=0.0001,
-    why="single precision of the result",
+    "least squares on a support that grows atom by atom",
+    "0.0001 relative",
+    "single precision of the result",
 )
-def orthogonal_matching_pursuit() -> float:
+def orthogonal_matching_pursuit() -> Errors:
     """Batch OMP in its Gram-matrix form finds what the plain algorithm finds."""
     rng = np.random.default_rng(6)
     chosen = np.sort(rng.choice(120, 40, replace=False))
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(120)) / 120)
     vectors = rng.normal(size=(12, 40, 2)) @ np.array([1, 1j]) + 3 * atoms[:, [17]].T
-    found, worst = omp(vectors, chosen, 120, 4), 0.0
+    found = omp(vectors, chosen, 120, 4)
     for vector, result in zip(vectors, found, strict=True):
         support: list[int] = []
         rest = vector
@@ -203,8 +188,7 @@ def orthogonal_matching_pursuit() -> float:
             rest = vector - atoms[:, support] @ solution
         truth = np.zeros(120, complex)
         truth[support] = 40 * solution
-        worst = max(worst, stage.relative(result, truth))
-    return worst
+        yield stage.relative(result, truth)
 
 
 # ---- detection
@@ -227,35 +211,26 @@ def _greatest_of(factor: float, looks: int, cells: int, snr: float = 0.0) -> flo
 
 
 @case(
-    truth="F distribution of a cell over one training mean; an integral for the greater of two",
-    unit="of the rate",
-    bound=0.001,
-    why="trapezoid over 4001 points",
+    "F distribution of a cell over one training mean; an integral for the greater of two",
+    "0.001 of the rate",
+    "trapezoid over 4001 points",
 )
-def false_alarm_factor() -> float:
+def false_alarm_factor() -> Errors:
     """The threshold's factor gives the false-alarm rate that was asked for, from 1e-2 to 1e-6,
     one-sided and greatest-of."""
-    worst = 0.0
     for rate, looks, cells in ((1e-2, 3, 8), (1e-4, 15, 8), (1e-6, 45, 20)):
         one = greatest_of_factor(rate, float(looks), float(cells), 0.0)
-        worst = max(worst, abs(stats.f.sf(one, 2 * looks, 2 * looks * cells) / rate - 1))
-        worst = max(
-            worst,
+        yield abs(stats.f.sf(one, 2 * looks, 2 * looks * cells) / rate - 1)
+        yield (
             abs(
                 _greatest_of(greatest_of_factor(rate, float(looks), cells, cells), looks, cells)
                 / rate
                 - 1
-            ),
+            )
         )
-    return worst
 
 
-@case(
-    truth="binomial law at the designed rate",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5,
-)
+@case("binomial law at the designed rate", "4.5 sigma", ONCE_IN_1E5)
 def false_alarms_along_range() -> float:
     """False alarms of the one-dimensional CFAR in noise of 15 receivers, 200,000 cells at 1e-3,
     ends included."""
@@ -264,10 +239,9 @@ def false_alarms_along_range() -> float:
 
 
 @case(
-    truth="integral of the noncentral chi-square law over the greater training mean",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5 + "; factor by the program, whose rate has a case of its own",
+    "integral of the noncentral chi-square law over the greater training mean",
+    "4.5 sigma",
+    ONCE_IN_1E5 + "; factor by the program, whose rate has a case of its own",
 )
 def detection_probability() -> float:
     """Share of detections of a steady target of 0 dB per receiver, 15 receivers, false-alarm rate
@@ -289,16 +263,11 @@ def _noise_cube(w: Waveform, seed: int) -> IFCube:
     )
 
 
-@case(
-    truth="the designed rate",
-    unit="relative",
-    bound=0.25,
-    why=(
-        "windowed neighbours count as fractions of independent cells, an approximation good to a "
-        "fifth; 1,200 "
-        "alarms in clusters scatter by 0.06"
-    ),
-    quick=False,
+@slow(
+    "the designed rate",
+    "0.25 relative",
+    "windowed neighbours count as fractions of independent cells, an approximation good to a "
+    "fifth; 1,200 alarms in clusters scatter by 0.06",
 )
 def false_alarms_of_the_whole_chain() -> float:
     """Cells above the threshold in noise through data removal, Doppler and accumulation, designed
@@ -316,20 +285,15 @@ def false_alarms_of_the_whole_chain() -> float:
 # ---- estimates
 
 
-@case(
-    truth="range, velocity and direction that the cube was made with",
-    unit="of a resolution",
-    bound=0.002,
-    why=(
-        "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in "
-        "the cube against spheres in the receiver"
-    ),
-    quick=False,
+@slow(
+    "range, velocity and direction that the cube was made with",
+    "0.002 of a resolution",
+    "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in "
+    "the cube against spheres in the receiver",
 )
-def bias_of_an_echo() -> float:
+def bias_of_an_echo() -> Errors:
     """Estimates of a noise-free echo off the grid, data on the chirps, at 31 and 58 m and up to
     14.6 m/s; nothing else is seen."""
-    worst = 0.0
     w, schedule, payload = stage.frame(w=Waveform(num_samples=512))
     for distance, speed, x, z in ((31.3217, 13.277, -0.52, 0.17), (57.618, -14.62, 0.05, 0.61)):
         signal = stage.cube_of(
@@ -337,10 +301,10 @@ def bias_of_an_echo() -> float:
         )
         d = receive_active(signal, payload, FULL, Receivers()).detections
         if len(d) != 1:
-            return np.inf
+            yield np.inf
+            return
         off = np.array([d.range[0] - distance, d.velocity[0] - speed, *(d.direction[0] - [x, z])])
-        worst = max(worst, float(np.abs(off / [0.24983, 0.25014, 0.108, 0.108]).max()))
-    return worst
+        yield np.abs(off / [0.24983, 0.25014, 0.108, 0.108]).max()
 
 
 def _loss(window: np.ndarray) -> tuple[float, float]:
@@ -351,15 +315,11 @@ def _loss(window: np.ndarray) -> tuple[float, float]:
     return float((window**2 * x**2).sum() / (window * x**2).sum() ** 2 / 2 / (4 * np.pi**2)), bound
 
 
-@case(
-    truth=(
-        "Cramer-Rao bound of a tone over channels of unknown phase, with the Hann windows' loss by "
-        "first-order perturbation"
-    ),
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5 + "; the variance of 100 frames is known to 14 %",
-    quick=False,
+@slow(
+    "Cramer-Rao bound of a tone over channels of unknown phase, with the Hann windows' loss by "
+    "first-order perturbation",
+    "4.5 sigma",
+    ONCE_IN_1E5 + "; the variance of 100 frames is known to 14 %",
 )
 def scatter_of_range_and_velocity() -> float:
     """Estimates of range and velocity in noise scatter as the bound says, 15 dB below the noise of
@@ -390,15 +350,14 @@ def scatter_of_range_and_velocity() -> float:
 
 
 @case(
-    truth="Cramer-Rao bound of a direction cosine on the arm's own elements",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5 + "; 400 draws",
+    "Cramer-Rao bound of a direction cosine on the arm's own elements",
+    "4.5 sigma",
+    ONCE_IN_1E5 + "; 400 draws",
 )
-def scatter_of_directions() -> float:
+def scatter_of_directions() -> Errors:
     """Direction cosines along both arms, one-way and two-way, scatter as the bound says, without
     bias."""
-    w, rng, worst, count, noise = Waveform(), np.random.default_rng(14), 0.0, 400, 0.02
+    w, rng, count, noise = Waveform(), np.random.default_rng(14), 400, 0.02
     scale = (
         2
         * np.pi
@@ -424,19 +383,15 @@ def scatter_of_directions() -> float:
             )
             errors.append(direction_cosine(channels, FULL, w, axis, virtual) - u)
         sigma = np.sqrt(noise / 2 / spread) / scale
-        worst = max(worst, abs(np.mean(np.square(errors)) / sigma**2 - 1) / np.sqrt(2 / count))
-        worst = max(worst, abs(np.mean(errors)) / sigma * np.sqrt(count))
-    return float(worst)
+        yield abs(np.mean(np.square(errors)) / sigma**2 - 1) / np.sqrt(2 / count)
+        yield abs(np.mean(errors)) / sigma * np.sqrt(count)
 
 
 @case(
-    truth="signal and noise of the accumulated map, measured",
-    unit="dB",
-    bound=0.6,
-    why=(
-        "scalloping of a path off the grid, up to 1.4 dB per axis at worst, here 0.2 and 0.1; the "
-        "window is 1.7 % short"
-    ),
+    "signal and noise of the accumulated map, measured",
+    "0.6 dB",
+    "scalloping of a path off the grid, up to 1.4 dB per axis at worst, here 0.2 and 0.1; the "
+    "window is 1.7 % short",
 )
 def processing_gain() -> float:
     """The link budget's gain from a sample to a cell of the map, against a path and noise sent
@@ -459,12 +414,7 @@ def processing_gain() -> float:
 # ---- clutter
 
 
-@case(
-    truth="what stands still is a constant over each antenna's chirps",
-    unit="relative",
-    bound=1e-05,
-    why="complex64",
-)
+@case("what stands still is a constant over each antenna's chirps", "1e-5 relative", "complex64")
 def standing_clutter_is_removed() -> float:
     """The notch takes a standing path away and leaves a moving one, but for its own mean."""
     schedule = conventional_schedule(3, 60, 3)
@@ -482,12 +432,7 @@ def standing_clutter_is_removed() -> float:
     return float(np.abs(spectra - moving).max() / 100)
 
 
-@case(
-    truth="mean power, and Rayleigh's law by Kolmogorov and Smirnov",
-    unit="sigma",
-    bound=4.5,
-    why=ONCE_IN_1E5,
-)
+@case("mean power, and Rayleigh's law by Kolmogorov and Smirnov", "4.5 sigma", ONCE_IN_1E5)
 def rayleigh_clutter() -> float:
     """Amplitudes of the paper's clutter are Rayleigh, on average 10 dB over the reference; 40 to 50
     cells about 20 to 30 m."""

@@ -16,7 +16,7 @@ from isac_rt.propagation import PathKind, make_paths
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.studies.validation import stage, truths
-from isac_rt.studies.validation.case import case
+from isac_rt.studies.validation.case import Errors, case, slow, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, flown, if_samples, wide
 
 START = 3.217
@@ -27,10 +27,9 @@ ORIGIN = np.zeros((1, 3))
 
 
 @case(
-    truth="Table I and the settings of the paper, corrected (T_d = f_s T~/B), worked out by hand",
-    unit="relative",
-    bound=5e-05,
-    why="the settings are printed with five to seven digits",
+    "Table I and the settings of the paper, corrected (T_d = f_s T~/B), worked out by hand",
+    "5e-5 relative",
+    "the settings are printed with five to seven digits",
 )
 def numbers_of_the_frame() -> float:
     """Durations, slope, cells, limits and bits of the paper's waveform."""
@@ -53,12 +52,7 @@ def numbers_of_the_frame() -> float:
     return max(abs(found / truth - 1) for found, truth in pairs)
 
 
-@case(
-    truth="every antenna once in each slot: a Latin rectangle, counted",
-    unit="violations",
-    bound=0,
-    why="exact",
-)
+@case("every antenna once in each slot: a Latin rectangle, counted", "0 violations", "exact")
 def antenna_schedule() -> float:
     """No antenna sends in two groups at once, and each sends once per cycle in every group."""
     wrong = 0
@@ -74,12 +68,7 @@ def antenna_schedule() -> float:
     return float(wrong)
 
 
-@case(
-    truth="the bits that were sent; Hamming distance of neighbours 1",
-    unit="bits",
-    bound=0,
-    why="exact",
-)
+@case("the bits that were sent; Hamming distance of neighbours 1", "0 bits", "exact")
 def bits_on_symbols() -> float:
     """Modulation and demodulation return the bits; neighbouring symbols differ in one bit."""
     w, wrong = Waveform(), 0
@@ -103,12 +92,7 @@ def bits_on_symbols() -> float:
     return float(wrong)
 
 
-@case(
-    truth="a plain loop over the chirps of each antenna",
-    unit="1",
-    bound=1e-12,
-    why="float64 rounding of exp",
-)
+@case("a plain loop over the chirps of each antenna", "1e-12 1", "float64 rounding of exp")
 def differential_phases() -> float:
     """The phase of a chirp is that of the same antenna's chirp before it, turned by the symbol
     between them."""
@@ -183,10 +167,9 @@ COMPLEX64 = "samples are complex64; two roundings"
 
 
 @case(
-    truth="chirps mixed sample by sample in long double",
-    unit="relative",
-    bound=0.0001,
-    why="the issue's 0.01 %; reached: " + COMPLEX64,
+    "chirps mixed sample by sample in long double",
+    "0.0001 relative",
+    "the issue's 0.01 %; reached: " + COMPLEX64,
 )
 def exact_model_at_rest() -> float:
     """IF samples of a line of sight between two arrays at rest, data on the chirps."""
@@ -194,10 +177,9 @@ def exact_model_at_rest() -> float:
 
 
 @case(
-    truth="chirps mixed sample by sample in long double, every element at its own distance",
-    unit="relative",
-    bound=0.0005,
-    why="the issue's 0.05 %; what is left is the turning of directions within the frame, 2 pi v r "
+    "chirps mixed sample by sample in long double, every element at its own distance",
+    "0.0005 relative",
+    "the issue's 0.05 %; what is left is the turning of directions within the frame, 2 pi v r "
     "t / (R lambda)",
 )
 def exact_model_in_motion() -> float:
@@ -211,9 +193,9 @@ def _against_exact(
     counts: tuple[int, ...],
     w: Waveform = stage.SMALL,
     speeds: tuple[float, ...] = (0.0, 3.0, 30.0),
-) -> float:
+) -> Errors:
     """Worst relative RMS over numbers of paths, speeds, and with and without data."""
-    worst, rx, antennas = 0.0, stage.pose((0, 0, 0), boresight=(0.2, 1.0, 0.3)), stage.arrays(w)
+    rx, antennas = stage.pose((0, 0, 0), boresight=(0.2, 1.0, 0.3)), stage.arrays(w)
     for i, count in enumerate(counts):
         for speed in speeds:
             rng = np.random.default_rng([i, int(speed)])
@@ -223,42 +205,32 @@ def _against_exact(
                 stage.synthesise(w, [(sender, paths)], rx, m, START, antennas)
                 for m in (method, "exact")
             )
-            worst = max(worst, stage.relative(found, truth))
-    return worst
+            yield stage.relative(found, truth)
 
 
-@case(
-    truth="the exact model, which has cases of its own",
-    unit="relative",
-    bound=2e-07,
-    why=COMPLEX64,
-    quick=False,
-)
-def direct_method() -> float:
+@slow("the exact model, which has cases of its own", "2e-7 relative", COMPLEX64)
+def direct_method() -> Errors:
     """The direct method over K = 1, 4, 30 paths, 0 to 30 m/s, with and without data."""
     return _against_exact("direct", (1, 4, 30))
 
 
-@case(
-    truth="the exact model",
-    unit="relative",
-    bound=GRIDDED_ERROR,
-    why="the error that the method states (isac_rt.signal.gridded.GRIDDED_ERROR)",
-    quick=False,
+@slow(
+    "the exact model",
+    f"{GRIDDED_ERROR} relative",
+    "the error that the method states (isac_rt.signal.gridded.GRIDDED_ERROR)",
 )
-def gridded_method() -> float:
+def gridded_method() -> Errors:
     """The gridded method over K = 3, 40 and 200 paths anywhere in the passband, 0 to 30 m/s, with
     and without data."""
     return _against_exact("gridded", (3, 40, 200))
 
 
 @case(
-    truth="the exact model",
-    unit="relative",
-    bound=GRIDDED_ERROR,
-    why="never worse than its parts; the strongest paths and lines of sight go direct",
+    "the exact model",
+    f"{GRIDDED_ERROR} relative",
+    "never worse than its parts; the strongest paths and lines of sight go direct",
 )
-def automatic_choice() -> float:
+def automatic_choice() -> Errors:
     """The method that runs use by default, over K = 2, 12 and 60 paths."""
     return _against_exact("auto", (2, 12, 60))
 
@@ -333,38 +305,20 @@ BEST = (
 )
 
 
-@case(
-    truth="closed forms and chirps mixed in long double",
-    unit="relative",
-    bound=0.0001,
-    why=BEST,
-    tracer=True,
-)
+@traced("closed forms and chirps mixed in long double", "0.0001 relative", BEST)
 def mesh_to_if_at_rest() -> float:
     """An echo from a target at rest, from the mesh through the ray tracer and the default method to
     samples."""
     return _city_link(False, False, True)
 
 
-@case(
-    truth="closed forms and chirps mixed in long double",
-    unit="relative",
-    bound=0.0005,
-    why=BEST,
-    tracer=True,
-)
+@traced("closed forms and chirps mixed in long double", "0.0005 relative", BEST)
 def mesh_to_if_in_motion() -> float:
     """An echo with transmitter, target and receiver in curved flight, from the mesh to samples."""
     return _city_link(True, False, True)
 
 
-@case(
-    truth="two rays in closed form, chirps mixed in long double",
-    unit="relative",
-    bound=0.001,
-    why=BEST,
-    tracer=True,
-)
+@traced("two rays in closed form, chirps mixed in long double", "0.001 relative", BEST)
 def mesh_to_if_two_rays_in_motion() -> float:
     """Line of sight and ground ray over concrete between two moving platforms, from the mesh to
     samples."""
@@ -408,11 +362,9 @@ def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
 
 
 @case(
-    truth="beat alpha tau + f_c dtau/dt and Doppler f_c v / c, by hand",
-    unit="relative",
-    bound=0.01,
-    why="the mean over the chirp shifts both by the sweep, 0.4 %, and by the range-Doppler "
-    "coupling",
+    "beat alpha tau + f_c dtau/dt and Doppler f_c v / c, by hand",
+    "0.01 relative",
+    "the mean over the chirp shifts both by the sweep, 0.4 %, and by the range-Doppler coupling",
 )
 def signs() -> float:
     """A farther target has a higher positive beat; a closing one a negative slow-time frequency."""
@@ -428,16 +380,15 @@ def signs() -> float:
 
 
 @case(
-    truth="cos^2 of the distance into the skirt, by hand",
-    unit="1",
-    bound=0.001,
-    why="a beat moves by 1e-4 of the skirt over the chirp",
+    "cos^2 of the distance into the skirt, by hand",
+    "0.001 1",
+    "a beat moves by 1e-4 of the skirt over the chirp",
 )
-def filter_skirts() -> float:
+def filter_skirts() -> Errors:
     """Amplitude inside the passband, a third and a half into either skirt, and outside; the
     neighbouring group is not heard."""
     w = Waveform(num_groups=1, num_tx=1, num_chirps=4, num_samples=64)
-    antennas, worst = stage.arrays(w, tx_x=1, tx_z=1), 0.0
+    antennas = stage.arrays(w, tx_x=1, tx_z=1)
     sender = Transmission(
         name="A",
         pose=stage.pose((0, 0, 0)),
@@ -467,18 +418,14 @@ def filter_skirts() -> float:
             found = stage.synthesise(
                 w, [(sender, paths)], stage.pose((0, 0, 0)), method, START, antennas
             )
-            worst = max(worst, abs(float(np.sqrt((np.abs(found) ** 2).mean())) - truth))
-    return worst
+            yield abs(float(np.sqrt((np.abs(found) ** 2).mean())) - truth)
 
 
 @case(
-    truth="distances to a point half a metre away",
-    unit="rad",
-    bound=0.002,
-    why=(
-        "the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but "
-        "for its change over the window"
-    ),
+    "distances to a point half a metre away",
+    "0.002 rad",
+    "the wideband part of the element delays: B/2 over 2e-11 s is 4e-2 cycles, taken out but "
+    "for its change over the window",
 )
 def spherical_waves() -> float:
     """Phases over the full array of a scatterer at 0.5 m follow the elements' own distances."""
@@ -523,10 +470,9 @@ def spherical_waves() -> float:
 
 
 @case(
-    truth="the same path with the clock's error in its delay",
-    unit="relative",
-    bound=1e-06,
-    why=COMPLEX64 + "; a drift of 1e-9 over half a frame",
+    "the same path with the clock's error in its delay",
+    "1e-6 relative",
+    COMPLEX64 + "; a drift of 1e-9 over half a frame",
 )
 def clock_errors() -> float:
     """A transmitter's clock that is late and slow lengthens every delay and its rate."""
@@ -547,13 +493,8 @@ def clock_errors() -> float:
     return stage.relative(found, truth)
 
 
-@case(
-    truth="energy of the chirps that the path lives through, counted",
-    unit="relative",
-    bound=1e-06,
-    why=COMPLEX64,
-)
-def births_and_deaths() -> float:
+@case("energy of the chirps that the path lives through, counted", "1e-6 relative", COMPLEX64)
+def births_and_deaths() -> Errors:
     """A path that dies in mid-frame leaves the later chirps empty."""
     w, rng = stage.SMALL, np.random.default_rng(2)
     sender, rx = stage.sender(w, rng, data=False), stage.pose((0, 0, 0))
@@ -562,31 +503,21 @@ def births_and_deaths() -> float:
     cut = (
         3 * slot - w.frame_duration / 2 - slot / 50
     )  # in the gap before the fourth chirp of the first group
-    worst = 0.0
     for method in ("exact", "direct", "gridded"):
         s = stage.synthesise(
             w, [(sender, replace(paths, end=np.array([cut])))], rx, method, START, stage.arrays(w)
         )
         energy = (np.abs(s[0]) ** 2).sum(axis=(0, 2))
-        worst = max(
-            worst,
-            float(energy[3:].sum() / energy.sum()),
-            abs(float(energy[:3].min() / energy[:3].max()) - 1) if method != "gridded" else 0.0,
-        )
-    return worst
+        yield energy[3:].sum() / energy.sum()
+        yield abs(float(energy[:3].min() / energy[:3].max()) - 1) if method != "gridded" else 0.0
 
 
-@case(
-    truth="the frame without data",
-    unit="of the peak",
-    bound=2e-06,
-    why="complex64 samples and transform",
-)
-def data_are_taken_out() -> float:
+@case("the frame without data", "2e-6 of the peak", "complex64 samples and transform")
+def data_are_taken_out() -> Errors:
     """A modulated frame with its data removed equals the unmodulated frame, at whole and fractional
     cells."""
     w, schedule, payload = stage.frame(w=Waveform(num_samples=256, num_chirps=30))
-    pilot, worst = unmodulated(w), 0.0
+    pilot = unmodulated(w)
     for cell in (0.61, 22.5, 87.28, 100.93):
         path = [(cell * w.range_cell(1), 0.0, 0.7 - 0.4j)]
         one = clean_spectrum(
@@ -595,16 +526,10 @@ def data_are_taken_out() -> float:
         other = clean_spectrum(
             stage.cube_of(w, schedule, pilot, path), pilot.delay_symbols, pilot.phases, 128
         )
-        worst = max(worst, float(np.abs(one - other).max() / np.abs(other).max()))
-    return worst
+        yield np.abs(one - other).max() / np.abs(other).max()
 
 
-@case(
-    truth="the same transmission in the blocks it is read in",
-    unit="relative",
-    bound=1e-06,
-    why=COMPLEX64,
-)
+@case("the same transmission in the blocks it is read in", "1e-6 relative", COMPLEX64)
 def resource_blocks() -> float:
     """A receiver whose reference stands one block later than the sender's hears the sender's later
     groups, shifted by one."""

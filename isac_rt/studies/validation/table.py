@@ -10,12 +10,12 @@ from pathlib import Path
 
 from isac_rt.results.files import write_text
 from isac_rt.results.provenance import commit, program_fingerprint, versions
-from isac_rt.studies.validation.case import Verdict
+from isac_rt.studies.validation.case import Measured
 
 STATES = {True: "passes", False: "FAILS", None: "left out"}
 
 
-def as_data(verdicts: Sequence[Verdict]) -> dict[str, object]:
+def as_data(verdicts: Sequence[Measured]) -> dict[str, object]:
     """All of the table as plain data, with what it was made by; an error that is no finite number
     is null."""
     rows = []
@@ -57,7 +57,7 @@ def shown(value: float) -> str:
     return "-" if not math.isfinite(value) else f"{value:.2g}"
 
 
-def as_markdown(verdicts: Sequence[Verdict]) -> str:
+def as_markdown(verdicts: Sequence[Measured]) -> str:
     """A table per group: claim, truth, error, bound and why."""
     data = as_data(verdicts)
     counts = f"{data['passed']} cases pass, {data['failed']} fail, {data['left_out']} were left out"
@@ -89,11 +89,11 @@ def as_markdown(verdicts: Sequence[Verdict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_json(verdicts: Sequence[Verdict], file: Path) -> None:
+def write_json(verdicts: Sequence[Measured], file: Path) -> None:
     """The table as JSON; the file appears whole or not at all."""
     write_text(file, json.dumps(as_data(verdicts), indent=1, allow_nan=False) + "\n")
 
 
-def write_markdown(verdicts: Sequence[Verdict], file: Path) -> None:
+def write_markdown(verdicts: Sequence[Measured], file: Path) -> None:
     """The table as Markdown; the file appears whole or not at all."""
     write_text(file, as_markdown(verdicts))
