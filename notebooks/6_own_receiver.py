@@ -7,7 +7,7 @@
 # ---
 
 # %% [markdown]
-# # A receiver of one's own
+# # A custom receiver
 # A terminal is a class with a method `receive`: samples and public knowledge in, a `Reception` out.
 # Replace it, and the rest of the run
 # (tracking, scoring, figures) stays.
@@ -20,7 +20,6 @@ from dataclasses import replace
 from tempfile import TemporaryDirectory
 
 import isac_rt as irt
-from isac_rt.receive import Detections
 
 
 class Cautious(irt.ActiveTerminal):
@@ -29,12 +28,7 @@ class Cautious(irt.ActiveTerminal):
     def receive(self, cube, payload, clutter, maps):
         found = super().receive(cube, payload, clutter, maps)
         strong = found.detections.snr > 25
-        return replace(
-            found,
-            detections=Detections(
-                **{name: value[strong] for name, value in vars(found.detections).items()}
-            ),
-        )
+        return replace(found, detections=found.detections.select(strong))
 
 
 def terminal(setup, link):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
@@ -65,18 +63,5 @@ def receive_active(
         detections = separate(
             Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections
         )[0]
-    groups, chirps = payload.delay_symbols.shape
-    return Reception(
-        detections=detections,
-        decoded=False,
-        delay_symbols=np.full((groups, chirps), -1),
-        transitions=np.full(payload.transitions.shape, -1),
-        bits=np.zeros(0, np.uint8),
-        delay_confidence=np.zeros((groups, chirps)),
-        transition_confidence=np.zeros(payload.transitions.shape),
-        raw_delay_symbols=np.zeros((0, chirps), int),
-        line_of_sight=False,
-        reference_power=float("nan"),
-        maps=make_maps(found.power, cube, settings, 2) if maps else None,
-        sparse=found.sparse,
-    )
+    picture = make_maps(found.power, cube, settings, 2) if maps else None
+    return Reception.undecoded(w, detections, picture, found.sparse)

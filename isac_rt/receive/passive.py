@@ -236,14 +236,8 @@ def _at_prediction(
     d = found.detections
     apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
     apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
-    everything = Detections(
-        **{
-            name: np.concatenate([getattr(reference, name), getattr(d, name)[apart]])
-            for name in ("range", "velocity", "direction", "snr", "std")
-        },
-        is_reference=np.arange(1 + apart.sum()) == 0,
-    )
-    return everything, estimate
+    first = replace(reference, is_reference=np.ones(1, bool))
+    return Detections.joined([first, d.select(apart)]), estimate
 
 
 def predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
@@ -264,28 +258,24 @@ def _reception(
     maps: bool,
 ) -> Reception:
     w = cube.waveform
-    shape, transitions = cube.schedule.shape, (w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1)
     picture = None
     if maps:
         power = found.power if found else np.zeros((w.num_delay_symbols, w.num_chirps))
         picture = make_maps(power, cube, settings, 1)
-    return Reception(
-        detections=detections,
-        decoded=symbols is not None,
-        delay_symbols=np.full(shape, -1) if symbols is None else symbols.delay,
-        transitions=np.full(transitions, -1) if symbols is None else symbols.transitions,
-        bits=np.zeros(0, np.uint8) if symbols is None else symbols.bits,
-        delay_confidence=np.zeros(shape) if symbols is None else symbols.delay_confidence,
-        transition_confidence=np.zeros(transitions)
-        if symbols is None
-        else symbols.transition_confidence,
-        raw_delay_symbols=np.zeros((0, shape[1]), int) if symbols is None else symbols.raw,
-        line_of_sight=reference is not None,
-        reference_power=float("nan") if reference is None else _power(reference),
-        maps=picture,
-        soft_bits=np.zeros(0)
-        if symbols is None or symbols.soft_bits is None
-        else symbols.soft_bits,
-        confidence_looks=0 if symbols is None else symbols.looks,
-        sparse=None if found is None else found.sparse,
+    out = Reception.undecoded(w, detections, picture, found.sparse if found else None)
+    if reference is not None:
+        out = replace(out, line_of_sight=True, reference_power=_power(reference))
+    if symbols is None:
+        return out
+    return replace(
+        out,
+        decoded=True,
+        delay_symbols=symbols.delay,
+        transitions=symbols.transitions,
+        bits=symbols.bits,
+        delay_confidence=symbols.delay_confidence,
+        transition_confidence=symbols.transition_confidence,
+        raw_delay_symbols=symbols.raw,
+        soft_bits=symbols.soft_bits,
+        confidence_looks=symbols.looks,
     )

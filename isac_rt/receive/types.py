@@ -3,9 +3,12 @@ truth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+
+from isac_rt.frame.waveform import Waveform
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +49,12 @@ class Detections:
     snr : (Q,) linear, of the range-Doppler cell after accumulation over antennas
     std : (Q, 4) standard deviations of range, velocity, u_x, u_z
     is_reference : (Q,) bool, the line of sight at a PT
+
+    Examples
+    --------
+    >>> d = no_detections()
+    >>> len(d), d.select(d.snr > 25), len(Detections.joined([d, d]))
+    (0, <0 detections>, 0)
     """
 
     range: np.ndarray
@@ -61,6 +70,16 @@ class Detections:
 
     def __len__(self) -> int:
         return self.range.shape[0]
+
+    def select(self, which: np.ndarray) -> Detections:
+        """The detections that a mask or an index array chooses."""
+        return Detections(**{name: value[which] for name, value in vars(self).items()})
+
+    @staticmethod
+    def joined(parts: Sequence[Detections]) -> Detections:
+        """All detections of some sets, in their order."""
+        names = [f.name for f in fields(Detections)]
+        return Detections(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
 
     def __repr__(self) -> str:
         rows = ["  range [m]  velocity [m/s]     u_x     u_z  SNR [dB]"]
@@ -153,6 +172,55 @@ class Reception:
     confidence_looks: int = 0
     sparse: bool | None = None
 
+    @classmethod
+    def undecoded(
+        cls,
+        waveform: Waveform,
+        detections: Detections,
+        maps: Maps | None = None,
+        sparse: bool | None = None,
+    ) -> Reception:
+        """A reception whose data, if it carried any, were not read.
+
+        Examples
+        --------
+        >>> Reception.undecoded(Waveform(), no_detections())
+        <Reception 0 detections, no data decoded>
+        """
+        w = waveform
+        shape = w.num_groups, w.num_chirps
+        transitions = w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1
+        return cls(
+            detections=detections,
+            decoded=False,
+            delay_symbols=np.full(shape, -1),
+            transitions=np.full(transitions, -1),
+            bits=np.zeros(0, np.uint8),
+            delay_confidence=np.zeros(shape),
+            transition_confidence=np.zeros(transitions),
+            raw_delay_symbols=np.zeros((0, w.num_chirps), int),
+            line_of_sight=False,
+            reference_power=float("nan"),
+            maps=maps,
+            sparse=sparse,
+        )
+
+    def without_reference(self) -> Reception:
+        """The same frame with its reference taken for something else: what was read by it is
+        erased."""
+        d = self.detections
+        return replace(
+            self,
+            detections=replace(d, is_reference=np.zeros(len(d), bool)),
+            decoded=False,
+            delay_symbols=np.full_like(self.delay_symbols, -1),
+            transitions=np.full_like(self.transitions, -1),
+            bits=np.zeros(0, np.uint8),
+            soft_bits=np.zeros(0),
+            raw_delay_symbols=np.zeros((0, self.raw_delay_symbols.shape[1]), int),
+            line_of_sight=False,
+        )
+
     def __repr__(self) -> str:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"
         sight = "line of sight, " if self.line_of_sight else ""
@@ -185,8 +253,8 @@ class ExpectedClutter:
         """The scatterers that a mask or an index array chooses."""
         return ExpectedClutter(*(a[which] for a in vars(self).values()))
 
-
-def joined(parts: list[ExpectedClutter]) -> ExpectedClutter:
-    """Several kinds of clutter as one."""
-    names = ("delay", "delay_rate", "power", "departure", "arrival")
-    return ExpectedClutter(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    @staticmethod
+    def joined(parts: Sequence[ExpectedClutter]) -> ExpectedClutter:
+        """Several kinds of clutter as one."""
+        names = [f.name for f in fields(ExpectedClutter)]
+        return ExpectedClutter(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))

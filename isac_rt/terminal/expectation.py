@@ -18,7 +18,7 @@ from isac_rt.propagation.clutter.field import ClutterField, Seen
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.randomness import generator, seed_sequence
-from isac_rt.receive.types import ExpectedClutter, joined
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.tree import Scenario
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose
@@ -95,7 +95,7 @@ class MeshExpectation:
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
             moved = 2 * error[part.mirror.faces[0]] * (met @ n)
             parts.append(self._expected(s, there, back, error, amplitude, local, moved))
-        return joined(parts)
+        return ExpectedClutter.joined(parts)
 
     def _expected(
         self,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 from enum import IntEnum
 
 import numpy as np
@@ -19,7 +18,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Detections, Prediction, Reception, receive_active, receive_passive
+from isac_rt.receive import Prediction, Reception, receive_active, receive_passive
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.receive.symbols.profile import learn_profile, reference_of
 from isac_rt.receive.types import ExpectedClutter
@@ -171,7 +170,7 @@ class PassiveTerminal:
         if reception.decoded:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
-            reception = _without_reference(reception)
+            reception = reception.without_reference()
         if (
             self._receivers.symbol_decision == "profile"
             and not modulated
@@ -329,20 +328,3 @@ def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
     mean = state.mean.copy()
     mean[:3] += span / np.linalg.norm(span) * distance
     return Gaussian(mean, state.covariance)
-
-
-def _without_reference(reception: Reception) -> Reception:
-    """The same frame with its reference taken for something else: nothing decoded, no line of
-    sight."""
-    d = reception.detections
-    return replace(
-        reception,
-        detections=Detections(**{**vars(d), "is_reference": np.zeros(len(d), bool)}),
-        decoded=False,
-        delay_symbols=np.full_like(reception.delay_symbols, -1),
-        transitions=np.full_like(reception.transitions, -1),
-        bits=np.zeros(0, np.uint8),
-        soft_bits=np.zeros(0),
-        raw_delay_symbols=np.zeros((0, reception.raw_delay_symbols.shape[1]), int),
-        line_of_sight=False,
-    )

@@ -10,6 +10,7 @@ import pytest
 
 from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Reception
 from isac_rt.receive.types import no_detections
 from isac_rt.scenario.environment import Propagation
@@ -114,19 +115,7 @@ def test_one_dense_advice_is_enough_and_the_last_word_counts(run):
 
 
 def empty():
-    none = np.zeros(0)
-    return Reception(
-        detections=no_detections(),
-        decoded=False,
-        delay_symbols=none,
-        transitions=none,
-        bits=none,
-        delay_confidence=none,
-        transition_confidence=none,
-        raw_delay_symbols=none,
-        line_of_sight=False,
-        reference_power=float("nan"),
-    )
+    return Reception.undecoded(Waveform(), no_detections())
 
 
 def test_a_fall_back_that_can_never_act_is_doubted():

@@ -8,6 +8,8 @@ one, so that clutter within a lobe still pulls them.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
@@ -71,11 +73,7 @@ def sense_in_clutter(
     for i, cosines in enumerate(towards):
         if np.isfinite(cosines).all():
             direction[i] = cosines if on_grid else _direction(found[i], antennas, w, cosines)
-    named = {
-        name: getattr(detections, name)
-        for name in ("range", "velocity", "snr", "std", "is_reference")
-    }
-    return Sensed(found, type(detections)(direction=direction, **named), power, judged.level)
+    return Sensed(found, replace(detections, direction=direction), power, judged.level)
 
 
 def _beam(antennas: Antennas, waveform: Waveform, cosines: np.ndarray) -> np.ndarray:

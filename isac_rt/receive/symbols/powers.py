@@ -8,7 +8,7 @@ where such a slip shows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -48,7 +48,7 @@ class Symbols:
     phases: np.ndarray
     bits: np.ndarray
     looks: int
-    soft_bits: np.ndarray | None = None
+    soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @lru_cache(maxsize=64)
