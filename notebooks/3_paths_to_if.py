@@ -49,7 +49,6 @@ cube = irt.if_signal(
     poses["PT1"],
     setup.antennas,
     start_time=start,
-    filter_transition=0.4e6,
     method="exact",
 )
 chirps = np.flatnonzero(cube.schedule[0] == 0)
@@ -108,8 +107,8 @@ ax.invert_yaxis()
 
 # %%
 links = [(sent, paths["AT", "PT1"])]
-common = {"start_time": start, "filter_transition": 0.4e6}
-exact = irt.if_signal(w, links, poses["PT1"], setup.antennas, method="exact", **common).samples
+heard = (w, links, poses["PT1"], setup.antennas)
+exact = irt.if_signal(*heard, start_time=start, method="exact").samples
 for method in ("direct", "gridded"):
-    fast = irt.if_signal(w, links, poses["PT1"], setup.antennas, method=method, **common).samples
+    fast = irt.if_signal(*heard, start_time=start, method=method).samples
     print(method, f"{np.linalg.norm(fast - exact) / np.linalg.norm(exact):.1e}")

@@ -8,7 +8,7 @@ import numpy as np
 LIGHT = np.longdouble(299_792_458)
 
 
-def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0):
+def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, block=0):
     """IF samples by mixing, sample by sample, the reference chirp with the chirp that arrives (long
     double).
 
@@ -17,7 +17,7 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, transition, block=0
     times an absolute time. Elements are placed as points: a path with a radius comes from (goes to)
     a point at this distance; a line of sight joins two elements.
     """
-    ld = np.longdouble
+    ld, transition = np.longdouble, w.filter_transition
     period = ld(1) / ld(w.sampling_rate)
     window = ld(w.num_samples) * period
     longest = ld(w.sampling_rate) * window / (ld(w.bandwidth) - 2 * ld(w.sampling_rate))

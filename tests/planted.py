@@ -267,11 +267,9 @@ OF_CASES = {
         "np.cumsum(transitions, axis=2)[..., ::-1]]",
     ),
     "exact model at rest": Bug(
-        "signal/direct.py",
-        """(
-                        w.slope * tau * (w.fast_time - tau / 2)
-                    ) % 1""",
-        "(w.slope * tau * (w.fast_time - tau)) % 1",
+        "frame/waveform.py",
+        "(self.slope * tau * (time - tau / 2)) % 1.0",
+        "(self.slope * tau * (time - tau)) % 1.0",
     ),
     "exact model in motion": Bug(
         "signal/direct.py", "t.delay[k] + t.rate[k] * time", "t.delay[k] - t.rate[k] * time"
@@ -288,9 +286,8 @@ OF_CASES = {
     ),
     "automatic choice": Bug(
         "signal/if_signal.py",
-        """add_direct(
-            samples, waveform, tones.select(alone), filter_transition,""",
-        "add_direct(samples, waveform, tones.select(alone[::-1]), filter_transition,",
+        "add_direct(samples, waveform, tones.select(alone), fresh",
+        "add_direct(samples, waveform, tones.select(alone[::-1]), fresh",
     ),
     "mesh to if at rest": Bug(
         "propagation/raytrace.py",
@@ -355,8 +352,8 @@ OF_CASES = {
     ),
     "data at the ends of the velocity": Bug(
         "receive/symbols/powers.py",
-        "data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay",
-        "data_phase(w, raw)",
+        "w.data_phase(raw) - (w.slope * w.delay_step * raw) * delay",
+        "w.data_phase(raw)",
     ),
     "union of the groups": Bug(
         "receive/maps.py",
@@ -546,8 +543,8 @@ OF_TESTS = (
         "test_hard_signal::test_beyond_the_filter_there_is_nothing",
         Bug(
             "signal/direct.py",
-            "np.maximum(-beat, beat - sampling_rate) / transition",
-            "np.maximum(-beat, beat - sampling_rate) / (2 * transition)",
+            "np.maximum(-beat, beat - w.sampling_rate) / w.filter_transition",
+            "np.maximum(-beat, beat - w.sampling_rate) / (2 * w.filter_transition)",
         ),
     ),
     (

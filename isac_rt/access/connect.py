@@ -144,7 +144,6 @@ def connect(
         listeners={name: tuple(passive) for name in active},
         noise_power={name: noise_power((name, name)) for name in active}
         | {name: noise_power((active[0], name)) for name in passive},
-        filter_transition=scenario.radio.filter_transition_hz,
         seed=scenario.seed,
         clocks=clocks,
         amplitude=transmit_amplitude(scenario.noise),

@@ -78,7 +78,6 @@ def mix(
     amplitude: np.ndarray,
     *,
     rate: float = 0.0,
-    transition: float,
     oversampling: int = OVERSAMPLING,
 ) -> np.ndarray:
     r"""IF samples of C reference chirps with the chirps that arrive, by multiplying oscillators and
@@ -95,7 +94,6 @@ def mix(
         start: data, path, clock and 2 T_d per block together, of either sign [s]
     amplitude : (K, C) complex, as it is in the IF (conjugate of what arrives)
     rate : of the delays
-    transition : width of the filter's skirts [Hz]
     oversampling : samples of the mixer per IF sample
 
     Returns
@@ -111,7 +109,7 @@ def mix(
     )
     taps = np.arange(-u.size, u.size + 1) * step
     size = scipy.fft.next_fast_len(3 * u.size + 1)
-    response = scipy.fft.fft(raised_cosine(taps, w.sampling_rate, transition) * step, size)
+    response = scipy.fft.fft(raised_cosine(taps, w.sampling_rate, w.filter_transition) * step, size)
     out = np.empty((delay.shape[1], w.num_samples), np.complex128)
     for c in range(delay.shape[1]):
         product = np.zeros(u.size, np.complex128)
@@ -148,7 +146,6 @@ def isolation(
     timing_error: float,
     rng: np.random.Generator,
     *,
-    transition: float,
     chirps: int = 24,
     path_cells: float | None = None,
     modulated: bool = True,
@@ -172,9 +169,9 @@ def isolation(
     symbol = rng.integers(0, w.num_delay_symbols, chirps) if modulated else np.zeros(chirps)
     delay = (path + symbol) * w.delay_step
     amplitude = np.exp(2j * np.pi * rng.random((1, chirps)))
-    own = mix(w, delay[None], amplitude, transition=transition, oversampling=oversampling)
+    own = mix(w, delay[None], amplitude, oversampling=oversampling)
     moved = delay + spacing * w.group_spacing + timing_error
-    other = mix(w, moved[None], amplitude, transition=transition, oversampling=oversampling)
+    other = mix(w, moved[None], amplitude, oversampling=oversampling)
     return Isolation(
         spacing=spacing,
         timing_error=timing_error,

@@ -80,7 +80,6 @@ class Network:
     clocks : of every terminal; those left out are right
     noise_power : E|n|^2 per IF sample of every receiver [W]
     amplitude : sqrt(transmit power) of every terminal's antenna
-    filter_transition : [Hz]
     seed : of all randomness here
     external_clock : whether stage 2 is left out
     dpsk_order : of the data of those that have joined
@@ -95,7 +94,6 @@ class Network:
     wishes: Mapping[str, int | None]
     listeners: Mapping[str, Sequence[str]]
     noise_power: Mapping[str, float]
-    filter_transition: float
     seed: int
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     amplitude: float = 1.0
@@ -230,7 +228,6 @@ class _Air:
             poses[name],
             n.antennas,
             start_time=self.time - w.frame_duration / 2 + first_block * w.group_spacing,
-            filter_transition=n.filter_transition,
             schedule=n.schedule,
             first_block=first_block,
             noise_power=n.noise_power[name],

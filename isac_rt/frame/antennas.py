@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.tree import Scenario
@@ -17,16 +18,33 @@ from isac_rt.scenario.tree import Scenario
 PatternModel = Literal["isotropic", "sector", "cosine"]
 
 
-def l_shape(num_x: int, num_z: int, spacing: float) -> np.ndarray:
+def l_shape(num_x: int, num_z: int, spacing: float, step_x: int = 1, step_z: int = 1) -> np.ndarray:
     """Elements of an L (num_x + num_z - 1, 3) [m] about their centroid.
 
     Order as in the paper: element 0 is farthest along X, then inwards to the corner (index
-    ``num_x - 1``), then up along Z.
+    ``num_x - 1``), then up along Z. Neighbours stand `step_x` (`step_z`) spacings apart.
     """
-    x = np.concatenate([np.arange(num_x)[::-1], np.zeros(num_z - 1)])
-    z = np.concatenate([np.zeros(num_x), np.arange(1, num_z)])
+    x = np.concatenate([np.arange(num_x)[::-1] * step_x, np.zeros(num_z - 1)])
+    z = np.concatenate([np.zeros(num_x), np.arange(1, num_z) * step_z])
     positions = spacing * np.stack([x, np.zeros_like(x), z], axis=1)
     return positions - positions.mean(axis=0)
+
+
+def unit_vector(cosines: npt.ArrayLike) -> np.ndarray:
+    """Body-frame unit vectors (..., 3) of direction cosines (u_x, u_z) (..., 2) in the front
+    half-space; outside the unit disc the Y component is 0."""
+    u_x, u_z = np.moveaxis(np.asarray(cosines), -1, 0)
+    forward = np.sqrt(np.maximum(1 - u_x**2 - u_z**2, 0.0))
+    return np.stack([u_x, forward, u_z], axis=-1)
+
+
+def azimuth_elevation(cosines: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and elevation [rad] (...) of direction cosines (u_x, u_z) (..., 2) in the front
+    half-space; NaN outside the unit disc."""
+    u_x, u_z = np.moveaxis(np.asarray(cosines), -1, 0)
+    forward = 1 - u_x**2 - u_z**2
+    seen = np.where(forward >= 0, 1.0, np.nan)
+    return np.arctan2(u_x, np.sqrt(np.maximum(forward, 0.0))) * seen, np.arcsin(u_z * seen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,19 +84,21 @@ class Antennas:
     @property
     def tx_positions(self) -> np.ndarray:
         """(num_tx, 3) [m] body frame, about the centroid."""
-        x = np.concatenate([np.arange(self.tx_x)[::-1] * self.rx_x, np.zeros(self.tx_z - 1)])
-        z = np.concatenate([np.zeros(self.tx_x), np.arange(1, self.tx_z) * self.rx_z])
-        positions = self.spacing * np.stack([x, np.zeros_like(x), z], axis=1)
-        return positions - positions.mean(axis=0)
+        return l_shape(self.tx_x, self.tx_z, self.spacing, self.rx_x, self.rx_z)
 
     @property
     def rx_positions(self) -> np.ndarray:
         """(num_rx, 3) [m] body frame, about the centroid."""
         return l_shape(self.rx_x, self.rx_z, self.spacing)
 
+    @property
+    def view_limit(self) -> float:
+        """Largest |u_x| and |u_z| of the field of view."""
+        return float(np.sin(min(self.half_view, np.pi / 2)))
+
     def in_view(self, direction: np.ndarray) -> np.ndarray:
         """Whether body-frame unit vectors (..., 3) lie inside the field of view of both arms."""
-        limit = np.sin(self.half_view)
+        limit = self.view_limit
         return (
             (direction[..., 1] > 0)
             & (np.abs(direction[..., 0]) <= limit)

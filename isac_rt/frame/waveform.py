@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from isac_rt.scenario.radio import ChirpTimes, chirp_times, num_resource_blocks
 from isac_rt.scenario.tree import Scenario
@@ -33,6 +33,7 @@ class Waveform:
     num_chirps : P, slots per frame
     num_groups : M, resource blocks that are used at once
     num_tx : L_tx, transmit antennas that share the slots
+    filter_transition : width of the skirts of the IF filter [Hz], which passes [0, f_s]
     blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A
         receiver that reads some of the groups only sees a waveform of these (`of_groups`)
     """
@@ -44,6 +45,7 @@ class Waveform:
     num_chirps: int = 120
     num_groups: int = 3
     num_tx: int = 3
+    filter_transition: float = 0.4e6
     blocks: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -190,6 +192,67 @@ class Waveform:
         t.setflags(write=False)
         return t
 
+    @cached_property
+    def middle_time(self) -> np.ndarray:
+        """Middle of each chirp's range window [s] (num_groups, num_chirps) since mid-frame."""
+        t = self.chirp_time + self.window_middle - self.frame_duration / 2
+        t.setflags(write=False)
+        return t
+
+    @cached_property
+    def window_length(self) -> float:
+        """Samples that the range window may cover, whatever the data: N less the largest s_D."""
+        return self.num_samples - float(self.data_shift(self.num_delay_symbols))
+
+    @cached_property
+    def window_middle(self) -> float:
+        """u_c [s], the middle of the range window since the start of the reference chirp."""
+        return self.window_start + self.window_length / 2 * self.sample_interval
+
+    def data_shift(self, delay_symbols: npt.ArrayLike) -> np.ndarray:
+        """s_D, the delay of data symbols in samples."""
+        return np.asarray(delay_symbols) * self.delay_step * self.sampling_rate
+
+    def data_phase(self, delay_symbols: npt.ArrayLike) -> np.ndarray:
+        """Phase of the data's delay where the sampled window begins [cycles], as of `phase`."""
+        return self.phase(np.asarray(delay_symbols) * self.delay_step, self.window_start)
+
+    def phase(self, delay: np.ndarray, time: float | np.ndarray) -> np.ndarray:
+        """Phase of a tone: f_c tau + alpha tau (u - tau/2) [cycles], each of the two modulo 1.
+
+        Parameters
+        ----------
+        delay : tau [s], float64, from the start of the reference chirp to that of the arriving one
+        time : u [s], since the start of the reference chirp
+        """
+        tau = delay
+        return (self.carrier_frequency * tau) % 1.0 + (self.slope * tau * (time - tau / 2)) % 1.0
+
+    def carrier(
+        self, delay: float | np.ndarray = 0.0, time: float | np.ndarray | None = None
+    ) -> np.ndarray:
+        """Frequency [Hz] of a chirp that arrives `delay` late, at `time` [s] since the start of the
+        reference chirp: f_c + alpha (u - tau). By default at `window_middle`."""
+        u = self.window_middle if time is None else time
+        return self.carrier_frequency + self.slope * (u - np.asarray(delay))
+
+    def beat_cells(
+        self,
+        delay: float | np.ndarray,
+        delay_rate: float | np.ndarray,
+        time: float | np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Beat [range cells] of a path without data at `window_middle`: T (alpha tau + tau_dot (f_c
+        + alpha (u_c - tau))).
+
+        Parameters
+        ----------
+        delay, delay_rate : of the path at mid-frame [s, 1]
+        time : since mid-frame [s]; by default `middle_time`, which makes the beat (M, P)
+        """
+        tau = delay + delay_rate * (self.middle_time if time is None else time)
+        return (self.slope * tau + delay_rate * self.carrier(tau)) * self.sampled_duration
+
 
 def waveform_of(scenario: Scenario) -> Waveform:
     """The waveform that a scenario states."""
@@ -202,21 +265,11 @@ def waveform_of(scenario: Scenario) -> Waveform:
         num_chirps=r.chirps_per_frame,
         num_groups=r.groups,
         num_tx=a.tx_x + a.tx_z - 1,
+        filter_transition=r.filter_transition_hz,
     )
 
 
-def window_length(waveform: Waveform) -> float:
-    """Samples that the range window may cover, whatever the data: N less the largest time shift."""
-    return waveform.num_samples - shift_of(waveform, waveform.num_delay_symbols)
-
-
-def shift_of(waveform: Waveform, delay_symbol: Any) -> Any:
-    """s_D, the data delay in samples."""
-    return np.asarray(delay_symbol) * waveform.delay_step * waveform.sampling_rate
-
-
-def data_phase(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
-    """f_c tau_D + alpha (T~ - T) tau_D - alpha tau_D^2/2 [cycles mod 1], float64."""
-    w = waveform
-    tau = np.asarray(delay_symbols) * w.delay_step
-    return (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (w.window_start - tau / 2)) % 1.0
+def hann(position: np.ndarray, length: float) -> np.ndarray:
+    """Hann window of `length` that starts at 0, at any (fractional) position; 0 outside."""
+    inside = (position >= 0) & (position <= length)
+    return np.where(inside, np.sin(np.pi * position / length) ** 2, 0.0)

@@ -20,11 +20,10 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.maps import slow_window
-from isac_rt.receive.spectrum import window_length
 
 # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
 HALF_WIDTH = 3
@@ -46,36 +45,10 @@ class Estimate:
     channels: np.ndarray
 
 
-def middle_times(waveform: Waveform) -> np.ndarray:
-    """(M, P) time of the middle of each chirp's window since mid-frame [s]."""
-    w = waveform
-    return w.chirp_time + window_middle(w) - w.frame_duration / 2
-
-
-def window_middle(waveform: Waveform) -> float:
-    """u_c [s], the middle of the Hann window since the start of the reference chirp."""
-    return waveform.window_start + window_length(waveform) / 2 * waveform.sample_interval
-
-
-def beat_cells(waveform: Waveform, delay: float, delay_rate: float) -> np.ndarray:
-    """(M, P) beat of a path in range cells, without data."""
-    w = waveform
-    tau = delay + delay_rate * middle_times(w)
-    carrier = w.carrier_frequency + w.slope * (window_middle(w) - tau)
-    return (w.slope * tau + delay_rate * carrier) * w.sampled_duration
-
-
-def middle_phase(waveform: Waveform, delay: float, delay_rate: float) -> np.ndarray:
-    """(M, P) phase of a path at the middle of each window [cycles mod 1], without data."""
-    w = waveform
-    tau = delay + delay_rate * middle_times(w)
-    return (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (window_middle(w) - tau / 2)) % 1.0
-
-
 def hann_response(waveform: Waveform, offset: np.ndarray) -> np.ndarray:
     """Transform of the range window, about its middle, at `offset` cells from a tone; real,
     (samples)."""
-    length = window_length(waveform)
+    length = waveform.window_length
     d = np.asarray(offset) * length / waveform.num_samples
     near = np.abs(np.abs(d) - 1) < 1e-6
     safe = np.where(near, 0.5, d)
@@ -105,7 +78,7 @@ class LocalSpectra:
         # the window begins at sample 0 and its transform is real about its middle: the turn from
         # row to row is taken out here
         turn = np.exp(
-            2j * np.pi * (low + np.arange(rows.shape[2])) * (window_length(w) / 2 / w.num_samples)
+            2j * np.pi * (low + np.arange(rows.shape[2])) * (w.window_length / 2 / w.num_samples)
         )
         self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(
             schedule.size, rows.shape[2], -1
@@ -113,14 +86,14 @@ class LocalSpectra:
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         self._tx = np.ascontiguousarray((schedule + own).ravel())
-        self._time = (middle_times(w) + delay_symbols * w.delay_step).ravel()
+        self._time = (w.middle_time + delay_symbols * w.delay_step).ravel()
         self._numbers = np.array(
             [
                 w.carrier_frequency,
                 w.slope,
-                window_middle(w),
+                w.window_middle,
                 w.sampled_duration,
-                window_length(w),
+                w.window_length,
                 w.num_samples,
             ]
         )
@@ -164,8 +137,7 @@ class LocalSpectra:
 def _match(
     data, weight, tx, time, first, numbers, delay, delay_rate, out, energy
 ):  # pragma: no cover - compiled
-    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the template; `beat_cells`,
-    `middle_phase` and `hann_response` in one loop, which a test holds against them.
+    """out[tx, rx] = sum of conj(template) * data over the XX
 
     `data` alternates real and imaginary parts, and is turned so that the template's rows differ by
     real factors.
@@ -309,12 +281,7 @@ def direction_cosine(
     ambiguous.
     """
     tx, rx, place = arm(antennas, axis, virtual)
-    scale = (
-        2
-        * np.pi
-        * (waveform.carrier_frequency + waveform.slope * window_middle(waveform))
-        / SPEED_OF_LIGHT
-    )
+    scale = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
     limit = min(1.0, np.pi / (scale * antennas.spacing))
     values = channels[tx, rx].reshape(1 if virtual else antennas.num_tx, -1).T
     apart = 1j * scale * place[: len(values)]  # the receivers stand alike for every transmitter
@@ -361,7 +328,7 @@ def direction_cosines(
     radius = estimate.delay * SPEED_OF_LIGHT / passes
     if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
         return u
-    towards = np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
+    towards = unit_vector(u)
     scale = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
     tx, rx = (
         scale * ((r**2).sum(1) - (r @ towards) ** 2)

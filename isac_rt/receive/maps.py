@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from isac_rt.frame.schedule import Schedule, is_latin
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import Waveform, hann
 
 UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler
@@ -25,7 +25,7 @@ bin; reached within 2 % of the unambiguous velocity."""
 def slow_window(waveform: Waveform) -> np.ndarray:
     """Hann over the slots (P,), periodic, float32."""
     p = np.arange(waveform.num_chirps) + 0.5
-    return (np.sin(np.pi * p / waveform.num_chirps) ** 2).astype(np.float32)
+    return hann(p, waveform.num_chirps).astype(np.float32)
 
 
 def doppler_bins(waveform: Waveform) -> np.ndarray:
@@ -201,7 +201,7 @@ def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedu
     """
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
     size = num_chirps // waveform.num_tx
-    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    window = hann(np.arange(size) + 0.5, size)
     analyse = (
         np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size) * window
     ).astype(np.complex64)

@@ -18,17 +18,13 @@ from isac_rt.receive.cfar import detect, first_row
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
-    beat_cells,
     direction_cosines,
     hann_response,
-    middle_times,
     refine,
     start_point,
-    window_middle,
 )
 from isac_rt.receive.joint.fit import element_delays
 from isac_rt.receive.maps import power_map
-from isac_rt.receive.spectrum import window_length
 from isac_rt.scenario.receivers import Receivers
 
 REACH = 24
@@ -100,7 +96,7 @@ def _fit_again(
 ) -> None:
     """Estimate the last path and those within its rows once more, each with the others taken out:
     the orthogonal step. In place."""
-    w, place = waveform, [float(beat_cells(waveform, e.delay, e.delay_rate).mean()) for e in found]
+    w, place = waveform, [float(waveform.beat_cells(e.delay, e.delay_rate).mean()) for e in found]
     near = [k for k in range(len(found)) if abs(place[k] - place[-1]) < 2 * NEAR[0]]
     for _ in range(CYCLES if len(near) > 1 else 0):
         for k in near:
@@ -130,14 +126,10 @@ def _take_out(
     """Subtract a path in place from the rows that it reaches, or put it `back`; returns the rows.
     The template is that of `LocalSpectra` with each element's own delay."""
     w = waveform
-    time = middle_times(w) + delay_symbols * w.delay_step
-    tau = estimate.delay + estimate.delay_rate * time
-    carrier = w.carrier_frequency + w.slope * (window_middle(w) - tau)
-    beat = (w.slope * tau + estimate.delay_rate * carrier) * w.sampled_duration
-    cycles = (w.carrier_frequency * tau) % 1.0 + (
-        w.slope * tau * (window_middle(w) - tau / 2)
-    ) % 1.0
-    middle = round(float(beat_cells(w, estimate.delay, estimate.delay_rate).mean()))
+    time = w.middle_time + delay_symbols * w.delay_step
+    beat = w.beat_cells(estimate.delay, estimate.delay_rate, time)
+    cycles = w.phase(estimate.delay + estimate.delay_rate * time, w.window_middle)
+    middle = round(float(w.beat_cells(estimate.delay, estimate.delay_rate).mean()))
     rows = np.arange(max(middle - REACH, 0), min(middle + REACH + 1, spectra.shape[2]))
     direction = np.nan_to_num(direction_cosines(estimate, antennas, w, passes))
     radius = max(estimate.delay * SPEED_OF_LIGHT / passes, w.range_cell(passes))
@@ -147,7 +139,7 @@ def _take_out(
     )
     for m in range(len(spectra)):
         turn = np.exp(
-            2j * np.pi * (cycles[m] - rows[:, None] * (window_length(w) / 2 / w.num_samples))
+            2j * np.pi * (cycles[m] - rows[:, None] * (w.window_length / 2 / w.num_samples))
         )
         for rx in range(spectra.shape[1]):
             shape = hann_response(w, beat[m] + sent[schedule[m]] + heard[rx] - rows[:, None])

@@ -178,7 +178,7 @@ def describe(
     has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam."""
     count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
-    limit = np.sin(antennas.half_view) if antennas.half_view < np.pi / 2 else 1.0
+    limit = antennas.view_limit
     for i, e in enumerate(estimates):
         u = direction_cosines(e, antennas, waveform, passes, on_grid=on_grid)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]

@@ -20,21 +20,14 @@ import numpy as np
 from numba import njit
 
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.waveform import data_phase, shift_of, window_length
 from isac_rt.receive.transform import transform
-
-
-def hann(position: np.ndarray, length: float) -> np.ndarray:
-    """Hann window of `length` samples that starts at 0, at any (fractional) position; 0 outside."""
-    inside = (position >= 0) & (position <= length)
-    return np.where(inside, np.sin(np.pi * position / length) ** 2, 0.0)
 
 
 def _factors(
     num_samples: int, delay_symbols: np.ndarray, starts: np.ndarray, length: float
 ) -> np.ndarray:
-    """`hann` of sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D to k:
-    (P, N) complex64."""
+    """Hann's window at sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D
+    to k: (P, N) complex64."""
     out = np.empty((len(starts), num_samples), np.complex64)
     _fill_factors(
         np.asarray(delay_symbols, np.int64) % num_samples,
@@ -100,11 +93,11 @@ def clean_spectrum(
     """
     w, samples = cube.waveform, cube.samples
     num_groups, num_rx, num_chirps, num_samples = samples.shape
-    shift = shift_of(w, delay_symbols)
+    shift = w.data_shift(delay_symbols)
     out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
     for m in range(num_groups):
-        factor = _factors(num_samples, delay_symbols[m], shift[m], window_length(w))
-        phase = phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, delay_symbols[m]))
+        factor = _factors(num_samples, delay_symbols[m], shift[m], w.window_length)
+        phase = phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(delay_symbols[m]))
         turn = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
         transform(samples[m], factor, np.arange(num_rows), out[m], turn=turn)
     return out

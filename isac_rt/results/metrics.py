@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import beta
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, azimuth_elevation
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -243,12 +243,9 @@ class Errors:
 def _angle_errors(truth: Truth, cosines: np.ndarray) -> tuple[float, float]:
     """Azimuth and elevation errors [deg] of estimated direction cosines (front half-space); NaN
     outside the unit disc."""
-    forward = 1 - cosines[0] ** 2 - cosines[1] ** 2
-    if not forward >= 0:
-        return np.nan, np.nan
-    azimuth = np.arctan2(cosines[0], np.sqrt(forward)) - truth.azimuth
-    azimuth = (azimuth + np.pi) % (2 * np.pi) - np.pi
-    return float(np.rad2deg(azimuth)), float(np.rad2deg(np.arcsin(cosines[1]) - truth.elevation))
+    azimuth, elevation = azimuth_elevation(cosines)
+    azimuth = (azimuth - truth.azimuth + np.pi) % (2 * np.pi) - np.pi
+    return float(np.rad2deg(azimuth)), float(np.rad2deg(elevation - truth.elevation))
 
 
 @dataclass

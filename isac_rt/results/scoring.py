@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, azimuth_elevation
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
@@ -140,11 +140,5 @@ def _estimates(
     rows: list[np.ndarray | None] = [None] * count
     for i, j in pairs:
         r, v, u_x, u_z = found[j]
-        forward = 1 - u_x**2 - u_z**2
-        angles = (
-            (np.arctan2(u_x, np.sqrt(forward)), np.arcsin(u_z))
-            if forward >= 0
-            else (np.nan, np.nan)
-        )
-        rows[seen[i]] = np.array([r, v, *angles])
+        rows[seen[i]] = np.array([r, v, *azimuth_elevation([u_x, u_z])])
     return _values(rows)

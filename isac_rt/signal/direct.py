@@ -86,14 +86,15 @@ class Tones:
         return Tones(**{k: v[which] if k in per_path else v for k, v in vars(self).items()})
 
 
-def filter_gain(beat: np.ndarray, sampling_rate: float, transition: float) -> np.ndarray:
-    """Amplitude gain of the IF filter: 1 on [0, f_s], a raised-cosine skirt of width `transition`
-    [Hz] on both sides."""
-    outside = np.clip(np.maximum(-beat, beat - sampling_rate) / transition, 0.0, 1.0)
+def filter_gain(waveform: Waveform, beat: np.ndarray) -> np.ndarray:
+    """Amplitude gain of the IF filter at `beat` [Hz]: 1 on [0, f_s], a raised-cosine skirt of width
+    `filter_transition` on both sides."""
+    w = waveform
+    outside = np.clip(np.maximum(-beat, beat - w.sampling_rate) / w.filter_transition, 0.0, 1.0)
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 
 
-def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
+def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
     """The model itself in float64, path by path, sample by sample: the oracle of the faster
     methods.
 
@@ -118,9 +119,7 @@ def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
             alive = (time >= t.begin[k]) & (time < t.end[k])
             for source in range(w.num_groups):
                 base = path + t.symbol_delay[q, source][:, None] - (m - source) * w.group_spacing
-                passed = filter_gain(
-                    w.slope * base[:, w.num_samples // 2], w.sampling_rate, transition
-                )
+                passed = filter_gain(w, w.slope * base[:, w.num_samples // 2])
                 weight = (t.factor[k] * t.send[q, source] * passed)[:, None] * alive
                 if not weight.any():
                     continue
@@ -132,21 +131,18 @@ def exact(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
                         + t.cross[t.cross_row[k], antenna, rx]
                     )
                     tau = base + element[:, None]
-                    cycles = (w.carrier_frequency * tau) % 1 + (
-                        w.slope * tau * (w.fast_time - tau / 2)
-                    ) % 1
-                    out[m, rx] += weight * np.exp(2j * np.pi * cycles)
+                    out[m, rx] += weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
     return out
 
 
-def sources(waveform: Waveform, tones: Tones, transition: float) -> tuple[np.ndarray, np.ndarray]:
+def sources(waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
     """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`,
     offsets. Both (C,) int64."""
     w, t = waveform, tones
     half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
     motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
     longest = float(t.symbol_delay.max(initial=0.0))
-    margin = transition / w.slope
+    margin = w.filter_transition / w.slope
     paths, offsets = [], []
     for offset in range(1 - w.num_groups, w.num_groups):
         delay = t.delay - offset * w.group_spacing
@@ -156,7 +152,7 @@ def sources(waveform: Waveform, tones: Tones, transition: float) -> tuple[np.nda
     return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
 
 
-def numbers(waveform: Waveform, transition: float) -> np.ndarray:
+def numbers(waveform: Waveform) -> np.ndarray:
     """The waveform as a vector for the kernels; the order is that of `chirp_terms` and its
     callers."""
     w = waveform
@@ -171,7 +167,7 @@ def numbers(waveform: Waveform, transition: float) -> np.ndarray:
             w.group_spacing,
             middle - w.frame_duration / 2,
             w.sampling_rate,
-            transition,
+            w.filter_transition,
         ]
     )
 
@@ -341,7 +337,7 @@ def _direct(
 
 
 def add_direct(
-    samples: np.ndarray, waveform: Waveform, tones: Tones, transition: float, *, fresh: bool = False
+    samples: np.ndarray, waveform: Waveform, tones: Tones, *, fresh: bool = False
 ) -> None:
     """Add paths one by one, every element with its own delay (wideband, spherical).
 
@@ -354,7 +350,7 @@ def add_direct(
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
     """
-    path, offset = sources(waveform, tones, transition)
+    path, offset = sources(waveform, tones)
     if path.size == 0:
         if fresh:
             samples[:] = 0
@@ -367,7 +363,7 @@ def add_direct(
     _direct(
         samples.reshape(-1).view(np.float32),
         samples.shape,
-        numbers(waveform, transition),
+        numbers(waveform),
         path,
         offset,
         t.link,

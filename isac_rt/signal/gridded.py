@@ -27,7 +27,7 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
-from isac_rt.frame.waveform import Waveform, data_phase, shift_of, window_length
+from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import (
     LANES,
@@ -587,9 +587,9 @@ class _Blocks:
     bounds: np.ndarray
 
 
-def _blocks(waveform: Waveform, t: Tones, transition: float) -> _Blocks:
+def _blocks(waveform: Waveform, t: Tones) -> _Blocks:
     w = waveform
-    path, offset = sources(w, t, transition)
+    path, offset = sources(w, t)
     order = np.lexsort((t.delay[path], offset, t.link[path]))
     path, offset = path[order], offset[order]
     segment = (
@@ -625,7 +625,6 @@ def add_gridded(
     samples: np.ndarray,
     waveform: Waveform,
     tones: Tones,
-    transition: float,
     setting: Setting = DEFAULT,
     *,
     fresh: bool = False,
@@ -648,7 +647,6 @@ def add_gridded(
             samples.shape,
             waveform,
             tones,
-            transition,
             setting,
             fresh,
             no_band(),
@@ -668,7 +666,6 @@ def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
 def range_cells(
     waveform: Waveform,
     tones: Tones,
-    transition: float,
     delay_symbols: np.ndarray,
     phases: np.ndarray,
     num_cells: int,
@@ -699,7 +696,7 @@ def range_cells(
             f"{num_cells} range cells of {w.num_samples} samples: at most three quarters can be "
             "made directly; take samples"
         )
-    length = window_length(w)
+    length = w.window_length
     band = make_band(
         w.num_samples,
         num_cells,
@@ -707,7 +704,7 @@ def range_cells(
         0.0 if key is None else power,
         np.zeros(2) if key is None else key,
     )
-    start = np.ravel(shift_of(w, delay_symbols))
+    start = np.ravel(w.data_shift(delay_symbols))
     size = len(band.window)
     pad = (size - num_cells) // 2 / w.num_samples
     limit = num_cells / w.num_samples + pad if size < w.num_samples else 1.0
@@ -726,10 +723,10 @@ def range_cells(
     shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
     out = cube_memory((*shape[:2], num_cells, w.num_chirps))
     cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(
-        data_phase(w, delay_symbols)
+        w.data_phase(delay_symbols)
     )
     turns = np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0))
-    _synthesise(out, shape, w, tones, transition, setting, True, band, views, turns)
+    _synthesise(out, shape, w, tones, setting, True, band, views, turns)
     return out
 
 
@@ -738,7 +735,6 @@ def _synthesise(
     shape: tuple[int, ...],
     w: Waveform,
     t: Tones,
-    transition: float,
     setting: Setting,
     fresh: bool,
     band: Band,
@@ -755,7 +751,7 @@ def _synthesise(
         below zero that are kept; first frequency left out
     turns : (M P,) complex, factors of the chirps' paths
     """
-    b = _blocks(w, t, transition)
+    b = _blocks(w, t)
     if b.path.size == 0 and band.turn.size == 0:
         return False
     num_samples = len(band.window) or w.num_samples
@@ -777,7 +773,7 @@ def _synthesise(
             first,
             chirps,
             together,
-            numbers(w, transition),
+            numbers(w),
             views,
             turns,
             float(w.num_samples // 2),
@@ -810,14 +806,13 @@ def add_plain(
     samples: np.ndarray,
     waveform: Waveform,
     tones: Tones,
-    transition: float,
     setting: Setting = DEFAULT,
 ) -> None:
     """What `add_gridded` does, path by path in numpy float64: its oracle, slow."""
     w, t, half = waveform, tones, waveform.num_samples // 2
     size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
     values, centre, steps = (
-        numbers(w, transition),
+        numbers(w),
         mean_square(w.num_samples),
         np.arange(setting.width) - setting.width // 2 + 1,
     )
@@ -831,7 +826,7 @@ def add_plain(
     for m, p in np.ndindex(w.num_groups, w.num_chirps):
         grid = np.zeros((size, samples.shape[1]), complex)
         time = values[6] + p * values[4] + m * values[5]
-        for k, offset in zip(*sources(w, t, transition), strict=True):
+        for k, offset in zip(*sources(w, t), strict=True):
             q, source = t.link[k], m - offset
             if not (0 <= source < w.num_groups and t.begin[k] <= time < t.end[k]):
                 continue
@@ -841,7 +836,7 @@ def add_plain(
                 + (t.rate[k] + t.accel[k] * time / 2) * time
                 - offset * w.group_spacing
             )
-            gain = filter_gain(np.array(w.slope * tau), w.sampling_rate, transition)
+            gain = filter_gain(w, np.array(w.slope * tau))
             sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
             phase, frequency, bend = chirp_terms(
                 values, sent, t.rate[k] + t.accel[k] * time, t.accel[k]

@@ -49,7 +49,6 @@ def if_signal(
     rx_antennas: Antennas,
     *,
     start_time: float,
-    filter_transition: float,
     schedule: Schedule | None = None,
     first_block: int | None = None,
     method: Method = "auto",
@@ -79,7 +78,6 @@ def if_signal(
         without unit
     rx_pose, rx_antennas : of the receiver, at the middle of the frame
     start_time : of the frame's first reference chirp [s], block `first_block` of its slot
-    filter_transition : width of the filter's skirts [Hz]
     schedule : of the cube; by default that of the first transmission
     first_block : resource block of the first reference chirp; by default that of the first
         transmission
@@ -109,9 +107,7 @@ def if_signal(
     tones, sight, power = _tones(waveform, links, rx_pose, rx_antennas, middle, first_block)
     shape = (waveform.num_groups, rx_antennas.num_rx, waveform.num_chirps, waveform.num_samples)
     if method in ("exact", "paper"):
-        samples = {"exact": exact, "paper": separable}[method](
-            waveform, tones, filter_transition
-        ).astype(np.complex64)
+        samples = {"exact": exact, "paper": separable}[method](waveform, tones).astype(np.complex64)
     else:
         samples = cube_memory(shape)
         alone = np.full(len(tones), method == "direct")
@@ -129,12 +125,8 @@ def if_signal(
                 num_paths=decide_for,
             )
         if not alone.all():
-            add_gridded(
-                samples, waveform, tones.select(~alone), filter_transition, setting, fresh=True
-            )
-        add_direct(
-            samples, waveform, tones.select(alone), filter_transition, fresh=bool(alone.all())
-        )
+            add_gridded(samples, waveform, tones.select(~alone), setting, fresh=True)
+        add_direct(samples, waveform, tones.select(alone), fresh=bool(alone.all()))
     return IFCube(samples=samples, waveform=waveform, schedule=schedule, start_time=start_time)
 
 
@@ -146,7 +138,6 @@ def range_profiles(
     payload: Payload,
     *,
     start_time: float,
-    filter_transition: float,
     num_cells: int | None = None,
     schedule: Schedule | None = None,
     first_block: int | None = None,
@@ -182,7 +173,6 @@ def range_profiles(
     spectra = range_cells(
         waveform,
         tones,
-        filter_transition,
         payload.delay_symbols,
         payload.phases,
         cells,

@@ -30,6 +30,7 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
+from isac_rt.frame.waveform import hann
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import LANES, aligned, load, splat, store, stream, transpose
 from isac_rt.signal.direct import FAST
@@ -85,9 +86,7 @@ def make_band(
     """
     size = band_size(num_samples, num_cells)
     x = (np.arange(size) - size // 2) * (num_samples / size)
-    window = np.where(
-        np.abs(x) < window_length / 2, np.cos(np.pi * x / window_length) ** 2, 0.0
-    ) * (num_samples / size)
+    window = hann(x + window_length / 2, window_length) * (num_samples / size)
     angle = -np.pi * np.arange(num_cells) * (window_length / num_samples)
     turn = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     room = aligned(size * ROW), aligned(CHIRPS * num_cells * ROW)

@@ -21,7 +21,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.signal.direct import Tones, filter_gain
 
 
-def separable(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray:
+def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
     """Samples (M, L_rx, P, N) complex128 by the paper's model; groups do not hear each other, paths
     live for the whole frame."""
     w, t = waveform, tones
@@ -35,11 +35,7 @@ def separable(waveform: Waveform, tones: Tones, transition: float) -> np.ndarray
         q = t.link[k]
         for m in range(w.num_groups):
             whole = start[k] + t.symbol_delay[q, m]
-            weight = (
-                t.factor[k]
-                * t.send[q, m]
-                * filter_gain(w.slope * whole, w.sampling_rate, transition)
-            )
+            weight = t.factor[k] * t.send[q, m] * filter_gain(w, w.slope * whole)
             carrier = (
                 w.carrier_frequency
                 * (start[k] + t.tx_delay[k, t.antenna[q, m]] + t.rate[k] * slots)

@@ -483,7 +483,6 @@ def _synthesis_error(
             setup.antennas,
             start_time=start,
             method=method,
-            filter_transition=setup.scenario.radio.filter_transition_hz,
             noise_power=level,
             costs=setup.plan.costs,
             max_error=setup.plan.synthesis_error,

@@ -204,12 +204,7 @@ class Plan:
             abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last
             for u in self.scenario.swarm.values()
         )
-        return (
-            w.max_delay
-            + self.scenario.radio.filter_transition_hz / w.slope
-            + apart * w.group_spacing
-            + clocks
-        )
+        return w.max_delay + w.filter_transition / w.slope + apart * w.group_spacing + clocks
 
     @property
     def reach(self) -> float:

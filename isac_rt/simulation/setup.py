@@ -198,7 +198,6 @@ class Setup:
         words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
         frame_of = {
             "start_time": self.timetable.start_time(frame, tx),
-            "filter_transition": self.scenario.radio.filter_transition_hz,
         }
         return arriving, self.noise_power(poses, link), words, frame_of
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.world.swarm import Pose
 
 STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
@@ -218,7 +219,7 @@ def birth(
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
         return None
-    e = own.to_world(np.array([u_x, np.sqrt(1 - u_x**2 - u_z**2), u_z]))
+    e = own.to_world(unit_vector([u_x, u_z]))
     rho = float(measurement[0])
     if transmitter is not None:
         rho = bistatic_distance(rho, transmitter.mean[:3] - own.position, e)

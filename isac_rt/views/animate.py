@@ -11,6 +11,7 @@ from matplotlib.animation import FuncAnimation, writers
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.results.files import ResultsError, write_bytes
 from isac_rt.results.recorder import Results
 from isac_rt.views.figures import STYLE, range_doppler, scene_map, uav_colour
@@ -41,11 +42,9 @@ def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndar
         sender = list(dataset.uav.values).index(str(dataset.transmitter.values[observer]))
         mine &= dataset.track_uav.values == sender
     u = np.column_stack([dataset.track_u_x.values[mine], dataset.track_u_z.values[mine]])
-    forward = np.sqrt(np.maximum(1 - (u**2).sum(axis=1), 0.0))
-    body = np.column_stack([u[:, 0], forward, u[:, 1]])
     rotation = dataset.uav_attitude.values[frame, own]
     return dataset.uav_position.values[frame, own] + dataset.track_range.values[mine, None] * (
-        body @ rotation.T
+        unit_vector(u) @ rotation.T
     )
 
 

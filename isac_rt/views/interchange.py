@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
@@ -446,8 +447,8 @@ def _world_angles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(elevation, bearing) in world axes [rad] of body direction cosines (u_x, u_z), and their
     covariance by linear propagation."""
-    forward = np.sqrt(max(1 - u @ u, 1e-12))
-    d = rotation @ np.array([u[0], forward, u[1]])
+    body = np.maximum(unit_vector(u), [-1.0, 1e-6, -1.0])
+    d, forward = rotation @ body, body[1]
     turn = rotation @ np.array(
         [[1.0, 0.0], [-u[0] / forward, -u[1] / forward], [0.0, 1.0]]
     )  # d of direction by (u_x, u_z)

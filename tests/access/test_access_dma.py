@@ -21,7 +21,7 @@ from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
 W = Waveform()
-SKIRT = 0.4e6
+SKIRT = W.filter_transition
 STILL = Pose.at_rest()
 
 
@@ -58,9 +58,7 @@ def test_the_filter_has_the_gain_that_the_signal_model_states():
         47.1e6,
     ):
         gain = (response * np.exp(-2j * np.pi * beat * t)).sum() * step
-        assert gain == pytest.approx(
-            filter_gain(np.array(beat), W.sampling_rate, SKIRT), rel=0, abs=1e-5
-        )
+        assert gain == pytest.approx(filter_gain(W, np.array(beat)), rel=0, abs=1e-5)
 
 
 def test_mixed_chirps_equal_the_signal_model():
@@ -96,9 +94,7 @@ def test_mixed_chirps_equal_the_signal_model():
         (near, sight(w, 37.3, -7.7, 0.8 + 0.3j, start)),
         (far, sight(w, 61.9, 4.1, -0.2 + 1.1j, start)),
     ]
-    model = if_signal(
-        w, links, STILL, one, start_time=start, filter_transition=SKIRT, method="exact"
-    ).samples[0, 0]
+    model = if_signal(w, links, STILL, one, start_time=start, method="exact").samples[0, 0]
     middle = np.arange(6) * w.slot_duration - w.frame_duration / 2
     samples = np.zeros_like(model, np.complex128)
     for block, (t, p), speed, gain in zip(
@@ -112,7 +108,7 @@ def test_mixed_chirps_equal_the_signal_model():
             + 2 * block * w.max_delay
         )
         amplitude = np.conj(gain) * 1.3 * t.payload.phases[0]
-        samples += mix(w, delay[None], amplitude[None], rate=speed / C, transition=SKIRT)
+        samples += mix(w, delay[None], amplitude[None], rate=speed / C)
     error = np.abs(samples - model) / np.abs(model).mean()
     assert error[:, 100:-100].max() < 2e-3
     assert np.sqrt((error**2).mean()) < 0.04
@@ -126,7 +122,7 @@ def test_neighbours_are_kept_out(spacing, least):
     (51.5, 58.1 and 61.7 dB).
 
     Planted bug: a group spacing of T_d."""
-    found = isolation(W, spacing, 0.0, np.random.default_rng(1), transition=SKIRT, chirps=12)
+    found = isolation(W, spacing, 0.0, np.random.default_rng(1), chirps=12)
     assert found.power_db > least
     assert found.peak_db > 85
 
@@ -135,9 +131,7 @@ def test_isolation_does_not_depend_on_the_mixers_rate():
     """Twice the rate changes it by less than 0.2 dB: the edges of chirps, which alias, are laid
     between the samples."""
     coarse, fine = (
-        isolation(
-            W, 1, 0.0, np.random.default_rng(1), transition=SKIRT, chirps=4, oversampling=rate
-        ).power_db
+        isolation(W, 1, 0.0, np.random.default_rng(1), chirps=4, oversampling=rate).power_db
         for rate in (32, 64)
     )
     assert fine == pytest.approx(coarse, abs=0.2)
@@ -162,7 +156,6 @@ def test_timing_errors_are_tolerated_as_the_beats_say(cells):
                 spacing,
                 error + outwards * sign * margin,
                 np.random.default_rng(4),
-                transition=SKIRT,
                 chirps=2,
                 path_cells=cells,
                 modulated=False,
@@ -178,7 +171,6 @@ def test_timing_errors_are_tolerated_as_the_beats_say(cells):
         1,
         1.9 * limit,
         np.random.default_rng(4),
-        transition=SKIRT,
         chirps=2,
         path_cells=cells,
         modulated=False,
@@ -206,9 +198,7 @@ def collided(first_block, modulated, rng, strength=1.0):
             "first_block": block,
         }
         links.append((Transmission(name="A", **fields), sight(w, length, speed, gain)))
-    cube = if_signal(
-        w, links, STILL, antennas, start_time=0.0, filter_transition=SKIRT, method="direct"
-    )
+    cube = if_signal(w, links, STILL, antennas, start_time=0.0, method="direct")
     noise = (
         np.float32(np.sqrt(0.05))
         * rng.standard_normal((*cube.samples.shape, 2), np.float32).view(np.complex64)[..., 0]

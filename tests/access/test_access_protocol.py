@@ -74,7 +74,6 @@ def network(**change) -> Network:
         "wishes": {"A": 4, "B": 5},
         "listeners": {"A": ("P", "Q"), "B": ("R",)},
         "noise_power": dict.fromkeys(names, 3.0),
-        "filter_transition": 0.4e6,
         "seed": 5,
     }
     return Network(**(fields | change))

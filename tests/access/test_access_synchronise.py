@@ -137,7 +137,7 @@ def received(w, antennas, forward, time, offset, held, seed, snr):
         clock_drift=s * DRIFT,
     )
     start = time - w.frame_duration / 2
-    cube = if_signal(w, [(sent, paths)], still, antennas, start_time=start, filter_transition=0.4e6)
+    cube = if_signal(w, [(sent, paths)], still, antennas, start_time=start)
     add_noise(cube, 1 / snr, seed_sequence(seed, "noise", forward).generate_state(2))
     return receive_passive(cube, antennas, Receivers(), 8, None, False)
 

@@ -10,7 +10,6 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter.correction import fit
 from isac_rt.receive.clutter.detectors import judge
 from isac_rt.receive.clutter.power import power_map
-from isac_rt.receive.estimate import window_length
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
@@ -40,7 +39,7 @@ def power_of(
 
     amplitude (K, LOOKS); rates of the ranges [m/s].
     """
-    n, p, size = np.arange(W.num_samples), np.arange(W.num_chirps), window_length(W)
+    n, p, size = np.arange(W.num_samples), np.arange(W.num_chirps), W.window_length
     carrier = W.carrier_frequency + W.slope * (W.chirp_duration - W.sampled_duration / 2)
     doppler = 2 * rates / C * carrier * W.num_chirps * W.slot_duration
     beat = (

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive import receive_active, receive_passive
 from isac_rt.receive.cfar import (
     background,
@@ -31,10 +31,8 @@ from isac_rt.receive.cfar import (
 )
 from isac_rt.receive.estimate import (
     LocalSpectra,
-    beat_cells,
     direction_cosine,
     hann_response,
-    middle_phase,
     refine,
     standard_deviations,
     start_point,
@@ -49,7 +47,7 @@ from isac_rt.receive.maps import (
 )
 from isac_rt.receive.omp import omp
 from isac_rt.receive.sense import sense, velocity_method
-from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
@@ -340,8 +338,10 @@ def test_compiled_match_is_the_template():
     tau, rate, row = 14.37 * w.delay_step, 3.1e-8, 14
     got = LocalSpectra(spectra, w, schedule, np.zeros_like(schedule), row).respond(tau, rate)
     rows = np.arange(row - 3, row + 4)
-    shape = hann_response(w, beat_cells(w, tau, rate)[..., None] - rows)
-    turn = middle_phase(w, tau, rate)[..., None] - rows * (window_length(w) / 2 / w.num_samples)
+    shape = hann_response(w, w.beat_cells(tau, rate)[..., None] - rows)
+    turn = w.phase(tau + rate * w.middle_time, w.window_middle)[..., None] - rows * (
+        w.window_length / 2 / w.num_samples
+    )
     template = shape * np.exp(2j * np.pi * turn)
     for tx in range(3):
         weight = (schedule == tx) * slow_window(w)
@@ -355,7 +355,7 @@ def test_compiled_match_is_the_template():
 def test_window_transform_is_closed_form():
     """Planted bug: the transform about the first sample."""
     w = Waveform()
-    n, length = np.arange(w.num_samples), window_length(w)
+    n, length = np.arange(w.num_samples), w.window_length
     for offset in (0.0, 0.37, -1.2, 2.6):
         slow = (
             hann(n, length) * np.exp(2j * np.pi * offset * (n - length / 2) / w.num_samples)
@@ -633,7 +633,7 @@ def test_two_cells_of_a_hann_tone_give_its_place():
     """Exact at any fraction, by the window's closed form. Planted bugs: the ratio's two for a one;
     the side of the greater neighbour."""
     w = Waveform()
-    length = window_length(w) / w.num_samples
+    length = w.window_length / w.num_samples
     for d in (-0.49, -0.2, 0.0, 0.13, 0.5):
         three = hann_response(w, (np.array([-1.0, 0.0, 1.0]) - d) / length)
         power = np.zeros((40, w.num_chirps))

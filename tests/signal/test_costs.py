@@ -81,7 +81,6 @@ def test_the_choice_keeps_the_stated_error(speed):
             job.pose,
             job.antennas,
             start_time=0.0,
-            filter_transition=0.4e6,
             noise_power=np.inf,
             max_error=stated,
             decide_for=20_000,
@@ -125,7 +124,7 @@ def test_the_costs_decide():
     job = Job(3)
     links, options = (
         job.paths(30),
-        {"start_time": 0.0, "filter_transition": 0.4e6, "noise_power": np.inf},
+        {"start_time": 0.0, "noise_power": np.inf},
     )
     found = if_signal(job.waveform, links, job.pose, job.antennas, costs=free, **options).samples
     np.testing.assert_array_equal(found, job.samples(links, "direct"))

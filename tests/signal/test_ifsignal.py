@@ -28,7 +28,13 @@ COMPLEX64 = 2e-7  # rounding: two float32 roundings of the result
 # cycles at worst, 3e-11 RMS
 FLOAT64 = 1e-10
 SMALL = Waveform(
-    bandwidth=523e6, sampling_rate=17.3e6, num_samples=90, num_chirps=10, num_tx=5, num_groups=3
+    bandwidth=523e6,
+    sampling_rate=17.3e6,
+    num_samples=90,
+    num_chirps=10,
+    num_tx=5,
+    num_groups=3,
+    filter_transition=SKIRT,
 )
 
 
@@ -83,7 +89,6 @@ def synthesise(w, links, method, *, turned=(0.2, 1.0, 0.3), array=None, **option
         pose(*turned),
         array,
         start_time=START,
-        filter_transition=SKIRT,
         method=method,
         **options,
     ).samples
@@ -125,11 +130,11 @@ def test_exact_model_is_what_mixing_gives():
     """Planted bugs: + alpha tau^2/2; conj(beta); 2 (m - m') T_d with the other sign; rotation
     transposed."""
     links = hard_links(SMALL, np.random.default_rng(11))
-    truth = mixed_chirps(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START, SKIRT)
+    truth = mixed_chirps(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START)
     tones, _, _ = _tones(
         SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START + SMALL.frame_duration / 2, 0
     )
-    assert relative(exact(SMALL, tones, SKIRT), truth) < FLOAT64
+    assert relative(exact(SMALL, tones), truth) < FLOAT64
     assert relative(synthesise(SMALL, links, "exact"), truth) < COMPLEX64
 
 
@@ -141,14 +146,13 @@ def test_resource_blocks_are_what_mixing_gives(block):
     w, links = SMALL, hard_links(SMALL, np.random.default_rng(17))
     links = [(replace(links[i][0], first_block=2 + i), links[i][1]) for i in (0, 1)]
     start = START + block * w.group_spacing
-    truth = mixed_chirps(w, links, pose(0.2, 1.0, 0.3), antennas(w), start, SKIRT, block)
+    truth = mixed_chirps(w, links, pose(0.2, 1.0, 0.3), antennas(w), start, block)
     found = if_signal(
         w,
         links,
         pose(0.2, 1.0, 0.3),
         antennas(w),
         start_time=start,
-        filter_transition=SKIRT,
         first_block=block,
         method="exact",
     )
@@ -178,7 +182,7 @@ def test_direct_is_exact(shape, data):
 def test_gridded_against_exact(samples, count, speed):
     """At 30 m/s and for the full L. Planted bugs: no second order of motion; no `lag`; modes not
     taken modulo the grid."""
-    w = replace(Waveform(), num_samples=samples, num_chirps=6)
+    w = replace(Waveform(filter_transition=SKIRT), num_samples=samples, num_chirps=6)
     rng = np.random.default_rng(samples + count)
     array = antennas(w, rx_x=8, rx_z=8)
     links = [(sender(w, rng, data=count != 40), paths(w, rng, count, speed=speed, reach=1.2))]
@@ -188,7 +192,7 @@ def test_gridded_against_exact(samples, count, speed):
 
 def test_paths_at_the_ends_of_the_passband():
     """Frequencies 0 and 1 wrap around the grid; planted bug: margins not wrapped."""
-    w = replace(Waveform(), num_chirps=3)
+    w = replace(Waveform(filter_transition=SKIRT), num_chirps=3)
     ends = np.array([-0.011, 0.0, 1e-7, 0.9999999, 1.0, 1.013]) * w.max_delay
     links = [
         (
@@ -240,7 +244,7 @@ def tone(w, *, delay=0.3, method="exact", **change):
 def test_signs(method):
     """Farther: higher positive beat. Receding: positive slow-time frequency, f_v = +f_eff *
     rate."""
-    w = Waveform(num_chirps=60, num_groups=1)
+    w = Waveform(num_chirps=60, num_groups=1, filter_transition=SKIRT)
     near, far = (tone(w, delay=d, method=method)[0, 0, 0] for d in (0.2137, 0.6213))
     assert np.argmax(np.abs(np.fft.fft(near))) == round(0.2137 * w.num_samples)
     assert np.argmax(np.abs(np.fft.fft(far))) == round(0.6213 * w.num_samples)
@@ -255,7 +259,7 @@ def test_signs(method):
 def test_arrival_from_the_right_along_the_array(method):
     """A wave from +X: element phase exp(-j 2 pi f_eff x/c) at mid-window, less what was sent tau
     earlier."""
-    w = Waveform(num_chirps=3, num_groups=1)
+    w = Waveform(num_chirps=3, num_groups=1, filter_transition=SKIRT)
     turned = pose(0.2, 1.0, 0.3).rotation
     samples = tone(w, arrival=turned[:, 0][None], method=method)[0, :, 1, w.num_samples // 2]
     x = antennas(w).rx_positions[:, 0]
@@ -271,8 +275,8 @@ def test_arrival_from_the_right_along_the_array(method):
 def test_filter(method):
     """Passband, half a skirt (amplitude 1/2), stop band, and the neighbour group whose beat is 2
     f_s lower."""
-    w = replace(Waveform(), num_chirps=3)
-    half = SKIRT / w.sampling_rate / 2
+    w = replace(Waveform(filter_transition=SKIRT), num_chirps=3)
+    half = w.filter_transition / w.sampling_rate / 2
     level = [
         np.sqrt((np.abs(tone(w, delay=d, method=method)) ** 2).mean(axis=(1, 2, 3)))
         for d in (0.7, 1 + half, -half, 1.5, 2.4)
@@ -291,7 +295,7 @@ def test_filter(method):
 def test_target_at_half_a_metre_is_seen_spherically(method):
     """Phase differences of the elements follow the distances to the point. Planted bug: plane
     waves."""
-    w = Waveform(num_chirps=3, num_groups=1)
+    w = Waveform(num_chirps=3, num_groups=1, filter_transition=SKIRT)
     u = np.array([[0.48, 0.8, 0.36]])
     samples = tone(w, delay=0.004, arrival=u, rx_radius=0.5, method=method)[
         0, :, 0, w.num_samples // 2

@@ -13,10 +13,10 @@ from receiver_cubes import ANTENNAS
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.receive import receive_active
-from isac_rt.receive.spectrum import clean_spectrum, hann, window_length
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.file import ScenarioError, load
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES
@@ -24,7 +24,6 @@ from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.simulation.simulate import run
 from isac_rt.world.swarm import Pose
 
-SKIRT = 0.41e6
 SCENES = Path(__file__).parents[2] / "scenes"
 POSE = Pose.at_rest(boresight=[0.1, 1.0, 0.05])
 
@@ -75,7 +74,7 @@ def paths(w: Waveform, name: str, count: int, seed: int, speed: float = 15.0) ->
 def both(w: Waveform, links: list, cells: int, setting) -> tuple[np.ndarray, np.ndarray]:
     """Profiles made directly, and exact samples transformed."""
     own = links[0][0].payload
-    frame = {"start_time": 0.0, "filter_transition": SKIRT}
+    frame = {"start_time": 0.0}
     found = range_profiles(w, links, POSE, ANTENNAS, own, num_cells=cells, setting=setting, **frame)
     cube = if_signal(w, links, POSE, ANTENNAS, method="exact", **frame)
     return found.spectra, clean_spectrum(cube, own.delay_symbols, own.phases, cells)
@@ -91,7 +90,7 @@ def test_profiles_are_transforms_of_the_exact_samples(setting, bound, cells):
     """Own data and another terminal's, whose chirps come 0.7 cells late. The bounds:
     `GRIDDED_ERROR`; what is cut of tails. Planted bug: the window's own start left out of a chirp's
     origin (`middle` without `start`)."""
-    w = replace(Waveform(), num_chirps=9)
+    w = replace(Waveform(filter_transition=0.41e6), num_chirps=9)
     links = [
         (sender(w, "A", 1), paths(w, "A", 30, 2)),
         (sender(w, "B", 3, clock_offset=0.7 * w.delay_step), paths(w, "B", 7, 4)),
@@ -103,7 +102,7 @@ def test_profiles_are_transforms_of_the_exact_samples(setting, bound, cells):
 def test_paths_below_the_first_cell_leave_their_tails():
     """A beat just under zero, which the filter's skirt lets pass: its tail is in the first cells.
     Planted bug: `pad` of 0, which takes such a path for one at the far end."""
-    w = replace(Waveform(), num_chirps=9)
+    w = replace(Waveform(filter_transition=0.41e6), num_chirps=9)
     low = paths(w, "A", 5, 6)
     low = replace(low, delay=np.array([-0.9, -0.4, 0.3, 0.8, 1.6]) * w.delay_step)
     found, truth = both(
@@ -119,7 +118,7 @@ def test_paths_of_the_last_cells_leave_their_tails_too():
     below zero, so that their tails lie in the first cells, with the phase of the window's place.
     The bound: tails cut 32 cells away, 1e-5 of a path. Planted bug: a folded path without its turn,
     `cycles` left as they are (0.54)."""
-    w = replace(Waveform(), num_chirps=9)
+    w = replace(Waveform(filter_transition=0.41e6), num_chirps=9)
     own = sender(w, "A", 1)
     small = replace(own.payload, delay_symbols=own.payload.delay_symbols % 16)
     high = paths(w, "A", 4, 6)
@@ -135,7 +134,7 @@ def test_paths_of_the_last_cells_leave_their_tails_too():
 
 
 def test_a_sky_without_paths_and_too_many_cells():
-    w = replace(Waveform(), num_chirps=9, num_samples=180)
+    w = replace(Waveform(filter_transition=0.41e6), num_chirps=9, num_samples=180)
     links = [(sender(w, "A", 1), paths(w, "A", 0, 2))]
     assert not both(w, links, 90, PROFILES)[0].any()
     with pytest.raises(ValueError, match="three quarters"):
@@ -146,19 +145,18 @@ def test_noise_is_that_of_windowed_white_samples():
     """Covariance over cells, from 3 x 15 x 12 chirps: the transform of w^2 to 5 sigma /
     sqrt(looks), at lags 0 to 4; white over chirps, receivers and groups. Planted bug: noise of the
     samples' power in the fewer samples of the band."""
-    w, power = replace(Waveform(), num_chirps=12), 1.7e-3
+    w, power = replace(Waveform(filter_transition=0.41e6), num_chirps=12), 1.7e-3
     silent = [(sender(w, "A", 1), paths(w, "A", 0, 2))]
     words = np.array([5, 9], np.uint32)
     options = {
         "start_time": 0.0,
-        "filter_transition": SKIRT,
         "noise_power": power,
         "seed_words": words,
     }
     y = range_profiles(w, silent, POSE, ANTENNAS, silent[0][0].payload, **options).spectra.astype(
         complex
     )
-    square = hann(np.arange(w.num_samples), window_length(w)) ** 2
+    square = hann(np.arange(w.num_samples), w.window_length) ** 2
     for lag in range(5):
         truth = (
             power
@@ -176,7 +174,7 @@ def test_the_active_terminal_makes_the_same_of_both():
     """Detections from profiles and from samples, with noise 107 dB under the strongest path's cell:
     the same paths, estimates apart by the noise (1e-5 cells) and the error of the method. Planted
     bug: `turn` of the cells with the other sign."""
-    w = Waveform()
+    w = Waveform(filter_transition=0.41e6)
     few = paths(w, "A", 4, 8, speed=5.0)
     delay, gain = (
         np.array([41.3, 77.8, 120.1, 200.6]) * w.delay_step,
@@ -184,7 +182,7 @@ def test_the_active_terminal_makes_the_same_of_both():
     )
     few = replace(few, delay=delay, gain=gain, begin=np.full(4, -np.inf))
     link = [(sender(w, "A", 1), few)]
-    frame, own = {"start_time": 0.0, "filter_transition": SKIRT}, link[0][0].payload
+    frame, own = {"start_time": 0.0}, link[0][0].payload
     noise, words = 1e-4, np.array([3, 4], np.uint32)
     samples = add_noise(
         if_signal(w, link, POSE, ANTENNAS, noise_power=noise, **frame), noise, words

@@ -45,9 +45,7 @@ def misfit(
         tx="A",
         rx="A",
     )
-    model = if_signal(
-        w, [(sent, path)], still, ONE, start_time=0.0, filter_transition=0.4e6, method="paper"
-    ).samples
+    model = if_signal(w, [(sent, path)], still, ONE, start_time=0.0, method="paper").samples
     truth = cube(
         w, schedule, payload, [Path(passes * reach, passes * speed, 1.0, aside, aside)], ONE
     ).samples

@@ -15,7 +15,6 @@ from isac_rt.frame.payload import MODULATION_ORDERS, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive import Prediction
 from isac_rt.receive.clutter.filter import chirp_runs
-from isac_rt.receive.estimate import beat_cells
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.studies.paper import fig8, fig11, fig12, montecarlo
@@ -215,7 +214,7 @@ def test_errors_are_those_of_the_receiver(link):
     )  # 45 cells of 10 dB each add up
     counted = count_errors(link, snr, 5, 2)
     frame, noise = draw_frame(link, 5, 2), cell_noise(link, 5, 2)
-    beats = beat_cells(w, frame.lengths[0] / SPEED_OF_LIGHT, frame.rate / SPEED_OF_LIGHT)[0]
+    beats = w.beat_cells(frame.lengths[0] / SPEED_OF_LIGHT, frame.rate / SPEED_OF_LIGHT)[0]
     turn = np.exp(2j * np.pi * beats[:, None] * np.arange(w.num_samples) / w.num_samples)
     still = np.zeros(frame.lengths.size)
     expected = Prediction(

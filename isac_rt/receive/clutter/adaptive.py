@@ -71,7 +71,7 @@ def beams_of(
     """Beams half a lobe apart over the field of view, along the axes (0 is X, 2 is Z) that the
     channels span."""
     k = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT
-    limit = float(np.sin(min(antennas.half_view, np.pi / 2)))
+    limit = antennas.view_limit
     lines = []
     for axis in axes:
         aperture = np.ptp(channels.places[:, axis]) + antennas.spacing

@@ -20,7 +20,6 @@ from scipy import ndimage
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.power import REACH, cells_of, doppler_products, kept_slots, range_power
-from isac_rt.receive.estimate import window_middle
 from isac_rt.receive.types import ExpectedClutter
 
 VELOCITY_STD = 0.1
@@ -82,8 +81,7 @@ def fit(
     w, rows = waveform, min(power.shape[0], waveform.num_delay_symbols)
     response = _Response(w, kept_slots(w, schedule, delay_symbols, 0), rows)
     towards = clutter.departure + clutter.arrival
-    carrier = w.carrier_frequency + w.slope * window_middle(w)
-    per_velocity = -carrier * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s
+    per_velocity = -w.carrier() * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s
     beat, doppler = cells_of(clutter, w)
     prior = np.array([LEVEL_STD, *[VELOCITY_STD] * 3]) ** -2.0
     theta = np.zeros(4)

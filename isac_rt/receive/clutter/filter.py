@@ -20,7 +20,7 @@ import scipy.fft
 from scipy import ndimage, stats
 
 from isac_rt.frame.schedule import Schedule
-from isac_rt.receive.spectrum import hann
+from isac_rt.frame.waveform import hann
 
 GAP = 3
 MARGIN = 2

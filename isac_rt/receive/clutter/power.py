@@ -25,7 +25,7 @@ from numba import njit
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.estimate import hann_response, window_middle
+from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.maps import slow_window
 from isac_rt.receive.types import ExpectedClutter
 
@@ -104,21 +104,15 @@ def one_each(antennas_sent: int) -> Channels:
 def steering(places: np.ndarray, cosines: np.ndarray, waveform: Waveform) -> np.ndarray:
     """(K, L) exp(-j k v.u) of echoes from body directions (K, 3), at the frequency of the window's
     middle."""
-    k = (
-        2
-        * np.pi
-        * (waveform.carrier_frequency + waveform.slope * window_middle(waveform))
-        / SPEED_OF_LIGHT
-    )
+    k = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
     return np.exp(-1j * k * (cosines @ places.T))
 
 
 def cells_of(clutter: ExpectedClutter, waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
     """Beat [range cells] and Doppler [bins, receding positive] of each scatterer at mid-frame."""
     w = waveform
-    carrier = w.carrier_frequency + w.slope * (window_middle(w) - clutter.delay)
-    beat = (w.slope * clutter.delay + clutter.delay_rate * carrier) * w.sampled_duration
-    return beat, clutter.delay_rate * carrier * w.frame_duration
+    beat = w.beat_cells(clutter.delay, clutter.delay_rate, 0.0)
+    return beat, clutter.delay_rate * w.carrier(clutter.delay) * w.frame_duration
 
 
 def range_power(waveform: Waveform, offset: np.ndarray, width: float) -> np.ndarray:

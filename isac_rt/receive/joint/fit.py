@@ -139,8 +139,8 @@ def _tone(frame: Frame, path: JointPath) -> _Tone:
     t = frame.middle
     schedule = frame.cube.schedule
     tau = frame.delay_symbols * w.delay_step + path.delay + path.delay_rate * t + e_tx[schedule]
-    g = w.carrier_frequency + w.slope * (u - tau)
-    phase = (w.carrier_frequency * tau) % 1.0 + (w.slope * tau * (u - tau / 2)) % 1.0
+    g = w.carrier(tau, u)
+    phase = w.phase(tau, u)
     frequency = (path.delay_rate * g + w.slope * tau) * T_s
     apart = e_rx[:, None] * g[:, None, :] - w.slope * e_rx[:, None] ** 2 / 2
     amplitude = path.amplitude[frame.amplitude_index]

@@ -88,7 +88,7 @@ def _credible(frame: Frame, paths: list[JointPath], near: list[JointPath]) -> bo
 def _hidden(frame: Frame, paths: list[JointPath]) -> tuple[int, JointPath] | None:
     """The surest path that the residual of a fit holds about one of its paths, with that path's
     number."""
-    limit = np.sin(min(frame.antennas.half_view, np.pi / 2 - 1e-3))
+    limit = frame.antennas.view_limit
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[(grid**2).sum(axis=1) < 0.98]
@@ -149,7 +149,7 @@ def _merged(
     power[rows] = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     values["range"][rows] = [p.delay * scale for p in paths]
     values["velocity"][rows] = [p.delay_rate * scale for p in paths]
-    limit = np.sin(frame.antennas.half_view) if frame.antennas.half_view < np.pi / 2 else 1.0
+    limit = frame.antennas.view_limit
     values["direction"][rows] = [
         np.where(np.abs(p.direction) <= limit, p.direction, np.nan) for p in paths
     ]

@@ -19,7 +19,6 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.filter import chirp_runs
-from isac_rt.receive.estimate import beat_cells, middle_times
 from isac_rt.receive.joint.fit import element_delays
 from isac_rt.receive.symbols.powers import (
     EXTRA_CELLS,
@@ -139,7 +138,7 @@ def _beam_spectra(
     the cells of the symbols."""
     w, shape = cube.waveform, cube.schedule.shape
     beats = [
-        beat_cells(w, r / SPEED_OF_LIGHT, v / SPEED_OF_LIGHT)
+        w.beat_cells(r / SPEED_OF_LIGHT, v / SPEED_OF_LIGHT)
         for r, v in zip(p.range, p.velocity, strict=True)
     ]
     weights = (
@@ -182,7 +181,7 @@ def _transitions(
     for one in picked:
         chains = by_antenna(one, cube.schedule, w.num_tx)
         products.append(chains[..., 1:] * chains[..., :-1].conj())
-    times = by_antenna(middle_times(w) + raw * w.delay_step, cube.schedule, w.num_tx)
+    times = by_antenna(w.middle_time + raw * w.delay_step, cube.schedule, w.num_tx)
     return np.array(products), np.diff(times, axis=-1)
 
 

@@ -18,8 +18,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.filter import chirp_runs
-from isac_rt.receive.estimate import beat_cells, middle_phase
-from isac_rt.receive.spectrum import data_phase, tones, window_length
+from isac_rt.receive.spectrum import tones
 from isac_rt.receive.symbols.profile import correlate
 from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Prediction
@@ -93,11 +92,11 @@ def demodulate(
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
-    beats = beat_cells(w, delays[0], rates[0])
+    beats = w.beat_cells(delays[0], rates[0])
     others = [
         (
             float(prediction.weight[k]),
-            np.round(beat_cells(w, delays[k], rates[k]) - beats).astype(int),
+            np.round(w.beat_cells(delays[k], rates[k]) - beats).astype(int),
         )
         for k in range(1, delays.size)
         if prediction.weight[k] >= WEAKEST_WEIGHT
@@ -147,9 +146,10 @@ def known_cycles(
 ) -> np.ndarray:
     """(M, P) phase [cycles] of the picked cells of a path that is as predicted and carries the
     symbols `raw`, but for its DPSK."""
-    w, beats = waveform, beat_cells(waveform, delay, delay_rate)
-    cycles = middle_phase(w, delay, delay_rate) - beats * (window_length(w) / 2 / w.num_samples)
-    return cycles + data_phase(w, raw) - (w.slope * w.delay_step * raw) * delay
+    w, beats = waveform, waveform.beat_cells(delay, delay_rate)
+    cycles = w.phase(delay + delay_rate * w.middle_time, w.window_middle)
+    cycles = cycles - beats * (w.window_length / 2 / w.num_samples)
+    return cycles + w.data_phase(raw) - (w.slope * w.delay_step * raw) * delay
 
 
 def decide(

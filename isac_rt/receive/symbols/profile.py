@@ -21,7 +21,6 @@ from scipy import stats
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.estimate import beat_cells
 from isac_rt.receive.types import Detections, Prediction
 
 FALSE_RATE = 1e-3
@@ -70,8 +69,8 @@ def reference_of(detections: Detections) -> Prediction:
 def derotation(waveform: Waveform, prediction: Prediction) -> np.ndarray:
     """(M, P, N) complex64 by which every chirp's reference is moved to cell 0."""
     w = waveform
-    beats = beat_cells(
-        w, prediction.range[0] / SPEED_OF_LIGHT, prediction.velocity[0] / SPEED_OF_LIGHT
+    beats = w.beat_cells(
+        prediction.range[0] / SPEED_OF_LIGHT, prediction.velocity[0] / SPEED_OF_LIGHT
     )
     cycles = (beats[..., None] * (np.arange(w.num_samples) / w.num_samples)) % 1.0
     return np.exp(-2j * np.pi * cycles).astype(np.complex64)

@@ -20,7 +20,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, unmodulated
 from isac_rt.frame.schedule import Schedule, conventional_schedule
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import Waveform, hann
 from isac_rt.receive.cfar import first_row
 from isac_rt.receive.estimate import to_delay
 from isac_rt.receive.types import Detections
@@ -67,5 +67,5 @@ def receive_fmcw(cube: IFCube, antennas: Antennas, settings: Receivers) -> Detec
 def fmcw_spectra(samples: np.ndarray) -> np.ndarray:
     """(L_rx, N, P) Hann-windowed range spectra of (L_rx, P, N) samples."""
     size = samples.shape[-1]
-    window = np.sin(np.pi * (np.arange(size) + 0.5) / size).astype(np.float32) ** 2
+    window = hann(np.arange(size) + 0.5, size).astype(np.float32)
     return scipy.fft.fft(samples * window, axis=-1, workers=1, overwrite_x=True).transpose(0, 2, 1)

@@ -41,7 +41,7 @@ import scipy.fft
 from scipy import stats
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive.cfar import first_row
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers
@@ -284,7 +284,7 @@ def loradar_spectra(
     whole = (
         np.floor(begin).astype(int) if compensation == "ordered" else np.zeros(w.num_chirps, int)
     )
-    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    window = hann(np.arange(size) + 0.5, size)
     turn = np.zeros(w.num_chirps) if compensation == "none" else begin - whole
     cells = np.exp(-2j * np.pi * np.outer(np.arange(size), turn) / size).astype(np.complex64)
     order = (np.arange(size) - whole[:, None]) % size

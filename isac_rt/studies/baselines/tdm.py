@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive.cfar import detect, strongest_peaks
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.maps import accumulate
@@ -44,7 +44,7 @@ def doppler_maps(
     num_rx, rows, num_chirps = spectra.shape
     pulses = num_chirps // num_tx
     bins = np.fft.fftfreq(pulses, 1 / pulses) / frame_duration
-    window = np.sin(np.pi * (np.arange(pulses) + 0.5) / pulses) ** 2
+    window = hann(np.arange(pulses) + 0.5, pulses)
     out = np.empty((num_tx, num_rx, rows, pulses), np.complex64)
     for tx in range(num_tx):
         mine = np.flatnonzero(schedule == tx)

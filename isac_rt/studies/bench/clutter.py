@@ -138,7 +138,6 @@ def _of_samples(setup: Setup, floor: float, repeats: int) -> list[dict[str, obje
             poses["AT"],
             setup.antennas,
             start_time=setup.timetable.start_time(0, "AT"),
-            filter_transition=setup.scenario.radio.filter_transition_hz,
             method="gridded",
         ).samples
 

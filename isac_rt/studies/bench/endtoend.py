@@ -93,7 +93,6 @@ def samples(setup: Setup) -> dict[Link, np.ndarray]:
             poses[link[1]],
             setup.antennas,
             start_time=setup.timetable.start_time(number, link[0]),
-            filter_transition=setup.scenario.radio.filter_transition_hz,
             noise_power=setup.noise_power(poses, link),
             method=setup.plan.synthesis(len(paths[link])),
         ).samples

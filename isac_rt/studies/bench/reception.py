@@ -18,7 +18,7 @@ import numpy as np
 from scipy.fft import fft
 from threadpoolctl import threadpool_limits
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
@@ -49,8 +49,7 @@ def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
         name="A", pose=pose, antennas=antennas, schedule=schedule, payload=payload
     )
     length, speed = 40.0 + 9.37 * np.arange(count), rng.uniform(-8, 8, count)
-    across = rng.uniform(-0.4, 0.4, (count, 2))
-    u = np.stack([across[:, 0], np.sqrt(1 - (across**2).sum(1)), across[:, 1]], axis=1)
+    u = unit_vector(rng.uniform(-0.4, 0.4, (count, 2)))
     paths = make_paths(
         epoch=w.frame_duration / 2,
         tx="A",
@@ -71,7 +70,6 @@ def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
         pose,
         antennas,
         start_time=0.0,
-        filter_transition=0.4e6,
         method="direct",
     )
     cube = add_noise(cube, 0.05, np.array([3, count], np.uint32))

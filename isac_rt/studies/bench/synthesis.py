@@ -37,7 +37,6 @@ PROFILE_SIZES = (3, 30, 1000, 10_000)
 BOTH = "samples (gridded wideband, 1.5 N, width 6), Hann window, transform, data out"
 JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
 ERROR_OF = "relative RMS against the exact model"
-_TRANSITION = 0.4e6
 GRIDS = (
     ("gridded narrowband, 2.25 N, width 4", Setting(2.25, 4, False)),
     ("gridded narrowband, 1.25 N, width 6", Setting(1.25, 6, False)),
@@ -110,7 +109,6 @@ class Job:
             self.pose,
             self.antennas,
             start_time=0.0,
-            filter_transition=_TRANSITION,
             method=method,
             setting=setting,
         ).samples
@@ -136,7 +134,6 @@ class Job:
             self.antennas,
             self.sender.payload,
             start_time=0.0,
-            filter_transition=_TRANSITION,
             setting=setting,
         ).spectra
 
@@ -153,7 +150,6 @@ class Job:
                 self.pose,
                 middle,
                 start_time=0.0,
-                filter_transition=_TRANSITION,
                 method="exact",
             ).samples
             delay = (

@@ -29,7 +29,6 @@ from isac_rt.studies.paper.claims_signal import prediction
 from isac_rt.studies.paper.outcome import Progress, Verdict, proportion
 from isac_rt.world.swarm import Pose
 
-SKIRT = onepath.FILTER_TRANSITION
 STILL = Pose.at_rest()
 KEPT_DB = 20.0
 """A neighbour this far down counts as kept out."""
@@ -65,7 +64,6 @@ def blocks(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
                 spacing,
                 0.0,
                 generator(seed, "claims", "blocks", spacing + 9, k),
-                transition=SKIRT,
                 chirps=6,
             )
             for k in range(sets)
@@ -116,7 +114,6 @@ def tolerance(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]
                     spacing,
                     float(error) * w.max_delay,
                     generator(seed, "claims", "tolerance", k),
-                    transition=SKIRT,
                     chirps=1,
                     path_cells=cells,
                     modulated=False,
@@ -186,9 +183,7 @@ def crowd(
                 payload=random_payload(w, schedule, 8, rng),
             )
             links.append((sent, path(w, length, rate, 10 ** (level / 20))))
-        cube = if_signal(
-            w, links, STILL, arrays, start_time=0.0, filter_transition=SKIRT, method="direct"
-        )
+        cube = if_signal(w, links, STILL, arrays, start_time=0.0, method="direct")
         add_noise(
             cube,
             10 ** (-snr_db / 10),
@@ -360,7 +355,6 @@ def _network(seed: int, snr_db: float) -> tuple[Network, dict[str, Clock]]:
         wishes={"A": int(rng.integers(0, 17))},
         listeners={"A": ("P", "Q")},
         noise_power=dict.fromkeys(place, 10 ** (-snr_db / 10)),
-        filter_transition=SKIRT,
         clocks=clocks,
         seed=seed,
     )

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -28,7 +29,6 @@ from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import detect
 from isac_rt.receive.clutter.filter import remove_standing
-from isac_rt.receive.estimate import beat_cells
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
@@ -191,9 +191,7 @@ def pt_errors(
             if clutter is None
             else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
         )
-        return if_signal(
-            w, links, other, bench.antennas, start_time=0.0, filter_transition=4e5, noise_power=1e-3
-        )
+        return if_signal(w, links, other, bench.antennas, start_time=0.0, noise_power=1e-3)
 
     payload = random_payload(w, schedule, ORDER, rng)
     cube = received(payload, 0)
@@ -202,7 +200,7 @@ def pt_errors(
         for name, frames in PILOTS.items()
         if kind.speed or frames == 1
     }
-    beats = beat_cells(w, DISTANCE / SPEED_OF_LIGHT, 0.0)[0]
+    beats = w.beat_cells(DISTANCE / SPEED_OF_LIGHT, 0.0)[0]
     shape = cube.samples[0].shape
     pairs = rng.standard_normal((*shape[:2], 2 * shape[2]), np.float32) * np.float32(
         np.sqrt(w.num_samples / 2)
@@ -335,7 +333,6 @@ def _cube(bench: Bench, paths: PathSet, sent: Transmission) -> IFCube:
         sent.pose,
         bench.antennas,
         start_time=0.0,
-        filter_transition=4e5,
         noise_power=1e-2,
     )
 
@@ -370,7 +367,7 @@ def _targets(bench: Bench, own: Pose, rng: np.random.Generator) -> tuple[PathSet
             cells.append(tried)
     place = np.array(cells)
     u = rng.uniform(-0.6, 0.6, (TARGETS, 2))
-    towards = own.to_world(np.stack([u[:, 0], np.sqrt(1 - (u**2).sum(axis=1)), u[:, 1]], axis=1))
+    towards = own.to_world(unit_vector(u))
     paths = make_paths(
         gain=np.exp(2j * np.pi * rng.uniform(size=TARGETS)),
         delay=place[:, 0] * w.range_cell(2) * 2 / SPEED_OF_LIGHT,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.level import thermal_noise_power, transmit_amplitude
 from isac_rt.frame.payload import Payload, random_payload
@@ -191,7 +192,6 @@ class Scenes:
             sent.pose,
             s.antennas,
             start_time=0.0,
-            filter_transition=s.scenario.radio.filter_transition_hz,
             noise_power=self.noise,
         )
 
@@ -283,7 +283,7 @@ def in_the_air(
             break
         u = rng.uniform(-WIDEST, WIDEST, (left.size, 2))
         inside = (u**2).sum(axis=1) < WIDEST**2
-        body = np.stack([u[:, 0], np.sqrt(np.maximum(1 - (u**2).sum(axis=1), 0)), u[:, 1]], axis=1)
+        body = unit_vector(u)
         world = pose.to_world(body)
         points = pose.position + ranges[left, None] * world
         good = inside & (points[:, 2] > 1.0) & (points[:, 2] < 120.0)

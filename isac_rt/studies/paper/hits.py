@@ -22,7 +22,7 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, pseudo_random_schedule
@@ -37,7 +37,7 @@ from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
 from isac_rt.receive.sense import describe
-from isac_rt.receive.spectrum import clean_spectrum, data_phase, shift_of, tones
+from isac_rt.receive.spectrum import clean_spectrum, tones
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Clutter
@@ -142,14 +142,10 @@ def _directions(rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _forward(u: np.ndarray) -> np.ndarray:
-    return np.array([u[0], np.sqrt(1 - u[0] ** 2 - u[1] ** 2), u[1]])
-
-
 def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload) -> IFCube:
     """Noise-free samples of a target of unit amplitude, and clutter from the same direction."""
     w, antennas = case.waveform, paper_antennas(case.waveform)
-    (distance, velocity), u = target.truth[:2], _forward(target.truth[2:])
+    (distance, velocity), u = target.truth[:2], unit_vector(target.truth[2:])
     lengths, count = case.passes * np.append(distance, target.ranges), 1 + target.ranges.size
     still = np.arange(count) > 0
     paths = make_paths(
@@ -157,7 +153,7 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
         delay=lengths / SPEED_OF_LIGHT,
         delay_rate=np.where(still, 0.0, case.passes * velocity / SPEED_OF_LIGHT),
         arrival=np.tile(u, (count, 1)),
-        departure=np.tile(u if case.passes == 2 else _forward(target.departure), (count, 1)),
+        departure=np.tile(u if case.passes == 2 else unit_vector(target.departure), (count, 1)),
         tx_radius=lengths / case.passes,
         rx_radius=lengths / case.passes,
         kind=np.where(still, PathKind.DIFFUSE, PathKind.TARGET),
@@ -174,7 +170,6 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
         pose,
         antennas,
         start_time=0.0,
-        filter_transition=4e5,
         method=method,
         max_direct=1,
     )
@@ -445,10 +440,10 @@ def plain_spectrum(cube: IFCube, payload: Payload) -> np.ndarray:
     out = np.empty((*cube.samples.shape[:2], w.num_delay_symbols, w.num_chirps), np.complex64)
     for m, samples in enumerate(cube.samples):
         cells = (symbols[m][:, None] + np.arange(w.num_delay_symbols)) % w.num_samples
-        turn = (payload.phases[m].conj() * np.exp(-2j * np.pi * data_phase(w, symbols[m]))).astype(
+        turn = (payload.phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(symbols[m]))).astype(
             np.complex64
         )[:, None]
-        turn = turn * tones(shift_of(w, symbols[m]) / w.num_samples, w.num_delay_symbols)
+        turn = turn * tones(w.data_shift(symbols[m]) / w.num_samples, w.num_delay_symbols)
         for rx, one in enumerate(samples):
             out[m, rx] = (
                 np.take_along_axis(scipy.fft.fft(one, axis=1, workers=1), cells, axis=1) * turn

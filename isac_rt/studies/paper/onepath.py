@@ -15,7 +15,6 @@ from isac_rt.randomness import seed_sequence
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.world.swarm import Pose
 
-FILTER_TRANSITION = 4e5
 """Skirt of the IF filter [Hz], as in the scenes."""
 
 
@@ -69,9 +68,7 @@ def frame(
         payload=payload,
         clock_offset=clock_offset,
     )
-    cube = if_signal(
-        waveform, [(sent, path)], pose, arrays, start_time=0.0, filter_transition=FILTER_TRANSITION
-    )
+    cube = if_signal(waveform, [(sent, path)], pose, arrays, start_time=0.0)
     if snr_db is None:
         return cube
     return add_noise(cube, 10 ** (-snr_db / 10), seed_sequence(seed, *purpose).generate_state(2))

@@ -25,7 +25,6 @@ from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
-from isac_rt.receive.estimate import beat_cells
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
 from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import Method, if_signal
@@ -43,7 +42,7 @@ VELOCITY_ERROR = 0.25
 def link_waveform(num_samples: int) -> Waveform:
     """One group of the paper's frame; 512 samples (T = 25.6 us) halve all times and keep the sweep
     of 640 MHz."""
-    return Waveform(num_samples=num_samples, num_groups=1)
+    return Waveform(num_samples=num_samples, num_groups=1, filter_transition=1e6)
 
 
 def paper_antennas(waveform: Waveform) -> Antennas:
@@ -142,7 +141,6 @@ def draw_frame(link: Link, seed: int, index: int) -> Frame:
         rx,
         antennas,
         start_time=0.0,
-        filter_transition=0.05 * w.sampling_rate,
         method=method,
         max_direct=1,
     )
@@ -258,10 +256,10 @@ def count_errors(link: Link, snr_db: np.ndarray, seed: int, index: int) -> Count
     paper's letter "delay floor", "delay round", "dpsk D literal"."""
     w, frame, noise = link.waveform, draw_frame(link, seed, index), cell_noise(link, seed, index)
     delay, rate = frame.lengths[0] / SPEED_OF_LIGHT, frame.rate / SPEED_OF_LIGHT
-    beats = beat_cells(w, delay, rate)
+    beats = w.beat_cells(delay, rate)
     cells = make_cells(frame.samples, beats[0], noise, link.run_cells is not None)
     offsets = [
-        np.round(beat_cells(w, x / SPEED_OF_LIGHT, rate) - beats).astype(int)[0]
+        np.round(w.beat_cells(x / SPEED_OF_LIGHT, rate) - beats).astype(int)[0]
         for x in frame.lengths[1:]
     ]
     # the weight is relative to the strongest prediction in the receiver's terms: the line of sight

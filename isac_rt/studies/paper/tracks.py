@@ -10,6 +10,7 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
+from isac_rt.frame.antennas import azimuth_elevation
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.studies.paper.flight import errors, scenario
 from isac_rt.studies.paper.outcome import Judgement, Verdict, blank, proportion, style
@@ -93,7 +94,7 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                     continue
                 r, v, u_x, u_z = measure(state.mean, own)
                 for i, (quantity, fused) in enumerate(
-                    zip(UNITS, (r, v, np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), strict=True)
+                    zip(UNITS, (r, v, azimuth_elevation([u_x, u_z])[0]), strict=True)
                 ):
                     truth, scale = (
                         float(one[f"truth_{quantity}"].values[k]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -239,7 +240,13 @@ def synthesise(
     **options: Any,
 ) -> np.ndarray:
     return if_signal(
-        w, links, rx, antennas, start_time=start, filter_transition=SKIRT, method=method, **options
+        replace(w, filter_transition=SKIRT),
+        links,
+        rx,
+        antennas,
+        start_time=start,
+        method=method,
+        **options,
     ).samples
 
 
