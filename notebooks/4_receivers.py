@@ -56,7 +56,7 @@ ax.set(xlabel="chirp", ylabel="cell", title="group 0, antenna 0, with data")
 spectra = spectrum.clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
 power = doppler.accumulate(doppler.channel_maps(spectra, w, cube.schedule, payload.delay_symbols))
 looks, r = setup.antennas.num_tx * setup.antennas.num_rx, scenario.receivers
-above, level = cfar.detect(power, looks, r.false_alarm_rate, r.guard_cells, r.training_cells)
+above, level = cfar.CfarRule.of(r, looks).detect(power)
 velocity = doppler.doppler_bins(w) * w.velocity_cell(2)
 figure, ax = plt.subplots(figsize=(8, 3.6))
 far = 120

@@ -372,8 +372,8 @@ OF_CASES = {
     ),
     "false alarms along range": Bug(
         "receive/cfar.py",
-        "greatest_of_factor(false_alarm_rate, float(looks), before, behind)",
-        "greatest_of_factor(false_alarm_rate, 1.0, before, behind)",
+        "greatest_of_factor(self.rate, float(self.looks), before, behind)",
+        "greatest_of_factor(self.rate, 1.0, before, behind)",
     ),
     "detection probability": Bug(
         "receive/cfar.py",

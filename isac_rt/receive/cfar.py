@@ -8,6 +8,7 @@ laws by quadrature, not from the large-number limit.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -33,6 +34,122 @@ DEEPEST_LOBE = 1e-8
 the map."""
 LEAST_KEPT = 0.25
 """Share of a training block that must be left for its mean to count."""
+
+
+@dataclass(frozen=True)
+class CfarRule:
+    """When a cell stands out of its surroundings.
+
+    Attributes
+    ----------
+    rate : false alarms of one cell
+    guard, training : (range, Doppler) cells on each side
+    looks : channels whose powers are averaged in the map
+
+    Examples
+    --------
+    >>> rule = CfarRule(1e-6, (3, 3), (8, 6), looks=45)
+    >>> above, level = rule.detect(np.ones((64, 32)))
+    >>> above.any(), bool(rule.threshold > 1)
+    (np.False_, True)
+    """
+
+    rate: float
+    guard: tuple[int, int]
+    training: tuple[int, int]
+    looks: int
+
+    @classmethod
+    def of(cls, settings: Receivers, looks: int) -> CfarRule:
+        """The rule that the settings state, for a map of so many looks."""
+        s = settings
+        return cls(s.false_alarm_rate, s.guard_cells, s.training_cells, looks)
+
+    @property
+    def threshold(self) -> float:
+        """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
+        return _factor(self, self.training[0], self.training[0])
+
+    def factors(self, rows: int) -> np.ndarray:
+        """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
+        return np.array([_factor(self, *count) for count in self.side_rows(rows).tolist()])
+
+    def detect(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cells above the threshold, and the background of every cell.
+
+        Parameters
+        ----------
+        power : (rows, P) mean power over the looks of Hann-windowed maps
+
+        Returns
+        -------
+        above : (rows, P) bool
+        level : (rows, P) background
+        """
+        level = np.maximum(self.background(power, ~strong_lobes(power)), ROUNDING * power.max())
+        return power > self.factors(len(power))[:, None] * level, level
+
+    def detect_chirps(self, power: np.ndarray) -> np.ndarray:
+        """One-dimensional CFAR along the range cells of every chirp (the paper's first stage).
+
+        Parameters
+        ----------
+        power : (N, P) mean power over the looks of spectra without a window, so that their noise
+            is independent
+
+        Returns
+        -------
+        above : (N, P) bool
+        """
+        along = replace(self, guard=(self.guard[0], 0), training=(self.training[0], 0))
+        level = along.background(power, np.ones(power.shape, bool))
+        level = np.maximum(level, ROUNDING * power.max())
+        sides = self.side_rows(len(power)).tolist()
+        factor = np.array([self._chirp_factor(*count) for count in sides])
+        return power > factor[:, None] * level
+
+    def background(self, power: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        """The greater of the means over the kept cells of the training blocks before and behind
+        each cell in range; Doppler wraps. Where one holds too few cells the other, infinite where
+        both do."""
+        guard = self.guard[0]
+        width = 2 * (self.guard[1] + self.training[1]) + 1
+        total, held = _summed(np.where(keep, power, 0.0), width), _summed(keep, width)
+        index, count = np.arange(len(power)), self.side_rows(len(power))
+        means = []
+        for rows, first in zip(
+            count.T, (index - guard - count[:, 0], index + guard + 1), strict=True
+        ):
+            start = np.where(rows == 0, 0, first)
+            cells = np.round(held[start + rows] - held[start])
+            enough = (rows[:, None] > 0) & (cells >= LEAST_KEPT * rows[:, None] * width)
+            mean = (total[start + rows] - total[start]) / np.maximum(cells, 1)
+            means.append(np.where(enough, mean, np.nan))
+        level = np.fmax(*means)
+        return np.where(np.isnan(level), np.inf, level)
+
+    def side_rows(self, rows: int) -> np.ndarray:
+        """(rows, 2) training rows before and behind each row; a side with less than half of them is
+        not used."""
+        index, guard, training = np.arange(rows), self.guard[0], self.training[0]
+        count = np.clip(np.stack([index - guard, rows - 1 - guard - index], axis=1), 0, training)
+        return np.where(count >= max(training // 2, 1), count, 0)
+
+    def _chirp_factor(self, before: int, behind: int) -> float:
+        if before == behind == 0:
+            return np.inf
+        return greatest_of_factor(self.rate, float(self.looks), before, behind)
+
+
+@lru_cache(maxsize=4096)
+def _factor(rule: CfarRule, before: int, behind: int) -> float:
+    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less
+    than one each. Infinite where there is no training row."""
+    if before == behind == 0:
+        return np.inf
+    across = independent_cells(2 * (rule.guard[1] + rule.training[1]) + 1)
+    sides = (independent_cells(rows) * across for rows in (before, behind))
+    return greatest_of_factor(rule.rate, float(rule.looks), *sides)
 
 
 @lru_cache(maxsize=256)
@@ -63,37 +180,6 @@ def greatest_of_factor(
     return float(optimize.brentq(excess, 0.5, 1000.0, xtol=1e-6))
 
 
-def side_rows(rows: int, guard: int, training: int) -> np.ndarray:
-    """(rows, 2) training rows before and behind each row; a side with less than half of them is not
-    used."""
-    index = np.arange(rows)
-    count = np.clip(np.stack([index - guard, rows - 1 - guard - index], axis=1), 0, training)
-    return np.where(count >= max(training // 2, 1), count, 0)
-
-
-def background(
-    power: np.ndarray, keep: np.ndarray, guard: tuple[int, int], training: tuple[int, int]
-) -> np.ndarray:
-    """The greater of the means over the kept cells of the training blocks before and behind each
-    cell in range; Doppler wraps. Where one holds too few cells the other, infinite where both
-    do."""
-    width = 2 * (guard[1] + training[1]) + 1
-    total, held = _summed(np.where(keep, power, 0.0), width), _summed(keep, width)
-    index, count = np.arange(len(power)), side_rows(len(power), guard[0], training[0])
-    means = []
-    for rows, first in zip(
-        count.T, (index - guard[0] - count[:, 0], index + guard[0] + 1), strict=True
-    ):
-        start = np.where(rows == 0, 0, first)
-        cells = np.round(held[start + rows] - held[start])
-        enough = (rows[:, None] > 0) & (cells >= LEAST_KEPT * rows[:, None] * width)
-        means.append(
-            np.where(enough, (total[start + rows] - total[start]) / np.maximum(cells, 1), np.nan)
-        )
-    level = np.fmax(*means)
-    return np.where(np.isnan(level), np.inf, level)
-
-
 def _summed(values: np.ndarray, width: int) -> np.ndarray:
     """(rows + 1, P) sums of the first 0, 1, ... rows over `width` bins about each."""
     across = ndimage.uniform_filter1d(values.astype(np.float64), width, axis=1, mode="wrap") * width
@@ -117,106 +203,6 @@ def strong_lobes(power: np.ndarray) -> np.ndarray:
             noise / power[row, column], DEEPEST_LOBE
         )
     return reached
-
-
-def detect(
-    power: np.ndarray,
-    looks: int,
-    false_alarm_rate: float,
-    guard: tuple[int, int],
-    training: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cells above the threshold, and the background of every cell.
-
-    Parameters
-    ----------
-    power : (rows, P) mean power over `looks` channels of Hann-windowed maps
-    guard, training : (range, Doppler) cells on each side
-
-    Returns
-    -------
-    above : (rows, P) bool
-    level : (rows, P) background
-    """
-    level = np.maximum(
-        background(power, ~strong_lobes(power), guard, training), ROUNDING * power.max()
-    )
-    return power > row_factors(len(power), looks, false_alarm_rate, guard, training)[
-        :, None
-    ] * level, level
-
-
-def row_factors(
-    rows: int,
-    looks: int,
-    false_alarm_rate: float,
-    guard: tuple[int, int],
-    training: tuple[int, int],
-) -> np.ndarray:
-    """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
-    sides = side_rows(rows, guard[0], training[0])
-    return np.array(
-        [_factor(looks, false_alarm_rate, guard, training, *count) for count in sides.tolist()]
-    )
-
-
-def detect_chirps(
-    power: np.ndarray, looks: int, false_alarm_rate: float, guard: int, training: int
-) -> np.ndarray:
-    """One-dimensional CFAR along the range cells of every chirp (the paper's first stage).
-
-    Parameters
-    ----------
-    power : (N, P) mean power over `looks` receivers of spectra without a window, so that their
-        noise is independent
-    guard, training : range cells on each side
-
-    Returns
-    -------
-    above : (N, P) bool
-    """
-    every = np.ones(power.shape, bool)
-    level = np.maximum(background(power, every, (guard, 0), (training, 0)), ROUNDING * power.max())
-    factor = np.array(
-        [
-            _chirp_factor(looks, false_alarm_rate, *count)
-            for count in side_rows(len(power), guard, training).tolist()
-        ]
-    )
-    return power > factor[:, None] * level
-
-
-def _chirp_factor(looks: int, false_alarm_rate: float, before: int, behind: int) -> float:
-    return (
-        np.inf
-        if before == behind == 0
-        else greatest_of_factor(false_alarm_rate, float(looks), before, behind)
-    )
-
-
-def threshold(
-    looks: int, false_alarm_rate: float, guard: tuple[int, int], training: tuple[int, int]
-) -> float:
-    """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
-    return _factor(looks, false_alarm_rate, guard, training, training[0], training[0])
-
-
-@lru_cache(maxsize=4096)
-def _factor(
-    looks: int,
-    false_alarm_rate: float,
-    guard: tuple[int, int],
-    training: tuple[int, int],
-    before: int,
-    behind: int,
-) -> float:
-    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less
-    than one each. Infinite where there is no training row."""
-    if before == behind == 0:
-        return np.inf
-    across = independent_cells(2 * (guard[1] + training[1]) + 1)
-    sides = (independent_cells(rows) * across for rows in (before, behind))
-    return greatest_of_factor(false_alarm_rate, float(looks), *sides)
 
 
 def independent_cells(count: int) -> float:

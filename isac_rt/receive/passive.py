@@ -12,7 +12,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.cfar import row_factors, threshold
+from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.receive.joint.fit import Frame, JointPath
 from isac_rt.receive.joint.separate import separate
@@ -181,9 +181,8 @@ def _earliest(
     false-alarm rate is asked of the whole map here and not of one cell, or an empty pilot would now
     and then be acquired."""
     d = found.detections
-    looks = num_looks(settings, schedule, antennas)
-    rate = settings.false_alarm_rate / found.power.size
-    sure = d.snr > threshold(looks, rate, settings.guard_cells, settings.training_cells)
+    rule = CfarRule.of(settings, num_looks(settings, schedule, antennas))
+    sure = d.snr > replace(rule, rate=rule.rate / found.power.size).threshold
     if not sure.any():
         return d, None
     power = np.array([_power(e) for e in found.estimates])
@@ -216,14 +215,8 @@ def _at_prediction(
     columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
     gate = found.power[np.ix_(rows, columns)]
     i, j = np.unravel_index(gate.argmax(), gate.shape)
-    looks = num_looks(settings, cube.schedule, antennas)
-    factors = row_factors(
-        len(found.power),
-        looks,
-        settings.false_alarm_rate,
-        settings.guard_cells,
-        settings.training_cells,
-    )
+    rule = CfarRule.of(settings, num_looks(settings, cube.schedule, antennas))
+    factors = rule.factors(len(found.power))
     snr = found.power[rows[i], columns[j]] / found.level[rows[i], columns[j]]
     if not snr > factors[rows[i]]:
         return no_detections(), None

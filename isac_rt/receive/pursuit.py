@@ -14,7 +14,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.cfar import detect, first_row
+from isac_rt.receive.cfar import CfarRule, first_row
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -56,16 +56,15 @@ def pursue(
     passes : 2 for echoes, 1 at a PT
     """
     w, left = waveform, spectra.copy()
-    looks, first = antennas.num_tx * antennas.num_rx, first_row(settings, w.range_cell(passes))
+    rule = CfarRule.of(settings, antennas.num_tx * antennas.num_rx)
+    first = first_row(settings, w.range_cell(passes))
     power = power_map(left, w, schedule, delay_symbols)
     whole = power.copy()
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder
     found: list[Estimate] = []
     snr: list[float] = []
     while len(found) < settings.max_detections:
-        above, level = detect(
-            power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
-        )
+        above, level = rule.detect(power)
         above[:first] = False
         above &= power > taken
         if not above.any():

@@ -12,7 +12,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.schedule import Schedule, is_latin
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.cfar import detect, detect_chirps, first_row, strongest_peaks
+from isac_rt.receive.cfar import CfarRule, first_row, strongest_peaks
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -41,7 +41,7 @@ OMP_SPARSITY = 4
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`cfar.detect`). `sparse`: see `Reception`."""
+    its background (`CfarRule.detect`). `sparse`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
@@ -83,25 +83,21 @@ def sense(
 ) -> Sensed:
     """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose
     `delay_symbols` were removed."""
-    w, method, looks = (
-        waveform,
-        velocity_method(settings, schedule, waveform.num_tx),
-        num_looks(settings, schedule, antennas),
-    )
-    rules = looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
+    w, method = waveform, velocity_method(settings, schedule, waveform.num_tx)
+    rule = CfarRule.of(settings, num_looks(settings, schedule, antennas))
     if method == "pursuit":
         paths, ratio, power = pursue(
             spectra, w, schedule, delay_symbols, antennas, settings, passes
         )
         return Sensed(
-            paths, describe(paths, ratio, antennas, w, passes), power, detect(power, *rules)[1]
+            paths, describe(paths, ratio, antennas, w, passes), power, rule.detect(power)[1]
         )
     conventional = method == "conventional"
     if conventional:
         power = conventional_power(spectra, w, schedule)
     else:
         power = power_map(spectra, w, schedule, delay_symbols)
-    above, level = detect(power, *rules)
+    above, level = rule.detect(power)
     above[: first_row(settings, w.range_cell(passes))] = False
     sparse = None
     if method in ("omp", "conventional"):
@@ -207,20 +203,14 @@ def make_maps(
     power: np.ndarray, cube: IFCube | RangeProfiles, settings: Receivers, passes: int
 ) -> Maps:
     """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
-    w, guard, training = cube.waveform, settings.guard_cells[0], settings.training_cells[0]
-    before, looks = (
-        (equivalent_range_power(cube), cube.samples.shape[1])
-        if isinstance(cube, IFCube)
-        else (np.zeros((0, 0)), 1)
-    )
+    w, before, looks = cube.waveform, np.zeros((0, 0)), 1
+    if isinstance(cube, IFCube):
+        before, looks = equivalent_range_power(cube), cube.samples.shape[1]
+    rule = CfarRule.of(settings, looks)
     return Maps(
         range_doppler=power.astype(np.float32),
         range_axis=np.arange(power.shape[0]) * w.range_cell(passes),
         velocity_axis=doppler_bins(w) * w.velocity_cell(passes),
         equivalent_range=np.sqrt(before),
-        equivalent_detections=detect_chirps(
-            before, looks, settings.false_alarm_rate, guard, training
-        )
-        if before.size
-        else before > 0,
+        equivalent_detections=rule.detect_chirps(before) if before.size else before > 0,
     )

@@ -12,7 +12,7 @@ from scipy import stats
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.adaptive import (
     Matched,
     beams_of,
@@ -353,7 +353,7 @@ def test_ratio_of_the_cfar_is_its_decision():
     rng, settings = np.random.default_rng(15), Receivers(false_alarm_rate=1e-2)
     power = rng.gamma(15, 1 / 15, (90, 60))
     ratio, level = cfar_ratio(power, 15, settings)
-    above, same = detect(power, 15, 1e-2, settings.guard_cells, settings.training_cells)
+    above, same = CfarRule.of(settings, 15).detect(power)
     assert above.sum() > 20 and np.array_equal(ratio > 1, above) and np.array_equal(level, same)
 
 

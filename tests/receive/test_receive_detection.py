@@ -17,16 +17,11 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive import receive_active, receive_passive
 from isac_rt.receive.cfar import (
-    background,
-    detect,
-    detect_chirps,
+    CfarRule,
     greatest_of_factor,
     hann_envelope,
     independent_cells,
     peaks,
-    row_factors,
-    side_rows,
-    threshold,
     without_sidelobes,
 )
 from isac_rt.receive.estimate import (
@@ -184,7 +179,7 @@ def test_false_alarm_rate_of_the_whole_chain():
             white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512
         )
         power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
-        above, _ = detect(power, 9, rate, GUARD, (1, 1))
+        above, _ = CfarRule(rate, GUARD, (1, 1), 9).detect(power)
         false, trials = false + int(above.sum()), trials + above.size
     low, high = stats.binom.ppf([FALSE_FAILURE / 2, 1 - FALSE_FAILURE / 2], trials // 3, rate)
     assert 3 * low <= false <= 3 * high
@@ -217,7 +212,8 @@ def test_threshold_of_a_map_by_its_integral(guard: tuple[int, int], training: tu
     )  # of the rate; the factor is good to 1e-4 and the tail is steep
     size = looks * independent(training[0]) * independent(2 * (guard[1] + training[1]) + 1)
     cell, mean = stats.gamma(looks, scale=1 / looks), stats.gamma(size, scale=1 / size)
-    z = threshold(looks, rate, guard, training)
+    rule = CfarRule(rate, guard, training, looks)
+    z = rule.threshold
     both = quad(
         lambda y: 2 * mean.pdf(y) * mean.cdf(y) * cell.sf(z * y),
         0,
@@ -226,7 +222,7 @@ def test_threshold_of_a_map_by_its_integral(guard: tuple[int, int], training: tu
         limit=200,
     )[0]
     assert both == pytest.approx(rate, rel=quadrature, abs=0)
-    first = row_factors(60, looks, rate, guard, training)[0]
+    first = rule.factors(60)[0]
     one = quad(lambda y: mean.pdf(y) * cell.sf(first * y), 0, 12, points=[0.3, 1, 2], limit=200)[0]
     assert one == pytest.approx(rate, rel=quadrature, abs=0)
 
@@ -234,7 +230,8 @@ def test_threshold_of_a_map_by_its_integral(guard: tuple[int, int], training: tu
 def test_training_at_the_ends_and_across_the_doppler_wrap():
     power = np.ones((40, 20))
     power[:, 0] = 5.0
-    level = background(power, np.ones(power.shape, bool), (1, 1), (4, 2))
+    rule = CfarRule(1e-3, (1, 1), (4, 2), 1)
+    level = rule.background(power, np.ones(power.shape, bool))
     assert np.isfinite(level).all()
     share = (6 * 1.0 + 5.0) / 7  # width 2 (1 + 2) + 1 = 7 columns, one of them the bright one
     assert (
@@ -242,7 +239,7 @@ def test_training_at_the_ends_and_across_the_doppler_wrap():
         and level[0, 2] == pytest.approx(share)
         and level[39, 10] == pytest.approx(1.0)
     )
-    counts = side_rows(40, 1, 4)
+    counts = rule.side_rows(40)
     assert (
         counts[0].tolist() == [0, 4]
         and counts[2].tolist() == [0, 4]
@@ -257,7 +254,7 @@ def test_background_against_plain_loops():
     range; the rows of the other side; a side of too few cells that counts."""
     rng, guard, training = np.random.default_rng(17), (2, 1), (5, 3)
     power, keep = rng.exponential(1.0, (23, 17)), rng.random((23, 17)) > 0.3
-    found = background(power, keep, guard, training)
+    found = CfarRule(1e-3, guard, training, 1).background(power, keep)
     for row in range(23):
         for column in range(17):
             columns = np.arange(column - 4, column + 5) % 17
@@ -275,7 +272,7 @@ def test_a_clutter_edge_raises_no_alarms():
     rng = np.random.default_rng(4)
     power = rng.gamma(45, 1 / 45, (200, 120))
     power[100:] *= 100
-    above, _ = detect(power, 45, 1e-4, GUARD, TRAINING)
+    above, _ = CfarRule(1e-4, GUARD, TRAINING, 45).detect(power)
     # the four rows behind the edge see it in their guard cells only: their own side holds the rate
     # to a few times the design
     assert above.sum() <= stats.binom.isf(FALSE_FAILURE, power.size, 3e-4)
@@ -649,8 +646,8 @@ def test_two_cells_of_a_hann_tone_give_its_place():
 
 def test_threshold_grows_with_fewer_training_cells():
     assert (
-        threshold(45, 1e-6, (3, 3), (2, 1))
-        > threshold(45, 1e-6, (3, 3), (8, 6))
+        CfarRule(1e-6, (3, 3), (2, 1), 45).threshold
+        > CfarRule(1e-6, (3, 3), (8, 6), 45).threshold
         > stats.gamma(45, scale=1 / 45).isf(1e-6) * 0.9
     )
 
@@ -661,10 +658,10 @@ def test_one_dimensional_cfar_keeps_its_rate_and_finds_a_tone():
     chirp. Planted bug: looks of one receiver."""
     rng = np.random.default_rng(21)
     power = rng.gamma(15, 1 / 15, (1000, 200))
-    above = detect_chirps(power, 15, 1e-3, 3, 8)
+    above = CfarRule(1e-3, (3, 3), (8, 6), 15).detect_chirps(power)
     assert abs(above.sum() - 200) < 4.5 * np.sqrt(200)
     power[417] += 10**1.2
-    assert detect_chirps(power, 15, 1e-6, 3, 8)[417].all()
+    assert CfarRule(1e-6, (3, 3), (8, 6), 15).detect_chirps(power)[417].all()
 
 
 def test_a_strong_path_does_not_hide_a_target_beside_it():
@@ -679,6 +676,6 @@ def test_a_strong_path_does_not_hide_a_target_beside_it():
         * (np.maximum.outer(rows, bins) < 40)
     )
     power[100, 55] += 100
-    above, _ = detect(power, 45, 1e-6, (3, 3), (8, 6))
+    above, _ = CfarRule(1e-6, (3, 3), (8, 6), 45).detect(power)
     assert above[100, 55]
     assert above[90, 50]

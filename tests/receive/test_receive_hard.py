@@ -15,7 +15,7 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import receive_active, receive_passive
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.maps import accumulate, channel_maps, conventional_power, own_bins
 from isac_rt.receive.sense import num_looks
 from isac_rt.receive.spectrum import clean_spectrum
@@ -81,13 +81,8 @@ def test_false_alarm_rate_of_each_map(groups: int, method: str):
         )
         payload = random_payload(w, schedule, 8, rng)
         power = power_map(white(w, schedule, seed), payload, settings)
-        above, _ = detect(
-            power,
-            num_looks(settings, schedule, FEW),
-            rate,
-            settings.guard_cells,
-            settings.training_cells,
-        )
+        rule = CfarRule.of(settings, num_looks(settings, schedule, FEW))
+        above, _ = replace(rule, rate=rate).detect(power)
         if method == "conventional":
             above = above[:, own_bins(w)]
         false, trials = false + int(above.sum()), trials + above.size
@@ -109,13 +104,8 @@ def test_false_alarm_rate_beside_a_clutter_edge():
     for seed in range(24):
         schedule = pseudo_random_schedule(3, 48, 3, np.random.default_rng(seed))
         power = power_map(white(w, schedule, seed, profile), unmodulated(w), settings)
-        above, _ = detect(
-            power,
-            num_looks(settings, schedule, FEW),
-            rate,
-            settings.guard_cells,
-            settings.training_cells,
-        )
+        rule = CfarRule.of(settings, num_looks(settings, schedule, FEW))
+        above, _ = replace(rule, rate=rate).detect(power)
         for name, rows in places.items():
             counts[name] += [above[rows].sum(), above[rows].size]
     assert counts["before"][0] <= bounds(int(counts["before"][1]), rate)[1]

@@ -24,7 +24,7 @@ from scipy import ndimage
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.cfar import background, detect, row_factors, strong_lobes
+from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.clutter.adaptive import (
     Beams,
     Scan,
@@ -145,12 +145,10 @@ def _nowhere(power: np.ndarray) -> np.ndarray:
 
 
 def cfar_ratio(power: np.ndarray, looks: int, settings: Receivers) -> tuple[np.ndarray, np.ndarray]:
-    """Power over the threshold of `detect`, and the background."""
-    rate, guard, training = settings.false_alarm_rate, settings.guard_cells, settings.training_cells
-    level = detect(power, looks, rate, guard, training)[1]
-    return power / (
-        row_factors(power.shape[0], looks, rate, guard, training)[:, None] * level
-    ), level
+    """Power over the threshold of `CfarRule.detect`, and the background."""
+    rule = CfarRule.of(settings, looks)
+    level = rule.detect(power)[1]
+    return power / (rule.factors(len(power))[:, None] * level), level
 
 
 def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> float:
@@ -182,9 +180,7 @@ def _directed(
     if settings is not None:
         left = np.fft.fftshift(np.mean([scan.energy for scan, _ in parts], axis=0), axes=1)
         found = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
-        around = background(
-            left, ~(found | strong_lobes(left)), settings.guard_cells, settings.training_cells
-        )
+        around = CfarRule.of(settings, 1).background(left, ~(found | strong_lobes(left)))
         ratio = ratio / np.maximum(around, 1.0)
     cosines = np.zeros((*ratio.shape, 2))
     for scan, beams in parts:

@@ -9,7 +9,7 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
-from isac_rt.receive.cfar import detect, strongest_peaks
+from isac_rt.receive.cfar import CfarRule, strongest_peaks
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.maps import accumulate
 from isac_rt.receive.sense import describe
@@ -78,10 +78,7 @@ def sense_tdm(
     w = waveform
     maps = doppler_maps(spectra, schedule, times, w.frame_duration, w.num_tx)
     power = accumulate(maps)
-    looks = antennas.num_tx * antennas.num_rx
-    above, level = detect(
-        power, looks, settings.false_alarm_rate, settings.guard_cells, settings.training_cells
-    )
+    above, level = CfarRule.of(settings, antennas.num_tx * antennas.num_rx).detect(power)
     above[:first_row] = False
     rows, columns = strongest_peaks(power, above, settings, SIDELOBES)
     estimates = [

@@ -27,7 +27,7 @@ from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator, seed_sequence
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
@@ -342,13 +342,7 @@ def _found(maps: np.ndarray, cells: np.ndarray) -> tuple[int, int, int]:
     number of cells there."""
     settings = Receivers(false_alarm_rate=FALSE_ALARMS)
     power = accumulate(maps)
-    above, _ = detect(
-        power,
-        maps.shape[0] * maps.shape[1],
-        FALSE_ALARMS,
-        settings.guard_cells,
-        settings.training_cells,
-    )
+    above, _ = CfarRule.of(settings, maps.shape[0] * maps.shape[1]).detect(power)
     near = ndimage.maximum_filter(above, size=3, mode=("nearest", "wrap"))
     clear = np.abs(np.arange(len(power))[:, None] - cells[:, 0]).min(axis=1) > CLEAR_ROWS
     return int(near[tuple(cells.T)].sum()), int(above[clear].sum()), above[clear].size

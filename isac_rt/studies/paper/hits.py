@@ -31,7 +31,7 @@ from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.randomness import generator
 from isac_rt.receive import Prediction
-from isac_rt.receive.cfar import detect
+from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -243,10 +243,7 @@ def strongest(
 
 def is_detected(power: np.ndarray, row: int, column: int, looks: int) -> bool:
     """Whether a cell is above the CFAR's threshold."""
-    above, _ = detect(
-        power, looks, SETTINGS.false_alarm_rate, SETTINGS.guard_cells, SETTINGS.training_cells
-    )
-    return bool(above[row, column])
+    return bool(CfarRule.of(SETTINGS, looks).detect(power)[0][row, column])
 
 
 def first_row(case: Case, cell: float) -> int:

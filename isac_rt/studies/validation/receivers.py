@@ -15,7 +15,7 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.receive import Prediction, receive_active
-from isac_rt.receive.cfar import detect, detect_chirps, greatest_of_factor
+from isac_rt.receive.cfar import CfarRule, greatest_of_factor
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.estimate import arm, direction_cosine
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator
@@ -235,7 +235,7 @@ def false_alarms_along_range() -> float:
     """False alarms of the one-dimensional CFAR in noise of 15 receivers, 200,000 cells at 1e-3,
     ends included."""
     power = np.random.default_rng(21).gamma(15, 1 / 15, (1000, 200))
-    return abs(detect_chirps(power, 15, 1e-3, 3, 8).sum() - 200) / np.sqrt(200)
+    return abs(CfarRule(1e-3, (3, 0), (8, 0), 15).detect_chirps(power).sum() - 200) / np.sqrt(200)
 
 
 @case(
@@ -250,9 +250,9 @@ def detection_probability() -> float:
     power = rng.gamma(looks, 1 / looks, (100, 4000))
     power[50] = rng.noncentral_chisquare(2 * looks, 2 * looks * snr, 4000) / (2 * looks)
     rate = _greatest_of(greatest_of_factor(1e-4, float(looks), 8, 8), looks, 8, snr)
-    return abs(detect_chirps(power, looks, 1e-4, 3, 8)[50].mean() - rate) / np.sqrt(
-        rate * (1 - rate) / 4000
-    )
+    return abs(
+        CfarRule(1e-4, (3, 0), (8, 0), looks).detect_chirps(power)[50].mean() - rate
+    ) / np.sqrt(rate * (1 - rate) / 4000)
 
 
 def _noise_cube(w: Waveform, seed: int) -> IFCube:
@@ -272,12 +272,13 @@ def _noise_cube(w: Waveform, seed: int) -> IFCube:
 def false_alarms_of_the_whole_chain() -> float:
     """Cells above the threshold in noise through data removal, Doppler and accumulation, designed
     for 5e-3."""
-    w, settings, alarms, cells = Waveform(num_samples=256), Receivers(), 0, 0
+    w, alarms, cells = Waveform(num_samples=256), 0, 0
+    rule = CfarRule.of(Receivers(false_alarm_rate=5e-3), 9)
     for seed in range(16):
         cube, pilot = _noise_cube(w, seed), unmodulated(w)
         spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
         power = accumulate(channel_maps(spectra, w, cube.schedule, pilot.delay_symbols))
-        above, _ = detect(power, 9, 5e-3, settings.guard_cells, settings.training_cells)
+        above, _ = rule.detect(power)
         alarms, cells = alarms + int(above.sum()), cells + above.size
     return abs(alarms / cells / 5e-3 - 1)
 
