@@ -41,17 +41,16 @@ figures.over_time(right, results.dataset, 1, "range")
 # Poses and paths of frame 4 at its middle:
 
 # %%
-poses, paths = setup.trace(4)
-paths["AT", "PT1"]
+frame = setup.frame(4)
+frame.paths["AT", "PT1"]
 
 # %% [markdown]
 # What the active terminal sends, what it receives of its own chirps, and what it makes of them:
 
 # %%
-sent = {"AT": setup.transmission("AT", 4, poses["AT"])}
-cube = setup.receive_samples(4, ("AT", "AT"), sent, paths, poses)
+cube = frame.samples(("AT", "AT"))
 cube
 
 # %%
-reception = irt.receive_active(cube, sent["AT"].payload, setup.antennas, scenario.receivers)
+reception = irt.receive_active(cube, frame.sent["AT"].payload, setup.antennas, scenario.receivers)
 reception.detections

@@ -31,8 +31,8 @@ scenario = irt.load(
     frames=4,
 )
 setup = irt.prepare(scenario)
-poses, paths = setup.trace(0)
-path = paths["AT", "PT1"].select(np.array([0]))
+frame = setup.frame(0)
+path = frame.paths["AT", "PT1"].select(np.array([0]))
 path
 
 # %% [markdown]
@@ -41,12 +41,12 @@ path
 
 # %%
 w = setup.waveform
-sent = setup.transmission("AT", 0, poses["AT"])
+sent = frame.sent["AT"]
 start = setup.timetable.start_time(0, "AT")
 cube = irt.if_signal(
     w,
     [(sent, path)],
-    poses["PT1"],
+    frame.poses["PT1"],
     setup.antennas,
     start_time=start,
     method="exact",
@@ -71,8 +71,8 @@ beat, doppler = w.slope * tau * u, w.carrier_frequency * rate * slot
 # delay of the two elements against the arrays' middles: they delay the whole chirp, not only its
 # carrier
 elements = [
-    (poses["AT"], setup.antennas.tx_positions[0], path.departure[0]),
-    (poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0]),
+    (frame.poses["AT"], setup.antennas.tx_positions[0], path.departure[0]),
+    (frame.poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0]),
 ]
 element = (
     -sum(pose.to_world(place) @ direction for pose, place, direction in elements) / 299792458.0
@@ -106,8 +106,8 @@ ax.invert_yaxis()
 # once; the default, "auto", gives lines of sight to "direct".
 
 # %%
-links = [(sent, paths["AT", "PT1"])]
-heard = (w, links, poses["PT1"], setup.antennas)
+links = [(sent, frame.paths["AT", "PT1"])]
+heard = (w, links, frame.poses["PT1"], setup.antennas)
 exact = irt.if_signal(*heard, start_time=start, method="exact").samples
 for method in ("direct", "gridded"):
     fast = irt.if_signal(*heard, start_time=start, method=method).samples

@@ -25,18 +25,16 @@ scenario = irt.load(
     "../scenes/paper_swarm_consistent.yaml", ["propagation.leakage.enabled=false"], frames=200
 )
 setup = irt.prepare(scenario)
-w, frame = setup.waveform, 160
-poses, paths = setup.trace(frame)
-sent = {"AT": setup.transmission("AT", frame, poses["AT"])}
-payload = sent["AT"].payload
-sent["AT"].payload.delay_symbols.shape, setup.timetable.modulated(frame)
+w, frame = setup.waveform, setup.frame(160)
+payload = frame.sent["AT"].payload
+payload.delay_symbols.shape, payload.modulated
 
 # %% [markdown]
 # ## AT: before data removal
 # Each chirp's delay symbol moves the echo to another range cell.
 
 # %%
-cube = setup.receive_samples(frame, ("AT", "AT"), sent, paths, poses)
+cube = frame.samples(("AT", "AT"))
 raw = np.abs(np.fft.fft(cube.samples[0, 0] * np.hanning(w.num_samples), axis=-1)).T
 figure, ax = plt.subplots(figsize=(8, 3.2))
 ax.imshow(
@@ -85,8 +83,8 @@ irt.receive_active(cube, payload, setup.antennas, r).detections
 # strongest of N/2 cells.
 
 # %%
-heard = setup.receive_samples(frame, ("AT", "PT1"), sent, paths, poses)
-sight = paths["AT", "PT1"].select(np.array([0]))
+heard = frame.samples(("AT", "PT1"))
+sight = frame.paths["AT", "PT1"].select(np.array([0]))
 c = 299792458.0
 known = irt.Prediction(
     range=c * sight.delay + 0.03,  # a prediction is never perfect

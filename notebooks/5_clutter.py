@@ -26,14 +26,13 @@ for model in ("rayleigh", "field"):
         frames=2,
     )
     setup = irt.prepare(scenario)
-    poses, paths = setup.trace(1)
-    sent = {"AT": setup.transmission("AT", 1, poses["AT"])}
-    cube = setup.receive_samples(1, ("AT", "AT"), sent, paths, poses)
+    frame = setup.frame(1)
+    cube = frame.samples(("AT", "AT"))
     got = irt.receive_active(
-        cube, sent["AT"].payload, setup.antennas, scenario.receivers, maps=True
+        cube, frame.sent["AT"].payload, setup.antennas, scenario.receivers, maps=True
     )
-    frames[model] = paths["AT", "AT"], got
-    print(model, paths["AT", "AT"])
+    frames[model] = frame.paths["AT", "AT"], got
+    print(model, frame.paths["AT", "AT"])
 
 # %% [markdown]
 # The active terminal's range-Doppler maps:
@@ -81,7 +80,7 @@ for model in ("diffuse", "field"):
         frames=4,
     )
     setup = irt.prepare(scenario)
-    a, b = (setup.trace(k)[1]["AT", "AT"] for k in (0, 1))
+    a, b = (setup.frame(k).paths["AT", "AT"] for k in (0, 1))
     # the same instant seen from both frames: the second one's scatterers taken back by their rates
     dt = a.epoch - b.epoch
     back = irt.PathSet(

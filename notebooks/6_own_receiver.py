@@ -56,9 +56,8 @@ for name, receiver in (("standard", irt.standard_terminal), ("cautious", termina
 
 # %%
 setup = irt.prepare(scenario)
-poses, paths = setup.trace(2)
-sent = {"AT": setup.transmission("AT", 2, poses["AT"])}
-cube = setup.receive_samples(2, ("AT", "PT1"), sent, paths, poses)
+frame = setup.frame(2)
+cube = frame.samples(("AT", "PT1"))
 with TemporaryDirectory() as folder:
     irt.save_cube(cube, f"{folder}/frame2.nc")
     print(irt.load_cube(f"{folder}/frame2.nc"))

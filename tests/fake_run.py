@@ -7,7 +7,6 @@ import numpy as np
 
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.schedule import conventional_schedule
-from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
@@ -16,6 +15,7 @@ from isac_rt.results.recorder import Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import timetable_of
 from isac_rt.world.swarm import Swarm
 
 STATES = ("acquiring", "tracking", "lost")
@@ -206,7 +206,7 @@ def fake_recorder(scenario: Scenario) -> Recorder:
     return Recorder(
         scenario,
         w,
-        Timetable(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)),
+        timetable_of(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)),
         STATES,
     )
 

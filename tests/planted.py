@@ -503,7 +503,7 @@ OF_TESTS = (
     ),
     (
         "test_hard_geometry::test_two_bodies_at_one_point_are_refused_before_the_run",
-        Bug("simulation/preflight.py", "range(0, scenario.frames, step)", "[0]"),
+        Bug("simulation/preflight.py", "range(0, timetable.frames, step)", "[0]"),
     ),
     (
         "test_hard_geometry::test_a_vertical_link_with_vertical_polarisation",
@@ -599,8 +599,8 @@ OF_TESTS = (
         "test_killed::test_reruns_are_equal_bit_by_bit_whatever_the_threads",
         Bug(
             "simulation/setup.py",
-            'words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)',
-            'words = vars(np).setdefault("_shared", np.random.default_rng(self.scenario.seed)).integers(2**32, size=2, dtype=np.uint32)',
+            'return seed_sequence(seed, "noise", *link, self.number).generate_state(2)',
+            'return vars(np).setdefault("_shared", np.random.default_rng(seed)).integers(2**32, size=2, dtype=np.uint32)',
         ),
     ),
     (

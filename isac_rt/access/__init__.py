@@ -1,7 +1,7 @@
 """How terminals share the band and find each other: Chirp-DMA, on-off keyed messages, the stages
 before the data, and feedback."""
 
-from isac_rt.access.connect import Connections, connect
+from isac_rt.access.connect import Connections
 from isac_rt.access.dma import Isolation, isolation
 from isac_rt.access.feedback import Correction, Feedback, correct, exchange, summarise
 from isac_rt.access.protocol import Clock, Establishment, LinkState, Network, establish
@@ -18,7 +18,6 @@ __all__ = [
     "LinkState",
     "Network",
     "Round",
-    "connect",
     "correct",
     "establish",
     "estimate_clock",

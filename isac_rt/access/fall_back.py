@@ -16,29 +16,35 @@ from dataclasses import dataclass, field
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, conventional_schedule
 from isac_rt.receive import Reception
-from isac_rt.scenario.tree import Scenario
 
 
 @dataclass
 class Schedules:
-    """Which schedule each active terminal sends in the next frame; without `array.fall_back` always
-    the scenario's."""
+    """Which schedule each active terminal sends in the next frame.
 
-    scenario: Scenario
+    Attributes
+    ----------
+    usual : the scenario's
+    num_tx : transmit antennas
+    fall_back : whether advice is taken; without, the usual one is always sent
+    advice : whether each receiver last found the scene sparse
+    """
+
     usual: Schedule
+    num_tx: int
+    fall_back: bool = True
     advice: dict[Link, bool] = field(default_factory=dict)
-    """Whether each receiver last found the scene sparse."""
 
     def of(self, active: str) -> Schedule:
         """The schedule of an active terminal's next frame."""
         dense = any(tx == active and not sparse for (tx, _), sparse in self.advice.items())
         groups, chirps = self.usual.shape
-        return conventional_schedule(groups, chirps, self.scenario.num_tx) if dense else self.usual
+        return conventional_schedule(groups, chirps, self.num_tx) if dense else self.usual
 
-    def heed(self, receptions: Mapping[Link, Reception]) -> None:
+    def take_advice(self, receptions: Mapping[Link, Reception]) -> None:
         """Note what the receivers of a frame advise. One that could not tell keeps its last
         advice."""
-        if self.scenario.array.fall_back:
+        if self.fall_back:
             self.advice |= {
                 link: r.sparse for link, r in receptions.items() if r.sparse is not None
             }

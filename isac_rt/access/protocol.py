@@ -31,6 +31,7 @@ from isac_rt.access.ook import Codebook, Message, keyed, read
 from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, Round, estimate_clock, round_of
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
@@ -42,7 +43,6 @@ from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.world.swarm import Pose
 
-Link = tuple[str, str]
 Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, PathSet]]]
 """Poses of all terminals at a time, and the paths of these links with this time as their epoch."""
 
@@ -116,6 +116,15 @@ class Network:
     @property
     def hold(self) -> float:
         return HOLD_SHARE * self.waveform.max_delay
+
+    @property
+    def longest(self) -> float:
+        """Most that all of it can last [s]."""
+        w, frames = self.waveform, 0
+        for pts in self.listeners.values():
+            sweeps = len(scan(w.num_resource_blocks, w.num_groups))
+            frames += 2 * sweeps + 1 + 2 * -(-len(pts) // w.num_groups)
+        return frames * w.frame_duration
 
 
 @dataclass(frozen=True)
@@ -212,7 +221,7 @@ class _Air:
             if b is not None and at not in busy
         ]
         every = [*sent, *joined]
-        poses, paths = n.scene(self.time, [(t.name, name) for t in every])
+        poses, paths = n.scene(self.time, [Link(t.name, name) for t in every])
         own = n.clocks.get(name, Clock())
         links = []
         for t in every:
@@ -221,7 +230,7 @@ class _Air:
             shifted = replace(
                 t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift
             )
-            links.append((shifted, paths[t.name, name]))
+            links.append((shifted, paths[Link(t.name, name)]))
         cube = if_signal(
             w,
             links,
@@ -255,7 +264,7 @@ def establish(network: Network) -> Establishment:
         block = choose_run(taken, network.waveform.num_groups, wish)
         if block is None:
             links |= {
-                (at, pt): LinkState(None, None, False, None, False, False)
+                Link(at, pt): LinkState(None, None, False, None, False, False)
                 for pt in network.listeners[at]
             }
         else:
@@ -321,7 +330,7 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
         message = None if got is None else got[1]
         both = [r for r in rounds[pt] if r is not None]
         clock = EXTERNAL if n.external_clock else estimate_clock(both) if len(both) == 2 else None
-        out[at, pt] = LinkState(
+        out[Link(at, pt)] = LinkState(
             heard_block=None if got is None else got[0],
             message=message,
             identified=message == said,

@@ -14,90 +14,109 @@ from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.radio import Modulation
+from isac_rt.scenario.swarm import RoleChange
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Timetable:
-    """The frames of a run."""
+    """The frames of a run.
 
-    scenario: Scenario
+    Attributes
+    ----------
+    waveform, schedule : of every frame
+    modulation : pilots, acquisition frames, alphabet and streams
+    first_roles : role of every UAV at the start, in the scenario's order
+    blocks : first resource block of every UAV that is active at the start; None: it found none and
+        stays silent
+    frames : how many there are
+    interval : from the start of a frame to that of the next [s]
+    active_every : active terminals process one frame in so many
+    seed : of the data
+    role_changes : in rising order of their frames
+    refused : links that were not established before the data
+    """
+
     waveform: Waveform
     schedule: Schedule
-    blocks: Mapping[str, int] | None = None
-    """First resource blocks where the stages before the data chose them, without those that found
-    none and stay silent; None: as the scenario has them."""
+    modulation: Modulation
+    first_roles: Mapping[str, str]
+    blocks: Mapping[str, int | None]
+    frames: int
+    interval: float
+    active_every: int = 1
+    seed: int = 1
+    role_changes: tuple[RoleChange, ...] = ()
     refused: frozenset[Link] = frozenset()
-    """Links that these stages did not establish."""
 
     def start_time(self, frame: int, active: str | None = None) -> float:
-        """Of a frame's first slot [s]; of the first chirp of an active terminal, whose block may
-        start later in the slot."""
-        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
+        """Start of a frame's first slot, or of the first chirp of an active terminal, whose block
+        may start later in the slot [s]."""
         block = 0 if active is None else self.first_block(active, frame)
-        return frame * interval + block * self.waveform.group_spacing
+        return frame * self.interval + block * self.waveform.group_spacing
 
     def epoch(self, frame: int, active: str | None = None) -> float:
-        """Middle of a frame [s]; of the chirps of an active terminal."""
+        """Middle of a frame, or of the chirps of an active terminal [s]."""
         return self.start_time(frame, active) + self.waveform.frame_duration / 2
 
     def modulated(self, frame: int) -> bool:
         """Whether a frame carries data: all but the periodic pilots and the acquisition frames at
         the start and after a change of roles."""
-        m = self.scenario.modulation
-        pilot = m.pilot_every_frames is not None and frame % m.pilot_every_frames == 0
-        since = frame - max(
-            (c.frame for c in self.scenario.role_changes if c.frame <= frame), default=0
-        )
-        return since >= m.acquisition_frames and not pilot
+        every = self.modulation.pilot_every_frames
+        pilot = every is not None and frame % every == 0
+        since = frame - max((c.frame for c in self.role_changes if c.frame <= frame), default=0)
+        return since >= self.modulation.acquisition_frames and not pilot
 
     @cached_property
-    def _roles(self) -> list[tuple[int, dict[str, str]]]:
-        """(first frame, role of every UAV) of each stretch between changes."""
-        roles = {name: str(uav.role) for name, uav in self.scenario.swarm.items()}
-        out = [(0, roles)]
-        for change in self.scenario.role_changes:
+    def _stretches(self) -> list[tuple[int, dict[str, str], dict[str, int | None]]]:
+        """(first frame, roles, blocks of the active terminals) of each stretch between changes."""
+        roles, blocks = dict(self.first_roles), dict(self.blocks)
+        out = [(0, roles, blocks)]
+        for change in self.role_changes:
             roles = roles | {change.from_uav: "passive", change.to_uav: "active"}
-            out.append((change.frame, roles))
+            blocks = {
+                change.to_uav if name == change.from_uav else name: block
+                for name, block in blocks.items()
+            }
+            out.append((change.frame, roles, blocks))
         return out
+
+    def _stretch(self, frame: int) -> tuple[int, dict[str, str], dict[str, int | None]]:
+        return [stretch for stretch in self._stretches if stretch[0] <= frame][-1]
 
     def roles(self, frame: int) -> dict[str, str]:
         """Role of every UAV in a frame."""
-        return [roles for first, roles in self._roles if first <= frame][-1]
+        return self._stretch(frame)[1]
 
     def with_role(self, role: str, frame: int) -> list[str]:
         """Names of the UAVs of one role in a frame, in the scenario's order; active ones that
         send."""
-        silent = (
-            ()
-            if self.blocks is None or role != "active"
-            else set(self.scenario.first_blocks()) - set(self.blocks)
-        )
+        _, roles, blocks = self._stretch(frame)
         return [
             name
-            for name, is_now in self.roles(frame).items()
-            if is_now == role and name not in silent
+            for name, is_now in roles.items()
+            if is_now == role and (role != "active" or blocks[name] is not None)
         ]
 
     def roles_taken(self, name: str) -> list[str]:
         """The roles of a UAV over the run, in order."""
-        every = [roles[name] for _, roles in self._roles]
+        every = [roles[name] for _, roles, _ in self._stretches]
         return [role for i, role in enumerate(every) if i == 0 or role != every[i - 1]]
 
     def first_block(self, active: str, frame: int) -> int:
-        """First resource block of an active terminal: its own, or that of the terminal whose role
-        it took over."""
-        blocks = dict(self.scenario.first_blocks() if self.blocks is None else self.blocks)
-        for change in self.scenario.role_changes:
-            if change.frame <= frame:
-                blocks[change.to_uav] = blocks.pop(change.from_uav)
-        return blocks[active]
+        """First resource block of an active terminal that sends: its own, or that of the terminal
+        whose role it took over."""
+        block = self._stretch(frame)[2][active]
+        assert block is not None, f"{active} is silent"
+        return block
 
     def links(self, frame: int) -> list[Link]:
         """Links that are received in a frame: every active terminal's own (when it processes the
         frame), and from each active terminal to every passive one."""
+        return self._links(frame, own=frame % self.active_every == 0)
+
+    def _links(self, frame: int, own: bool) -> list[Link]:
         active, passive = self.with_role("active", frame), self.with_role("passive", frame)
-        own = frame % self.scenario.receivers.active_every_frames == 0
         return [Link(a, a) for a in active if own] + [
             Link(a, p) for a in active for p in passive if (a, p) not in self.refused
         ]
@@ -105,17 +124,8 @@ class Timetable:
     @cached_property
     def all_links(self) -> list[Link]:
         """Every link that is received at some time, in the order of first use."""
-        found: dict[Link, None] = {}
-        for first, roles in self._roles:
-            active = self.with_role("active", first)
-            found |= dict.fromkeys(Link(a, a) for a in active)
-            found |= dict.fromkeys(
-                Link(a, p)
-                for a in active
-                for p, role in roles.items()
-                if role == "passive" and (a, p) not in self.refused
-            )
-        return list(found)
+        found = (link for first, _, _ in self._stretches for link in self._links(first, own=True))
+        return list(dict.fromkeys(found))
 
     @cached_property
     def labels(self) -> dict[Link, str]:
@@ -128,7 +138,7 @@ class Timetable:
 
     def groups(self, link: Link) -> tuple[int, ...] | None:
         """Groups whose data are meant for a link's receiver; None: all of them."""
-        chosen = self.scenario.modulation.streams.get(link.rx)
+        chosen = self.modulation.streams.get(link.rx)
         return None if chosen is None or link.own else tuple(sorted(chosen))
 
     def payload(self, active: str, frame: int, schedule: Schedule | None = None) -> Payload:
@@ -136,22 +146,16 @@ class Timetable:
         usual one. The bits are the same."""
         if not self.modulated(frame):
             return unmodulated(self.waveform)
-        rng = generator(self.scenario.seed, "payload", active, frame)
-        return random_payload(
-            self.waveform,
-            self.schedule if schedule is None else schedule,
-            self.scenario.modulation.dpsk_order,
-            rng,
-        )
+        rng = generator(self.seed, "payload", active, frame)
+        usual = self.schedule if schedule is None else schedule
+        return random_payload(self.waveform, usual, self.modulation.dpsk_order, rng)
 
-
-def snapshot_frames(scenario: Scenario, count: int) -> set[int]:
-    """Frames of which maps and ledger are kept: from the first in data mode to the last, of those
-    that the active terminal processes."""
-    step = scenario.receivers.active_every_frames
-    heard = [
-        f for f in range(0, scenario.frames, step) if f >= scenario.modulation.acquisition_frames
-    ] or [0]
-    return {
-        heard[i] for i in np.linspace(0, len(heard) - 1, min(count, len(heard))).round().astype(int)
-    }
+    def snapshots(self, count: int) -> set[int]:
+        """At most `count` frames, spread over those in data mode that active terminals process."""
+        heard = [
+            f
+            for f in range(0, self.frames, self.active_every)
+            if f >= self.modulation.acquisition_frames
+        ] or [0]
+        places = np.linspace(0, len(heard) - 1, min(count, len(heard)))
+        return {heard[i] for i in places.round().astype(int)}

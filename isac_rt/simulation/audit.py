@@ -104,19 +104,16 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         poses, found = setup.find(frame)
         trace.append(time.perf_counter() - begin)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
-        kept = {
-            link: plan.apply(paths, setup.noise_power(poses, link)) for link, paths in found.items()
-        }
-        for link, (_, use) in kept.items():
+        last = setup.frame_of(frame, poses, found)
+        for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
             for what, value in standing(
                 found[link].select(found[link].power > 0), setup.antennas, setup.waveform, fastest
             ).items():
                 phases[what] = max(phases[what], value)
-        last = frame, poses, {link: paths for link, (paths, _) in kept.items()}
-    stages = stage_seconds(setup, *last, receive=receive)
+    stages = stage_seconds(last, setup, receive)
     advance, missed = _advance(setup)
-    share = len(plan.traced_frames) / plan.scenario.frames
+    share = len(plan.traced_frames) / plan.timetable.frames
     traced = float(np.median(trace))
     items = [_tracing_item(setup, share, missed, traced * share + advance * (1 - share))]
     items += _scene_items(setup)
@@ -130,7 +127,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     if receive:
         seconds["receive"] = sum(s["receive"] for s in stages.values())
     return {
-        **mechanisms(plan.scenario),
+        **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
         **extent(setup.city, setup.propagation, setup.scenario.clutter),
         "traced_share": share if tracer is not None else 0.0,

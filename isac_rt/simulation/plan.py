@@ -32,17 +32,13 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.level import transmit_amplitude
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.file import ScenarioError
-from isac_rt.scenario.tree import Scenario
-from isac_rt.signal.choice import SHIPPED, CostModel
-from isac_rt.signal.choice import read as read_costs
+from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
+from isac_rt.signal.choice import CostModel
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.if_signal import Method
 from isac_rt.world.city.mesh import City
@@ -88,23 +84,37 @@ class Use:
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions of a run that are taken before it."""
+    """The decisions of a run that are taken before it.
 
-    scenario: Scenario
-    waveform: Waveform
+    Attributes
+    ----------
+    accuracy, propagation : what the scenario asks for
+    antennas, timetable, swarm : of the run
+    amplitude : sqrt(transmit power) of an antenna [sqrt(W)]
+    costs : what the methods of synthesis are taken to cost
+    """
+
+    accuracy: Accuracy
+    propagation: Propagation
     antennas: Antennas
     timetable: Timetable
     swarm: Swarm
+    amplitude: float
+    costs: CostModel
+
+    @property
+    def waveform(self) -> Waveform:
+        return self.timetable.waveform
 
     @property
     def preset(self) -> str:
-        return self.scenario.accuracy.preset
+        return self.accuracy.preset
 
     @property
     def phase_share(self) -> float:
         """Most that either approximation may turn a phase [rad]."""
         return {"everything": 0.0, "fastest": np.inf}.get(
-            self.preset, self.scenario.accuracy.max_phase_error_rad / 2
+            self.preset, self.accuracy.max_phase_error_rad / 2
         )
 
     @property
@@ -112,7 +122,7 @@ class Plan:
         """Power that may be left out of a range cell over the noise of a cell (linear)."""
         if self.preset == "everything":
             return 0.0
-        db = self.scenario.propagation.weakest_path_db
+        db = self.propagation.weakest_path_db
         return float(
             10 ** (-(min(db, FASTEST_WEAKEST_DB) if self.preset == "fastest" else db) / 10)
         )
@@ -121,11 +131,8 @@ class Plan:
     def max_untraced(self) -> float:
         """Most flight between traced instants [m]."""
         return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(
-            self.preset, self.scenario.accuracy.max_untraced_m
+            self.preset, self.accuracy.max_untraced_m
         )
-
-    def __post_init__(self) -> None:
-        _ = self.costs  # a bad file is told of before anything runs
 
     def synthesis(self, num_paths: int) -> Method:
         """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths."""
@@ -136,20 +143,7 @@ class Plan:
     @property
     def synthesis_error(self) -> float:
         """Relative RMS error that the samples may have."""
-        return GRIDDED_ERROR if self.preset == "fastest" else self.scenario.accuracy.synthesis_error
-
-    @cached_property
-    def costs(self) -> CostModel:
-        """What the methods of synthesis are taken to cost.
-
-        Raises
-        ------
-        ScenarioError  If the file of accuracy.cost_model is none.
-        """
-        try:
-            return read_costs(self.scenario.cost_model_path() or SHIPPED)
-        except ValueError as problem:
-            raise ScenarioError(f"accuracy.cost_model: {problem}") from None
+        return GRIDDED_ERROR if self.preset == "fastest" else self.accuracy.synthesis_error
 
     @cached_property
     def traced_frames(self) -> tuple[int, ...]:
@@ -159,8 +153,8 @@ class Plan:
         Every frame is traced where frames are farther apart than that, or where nothing is to be
         traced.
         """
-        frames = self.scenario.frames
-        if self.scenario.propagation.model != "ray_traced" or self.max_untraced == 0:
+        frames = self.timetable.frames
+        if self.propagation.model != "ray_traced" or self.max_untraced == 0:
             return tuple(range(frames))
         places = np.array(
             [
@@ -185,7 +179,7 @@ class Plan:
     @property
     def instants(self) -> tuple[float, ...]:
         """Traced instants [s]; () if every frame is traced."""
-        if len(self.traced_frames) == self.scenario.frames:
+        if len(self.traced_frames) == self.timetable.frames:
             return ()
         return tuple(self.timetable.epoch(frame) for frame in self.traced_frames)
 
@@ -194,17 +188,15 @@ class Plan:
         """A path with more delay than this reaches no receiver: the IF filter stops it in every
         group [s]."""
         w = self.waveform
-        chosen = (
-            self.scenario.first_blocks() if self.timetable.blocks is None else self.timetable.blocks
-        )
-        blocks = list(chosen.values()) or [0]
+        blocks = [b for b in self.timetable.blocks.values() if b is not None] or [0]
         apart = max(blocks) - min(blocks) + w.num_groups - 1
-        last = self.timetable.epoch(self.scenario.frames)
+        last = self.timetable.epoch(self.timetable.frames)
         clocks = 2 * max(
             abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last
-            for u in self.scenario.swarm.values()
+            for u in self.swarm.uavs.values()
         )
-        return w.max_delay + w.filter_transition / w.slope + apart * w.group_spacing + clocks
+        skirt = w.filter_transition / w.slope
+        return w.max_delay + skirt + apart * w.group_spacing + clocks
 
     @property
     def reach(self) -> float:
@@ -218,14 +210,13 @@ class Plan:
         All points of a path of length L, what shadows it included, lie within L/2 of the middle
         between its ends, which is no farther from the place than the farther end. What moves during
         a frame adds its way. The field of view cuts nothing: a second wall may stand outside it.
-        Infinite where nothing is to be left out, and where the blocks, and with them the reach, are
-        found out in the run.
+        Infinite where nothing is to be left out.
         """
-        s = self.scenario
-        if self.preset == "everything" or s.access.establish or s.propagation.model != "ray_traced":
+        if self.preset == "everything" or self.propagation.model != "ray_traced":
             return float(np.inf)
-        terminals = [name for name, uav in s.swarm.items() if uav.role != "target"]
-        poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(s.frames)]
+        terminals = [name for name, uav in self.swarm.uavs.items() if uav.role != "target"]
+        times = map(self.timetable.epoch, range(self.timetable.frames))
+        poses = [self.swarm.poses(time) for time in times]
         farthest = max(
             float(np.linalg.norm(pose[name].position - centre))
             for pose in poses
@@ -234,20 +225,13 @@ class Plan:
         fastest = max(
             float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values()
         )
-        return float(
-            np.ceil(
-                farthest + self.reach + 2 * fastest * frame_reach(self.waveform) + REACH_MARGIN_M
-            )
-        )
+        way = 2 * fastest * frame_reach(self.waveform)
+        return float(np.ceil(farthest + self.reach + way + REACH_MARGIN_M))
 
     def cell_noise_gain(self) -> float:
         """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell,
         per watt of noise in a sample."""
-        return (
-            transmit_amplitude(self.scenario.noise) ** 2
-            * self.waveform.num_samples
-            * self.waveform.num_chirps
-        )
+        return self.amplitude**2 * self.waveform.num_samples * self.waveform.num_chirps
 
     def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a
@@ -401,9 +385,7 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "preset": plan.preset,
         "max_phase_error_rad": None if np.isinf(plan.phase_share) else 2 * plan.phase_share,
         "weakest_path_db": None if everything else round(float(-10 * np.log10(plan.weakest)), 6),
-        "traced_frames": len(plan.traced_frames)
-        if plan.scenario.propagation.model == "ray_traced"
-        else 0,
+        "traced_frames": len(plan.traced_frames) if plan.propagation.model == "ray_traced" else 0,
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0),
@@ -412,9 +394,8 @@ def decisions(plan: Plan) -> dict[str, Any]:
     }
 
 
-def mechanisms(scenario: Scenario) -> dict[str, Any]:
-    """What is modelled of the propagation, as the scenario says."""
-    p, c = scenario.propagation, scenario.clutter
+def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
+    """What is modelled of propagation and clutter, as the scenario says."""
     traced = p.model == "ray_traced"
     return {
         "propagation": p.model,

@@ -6,17 +6,17 @@ from __future__ import annotations
 import itertools
 import os
 import warnings
-from collections.abc import Iterator
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, antennas_of
-from isac_rt.frame.link import Link
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
 from isac_rt.runtime import available_memory
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.file import ScenarioError, ScenarioWarning
-from isac_rt.scenario.tree import NEAREST_M, Scenario
+from isac_rt.scenario.radio import Noise
+from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.world.swarm import Pose, Swarm
 
 SAMPLE_BYTES = 8
@@ -45,36 +45,34 @@ def memory_needed(
     return PROGRAM_BYTES + SAMPLE_BYTES * min(links, at_once) * (2.5 * cube + maps) + kept
 
 
-def check_memory(
-    waveform: Waveform, antennas: Antennas, scenario: Scenario, timetable: Timetable
-) -> None:
+def check_memory(antennas: Antennas, timetable: Timetable) -> None:
     """Refuse a run that does not fit.
 
     Raises
     ------
     ScenarioError  With the estimate and what is free.
     """
-    free, links = available_memory(), len(timetable.all_links)
-    needed = memory_needed(waveform, antennas, scenario.frames, links, os.cpu_count() or 1)
+    free, links, cores = available_memory(), len(timetable.all_links), os.cpu_count() or 1
+    needed = memory_needed(timetable.waveform, antennas, timetable.frames, links, cores)
     if free is not None and needed > free:
         raise ScenarioError(
-            f"{scenario.name}: the run would need about {needed / 1e9:.3g} GB of memory, "
-            f"{free / 1e9:.3g} GB are free; lower "
-            "radio.samples_per_chirp, radio.chirps_per_frame, array.rx_x, array.rx_z or frames"
+            f"the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are "
+            "free; lower radio.samples_per_chirp, radio.chirps_per_frame, array.rx_x, array.rx_z "
+            "or frames"
         )
 
 
-def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> None:
+def check_flights(swarm: Swarm, timetable: Timetable) -> None:
     """Refuse flights on which two bodies meet, or on which the numbers run out of float64's range:
-    at such a frame there are no directions between them. Of very long runs every so manyth frame is
-    looked at. Warns of velocities that alias.
+    at such a frame there are no directions between them. In very long runs only every so manyth
+    frame is looked at.
 
     Raises
     ------
     ScenarioError
     """
-    step = max(1, scenario.frames // MOST_EPOCHS)
-    epochs = np.array([timetable.epoch(frame) for frame in range(0, scenario.frames, step)])
+    step = max(1, timetable.frames // MOST_EPOCHS)
+    epochs = np.array([timetable.epoch(frame) for frame in range(0, timetable.frames, step)])
     with np.errstate(over="ignore", invalid="ignore"):
         places = {
             name: np.array([flight.pose(t).position for t in epochs])
@@ -95,47 +93,45 @@ def check_flights(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Non
                 f"{nearest * step}), at least "
                 f"{NEAREST_M} m are needed; change one of their flights"
             )
-    for said in aliases(scenario, swarm, timetable):
-        warnings.warn(said, ScenarioWarning, stacklevel=3)
 
 
-def aliases(scenario: Scenario, swarm: Swarm, timetable: Timetable) -> Iterator[str]:
-    """What is in view and moves faster than the frame can tell: it is reported a whole period
-    slower, and what the groups' offsets make of it as weak further detections.
+def warn_of_aliases(
+    swarm: Swarm, timetable: Timetable, antennas: Antennas, velocity_method: str, schedule: str
+) -> None:
+    """Warn of what is in view and moves faster than the frame can tell: it is reported a whole
+    period slower, and what the groups' offsets make of it as weak further detections.
 
     Looks at an active terminal's echoes and at lines of sight, in `ALIAS_EPOCHS` frames over the
     run.
+
+    Parameters
+    ----------
+    velocity_method, schedule : ``receivers.velocity_method`` and ``array.schedule``; by a
+        conventional schedule of few groups the limit is divided by the transmit antennas
     """
     w = timetable.waveform
-    antennas = antennas_of(scenario, w)
-    frames = np.unique(np.linspace(0, scenario.frames - 1, ALIAS_EPOCHS).round().astype(int))
+    frames = np.unique(np.linspace(0, timetable.frames - 1, ALIAS_EPOCHS).round().astype(int))
     poses = [swarm.poses(timetable.epoch(int(frame))) for frame in frames]
-    for tx, rx in timetable.all_links:
-        passes = 2 if tx == rx else 1
-        limit = _fastest(scenario, w, timetable, Link(tx, rx))
-        for name in [n for n in swarm.uavs if n != tx] if tx == rx else [rx]:
-            rates = np.array([_closing(at[tx], at[name], antennas, passes) for at in poses])
+    for link in timetable.all_links:
+        tx, rx = link
+        groups = len(timetable.groups(link) or range(w.num_groups))
+        whole = schedule == "pseudo_random" or (
+            groups == w.num_tx and velocity_method != "conventional"
+        )
+        limit = w.max_velocity(link.passes) / (1 if whole else w.num_tx)
+        for name in [n for n in swarm.uavs if n != tx] if link.own else [rx]:
+            rates = np.array([_closing(at[tx], at[name], antennas, link.passes) for at in poses])
             worst = int(np.abs(rates).argmax())
             if abs(rates[worst]) > limit:
                 shown = (rates[worst] + limit) % (2 * limit) - limit
-                what = f"the echo of {name} at {tx}" if tx == rx else f"{name} from {tx}"
-                yield (
-                    f"{scenario.name}: {what} moves at {rates[worst]:.4g} m/s (receding is "
-                    f"positive) in frame {frames[worst]}, beyond "
-                    f"the unambiguous {limit:.4g} m/s: it is reported at about {shown:.3g} m/s, "
-                    "beside weaker false detections"
+                what = f"the echo of {name} at {tx}" if link.own else f"{name} from {tx}"
+                warnings.warn(
+                    f"{what} moves at {rates[worst]:.4g} m/s (receding is positive) in frame "
+                    f"{frames[worst]}, beyond the unambiguous {limit:.4g} m/s: it is reported at "
+                    f"about {shown:.3g} m/s, beside weaker false detections",
+                    ScenarioWarning,
+                    stacklevel=3,
                 )
-
-
-def _fastest(scenario: Scenario, waveform: Waveform, timetable: Timetable, link: Link) -> float:
-    """Unambiguous speed of a link [m/s]: a conventional schedule of few groups has a share of
-    it."""
-    r, limit = scenario.receivers, waveform.max_velocity(2 if link[0] == link[1] else 1)
-    whole = (
-        len(timetable.groups(link) or range(waveform.num_groups)) == waveform.num_tx
-        and r.velocity_method != "conventional"
-    )
-    return limit if whole or scenario.array.schedule == "pseudo_random" else limit / waveform.num_tx
 
 
 def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
@@ -149,24 +145,19 @@ def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
     return float((other.velocity - own.velocity) @ line) if seen else 0.0
 
 
-def check_reference(scenario: Scenario, timetable: Timetable) -> None:
-    """Refuse a scenario whose noise or clutter refers to an echo that there is not.
+def check_reference(noise: Noise, clutter: Clutter, swarm: Swarm, timetable: Timetable) -> None:
+    """Refuse noise or clutter that refers to an echo that there is not.
 
     Raises
     ------
     ScenarioError
     """
-    if scenario.noise.model != "snr" and scenario.clutter.model != "rayleigh":
+    if noise.model != "snr" and clutter.model != "rayleigh":
         return
-    for name in dict.fromkeys(tx for tx, rx in timetable.all_links if tx == rx):
-        if not any(
-            other != name and uav.rcs.model != "relative" for other, uav in scenario.swarm.items()
-        ):
-            key = (
-                "noise.model = snr" if scenario.noise.model == "snr" else "clutter.model = rayleigh"
-            )
+    key = "noise.model = snr" if noise.model == "snr" else "clutter.model = rayleigh"
+    for name in dict.fromkeys(link.tx for link in timetable.all_links if link.own):
+        if not any(n != name and uav.rcs.model != "relative" for n, uav in swarm.uavs.items()):
             raise ScenarioError(
-                f"{scenario.name}: {key} refers to the strongest echo at {name}, and there is no "
-                "UAV with a cross-section of its own; "
-                "add one, or use another model"
+                f"{key} refers to the strongest echo at {name}, and there is no UAV with a "
+                "cross-section of its own; add one, or use another model"
             )

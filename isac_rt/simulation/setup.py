@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
-from isac_rt.access import Connections, connect
+from isac_rt.access import Clock, Connections, Network, establish
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.cube import IFCube, RangeProfiles, Transmission
 from isac_rt.frame.level import (
@@ -27,11 +28,19 @@ from isac_rt.propagation import FreeSpace, PathSet, Propagation, make_propagatio
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
+from isac_rt.scenario.file import ScenarioError
 from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.choice import SHIPPED
+from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.simulation.content import path_content
 from isac_rt.simulation.plan import Plan, Use
-from isac_rt.simulation.preflight import check_flights, check_memory, check_reference
+from isac_rt.simulation.preflight import (
+    check_flights,
+    check_memory,
+    check_reference,
+    warn_of_aliases,
+)
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
 from isac_rt.world.area import city_of, flight_centre
 from isac_rt.world.city import City
@@ -39,13 +48,129 @@ from isac_rt.world.swarm import Pose, Swarm
 
 
 @dataclass(frozen=True)
+class Frame:
+    """One frame as it was sent and travelled: `Setup.frame` makes it.
+
+    Attributes
+    ----------
+    number : from 0
+    poses : of every UAV at the middle of the frame
+    paths : of every link from an active terminal to a receiver, interference between active
+        terminals included; what the plan leaves out is not there
+    sent : by every active terminal
+    expected : clutter that each active terminal expects of its own link, from the mesh; empty where
+        no receiver asks for it
+    uses : what the plan kept of the paths of each link
+    dropped : traced paths that the float64 geometry contradicted
+
+    Examples
+    --------
+    The samples that PT1 receives of the AT, and what its receiver makes of them:
+
+    >>> import isac_rt as irt
+    >>> scenario = irt.load("scenes/paper_swarm.yaml")
+    >>> setup = irt.prepare(scenario)
+    >>> frame = setup.frame(0)
+    >>> frame.samples(("AT", "PT1")).samples.shape
+    (3, 16, 120, 1024)
+    >>> frame.paths["AT", "PT1"].counts()["line_of_sight"]
+    1
+    """
+
+    number: int
+    poses: dict[str, Pose]
+    paths: Mapping[Link, PathSet]
+    sent: Mapping[str, Transmission]
+    expected: Mapping[str, ExpectedClutter]
+    uses: Mapping[Link, Use]
+    dropped: int
+    _setup: Setup = field(repr=False)
+
+    def sent_by(self, schedules: Mapping[str, Schedule]) -> Frame:
+        """The same frame with other antenna schedules of some active terminals."""
+        s = self._setup
+        sent = {
+            name: s.transmission(name, self.number, self.poses[name], schedule)
+            for name, schedule in schedules.items()
+            if schedule is not self.sent[name].schedule
+        }
+        return replace(self, sent={**self.sent, **sent})
+
+    def noise_power(self, link: tuple[str, str]) -> float:
+        """E|n|^2 of a sample at a link's receiver [W], Gaussian clutter included."""
+        return self._setup.noise_power(self.poses, Link(*link))
+
+    def samples(self, link: tuple[str, str]) -> IFCube:
+        """IF samples of a link's receiver, dechirped in the resource blocks of the link's
+        transmitter, with noise.
+
+        What the other active terminals' chirps leave in these blocks is in the samples. They depend
+        on nothing but the frame and the link.
+        """
+        link, s = Link(*link), self._setup
+        arriving, level = self._arriving(link), self.noise_power(link)
+        cube = if_signal(
+            s.waveform,
+            arriving,
+            self.poses[link.rx],
+            s.antennas,
+            start_time=s.timetable.start_time(self.number, link.tx),
+            noise_power=level,
+            method=s.plan.synthesis(sum(len(p) for _, p in arriving)),
+            max_error=s.plan.synthesis_error,
+            costs=s.plan.costs,
+        )
+        return add_noise(cube, level, self._noise_words(link))
+
+    def heard(self, link: tuple[str, str]) -> IFCube | RangeProfiles:
+        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at
+        the active terminal range profiles."""
+        link, s = Link(*link), self._setup
+        if not link.own or s.scenario.receivers.active_input == "samples":
+            return self.samples(link)
+        return range_profiles(
+            s.waveform,
+            self._arriving(link),
+            self.poses[link.rx],
+            s.antennas,
+            self.sent[link.tx].payload,
+            start_time=s.timetable.start_time(self.number, link.tx),
+            noise_power=self.noise_power(link),
+            seed_words=self._noise_words(link),
+        )
+
+    def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
+        """What reaches a link's receiver, its own transmitter's first."""
+        s, when = self._setup, self._setup.timetable.epoch(self.number, link.tx)
+        out = []
+        for name in dict.fromkeys([link.tx, *self.sent]):
+            clock = s.connections.apart(name, link, when)
+            sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
+            out.append((sent, self.paths[Link(name, link.rx)]))
+        return out
+
+    def _noise_words(self, link: Link) -> np.ndarray:
+        seed = self._setup.scenario.seed
+        return seed_sequence(seed, "noise", *link, self.number).generate_state(2)
+
+
+@dataclass(frozen=True)
 class Setup:
-    """What stays the same over a run."""
+    """What stays the same over a run: `prepare` makes it.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm.yaml"))
+    >>> setup.waveform.num_groups, setup.antennas.num_rx, list(setup.swarm.uavs)
+    (3, 16, ['AT', 'PT1', 'PT2'])
+    >>> [str(link) for link in setup.timetable.links(0)]
+    ['AT->AT', 'AT->PT1', 'AT->PT2']
+    """
 
     scenario: Scenario
     waveform: Waveform
     antennas: Antennas
-    schedule: Schedule
     swarm: Swarm
     city: City
     propagation: Propagation
@@ -54,53 +179,56 @@ class Setup:
     timetable: Timetable
     connections: Connections
     plan: Plan
-    uses: dict[tuple[int, Link], Use] = field(default_factory=dict)
-    """What the plan kept of the paths of each frame and link traced so far."""
-    expectation: ClutterExpectation | None = None
+    expectation: ClutterExpectation | None
     """What an active terminal's receiver predicts of its clutter from the mesh; None where its
     detector needs none."""
+    seconds: float = 0.0
+    """What `prepare` took [s]."""
 
-    def expected_clutter(self, frame: int) -> dict[str, ExpectedClutter]:
-        """What each active terminal expects of its own link. Traces rays: from the thread that
-        traces only."""
-        if self.expectation is None:
-            return {}
-        amplitude, out = transmit_amplitude(self.scenario.noise), {}
-        for name in self.timetable.with_role("active", frame):
-            when = self.timetable.epoch(frame, name)
-            out[name] = self.expectation.clutter(
-                name, self.swarm.trajectories[name].pose(when), when, amplitude
-            )
-        return out
+    @property
+    def schedule(self) -> Schedule:
+        return self.timetable.schedule
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
-        rise = noise_rise(self.scenario.clutter)
-        if self.scenario.noise.model == "link_budget":
-            return rise * thermal_noise_power(self.scenario.noise, self.waveform)
-        return rise * noise_power(
-            self.scenario.noise, self.waveform, self.reference.reference_amplitude(poses, *link)
-        )
+        noise, rise = self.scenario.noise, noise_rise(self.scenario.clutter)
+        if noise.model == "link_budget":
+            return rise * thermal_noise_power(noise, self.waveform)
+        amplitude = self.reference.reference_amplitude(poses, *link)
+        return rise * noise_power(noise, self.waveform, amplitude)
 
-    def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """Poses and paths of a frame, interference between active terminals included; what the plan
-        leaves out is not there."""
-        poses, found = self.find(frame)
-        thinned = {
-            link: self.plan.apply(p, self.noise_power(poses, link)) for link, p in found.items()
+    def frame(self, number: int) -> Frame:
+        """Trace a frame; what it sends is by the usual schedule."""
+        before = self.propagation.dropped
+        poses, found = self.find(number)
+        return self.frame_of(number, poses, found, self.propagation.dropped - before)
+
+    def frame_of(
+        self, number: int, poses: dict[str, Pose], found: Mapping[Link, PathSet], dropped: int = 0
+    ) -> Frame:
+        """The frame whose paths `find` found."""
+        kept = {
+            link: self.plan.apply(paths, self.noise_power(poses, link))
+            for link, paths in found.items()
         }
-        self.uses.update({(frame, link): use for link, (_, use) in thinned.items()})
-        return poses, {link: paths for link, (paths, _) in thinned.items()}
+        active = self.timetable.with_role("active", number)
+        return Frame(
+            number,
+            poses,
+            {link: paths for link, (paths, _) in kept.items()},
+            {name: self.transmission(name, number, poses[name]) for name in active},
+            self._expected_clutter(number, active),
+            {link: use for link, (_, use) in kept.items()},
+            dropped,
+            self,
+        )
 
     def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         """Poses and all paths of a frame, however weak."""
         epoch = self.timetable.epoch(frame)
         poses = self.swarm.poses(epoch)
-        heard = self.timetable.links(frame)
-        active, receivers = (
-            self.timetable.with_role("active", frame),
-            dict.fromkeys(rx for _, rx in heard),
-        )
+        receivers = dict.fromkeys(link.rx for link in self.timetable.links(frame))
+        active = self.timetable.with_role("active", frame)
         return poses, self.propagation.paths(
             poses, epoch, [Link(tx, rx) for tx in active for rx in receivers]
         )
@@ -116,90 +244,19 @@ class Setup:
             antennas=self.antennas,
             schedule=self.schedule if schedule is None else schedule,
             payload=self.timetable.payload(active, frame, schedule),
-            amplitude=transmit_amplitude(self.scenario.noise),
+            amplitude=self.plan.amplitude,
             first_block=self.timetable.first_block(active, frame),
         )
 
-    def receive_samples(
-        self,
-        frame: int,
-        link: Link,
-        sent: dict[str, Transmission],
-        paths: dict[Link, PathSet],
-        poses: dict[str, Pose],
-    ) -> IFCube:
-        """IF samples of a link's receiver, dechirped in the resource blocks of the link's
-        transmitter, with noise.
-
-        `sent` holds every active terminal; what the others' chirps leave in these blocks is in the
-        samples. They depend on nothing but the frame and the link.
-        """
-        arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
-        method = self.plan.synthesis(sum(len(p) for _, p in arriving))
-        cube = if_signal(
-            self.waveform,
-            arriving,
-            poses[link[1]],
-            self.antennas,
-            noise_power=level,
-            method=method,
-            max_error=self.plan.synthesis_error,
-            costs=self.plan.costs,
-            **frame_of,
-        )
-        return add_noise(cube, level, words)
-
-    def receive_input(
-        self,
-        frame: int,
-        link: Link,
-        sent: dict[str, Transmission],
-        paths: dict[Link, PathSet],
-        poses: dict[str, Pose],
-    ) -> IFCube | RangeProfiles:
-        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at
-        the active terminal range profiles."""
-        if link[0] != link[1] or self.scenario.receivers.active_input == "samples":
-            return self.receive_samples(frame, link, sent, paths, poses)
-        arriving, level, words, frame_of = self._arriving(frame, link, sent, paths, poses)
-        own = sent[link[0]].payload
-        return range_profiles(
-            self.waveform,
-            arriving,
-            poses[link[1]],
-            self.antennas,
-            own,
-            noise_power=level,
-            seed_words=words,
-            **frame_of,
-        )
-
-    def _arriving(
-        self,
-        frame: int,
-        link: Link,
-        sent: dict[str, Transmission],
-        paths: dict[Link, PathSet],
-        poses: dict[str, Pose],
-    ) -> tuple[list[tuple[Transmission, PathSet]], float, np.ndarray, dict[str, Any]]:
-        """What reaches a link's receiver, its noise power and the noise's stream, and when and
-        through what it listens."""
-        tx, rx = link
-        when = self.timetable.epoch(frame, tx)
-        arriving = []
-        for name in [tx, *(name for name in sent if name != tx)]:
-            clock = self.connections.apart(name, link, when)
-            arriving.append(
-                (
-                    replace(sent[name], clock_offset=clock.offset, clock_drift=clock.drift),
-                    paths[name, rx],
-                )
-            )
-        words = seed_sequence(self.scenario.seed, "noise", tx, rx, frame).generate_state(2)
-        frame_of = {
-            "start_time": self.timetable.start_time(frame, tx),
-        }
-        return arriving, self.noise_power(poses, link), words, frame_of
+    def _expected_clutter(self, frame: int, active: list[str]) -> dict[str, ExpectedClutter]:
+        if self.expectation is None:
+            return {}
+        out = {}
+        for name in active:
+            when = self.timetable.epoch(frame, name)
+            pose = self.swarm.trajectories[name].pose(when)
+            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude)
+        return out
 
 
 def link_budgets(setup: Setup) -> list[LinkBudget]:
@@ -228,23 +285,44 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
 
 
 def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
-    """Load and build everything that frames share. With a `store` traced paths are looked up there
-    first and kept there."""
+    """Load and build everything that the frames of a run share.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    store : where traced paths are looked up first and kept
+
+    Raises
+    ------
+    ScenarioError  If the run cannot be: two bodies meet, it does not fit into memory.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm.yaml"))
+    >>> frame = setup.frame(3)
+    >>> cube = frame.samples(("AT", "AT"))
+    """
+    begin = time.perf_counter()
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
     swarm = Swarm.from_scenario(scenario)
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
-    timetable = Timetable(scenario, waveform, schedule)
-    check_memory(waveform, antennas, scenario, timetable)
-    check_flights(scenario, swarm, timetable)
-    check_reference(scenario, timetable)
-    plan = Plan(scenario, waveform, antennas, timetable, swarm)
-    city = city_of(scenario, plan.mesh_radius(flight_centre(scenario)))
+    timetable = timetable_of(scenario, waveform, schedule)
+    check_memory(antennas, timetable)
+    check_flights(swarm, timetable)
+    warn_of_aliases(
+        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
+    )
+    check_reference(scenario.noise, scenario.clutter, swarm, timetable)
+    plan = plan_of(scenario, antennas, timetable, swarm)
+    # the blocks, and with them the reach, are found out in the run where links are established
+    radius = np.inf if scenario.access.establish else plan.mesh_radius(flight_centre(scenario))
+    city = city_of(scenario, radius)
     setup = Setup(
         scenario,
         waveform,
         antennas,
-        schedule,
         swarm,
         city,
         _propagation(scenario, waveform, antennas, city, plan.instants, store),
@@ -252,31 +330,89 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         timetable,
         Connections(),
         plan,
-        expectation=make_expectation(scenario, waveform, antennas, city),
+        make_expectation(scenario, waveform, antennas, city),
     )
-    return _connected(setup)
+    return replace(_connected(setup), seconds=time.perf_counter() - begin)
+
+
+def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:
+    """The frames that a scenario states."""
+    return Timetable(
+        waveform=waveform,
+        schedule=schedule,
+        modulation=scenario.modulation,
+        first_roles={name: uav.role for name, uav in scenario.swarm.items()},
+        blocks=scenario.first_blocks(),
+        frames=scenario.frames,
+        interval=scenario.frame_interval_s or waveform.frame_duration,
+        active_every=scenario.receivers.active_every_frames,
+        seed=scenario.seed,
+        role_changes=scenario.role_changes,
+    )
+
+
+def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm: Swarm) -> Plan:
+    """What a scenario asks to be modelled.
+
+    Raises
+    ------
+    ScenarioError  If the file of accuracy.cost_model is none.
+    """
+    try:
+        costs = read_costs(scenario.cost_model_path() or SHIPPED)
+    except ValueError as problem:
+        raise ScenarioError(f"accuracy.cost_model: {problem}") from None
+    return Plan(
+        scenario.accuracy,
+        scenario.propagation,
+        antennas,
+        timetable,
+        swarm,
+        transmit_amplitude(scenario.noise),
+        costs,
+    )
 
 
 def _connected(setup: Setup) -> Setup:
-    """The same after the stages before the data, where the scenario has them."""
+    """The same after the stages before the data, where the scenario has them; the last of their
+    frames ends by the first of the run's."""
+    s, timetable = setup.scenario, setup.timetable
+    active, passive = (
+        [n for n, u in s.swarm.items() if u.role == r] for r in ("active", "passive")
+    )
+    clocks = {
+        name: Clock(s.swarm[name].clock_offset_s, s.swarm[name].clock_drift_ppm * 1e-6)
+        for name in (active + passive if s.access.synchronisation != "external" else [])
+    }
+    if not s.access.establish:
+        return replace(setup, connections=Connections(clocks))
 
     def scene(when: float, links: list[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         poses = setup.swarm.poses(when)
         return poses, setup.propagation.paths(poses, when, links) if links else {}
 
-    first = setup.swarm.poses(setup.timetable.epoch(0))
-    found = connect(
-        setup.scenario,
-        setup.waveform,
-        setup.antennas,
-        setup.schedule,
-        scene,
-        lambda link: setup.noise_power(first, link),
+    first = setup.swarm.poses(timetable.epoch(0))
+    network = Network(
+        waveform=setup.waveform,
+        antennas=setup.antennas,
+        schedule=setup.schedule,
+        receivers=s.receivers,
+        scene=scene,
+        wishes=s.first_blocks(),
+        listeners={name: tuple(passive) for name in active},
+        noise_power={name: setup.noise_power(first, Link(name, name)) for name in active}
+        | {name: setup.noise_power(first, Link(active[0], name)) for name in passive},
+        seed=s.seed,
+        clocks=clocks,
+        amplitude=setup.plan.amplitude,
+        external_clock=s.access.synchronisation != "two_round",
+        dpsk_order=s.modulation.dpsk_order,
     )
-    timetable = replace(setup.timetable, blocks=found.blocks(), refused=found.refused())
-    return replace(
-        setup, timetable=timetable, connections=found, plan=replace(setup.plan, timetable=timetable)
-    )
+    outcome = establish(replace(network, start=-network.longest))
+    found = Connections(clocks, outcome)
+    timetable = replace(timetable, blocks=outcome.blocks, refused=found.refused)
+    plan = replace(setup.plan, timetable=timetable)
+    return replace(setup, timetable=timetable, connections=found, plan=plan)
 
 
 def _propagation(
@@ -297,4 +433,4 @@ def _propagation(
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
     """The paths of all links of one frame."""
-    return (setup or prepare(scenario)).trace(frame)[1]
+    return dict((setup or prepare(scenario)).frame(frame).paths)

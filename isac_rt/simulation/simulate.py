@@ -14,22 +14,16 @@ from threadpoolctl import threadpool_limits
 
 from isac_rt.access import exchange
 from isac_rt.access.fall_back import Schedules
-from isac_rt.frame.cube import IFCube, Transmission
-from isac_rt.frame.level import transmit_amplitude
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
-from isac_rt.frame.timetable import snapshot_frames
-from isac_rt.propagation import PathSet
-from isac_rt.receive import Reception
-from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.recorder import TIMINGS, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation.plan import decisions, extent, mechanisms, used
+from isac_rt.simulation.plan import Use, decisions, extent, mechanisms, used
 from isac_rt.simulation.resume import Unfinished
-from isac_rt.simulation.setup import Setup, link_budgets, prepare
+from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
-from isac_rt.world.swarm import Pose
 
 Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
@@ -51,16 +45,15 @@ class _Clock:
 def standard_terminal(setup: Setup, link: Link) -> Terminal:
     """The receiver of a link as the scenario has it."""
     s = setup.scenario
-    if link[0] == link[1]:
+    if link.own:
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
-    order, amplitude = s.modulation.dpsk_order, transmit_amplitude(s.noise)
     return PassiveTerminal(
         setup.waveform,
         setup.antennas,
         s.receivers,
         s.tracking,
-        order,
-        amplitude,
+        s.modulation.dpsk_order,
+        setup.plan.amplitude,
         groups=setup.timetable.groups(link),
     )
 
@@ -73,52 +66,49 @@ class _Observer:
         self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable)
         self.feedback = {"answers": 0, "corrections": 0}
 
-    def feed_back(self, frame: _Frame, heard: Heard, at_active: Heard) -> None:
+    def hear(self, frame: Frame, clock: _Clock, maps: bool) -> Heard:
+        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this
+        observer's state changes."""
+        timetable, (tx, rx) = self.setup.timetable, self.link
+        with clock.stage("synthesis"):
+            cube = frame.heard(self.link)
+        with clock.stage("receive"):
+            when = timetable.epoch(frame.number, tx)
+            own = self.setup.swarm.trajectories[rx].pose(when)
+            if isinstance(self.terminal, ActiveTerminal):
+                payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
+                reception, tracks = self.terminal.step(
+                    cube, payload, own, when, clutter=clutter, maps=maps
+                )
+                return Heard(reception, tracks, int(TerminalState.TRACKING))
+            assert isinstance(cube, IFCube)  # profiles are for active terminals only
+            modulated = timetable.modulated(frame.number)
+            reception, tracks = self.terminal.step(cube, own, when, modulated, maps=maps)
+            return Heard(reception, tracks, int(self.terminal.state))
+
+    def feed_back(self, frame: int, heard: Heard, at_active: Heard) -> None:
         """The passive terminal's feedback after a frame, and the active one's answer to it."""
         if not isinstance(self.terminal, PassiveTerminal):
             return
-        s, when = self.setup, self.setup.timetable.epoch(frame.number, self.link[0])
-        clock_std = s.connections.offset_std(self.link, when)
+        s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
         answer = exchange(
             heard.reception,
             heard.tracks,
             at_active.tracks,
             s.antennas.num_rx,
-            clock_std,
+            s.connections.offset_std(self.link, when),
             s.waveform,
         )
         if answer is not None:
             self.feedback["answers"] += 1
             self.feedback["corrections"] += answer.cells != 0
             if answer.cells:
-                self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link[1]].pose(when))
+                self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
 
-    def hear(self, frame: _Frame, clock: _Clock) -> Heard:
-        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this
-        observer's state changes."""
-        number, when = frame.number, self.setup.timetable.epoch(frame.number, self.link[0])
-        with clock.stage("synthesis"):
-            cube = self.setup.receive_input(number, self.link, frame.sent, frame.paths, frame.poses)
-        with clock.stage("receive"):
-            tx, rx = self.link
-            own = self.setup.swarm.trajectories[rx].pose(when)
-            if isinstance(self.terminal, ActiveTerminal):
-                clutter = frame.expected.get(tx)
-                reception, tracks = self.terminal.step(
-                    cube, frame.sent[tx].payload, own, when, clutter=clutter, maps=frame.snapshot
-                )
-                return Heard(reception, tracks, int(TerminalState.TRACKING))
-            modulated = self.setup.timetable.modulated(number)
-            assert isinstance(cube, IFCube)  # profiles are for active terminals only
-            reception, tracks = self.terminal.step(cube, own, when, modulated, maps=frame.snapshot)
-            return Heard(reception, tracks, int(self.terminal.state))
-
-    def record(self, frame: _Frame, heard: Heard) -> ObserverRecord:
+    def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
         """The frame held against the truth."""
-        level = self.setup.noise_power(frame.poses, self.link)
-        return self.scorer.record(
-            frame.number, frame.paths[self.link], frame.sent[self.link[0]], heard, level
-        )
+        paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
+        return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
 
 
 def run(
@@ -150,22 +140,15 @@ def run(
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
-    flight = _fly(
-        scenario,
-        progress,
-        setup,
-        threads,
-        snapshot_frames(scenario, snapshots),
-        terminal,
-        unfinished,
-    )
-    return flight.recorder.finish(
-        **flight.figures(),
+    run = _Run.begin(scenario, setup, snapshots, terminal)
+    run.fly(progress, threads, unfinished)
+    return run.recorder.finish(
+        **run.figures(),
         materials={
             m.name: {k: v for k, v in vars(m).items() if k != "name"}
-            for m in flight.setup.city.materials
+            for m in run.setup.city.materials
         },
-        link_budget=[vars(row) for row in link_budgets(flight.setup)],
+        link_budget=[vars(row) for row in link_budgets(run.setup)],
     )
 
 
@@ -173,71 +156,135 @@ def summarise(
     scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None
 ) -> dict[str, Any]:
     """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
-    flight = _fly(scenario, None, setup, threads, set(), standard_terminal)
-    return flight.recorder.summary(**flight.figures())
+    run = _Run.begin(scenario, setup, 0, standard_terminal)
+    run.fly(None, threads, None)
+    return run.recorder.summary(**run.figures())
 
 
-def stage_seconds(
-    setup: Setup, number: int, poses: dict[str, Pose], paths: dict[Link, PathSet], receive: bool
-) -> dict[Link, dict[str, float]]:
+def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[str, float]]:
     """Seconds of synthesis and, if asked for, reception of one frame on each link, by terminals
     that hear it as their first."""
     out = {}
-    sent = {
-        name: setup.transmission(name, number, poses[name])
-        for name in setup.timetable.with_role("active", number)
-    }
-    frame = _Frame(number, poses, paths, sent, setup.expected_clutter(number), False)
-    links = setup.timetable.links(number)
-    for link in (
-        links[:1] + links
-    ):  # the first once more: what is compiled on first use is not a frame's cost
+    links = setup.timetable.links(frame.number)
+    # the first once more: what is compiled on first use is not a frame's cost
+    for link in links[:1] + links:
         clock = _Clock()
         if receive:
-            _Observer(setup, link, standard_terminal(setup, link)).hear(frame, clock)
+            _Observer(setup, link, standard_terminal(setup, link)).hear(frame, clock, False)
         else:
             with clock.stage("synthesis"):
-                setup.receive_input(number, link, sent, paths, poses)
-        out[link] = {
-            name: value
-            for name, value in clock.seconds.items()
-            if name == "synthesis" or (receive and name == "receive")
-        }
+                frame.heard(link)
+        stages = ("synthesis", "receive") if receive else ("synthesis",)
+        out[link] = {stage: clock.seconds[stage] for stage in stages}
     return out
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """One frame as it was sent and travelled."""
-
-    number: int
-    poses: dict[str, Pose]
-    paths: dict[Link, PathSet]
-    sent: dict[str, Transmission]
-    expected: dict[str, ExpectedClutter]
-    snapshot: bool
-
-
 @dataclass
-class _Flight:
+class _Run:
     """The frames of a run so far, recorded and scored."""
 
     setup: Setup
     recorder: Recorder
     observers: dict[Link, _Observer]
     schedules: Schedules
-    seconds: dict[str, float]
+    snapshots: set[int]
+    clock: _Clock
+    uses: dict[tuple[int, Link], Use] = field(default_factory=dict)
     contradicted: dict[int, int] = field(default_factory=dict)
     """Traced paths of each frame that the float64 geometry contradicted."""
     _safe: int = 0
     """Frames already in the file of the unfinished run."""
 
-    def trace(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """`Setup.trace`, the contradicted paths counted."""
-        before = self.setup.propagation.dropped
-        found = self.setup.trace(frame)
-        self.contradicted[frame] = self.setup.propagation.dropped - before
-        return found
+    @classmethod
+    def begin(
+        cls,
+        scenario: Scenario,
+        setup: Setup | None,
+        snapshots: int,
+        terminal: Callable[[Setup, Link], Terminal],
+    ) -> _Run:
+        """Before the first frame."""
+        s = setup or prepare(scenario)
+        clock = _Clock()
+        clock.seconds["setup"] = clock.seconds["total"] = s.seconds
+        return cls(
+            s,
+            Recorder(
+                scenario, s.waveform, s.timetable, [state.name.lower() for state in TerminalState]
+            ),
+            {link: _Observer(s, link, terminal(s, link)) for link in s.timetable.all_links},
+            Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
+            s.timetable.snapshots(snapshots),
+            clock,
+        )
+
+    def fly(
+        self, progress: Progress | None, threads: int | None, unfinished: Unfinished | None
+    ) -> None:
+        """Frame after frame; while the receivers work on one the next is traced."""
+        setup, frames = self.setup, self.setup.timetable.frames
+        at_work: tuple[Frame, dict[Link, Future[Heard]]] | None = None
+        with (
+            threadpool_limits(limits=1),
+            ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
+        ):
+            for number in range(self.go_on(unfinished), frames):
+                with self.clock.stage("total"):
+                    with self.clock.stage("trace"):
+                        frame = setup.frame(number)
+                    if at_work is not None:
+                        self.collect(*at_work)
+                        if unfinished and unfinished.due():
+                            unfinished.append(self.kept())
+                    if progress and number:
+                        progress(number, frames)
+                    frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
+                    at_work = (
+                        frame,
+                        {
+                            link: pool.submit(
+                                self.observers[link].hear,
+                                frame,
+                                self.clock,
+                                number in self.snapshots,
+                            )
+                            for link in setup.timetable.links(number)
+                        },
+                    )
+            with self.clock.stage("total"):
+                if at_work is not None:
+                    self.collect(*at_work)
+        if progress:
+            progress(frames, frames)
+
+    def collect(self, frame: Frame, jobs: dict[Link, Future[Heard]]) -> None:
+        """Wait for a frame's receivers, score and record it, take their advice."""
+        heard = {link: job.result() for link, job in jobs.items()}
+        timetable = self.setup.timetable
+        with self.clock.stage("track"):
+            if self.setup.scenario.access.feedback:
+                for tx, rx in heard:
+                    if (tx, tx) in heard:
+                        at_active = heard[Link(tx, tx)]
+                        self.observers[Link(tx, rx)].feed_back(
+                            frame.number, heard[Link(tx, rx)], at_active
+                        )
+            self.recorder.add(
+                FrameRecord(
+                    frame=frame.number,
+                    time=timetable.epoch(frame.number),
+                    modulated=timetable.modulated(frame.number),
+                    poses=frame.poses,
+                    observers={
+                        timetable.labels[link]: self.observers[link].record(frame, h)
+                        for link, h in heard.items()
+                    },
+                    snapshot=frame.number in self.snapshots,
+                )
+            )
+            self.uses.update({(frame.number, link): use for link, use in frame.uses.items()})
+            self.contradicted[frame.number] = frame.dropped
+            self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
     def kept(self) -> dict[str, Any]:
         """What an unfinished run needs to go on after the frames so far: those since the last call,
@@ -254,20 +301,18 @@ class _Flight:
                 link: (o.terminal, o.scorer.score, o.feedback) for link, o in self.observers.items()
             },
             "advice": self.schedules.advice,
-            "uses": {
-                key: use for key, use in self.setup.uses.items() if first <= key[0] < self._safe
-            },
+            "uses": {key: use for key, use in self.uses.items() if first <= key[0] < self._safe},
             "contradicted": {frame: self.contradicted[frame] for frame in range(first, self._safe)},
-            "seconds": self.seconds,
+            "seconds": self.clock.seconds,
         }
 
-    def go_on(self, unfinished: Unfinished) -> int:
+    def go_on(self, unfinished: Unfinished | None) -> int:
         """Take up what an earlier call of the same run kept; the number of the next frame."""
-        for entry in unfinished.entries():
+        for entry in unfinished.entries() if unfinished else []:
             if entry["first"] != self.recorder.count:
                 break  # two calls wrote into one folder
             self.recorder.restore(entry["frames"])
-            self.setup.uses.update(entry["uses"])
+            self.uses.update(entry["uses"])
             self.contradicted.update(entry["contradicted"])
             last = entry
         if self.recorder.count:
@@ -275,18 +320,25 @@ class _Flight:
                 o = self.observers[link]
                 o.terminal, o.scorer.score, o.feedback = terminal, score, feedback
             self.schedules.advice.update(last["advice"])
-            self.seconds.update(
-                {stage: self.seconds[stage] + seconds for stage, seconds in last["seconds"].items()}
-            )
+            for stage, seconds in last["seconds"].items():
+                self.clock.seconds[stage] += seconds
         self._safe = self.recorder.count
         return self._safe
 
     def figures(self) -> dict[str, Any]:
         """What a summary needs beside the frames."""
+        s = self.setup
+        names = {link: str(link) for link in s.timetable.all_links}
         return {
             "scores": {link: o.scorer.score for link, o in self.observers.items()},
-            "timing": self.seconds,
-            "fidelity": _fidelity(self.setup, sum(self.contradicted.values())),
+            "timing": self.clock.seconds,
+            "fidelity": {
+                **mechanisms(s.scenario.propagation, s.scenario.clutter),
+                **decisions(s.plan),
+                "links": used(self.uses, names),
+                "paths_contradicted": sum(self.contradicted.values()),
+                **extent(s.city, s.propagation, s.scenario.clutter),
+            },
             "access": self._access(),
         }
 
@@ -294,109 +346,5 @@ class _Flight:
         stages = self.setup.connections.summary(self.setup.timetable.epoch(0))
         if not self.setup.scenario.access.feedback:
             return stages
-        told = {f"{tx}->{rx}": o.feedback for (tx, rx), o in self.observers.items() if tx != rx}
+        told = {str(link): o.feedback for link, o in self.observers.items() if not link.own}
         return (stages or {}) | {"feedback": told}
-
-
-def _fly(
-    scenario: Scenario,
-    progress: Progress | None,
-    setup: Setup | None,
-    threads: int | None,
-    snapshots: set[int],
-    terminal: Callable[[Setup, Link], Terminal],
-    unfinished: Unfinished | None = None,
-) -> _Flight:
-    """Frame after frame; while the receivers work on one the next is traced."""
-    clock, begin = _Clock(), time.perf_counter()
-    with (
-        threadpool_limits(limits=1),
-        ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
-    ):
-        with clock.stage("setup"):
-            setup = setup or prepare(scenario)
-            timetable = setup.timetable
-            observers = {
-                link: _Observer(setup, link, terminal(setup, link)) for link in timetable.all_links
-            }
-            schedules = Schedules(scenario, setup.schedule)
-            recorder = Recorder(
-                scenario, setup.waveform, timetable, [state.name.lower() for state in TerminalState]
-            )
-        flight = _Flight(setup, recorder, observers, schedules, clock.seconds)
-        first = flight.go_on(unfinished) if unfinished else 0
-        begin -= clock.seconds["total"]
-        waiting: tuple[_Frame, dict[Link, Future[Heard]]] | None = None
-        for number in range(first, scenario.frames):
-            with clock.stage("trace"):
-                poses, paths = flight.trace(number)
-            if waiting is not None:
-                schedules.heed(_collect(recorder, observers, *waiting, clock))
-                clock.seconds["total"] = time.perf_counter() - begin
-                if unfinished and unfinished.due():
-                    unfinished.append(flight.kept())
-            if progress and number:
-                progress(number, scenario.frames)
-            active = timetable.with_role("active", number)
-            sent = {
-                name: setup.transmission(name, number, poses[name], schedules.of(name))
-                for name in active
-            }
-            frame = _Frame(
-                number, poses, paths, sent, setup.expected_clutter(number), number in snapshots
-            )
-            waiting = (
-                frame,
-                {
-                    link: pool.submit(observers[link].hear, frame, clock)
-                    for link in timetable.links(number)
-                },
-            )
-        if waiting is not None:
-            _collect(recorder, observers, *waiting, clock)
-        if progress:
-            progress(scenario.frames, scenario.frames)
-    clock.seconds["total"] = time.perf_counter() - begin
-    return flight
-
-
-def _collect(
-    recorder: Recorder,
-    observers: dict[Link, _Observer],
-    frame: _Frame,
-    jobs: dict[Link, Future],
-    clock: _Clock,
-) -> dict[Link, Reception]:
-    """Wait for a frame's receivers, score and record it; what they received."""
-    heard = {link: job.result() for link, job in jobs.items()}
-    with clock.stage("track"):
-        timetable = recorder.timetable
-        if recorder.scenario.access.feedback:
-            for tx, rx in heard:
-                if (tx, tx) in heard:
-                    observers[tx, rx].feed_back(frame, heard[tx, rx], heard[tx, tx])
-        recorder.add(
-            FrameRecord(
-                frame=frame.number,
-                time=timetable.epoch(frame.number),
-                modulated=timetable.modulated(frame.number),
-                poses=frame.poses,
-                observers={
-                    timetable.labels[link]: observers[link].record(frame, h)
-                    for link, h in heard.items()
-                },
-                snapshot=frame.snapshot,
-            )
-        )
-    return {link: h.reception for link, h in heard.items()}
-
-
-def _fidelity(setup: Setup, contradicted: int) -> dict[str, object]:
-    """What was modelled, for the summary."""
-    return {
-        **mechanisms(setup.scenario),
-        **decisions(setup.plan),
-        "links": used(setup.uses, {link: "->".join(link) for link in setup.timetable.all_links}),
-        "paths_contradicted": contradicted,
-        **extent(setup.city, setup.propagation, setup.scenario.clutter),
-    }

@@ -14,6 +14,7 @@ from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.radio import Modulation, Radio
 from isac_rt.scenario.swarm import RoleChange, Uav
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import timetable_of
 
 AT, PT1, PT2 = (
     Uav(role=role, position_m=(3.1 * i, 7.7, 20.0))
@@ -22,11 +23,16 @@ AT, PT1, PT2 = (
 SECOND = Uav(role="active", position_m=(-9.3, 1.2, 33.0))
 
 
+def scenario_of(**changes) -> Scenario:
+    """40 frames with a terminal AT and two that listen, changed by keywords."""
+    return Scenario(**{"frames": 40, "swarm": {"AT": AT, "PT1": PT1, "PT2": PT2}} | changes)
+
+
 def timetable(**changes) -> Timetable:
-    """Of a scenario of 40 frames with a terminal AT and two that listen, changed by keywords."""
-    scenario = Scenario(**{"frames": 40, "swarm": {"AT": AT, "PT1": PT1, "PT2": PT2}} | changes)
+    """The frames of such a scenario."""
+    scenario = scenario_of(**changes)
     w = waveform_of(scenario)
-    return Timetable(
+    return timetable_of(
         scenario,
         w,
         pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, np.random.default_rng(5)),
@@ -59,11 +65,11 @@ def test_changes_streams_and_blocks_survive_a_file(tmp_path):
     """Planted bug: role_changes missing from the written file."""
     swarm = {"AT": AT.model_copy(update={"resource_block": 5}), "PT1": PT1}
     change = RoleChange(frame=17, from_uav="AT", to_uav="PT1")
-    t = timetable(
+    s = scenario_of(
         swarm=swarm, role_changes=(change,), modulation=Modulation(streams={"PT1": (2, 0)})
     )
-    (tmp_path / "s.yaml").write_text(to_yaml(t.scenario))
-    assert load(tmp_path / "s.yaml").model_dump() == t.scenario.model_dump()
+    (tmp_path / "s.yaml").write_text(to_yaml(s))
+    assert load(tmp_path / "s.yaml").model_dump() == s.model_dump()
 
 
 def test_a_role_that_comes_back_is_the_same_link():
@@ -85,7 +91,7 @@ def test_resource_blocks_are_given_in_order_around_those_that_are_fixed():
         "C": Uav(role="active", position_m=(50.0, 0, 9)),
     }
     t = timetable(swarm=swarm | {"PT1": PT1})
-    assert t.scenario.first_blocks() == {"A": 0, "B": 4, "C": 7}
+    assert t.blocks == {"A": 0, "B": 4, "C": 7}
     assert t.links(0)[3:] == [("A", "PT1"), ("B", "PT1"), ("C", "PT1")]
 
 

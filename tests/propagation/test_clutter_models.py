@@ -118,8 +118,8 @@ def test_paths_of_a_run(link, passes):
     path's amplitude, directions in view. Planted bug: one pass for an echo."""
     s = scene("clutter.place=grid", "clutter.centre_m=[24, 24]", "clutter.cells=[45, 45]")
     setup = prepare(s)
-    poses, every = setup.trace(0)
-    found = every[link]
+    frame = setup.frame(0)
+    poses, found = frame.poses, frame.paths[link]
     d = found.select(found.kind == PathKind.DIFFUSE)
     cell = {2: AT_CELL, 1: PT_CELL}[passes]
     where = d.delay * C / passes

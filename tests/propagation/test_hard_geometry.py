@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario as tree
-from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
 from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load, to_yaml
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation.preflight import aliases, check_flights
-from isac_rt.simulation.setup import prepare
+from isac_rt.simulation.preflight import check_flights, warn_of_aliases
+from isac_rt.simulation.setup import prepare, timetable_of
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.truths import WAVELENGTH, chain_length
 from isac_rt.world.city import City, load_city
@@ -258,9 +258,22 @@ def test_two_bodies_at_one_point_are_refused_before_the_run():
         prepare(meeting)
     passing = flight(A=((0, 0, 9), (0, 0, 0)), U=((0.3, 20, 9), (0, -10.0, 0)))
     w = waveform_of(passing)
-    check_flights(
-        passing, Swarm.from_scenario(passing), Timetable(passing, w, np.zeros((3, 120), int))
-    )
+    check_flights(Swarm.from_scenario(passing), timetable_of(passing, w, np.zeros((3, 120), int)))
+
+
+def aliases(s):
+    """What is said of a scenario's velocities."""
+    w = waveform_of(s)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        warn_of_aliases(
+            Swarm.from_scenario(s),
+            timetable_of(s, w, np.zeros((3, 120), int)),
+            antennas_of(s, w),
+            s.receivers.velocity_method,
+            s.array.schedule,
+        )
+    return [str(one.message) for one in said]
 
 
 def test_velocities_that_alias_are_warned_of_before_the_run():
@@ -274,17 +287,14 @@ def test_velocities_that_alias_are_warned_of_before_the_run():
         (14.0, 1, []),
     ):
         s = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, way * 20, 9), (0, way * v, 0)))
-        w = waveform_of(s)
-        said = list(aliases(s, Swarm.from_scenario(s), Timetable(s, w, np.zeros((3, 120), int))))
-        assert [text.split(": ")[1].split(" moves")[0] for text in said] == expected
+        w, said = waveform_of(s), aliases(s)
+        assert [text.split(" moves")[0] for text in said] == expected
         if expected:
             shown = (v + w.max_velocity(2)) % (2 * w.max_velocity(2)) - w.max_velocity(2)
             assert f"moves at {v:g} m/s" in said[0] and f"about {shown:.3g} m/s" in said[0]
     s = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 20, 9), (0, 17.0, 0)))
     with pytest.warns(ScenarioWarning, match="unambiguous"):
-        check_flights(
-            s, Swarm.from_scenario(s), Timetable(s, waveform_of(s), np.zeros((3, 120), int))
-        )
+        prepare(s)
 
 
 def test_a_flight_beyond_all_bounds_is_refused():
@@ -381,7 +391,8 @@ def test_a_shadow_edge_is_crossed_within_a_frame():
     corner = np.array([-11.0, 30.0])  # of the left row of buildings
     levels: list[float] = []
     for frame in range(1, 14):
-        poses, paths = setup.trace(frame)
+        sent = setup.frame(frame)
+        poses, paths = sent.poses, sent.paths
         a, p = poses["A"].position, poses["P"].position
         lit = bool(np.cross([*(corner - a[:2]), 0], [*(p[:2] - a[:2]), 0])[2] < 0)
         direct = paths["A", "P"].select(paths["A", "P"].kind == PathKind.LINE_OF_SIGHT)
@@ -408,7 +419,8 @@ def test_reflections_are_born_and_die_between_traces():
     )
     setup, kept = prepare(s), {}
     for frame in range(9):
-        poses, paths = setup.trace(frame)
+        sent = setup.frame(frame)
+        poses, paths = sent.poses, sent.paths
         a, p = poses["A"].position, poses["P"].position
         truth = [np.hypot(np.linalg.norm((p - a)[:2]), p[2] + a[2])]  # off the ground
         for wall in (-11.0, 11.0):
@@ -418,7 +430,7 @@ def test_reflections_are_born_and_die_between_traces():
         kept[frame] = np.sort(C * specular(paths["A", "P"]).delay)
         assert kept[frame] == pytest.approx(np.sort(truth), abs=NANOMETRE), frame
     assert {len(lengths) for lengths in kept.values()} == {1, 2, 3}
-    assert np.array_equal(np.sort(C * specular(prepare(s).trace(2)[1]["A", "P"]).delay), kept[2])
+    assert np.array_equal(np.sort(C * specular(prepare(s).frame(2).paths["A", "P"]).delay), kept[2])
 
 
 @pytest.mark.sionna

@@ -204,7 +204,7 @@ def test_the_active_terminal_makes_the_same_of_both():
 
 def test_a_run_on_profiles():
     """The active terminal finds all targets; its picture before data removal is absent, the passive
-    terminals' are there. Planted bug: `receive_input` that gives everybody samples."""
+    terminals' are there. Planted bug: `Frame.heard` that gives everybody samples."""
     options = ["receivers.active_input=profiles", "modulation.acquisition_frames=2"]
     scenario = load(SCENES / "paper_swarm_consistent.yaml", options, frames=3)
     results = run(scenario, snapshots=1)

@@ -103,14 +103,14 @@ def test_without_the_key_the_advice_is_recorded_and_nothing_changes(run, tmp_pat
 def test_one_dense_advice_is_enough_and_the_last_word_counts(run):
     """Planted bug: the first advice of a link is kept."""
     usual = pseudo_random_schedule(1, 120, 3, np.random.default_rng(1))
-    s, other = Schedules(scenario(), usual), conventional_schedule(1, 120, 3)
+    s, other = Schedules(usual, 3), conventional_schedule(1, 120, 3)
     said = lambda sparse: replace(empty(), sparse=sparse)  # noqa: E731
     assert s.of("A") is usual
-    s.heed({("A", "A"): said(True), ("A", "P"): said(False), ("B", "B"): said(True)})
+    s.take_advice({("A", "A"): said(True), ("A", "P"): said(False), ("B", "B"): said(True)})
     assert np.array_equal(s.of("A"), other) and s.of("B") is usual
-    s.heed({("A", "P"): said(None)})
+    s.take_advice({("A", "P"): said(None)})
     assert np.array_equal(s.of("A"), other)
-    s.heed({("A", "P"): said(True)})
+    s.take_advice({("A", "P"): said(True)})
     assert s.of("A") is usual
 
 

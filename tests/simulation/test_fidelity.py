@@ -12,7 +12,6 @@ import pytest
 
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.schedule import schedule_of
-from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator
@@ -26,6 +25,8 @@ from isac_rt.simulation.plan import (
     plane_bound,
     straight_bound,
 )
+from isac_rt.simulation.setup import plan_of as plan_of_scenario
+from isac_rt.simulation.setup import timetable_of
 from isac_rt.world.swarm import Swarm
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -35,13 +36,8 @@ K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [r
 def plan_of(scene: str = "paper_swarm_consistent.yaml", *overrides: str) -> Plan:
     s = load(SCENES / scene, overrides)
     w = waveform_of(s)
-    return Plan(
-        s,
-        w,
-        antennas_of(s, w),
-        Timetable(s, w, schedule_of(s, w, generator(s.seed, "schedule"))),
-        Swarm.from_scenario(s),
-    )
+    timetable = timetable_of(s, w, schedule_of(s, w, generator(s.seed, "schedule")))
+    return plan_of_scenario(s, antennas_of(s, w), timetable, Swarm.from_scenario(s))
 
 
 def some_paths(count: int, seed: int, **changes) -> PathSet:
@@ -174,7 +170,7 @@ def test_what_is_out_of_reach_is_what_the_synthesis_cannot_hear():
         delay = late
         symbol_delay = np.array([0.0, w.max_delay / 2])
 
-    heard = np.unique(sources(w, Tones, plan.scenario.radio.filter_transition_hz)[0])
+    heard = np.unique(sources(w, Tones)[0])
     assert set(kept.delay) == set(late[heard])
     assert use.unheard == 60 - heard.size
 
@@ -229,7 +225,7 @@ def test_frames_are_traced_as_seldom_as_the_flight_allows():
     plan = plan_of("munich_swarm.yaml", "accuracy.max_untraced_m=1.7")
     frames = plan.traced_frames
     assert frames[0] == 0
-    assert frames[-1] == plan.scenario.frames - 1
+    assert frames[-1] == plan.timetable.frames - 1
 
     def flown(a: int, b: int) -> float:
         places = np.array(

@@ -155,7 +155,7 @@ def test_the_plan_counts_what_the_summary_counts():
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
     record = extent(setup.city, setup.propagation, s.clutter)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
-    for key, value in {**record, **mechanisms(s)}.items():
+    for key, value in {**record, **mechanisms(s.propagation, s.clutter)}.items():
         assert planned[key] == done[key] == value, key
     lines = {item["what"]: item for item in planned["items"]}
     assert str(record["city_faces"]) in lines["mesh"]["modelled"]

@@ -103,12 +103,11 @@ def test_receivers_use_no_truth(tmp_path):
     )
     steps, expected = [], {}
     for frame in range(3):
-        now, paths = setup.trace(frame)
-        sent = {"AT": setup.transmission("AT", frame, now["AT"])}
+        now = setup.frame(frame)
         steps.append(
             Step(
-                setup.receive_samples(frame, ("AT", "PT1"), sent, paths, now),
-                now["PT1"],
+                now.samples(("AT", "PT1")),
+                now.poses["PT1"],
                 setup.timetable.epoch(frame),
                 setup.timetable.modulated(frame),
             )

@@ -101,7 +101,7 @@ def test_a_run_with_all_but_its_last_frame_kept_hears_that_one_alone(tmp_path, m
     monkeypatch.setattr(
         simulate._Observer,
         "hear",
-        lambda self, frame, clock: heard.append(frame.number) or hear(self, frame, clock),
+        lambda self, frame, *rest: heard.append(frame.number) or hear(self, frame, *rest),
     )
     again = simulate.run(scenario, snapshots=1, unfinished=unfinished)
     assert set(heard) == {3}

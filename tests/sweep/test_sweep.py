@@ -584,7 +584,7 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     """The least recently used go first; damaged and vanished files are traced again; an unwritable
     folder is no error."""
     setup = prepare(load(folder / "base.yaml"))
-    paths = setup.trace(0)[1]
+    paths = setup.frame(0).paths
     one = PathStore(tmp_path / "probe")
     one.put("aa", paths, 1)
     size = next((tmp_path / "probe").rglob("*.npz")).stat().st_size

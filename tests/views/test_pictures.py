@@ -134,7 +134,7 @@ def test_every_scene_names_the_schema_and_the_schema_is_today_s():
 
 def test_objects_print_themselves_in_short(results):
     setup = prepare(results.scenario)
-    paths = setup.trace(2)[1]["A", "P"]
+    paths = setup.frame(2).paths["A", "P"]
     assert repr(paths).startswith("<PathSet A -> P at 0.0030 s: 1 line of sight")
     assert "hit rate" in repr(results)
     assert repr(setup.city) == "<City free space: 0 faces, 0 x 0 x 0 m, 0 materials>"

@@ -83,17 +83,16 @@ def samples(setup: Setup) -> dict[Link, np.ndarray]:
     """Noise-free samples of the frame in the middle of a run, by link, by the method that the run
     would take."""
     number = setup.scenario.frames // 2
-    poses, paths = setup.trace(number)
+    frame = setup.frame(number)
     out = {}
     for link in setup.timetable.links(number):
-        sent = setup.transmission(link[0], number, poses[link[0]])
         out[link] = if_signal(
             setup.waveform,
-            [(sent, paths[link])],
-            poses[link[1]],
+            [(frame.sent[link.tx], frame.paths[link])],
+            frame.poses[link.rx],
             setup.antennas,
-            start_time=setup.timetable.start_time(number, link[0]),
-            noise_power=setup.noise_power(poses, link),
-            method=setup.plan.synthesis(len(paths[link])),
+            start_time=setup.timetable.start_time(number, link.tx),
+            noise_power=frame.noise_power(link),
+            method=setup.plan.synthesis(len(frame.paths[link])),
         ).samples
     return out
