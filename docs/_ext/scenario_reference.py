@@ -31,6 +31,8 @@ def kind_of(entry: dict[str, Any], definitions: dict[str, Any]) -> str:
         return "list" + (f" of {kind_of(inner, definitions)}" if isinstance(inner, dict) else "")
     if entry.get("type") == "object":
         inner = entry.get("additionalProperties")
+        if "patternProperties" in entry:  # names of UAVs
+            (inner,) = entry["patternProperties"].values()
         return "mapping" + (f" to {kind_of(inner, definitions)}" if isinstance(inner, dict) else "")
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
     limits = [f"{sign} {entry[key]:g}" for key, sign in signs.items() if key in entry]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from importlib import resources
 from pathlib import Path
 
@@ -42,6 +43,7 @@ def starter_text(
 
     Parameters
     ----------
+    name : of the scenario; what a name may not hold becomes _
     footprints : a GeoJSON or CityJSON file of buildings, relative to the scenario's folder; None
         for a street canyon
     centre : where the swarm flies, in the city's coordinates [m]
@@ -49,7 +51,7 @@ def starter_text(
     """
     text = resources.files("isac_rt.cli").joinpath("starter.yaml").read_text(encoding="utf-8")
     city = _CANYON if footprints is None else _BUILDINGS.format(file=json.dumps(footprints))
-    values = {"NAME": name, "CITY": city, "Z": f"{height:g}"}
+    values = {"NAME": re.sub(r"[^A-Za-z0-9_-]", "_", name)[:100], "CITY": city, "Z": f"{height:g}"}
     for i, (x, y) in enumerate(_PLACES):
         values |= {f"X{i}": f"{centre[0] + x:.1f}", f"Y{i}": f"{centre[1] + y:.1f}"}
     for key, value in values.items():

@@ -8,52 +8,98 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from isac_rt.scenario.node import Finite, Fraction, Node, Positive, Problem
+from isac_rt.scenario.node import Decibels, Fraction, Loss, Node, Positive, Problem
 
 
 class MaterialOverride(Node):
-    """What a scenario changes of a material; what is left out keeps its table value."""
+    """Properties of one material that replace those of the table; what is left out keeps its table
+    value."""
 
     relative_permittivity: Annotated[float, Field(ge=1)] | None = None
+    """Real part of the relative permittivity at the carrier, without unit. By default the value of
+    ITU-R P.2040 or the rule that the report of a run states."""
     conductivity_s_per_m: Annotated[float, Field(ge=0)] | None = None
+    """Conductivity at the carrier, which stands for all losses [S/m]. By default the value of ITU-R
+    P.2040 or the rule that the report of a run states."""
     scattering_coefficient: Fraction | None = None
+    """Share of the reflected amplitude that leaves diffusely; its square is the share of the power.
+    By default the table's, 0.1 to 0.4 by roughness for building materials: a stated choice, for
+    there is no agreed measurement at 77 GHz."""
     scattering_pattern: Literal["lambertian", "directive", "backscattering"] | None = None
+    """Directions that diffuse power leaves in: `lambertian` about the normal, `directive` about the
+    mirror direction, `backscattering` also back to the source. The table has `lambertian`."""
     pattern_exponent: Annotated[int, Field(ge=1, le=20)] | None = None
+    """Narrowness of the lobes of `directive` and `backscattering`: a higher exponent makes them
+    narrower. The default, 4, fitted measured buildings (Degli-Esposti 2007)."""
     thickness_m: Positive | None = None
+    """Thickness of the slab that a face stands for [m]; the two faces of a thin one interfere. By
+    default the table's, 0.1 m for most materials."""
 
 
 class City(Node):
-    """Where the mesh comes from. `source` decides which of the keys below it apply."""
+    """Where the mesh of the city comes from. `source` decides which of the other keys apply."""
 
     source: Literal["builtin", "mitsuba", "mesh", "footprints", "canyon", "blocks"]
-    # builtin: name of a scene that ships with Sionna RT; mitsuba, mesh, footprints: a file beside
-    # the scenario
+    """Kind of city: `builtin` is a scene that comes with Sionna RT, `mitsuba`, `mesh` and
+    `footprints` read a file, `canyon` is one street between two rows of buildings, `blocks` a grid
+    of blocks."""
     name: str | None = None
+    """Name of a scene of Sionna RT, such as munich, for `builtin`."""
     file: str | None = None
-    # mesh files
+    """Path of the city's file, relative to the scenario's folder, for `mitsuba` (XML), `mesh` (PLY,
+    OBJ, STL, GLB) and `footprints` (GeoJSON, CityJSON)."""
     up_axis: Literal["y", "z"] = "z"
+    """Axis of a `mesh` file that points up. The default is z; glTF has y by its standard."""
     scale: Positive = 1.0
+    """Metres per unit of a `mesh` file. By default the file is in metres."""
     material: str = "concrete"
+    """Material of the pieces of a `mesh` that neither `material_map` nor their names tell. The
+    default, concrete, is the most common."""
     material_map: dict[str, str] = Field({})
-    # footprints
+    """Material by the name of a node, geometry or material of a `mesh` file. By default these names
+    are looked up in the table of materials as they are."""
     coordinates: Literal["auto", "metres", "lonlat"] = "auto"
+    """Coordinates of `footprints`: `metres`, `lonlat` for longitude and latitude in degrees, or
+    `auto`, the default: told by their size."""
     height_property: str = "height"
+    """Property that holds a building's height [m] in a `footprints` file. The default is what most
+    exports of OpenStreetMap call it."""
     default_height_m: Positive = 10.0
+    """Height of a building whose footprint has none [m]. The default is three storeys."""
     wall_material: str = "concrete"
+    """Material of the walls, for `footprints`, `canyon` and `blocks`; by default concrete."""
     roof_material: str = "concrete"
+    """Material of the roofs, for `footprints`, `canyon` and `blocks`; by default concrete."""
     ground_material: str = "asphalt"
+    """Material of the ground, for `footprints`, `canyon` and `blocks`. The default is a
+    street's."""
     ground_margin_m: Annotated[float, Field(ge=0)] = 50.0
-    # canyon and blocks
+    """How far the ground reaches beyond the outermost buildings [m], for `footprints`, `canyon` and
+    `blocks`."""
     street_width_m: Positive = 20.0
+    """Width of a street from facade to facade [m], for `canyon` and `blocks`. The default is a city
+    street."""
     street_length_m: Positive = 120.0
+    """Length of the street, along y [m], for `canyon`."""
     building_height_m: Positive = 20.0
+    """Mean height of the buildings [m], for `canyon` and `blocks`. The default is six storeys."""
     height_spread_m: Annotated[float, Field(ge=0)] = 0.0
+    """Most that a building is higher or lower than `building_height_m` [m]; the same for the same
+    building in every run. By default all are alike."""
     block_size_m: Positive = 40.0
+    """Side of a square block, for `blocks`; depth of the rows and length of a building along the
+    street, for `canyon` [m]."""
     blocks_x: Annotated[int, Field(ge=1, le=100)] = 3
+    """Blocks from west to east, for `blocks`."""
     blocks_y: Annotated[int, Field(ge=1, le=100)] = 3
-    # all
+    """Blocks from south to north, for `blocks`."""
     keep_radius_m: Positive | None = None
+    """Horizontal distance from the middle of the flight within which the city is kept [m]. A
+    smaller city is traced faster, but what is left out neither reflects nor shadows. By default all
+    of it is kept."""
     materials: dict[str, MaterialOverride] = Field({})
+    """Properties to change, by the name of the material. By default the table of ITU-R P.2040
+    holds."""
 
     def applies(self, name: str) -> bool:
         return name in CITY_KEYS[self.source] or name in ("source", "keep_radius_m", "materials")
@@ -98,78 +144,101 @@ CITY_KEYS: dict[str, frozenset[str]] = {
 
 
 class Leakage(Node):
-    """The transmitter heard by the receiver on the same body."""
+    """What a terminal's receiver hears of its own transmitter on the same body."""
 
     enabled: bool = True
-    isolation_db: Annotated[float, Field(ge=0)] = 60.0
+    """Whether leakage is simulated, with `propagation.model: ray_traced`. On by default, for no
+    radar is without it."""
+    isolation_db: Loss = 60.0
+    """Loss from the transmit to the receive antennas of one body [dB]. The default is that of
+    separate antennas on one board."""
     delay_s: Annotated[float, Field(ge=0)] = 1e-9
+    """Delay of the leakage [s]. The default is 30 cm of way."""
 
 
 class Propagation(Node):
-    """Which paths there are."""
+    """Which paths there are between the terminals and by way of the targets."""
 
     model: Literal["free_space", "ray_traced"] = "free_space"
+    """How paths are found: `free_space`, the default and the paper's, has lines of sight and echoes
+    only; `ray_traced` finds reflections, ghosts and shadows in the city's mesh."""
     max_bounces: Annotated[int, Field(ge=0, le=6)] = 2
-    """Specular bounces per leg (terminal to terminal, terminal to target)."""
+    """Most mirror reflections on a path between two terminals, and on the ways to and from a target
+    together. More reflections cost time and add weaker paths; the default finds single and double
+    ones."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
+    """Rays that search for mirror reflections, per transmitter. More rays find paths over small
+    faces more surely and take longer. Paths that are found do not depend on it. The default suits
+    cities of some hundred metres."""
     ghosts: bool = True
+    """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
+    for targets."""
     specular: bool = True
-    weakest_path_db: Annotated[float, Field(ge=0)] = 40.0
-    """Paths this far below the noise of one range-Doppler-antenna cell are left out."""
+    """Whether mirror reflections off the city are simulated. On by default, as in any street."""
+    weakest_path_db: Loss = 40.0
+    """How far below the noise of one range-Doppler-antenna cell paths must be to be left out [dB].
+    The default leaves out a ten-thousandth of the noise; a smaller value is faster."""
     leakage: Leakage = Leakage()
+    """What a terminal's receiver hears of its own transmitter."""
 
 
 class Clutter(Node):
-    """What is received beside line of sight, targets, ghosts and mirror images.
-
-    none: nothing; with noise.model snr this is the paper's "Gaussian noise environment", whose SNR
-    counts weak clutter and thermal noise as one. gaussian: white Gaussian clutter beside the
-    thermal noise, so that the SNR that is asked for is the thermal noise's alone. rayleigh: the
-    paper's urban model, a run of range cells that stand still
-    (`isac_rt.propagation.clutter.rayleigh`). Both go with any propagation model. field: scatterers
-    pinned to the mesh, the same in all frames and links. diffuse: Sionna's own, traced anew in
-    every frame, which draws the points anew as well; to compare with.
-    """
+    """What is received beside lines of sight, targets, ghosts and mirror images."""
 
     model: Literal["none", "gaussian", "rayleigh", "diffuse", "field"] = "none"
-    clutter_to_noise_db: Finite = 0.0
-    """gaussian: power of the clutter over that of the thermal noise."""
-    level_db: Finite = 10.0
-    """rayleigh: mean level of one cell over the link's reference path (the strongest target at the
-    AT, the line of sight at a PT) as it would be unshadowed and in view."""
+    """Kind of clutter. `none`, the default; with `noise.model: snr` it is the paper's "Gaussian
+    noise environment". `gaussian`: white noise beside the thermal noise. `rayleigh`, the paper's
+    urban model: a run of range cells that stand still. `field`: scatterers pinned to the city's
+    mesh, the same in all frames and links. `diffuse`: Sionna RT's own diffuse paths, drawn anew in
+    every frame, to compare with."""
+    clutter_to_noise_db: Decibels = 0.0
+    """Power of `gaussian` clutter over that of the thermal noise [dB]. By default they are
+    alike."""
+    level_db: Decibels = 10.0
+    """Mean level of one cell of `rayleigh` clutter over the reference path of the link [dB]: the
+    strongest target at an active terminal, the line of sight at a passive one, as if nothing hid
+    it. The default is the paper's."""
     level_of: Literal["power", "amplitude"] = "power"
-    """rayleigh: whether `level_db` is of the mean power or of the mean amplitude; the latter is
-    1.05 dB more of power."""
+    """Whether `level_db` of `rayleigh` clutter is that of the mean power, the default, or of the
+    mean amplitude, which is 1.05 dB more of power."""
     cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (40, 50)
-    """rayleigh: least and most consecutive range cells, drawn in between."""
+    """Least and most consecutive range cells of `rayleigh` clutter; the number is drawn in between.
+    The default is the paper's."""
     centre: Literal["drawn", "reference"] = "drawn"
-    """rayleigh: centre drawn uniformly within `centre_m`, or around the reference path."""
+    """Where the middle of `rayleigh` clutter lies: `drawn` uniformly within `centre_m`, the
+    default, or at the range of the `reference` path."""
     centre_m: tuple[Positive, Positive] = (20.0, 30.0)
-    """rayleigh, centre drawn: its least and greatest range, twice the same to fix it; one way at
-    the AT, path length at a PT."""
+    """Least and greatest range of the middle of `rayleigh` clutter that is drawn [m], twice the
+    same to fix it; one way at an active terminal, path length at a passive one. The default is the
+    paper's."""
     place: Literal["drawn", "grid"] = "drawn"
-    """rayleigh: a scatterer anywhere in its range cell, or in the middle of it."""
+    """Where a scatterer of `rayleigh` clutter lies: `drawn` anywhere in its range cell, the
+    default, or in its middle (`grid`)."""
     direction: Literal["field_of_view", "reference"] = "field_of_view"
-    """rayleigh: directions drawn over the field of view of either end, or all that of the reference
-    path."""
+    """Directions of `rayleigh` clutter: drawn over the `field_of_view` of both ends, the default,
+    or all that of the `reference` path."""
     cell_correlation: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """rayleigh: correlation of the complex amplitudes of neighbouring cells."""
+    """Correlation of the complex amplitudes of neighbouring cells of `rayleigh` clutter, from 0 to
+    1. By default cells are independent."""
     redraw: Literal["each_frame", "once"] = "each_frame"
-    """rayleigh: how often number, centre, places, directions and amplitudes are drawn."""
+    """How often `rayleigh` clutter is drawn: in `each_frame`, the default, or `once` for the
+    run."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
-    """diffuse: rays of a re-trace, per transmitter."""
+    """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
+    paths, the same power in all, and take longer."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
-    """field: error of the mean power in a range cell of 4 m that nine of ten cells keep to, of
-    those with a thousandth of all power and more; decides how many scatterers there are
-    (`isac_rt.propagation.clutter.cells`)."""
+    """Error of the mean clutter power in a range cell of 4 m that nine of ten cells keep to [dB],
+    for `field`. A smaller error takes more scatterers. The default is far below the fluctuation of
+    clutter itself."""
     cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
-    """field: largest area that one scatterer stands for, over its distance to the nearest
-    terminal's flight [m^2/m], in place of what max_error_db asks for."""
+    """Largest area that one scatterer stands for, per metre of distance to the nearest terminal's
+    flight [m^2/m], for `field`. null, the default: what `max_error_db` asks for."""
     smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
-    """field: cells of this area are cut no further, however near."""
+    """Area of a surface cell that is cut no further, however near a terminal flies [m^2], for
+    `field`. The default bounds the number of scatterers beside a wall."""
     mirrors: Annotated[int, Field(ge=0, le=64)] = 0
-    """field: walls, roofs and grounds per terminal, the strongest, by way of which each scatterer
-    is lit and heard as well (two bounces); 0: one bounce."""
+    """Walls, roofs and grounds per terminal, the strongest, by way of which each scatterer is lit
+    and heard as well, for `field`. 0, the default: clutter of one bounce only."""
 
     def applies(self, name: str) -> bool:
         if name == "centre_m" and self.centre != "drawn":
@@ -209,27 +278,28 @@ back."""
 
 
 class Accuracy(Node):
-    """How near to the full model a run has to come; what the scene then needs is decided link by
-    link and frame by frame (`isac_rt.simulation.plan`, `isac-rt plan`).
-
-    budget: what the keys below and propagation.weakest_path_db allow is left out. everything:
-    nothing is left out, every frame is traced. fastest: plane wavefronts, straight flight within a
-    frame, weak paths up to the noise of a cell left out, few traces.
-    """
+    """How near to the full model a run has to come. What the scene then needs is decided link by
+    link and frame by frame; `isac-rt plan` shows it."""
 
     preset: Literal["budget", "everything", "fastest"] = "budget"
+    """What may be left out. `budget`, the default: what the keys below and
+    `propagation.weakest_path_db` allow. `everything`: nothing is left out, every frame is traced.
+    `fastest`: plane wavefronts, straight flight within a frame, no path below the noise of a cell,
+    few traces."""
     max_phase_error_rad: Positive = 0.05
-    """budget: most by which approximations together may turn the phase of a path, at any element
-    and chirp."""
+    """Most by which approximations together may turn the phase of a path at any element and chirp
+    [rad], for `budget`. The default costs at most 0.01 dB of the path's power."""
     max_untraced_m: Annotated[float, Field(ge=0)] = 1.0
-    """budget: farthest that a UAV flies between two traced instants; 0: every frame is traced."""
+    """Farthest that a UAV flies between two traced instants [m], for `budget`; 0: every frame is
+    traced. A longer way is faster and misses paths that last less than that; the default misses
+    none that lasts more than a metre of flight."""
     synthesis_error: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-4
-    """budget, everything: relative RMS error that fast synthesis of IF samples may have; the
-    cheapest method that keeps it is taken."""
+    """Relative RMS error that fast synthesis of IF samples may have, for `budget` and `everything`;
+    the cheapest method that keeps it is taken. The default is 80 dB below the signal."""
     cost_model: str | None = None
-    """budget, everything: what the methods cost, a file of `isac-rt bench --fit`, relative to the
-    scenario's folder; without one, the costs that ship with the program. It decides between methods
-    that all keep synthesis_error."""
+    """File of what the methods of synthesis cost on a machine, made by `isac-rt bench --fit` and
+    relative to the scenario's folder, for `budget` and `everything`. It decides between methods
+    that all keep `synthesis_error`. By default the costs that come with the program hold."""
 
     def applies(self, name: str) -> bool:
         if name in ("synthesis_error", "cost_model"):

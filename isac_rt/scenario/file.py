@@ -280,6 +280,7 @@ def _shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return words[value]
     text = "{...}" if isinstance(value, dict) else str(value)
+    text = text if text.isprintable() and text else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -359,7 +360,7 @@ class _Complaints:
         """All complaints of a validation, in the order of the tree."""
         lines: dict[Any, str] = {}
         for found in error.errors():
-            key: Key = found["loc"]
+            key: Key = tuple(part for part in found["loc"] if part != "[key]")
             if found["type"] == "inconsistent":
                 for problem in found["ctx"]["problems"]:
                     lines[key, problem] = self.problem(problem, key)
@@ -384,6 +385,8 @@ class _Complaints:
                 [key],
                 f"must be a mapping{' with keys out of ' + ', '.join(allowed) if allowed else ''}",
             )
+        if kind == "string_pattern_mismatch":
+            return self.line([key], "a name may hold letters, digits, _ and - only; rename it")
         if kind == "value_error":
             return self.line([key], str(found["ctx"]["error"]))
         return self.line([key], _plain_words(found["msg"]))
@@ -393,6 +396,7 @@ def _plain_words(message: str) -> str:
     message = (
         message.split(", unable to parse")[0]
         .replace("Input should be", "must be")
+        .replace("String should have", "must have")
         .replace("Tuple should have", "must have")
         .replace("'", "")
     )

@@ -33,6 +33,13 @@ def _three_numbers(value: Any) -> Any:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Decibels = Annotated[float, Field(ge=-400, le=400, allow_inf_nan=False)]
+Loss = Annotated[float, Field(ge=0, le=400, allow_inf_nan=False)]
+"""Decibels beyond 400 are beyond any ratio of powers in nature, and overflow not far beyond."""
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+"""A whole number that results can keep."""
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
+"""What may name a file, a folder or a terminal anywhere."""
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Vector = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_three_numbers)]
 

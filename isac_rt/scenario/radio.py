@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from isac_rt.scenario.node import Finite, Node, Positive, Problem
+from isac_rt.scenario.node import Decibels, Node, Positive, Problem
 
 
 class ChirpTimes(NamedTuple):
@@ -42,16 +42,35 @@ def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> 
 
 
 class Radio(Node):
-    """The chirp and the frame."""
+    """The chirp that is sent and the frame that chirps form."""
 
     carrier_hz: Positive = 77e9
+    """Frequency at which the chirp starts [Hz]; it sweeps upwards from there by `bandwidth_hz`.
+    Wavelengths and Doppler shifts follow from it. The default is the automotive radar band, for
+    which the paper is written."""
     bandwidth_hz: Positive = 640e6
+    """Frequency that the whole chirp sweeps through [Hz]; more than twice the sampling rate. A
+    wider sweep gives finer range cells: 25 cm for an echo with the default, which is the
+    paper's."""
     sampling_rate_hz: Positive = 20e6
+    """Rate of the complex samples behind the receiver's mixer [Hz]. It sets the longest delay that
+    can be told: 256 m for an echo with the default, which is the paper's, and half of that while
+    chirps carry data."""
     samples_per_chirp: Annotated[int, Field(ge=16, le=65536)] = 1024
+    """Samples taken of each chirp, an even number because half of the range cells carry the data
+    symbols. More samples make chirps and frames longer. The default is the paper's."""
     chirps_per_frame: Annotated[int, Field(ge=2, le=4096)] = 120
+    """Chirps in a frame, a multiple of the number of transmit antennas, which take turns. More
+    chirps resolve velocities more finely (0.25 m/s for an echo with the default, which is the
+    paper's) and make the frame longer."""
     groups: Annotated[int, Field(ge=1, le=16)] = 3
+    """Chirp groups that are sent at once, each in a resource block of its own; at most the number
+    of transmit antennas. Every group carries data of its own. The default keeps all three transmit
+    antennas of the default array busy."""
     filter_transition_hz: Positive = 0.4e6
-    """Width of the IF filter's skirts on each side of its passband [0, sampling rate)."""
+    """Width of the IF filter's skirts on each side of its passband, which reaches from zero to the
+    sampling rate [Hz]. Wider skirts let in more of the neighbouring resource blocks. The default is
+    2 % of the default sampling rate; the paper names none."""
 
     def problems(self) -> Iterator[Problem]:
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
@@ -69,42 +88,79 @@ class Radio(Node):
 
 
 class Array(Node):
-    """L-shaped arrays: elements along X and Z that share the corner."""
+    """The antenna arrays of every terminal: an L of elements along X and Z for sending and one for
+    receiving."""
 
     tx_x: Annotated[int, Field(ge=1, le=16)] = 2
+    """Transmit elements along X (to the right of the boresight), the corner of the L included. The
+    default gives three transmit antennas with `tx_z`, as in the paper."""
     tx_z: Annotated[int, Field(ge=1, le=16)] = 2
+    """Transmit elements along Z (upwards), the corner of the L included. The default gives three
+    transmit antennas with `tx_x`, as in the paper."""
     rx_x: Annotated[int, Field(ge=2, le=64)] = 8
+    """Receive elements along X (to the right of the boresight), the corner of the L included. More
+    elements resolve azimuth more finely. The default is the paper's."""
     rx_z: Annotated[int, Field(ge=2, le=64)] = 8
+    """Receive elements along Z (upwards), the corner of the L included. More elements resolve
+    elevation more finely. The default is the paper's."""
     spacing_wavelengths: Positive = 0.5774
+    """Distance between neighbouring receive elements, in wavelengths at `radio.carrier_hz`;
+    transmit elements stand one receive arm apart. The default makes directions unambiguous within
+    60 degrees of the boresight."""
     schedule: Literal["pseudo_random", "conventional"] = "pseudo_random"
+    """Order in which the transmit antennas take the slots. `pseudo_random`, the default and the
+    paper's, keeps the full unambiguous velocity; `conventional` goes round the antennas, which
+    divides it by their number."""
     fall_back: bool = False
-    """Send the conventional schedule instead of the pseudo-random one as long as a receiver finds
-    the scene not sparse."""
+    """Whether a transmitter sends the conventional schedule in place of the pseudo-random one as
+    long as a receiver finds too many paths for sparse recovery. Off by default: with the default
+    number of groups there is no need of sparse recovery."""
     element_pattern: Literal["isotropic", "sector", "cosine"] = "cosine"
-    element_gain_dbi: Finite = 5.0
+    """Pattern of one element: `isotropic` in all directions; `sector` the same gain within the
+    field of view and none outside; `cosine`, the default, falls off from the boresight as a patch
+    antenna does."""
+    element_gain_dbi: Decibels = 5.0
+    """Gain of one element on boresight over an isotropic one [dBi]; with `isotropic` it holds in
+    all directions. The default is that of a patch antenna."""
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0
+    """Full angle that the arrays look at, in azimuth as in elevation [degrees]. Targets outside
+    count as out of view. The default is what the default spacing tells without ambiguity."""
 
 
 class Modulation(Node):
-    """What is on the chirps, and in which frames nothing is."""
+    """The data on the chirps, and the frames that carry none."""
 
     dpsk_order: Literal[2, 4, 8, 16] = 8
+    """Number of phases of the differential phase-shift keying between chirps. More phases carry
+    more bits (3 per symbol with the default, which is the paper's) and need a higher SNR."""
     acquisition_frames: Annotated[int, Field(ge=1)] = 3
-    """Unmodulated frames at the start, from which every terminal acquires."""
+    """Frames without data at the start and after a change of roles, from which every terminal
+    acquires the others. The default is what a track needs to be confirmed
+    (`tracking.confirm_hits`)."""
     pilot_every_frames: Annotated[int, Field(ge=2)] | None = 25
-    """One unmodulated frame in so many, for late and lost terminals; null: none after the start."""
+    """One frame in so many carries no data, so that late or lost terminals can acquire; null: none
+    after the start. The default spends 4 % of the data rate on it."""
     streams: dict[str, tuple[Annotated[int, Field(ge=0)], ...]] = Field({})
-    """Groups that carry data for a passive terminal, by its name; a terminal that is not named
-    reads them all."""
+    """Groups, counted from 0, that carry data for a passive terminal, by its name. A terminal that
+    is not named reads all groups, and that is the default for all."""
 
 
 class Noise(Node):
-    """link_budget: thermal noise and transmit power. snr: per-sample IF SNR of the reference path
-    (the strongest target at the AT, the line of sight at a PT) as it would be unshadowed and in
-    view."""
+    """How strong the receiver's noise is: by a link budget in watts, or by a stated SNR."""
 
     model: Literal["link_budget", "snr"] = "link_budget"
-    tx_power_dbm: Finite = 12.0
-    noise_figure_db: Finite = 12.0
+    """How the noise is set: `link_budget`, the default, takes transmit power and thermal noise, so
+    that paths stand in their true proportion; `snr` takes `snr_db`, as the paper does."""
+    tx_power_dbm: Decibels = 12.0
+    """Transmit power of one antenna [dBm], for `link_budget`. The default is what one channel of a
+    77 GHz radar chip delivers."""
+    noise_figure_db: Decibels = 12.0
+    """Noise figure of the receiver [dB], for `link_budget`: how far its noise is above the thermal
+    noise. The default is that of a 77 GHz radar chip."""
     temperature_k: Positive = 290.0
-    snr_db: Finite = 10.0
+    """Temperature of the thermal noise [K], for `link_budget`. The default is the standard's
+    reference temperature."""
+    snr_db: Decibels = 10.0
+    """SNR of one IF sample at one antenna before any processing [dB], for `snr`. It is that of the
+    reference path (the strongest target at an active terminal, the line of sight at a passive one),
+    as if nothing hid it and it were in view. The default is far above where symbol errors begin."""

@@ -11,50 +11,69 @@ from isac_rt.scenario.node import Node, Positive, Problem
 
 
 class Receivers(Node):
-    """How terminals detect and demodulate."""
+    """How terminals detect targets and decode data."""
 
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
-    """omp: the paper's, for sparse sampling. pursuit: OMP off the grid, path by path. latin_union:
-    all groups as one uniform sampling, for M = L_tx. conventional: the DFT over each antenna's
-    equally spaced chirps, up to the unambiguous velocity divided by L_tx. auto: by the schedule and
-    the groups received."""
+    """How velocities are found. `omp`: orthogonal matching pursuit on the grid, the paper's for
+    sparse sampling. `pursuit`: the same off the grid, path by path. `latin_union`: all groups as
+    one uniform sampling, where there are as many as transmit antennas. `conventional`: the DFT over
+    each antenna's equally spaced chirps, which divides the unambiguous velocity by their number.
+    `auto`, the default: by the schedule and the groups received."""
     refinement: Literal["grid", "local", "joint"] = "local"
-    """grid: the centres of range and Doppler cells, the paper's. local: maximum likelihood on the
-    windowed spectra about each peak. joint: all paths at once on the samples, at the Cramer-Rao
-    bound; paths in one cell are told apart by direction (slower)."""
+    """How finely a detection is placed. `grid`: the middle of its range and Doppler cell, the
+    paper's. `local`, the default: maximum likelihood about each peak, at little cost. `joint`: all
+    paths at once on the samples, which reaches the Cramer-Rao bound and separates paths in one cell
+    by direction, but is slower."""
     symbol_decision: Literal["powers", "profile", "beams"] = "powers"
-    """How a PT reads symbols. powers: the receivers' powers added, the paper's. profile: the same,
-    delay symbols by correlation with the range profile of the last unmodulated frame, in which
-    clutter votes with the line of sight. beams: receivers added in phase towards the tracked paths,
-    the error of the predicted velocity taken out, and a log-likelihood ratio for every bit."""
+    """How a passive terminal reads symbols. `powers`, the default and the paper's: the powers of
+    the receive antennas are added. `profile`: delay symbols by correlation with the range profile
+    of the last frame without data, in which clutter counts too. `beams`: the antennas are added in
+    phase towards the tracked paths, with a log-likelihood ratio for every bit; the most
+    sensitive."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
-    """Of one cell of the range-Doppler map."""
+    """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
+    The default gives about one false alarm in ten frames of the default size."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
+    """Cells in range and in Doppler on each side of a cell that are left out when its background is
+    measured, so that a target does not raise its own threshold. The default covers the main lobe of
+    the Hann window."""
     training_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (8, 6)
-    """Range, Doppler; on each side."""
+    """Cells in range and in Doppler on each side, beyond the guard cells, from which the background
+    of a cell is measured. More cells measure it better and follow its changes worse; the default
+    takes over a hundred before and behind."""
     cluster_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1, 1)
+    """Reach in range and in Doppler within which only the strongest cell counts as a detection. The
+    default tells neighbours apart that are two cells away."""
     max_detections: Annotated[int, Field(ge=1, le=10_000)] = 64
+    """Most detections that a terminal keeps of a frame, the strongest ones. The default is far more
+    than a swarm has targets."""
     min_range_m: Annotated[float, Field(ge=0)] = 2.0
+    """Least range at which a terminal searches [m]; one way at an active terminal, path length at a
+    passive one. The default leaves out the transmitter's leakage."""
     clutter_filter: Literal["none", "zero_doppler", "runs"] = "none"
-    """runs: the paper's. Range cells that lie in a run of occupied ones are cleared of what stands
-    still (AT), or left out of the symbol decision (PT). zero_doppler: all range cells are cleared
-    of what stands still at the AT; a PT's line of sight may, so that it filters nothing."""
+    """What is taken out before detection. `none`: nothing, the default. `zero_doppler`: what stands
+    still relative to an active terminal, in all range cells. `runs`, the paper's: the same in long
+    runs of occupied range cells only, which a passive terminal leaves out of its symbol
+    decision."""
     clutter_run_cells: Annotated[int, Field(ge=2)] = 15
-    """Consecutive occupied range cells from which on a run counts as clutter."""
+    """Consecutive occupied range cells from which on a run counts as clutter, for `clutter_filter:
+    runs`. The default lies below the 40 cells that the paper's clutter has at least."""
     clutter_detector: Literal["cfar", "map", "angle_doppler", "sample_matrix"] = "cfar"
-    """What the AT holds a cell against, after the filter if there is one. cfar: its surroundings.
-    map: the clutter power that the city's mesh predicts. angle_doppler: filtered over the antennas
-    with the covariance that the mesh and the terminal's own velocity predict. sample_matrix:
-    filtered with the covariance of the cells around. map and angle_doppler first correct the own
-    velocity and the clutter's level by the frame."""
+    """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
+    `map`: the clutter power that the city's mesh predicts. `angle_doppler`: the antennas are
+    filtered with the clutter's covariance, as mesh and own velocity predict it. `sample_matrix`:
+    the same with the covariance of the cells around. `map` and `angle_doppler` first correct the
+    own velocity and the clutter's level by the frame."""
     clutter_channels: Literal["arms", "joint"] = "arms"
-    """angle_doppler, sample_matrix: filter each arm of the virtual L by itself, or both jointly
-    (several times slower)."""
+    """Antennas that are filtered together, for `angle_doppler` and `sample_matrix`: each arm of the
+    virtual L by itself (`arms`, the default), or both at once (`joint`, several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
-    """The AT processes one frame in so many."""
+    """An active terminal processes one frame in so many; the others only carry data. By default it
+    processes all."""
     active_input: Literal["samples", "profiles"] = "samples"
-    """samples: the AT transforms IF samples. profiles: range profiles made directly
-    (`isac_rt.signal.if_signal.range_profiles`), faster."""
+    """What an active terminal starts from: `samples`, the default, simulates IF samples and
+    transforms them; `profiles` makes range profiles directly, which is faster and has another draw
+    of the noise."""
 
     def problems(self) -> Iterator[Problem]:
         if self.active_input == "profiles" and self.refinement == "joint":
@@ -65,13 +84,24 @@ class Receivers(Node):
 
 
 class Tracking(Node):
-    """The Kalman filters and the life of a track."""
+    """The Kalman filters, and when a track begins and ends."""
 
     acceleration_std_mps2: Positive = 1.0
+    """Standard deviation of the acceleration that the filter expects of a UAV [m/s^2]. A higher
+    value follows turns more quickly and smooths less; the default suits straight and gently curved
+    flight."""
     gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
+    """Probability that a detection of a tracked UAV falls within the gate about its prediction. A
+    higher value loses fewer detections and lets more false ones in; the default loses one in a
+    thousand."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
+    """Detections within `confirm_window` frames that confirm a track. Three of five, the default,
+    let hardly any false alarm become a track."""
     confirm_window: Annotated[int, Field(ge=1)] = 5
+    """Frames within which `confirm_hits` detections must fall to confirm a track."""
     drop_misses: Annotated[int, Field(ge=1)] = 8
+    """Frames without a detection in a row after which a confirmed track ends. The default bridges
+    short shadows."""
 
     def problems(self) -> Iterator[Problem]:
         if self.confirm_hits > self.confirm_window:

@@ -8,54 +8,74 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from isac_rt.scenario.node import Finite, Node, Problem, Vector
+from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
 
 class Rcs(Node):
-    """Radar cross-section of a UAV.
-
-    constant: `value_dbsm`. tr38901: mean of TR 38.901's UAV of small or large size; with
-    `fluctuation_db` it varies smoothly with aspect, alike on all links and frames. relative: the
-    reflected path stands `level_db` above the reference path of its link (line of sight at a PT,
-    strongest other target at the AT), whatever the geometry.
-    """
+    """Radar cross-section of a UAV: how strong its echo is."""
 
     model: Literal["constant", "tr38901", "relative"] = "tr38901"
-    value_dbsm: Finite = -12.81
+    """Where the cross-section comes from: `constant` is `value_dbsm`; `tr38901`, the default, is
+    the UAV of 3GPP TR 38.901 of the given `size`; `relative` sets the echo's level by `level_db`
+    whatever the geometry, as the paper does."""
+    value_dbsm: Decibels = -12.81
+    """Cross-section over one square metre [dBsm], for `constant`. The default is the mean of TR
+    38.901's small UAV."""
     size: Literal["small", "large"] = "small"
+    """Which UAV of TR 38.901 is meant, for `tr38901`: `small`, the default, reflects alike to all
+    sides; `large` has lobes to front, back, sides, top and bottom."""
     fluctuation_db: Annotated[float, Field(ge=0, le=20)] = 0.0
-    level_db: Finite = -20.0
+    """Standard deviation by which the cross-section varies smoothly with the aspect [dB], for
+    `tr38901` and `constant`; the same on all links and frames. The default is none."""
+    level_db: Decibels = -20.0
+    """Level of the reflected path over the reference path of its link [dB], for `relative`: the
+    line of sight at a passive terminal, the strongest other target at an active one. The default
+    leaves the reference path far stronger."""
 
 
 class Waypoint(Node):
-    """Where a UAV is at a time after the start of the run."""
+    """Where a UAV is at one time."""
 
     time_s: Finite
+    """Time after the start of the run [s]; later than that of the waypoint before."""
     position_m: Vector
+    """Position at that time: x east, y north, z up [m]."""
 
 
 class Uav(Node):
-    """One UAV: position and velocity, or waypoints with times (flown as a smooth curve through
-    them)."""
+    """One UAV: its role, its flight and its body. It flies straight from `position_m`, or a smooth
+    curve through `waypoints`."""
 
     role: Literal["active", "passive", "target"]
+    """What the UAV does: `active` sends the chirps and senses with their echoes, `passive` decodes
+    the data and senses with the chirps it hears, `target` only reflects."""
     position_m: Vector | None = None
+    """Position at the start of the run: x east, y north, z up [m]. A UAV has either this or
+    `waypoints`."""
     velocity_mps: Vector = (0.0, 0.0, 0.0)
+    """Velocity of a straight flight: east, north, up [m/s]; beside `position_m` only. By default
+    the UAV hovers."""
     waypoints: tuple[Waypoint, ...] | None = None
+    """Two places or more with their times, which the UAV flies through on a smooth curve; in place
+    of `position_m` and `velocity_mps`."""
     boresight: Literal["velocity"] | Vector = "velocity"
+    """Direction [x, y, z] that the arrays look in, of any length, or `velocity`, the default: where
+    the UAV flies to. Targets outside the field of view about it are not seen."""
     rcs: Rcs = Rcs()
+    """Radar cross-section of the UAV: how strong its echo is. By default that of a small UAV."""
     clock_offset_s: Finite = 0.0
-    """By how much the clock is late at time 0: what the UAV sends arrives later by it, what it
-    receives seems earlier."""
+    """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
+    receives seems to arrive earlier. By default all clocks agree."""
     clock_drift_ppm: Finite = 0.0
-    """How much later it gets [us/s]; 0.01 ppm against another clock is 3 m/s of apparent
-    velocity."""
+    """How much later the clock gets [microseconds per second]; 0.01 ppm against another clock looks
+    like 3 m/s of velocity. By default none."""
     body_radius_m: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.2
-    """ray_traced: of the opaque disc that shadows what passes behind it; 0: transparent. No body
-    shadows its own paths and echoes."""
+    """Radius of the opaque disc that shadows what passes behind the UAV [m], with
+    `propagation.model: ray_traced`; 0: transparent. A body does not shadow its own paths and
+    echoes. The default is that of a small quadcopter."""
     resource_block: Annotated[int, Field(ge=0)] | None = None
-    """First of the consecutive resource blocks, one per group, in which the UAV sends while it is
-    active; null: the lowest that the active UAVs before it leave free."""
+    """First of the consecutive resource blocks, one per group, that an active UAV sends in, counted
+    from 0. null, the default: the lowest blocks that the active UAVs before it leave free."""
 
     @field_validator("boresight", mode="before")
     @classmethod
@@ -127,27 +147,30 @@ class Uav(Node):
 
 
 class Access(Node):
-    """How terminals find each other before the first frame."""
+    """How the terminals find each other before the first frame, and what they tell each other
+    later."""
 
     establish: bool = False
-    """Go through the stages before the data (`isac_rt.access.establish`): active terminals listen
-    for free blocks and announce theirs, clocks are measured, links acknowledged, with every wrong
-    decision that the noise brings. Else blocks and links are as stated."""
+    """Whether the stages before the data are simulated: active terminals listen for free resource
+    blocks and announce theirs, clocks are measured, links acknowledged, with the wrong decisions
+    that noise brings. Off by default: blocks and links are as stated."""
     synchronisation: Literal["external", "two_round", "none"] = "external"
-    """external: an outside source keeps all clocks equal. two_round: passive terminals correct
-    theirs by what the stages measured. none: nobody corrects anything."""
+    """Who sets the clocks right: `external`, the default, an outside source that keeps all equal;
+    `two_round`, passive terminals by what the stages before the data measured; `none`, nobody."""
     feedback: bool = False
-    """After every frame that the active terminals process, the passive ones report their range and
-    their symbols, and the active ones, which have the same distance from their echoes, answer by
-    how many whole range cells it is off."""
+    """Whether passive terminals report their range and symbols after every frame that active ones
+    process, which answer by how many whole range cells the range is off. Off by default, as in the
+    paper."""
 
 
 class RoleChange(Node):
     """An active terminal and a passive one change places."""
 
     frame: Annotated[int, Field(ge=1)]
-    """First frame in the new roles; acquisition frames follow, as at the start."""
+    """First frame in the new roles, counted from 0; frames without data follow, as at the start
+    (`modulation.acquisition_frames`)."""
     from_uav: str
-    """Active until then, passive from then on."""
+    """Name of the UAV that is active until then and passive from then on."""
     to_uav: str
-    """Passive until then; takes over the role and the resource blocks."""
+    """Name of the UAV that is passive until then; it takes over the role and the resource
+    blocks."""

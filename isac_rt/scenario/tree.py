@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +17,7 @@ from pydantic import Field, PrivateAttr
 
 from isac_rt.scenario.doubts import implausible
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
-from isac_rt.scenario.node import Key, Node, Positive, Problem
+from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio, chirp_times, num_resource_blocks
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.scenario.swarm import Access, RoleChange, Uav
@@ -32,24 +31,47 @@ FARTHEST_M = 1e5
 class Scenario(Node):
     """Everything that a run depends on."""
 
-    name: str = "unnamed"
-    seed: Annotated[int, Field(ge=0)] = 1
+    name: Name = "unnamed"
+    """Name of the scenario, which titles results and names the folder they go to by default. It may
+    hold letters, digits, _ and - only."""
+    seed: Seed = 1
+    """Number that all randomness follows from: the same seed gives the same bits, another seed
+    another draw of noise, data and clutter."""
     frames: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """Number of frames to simulate; more than `modulation.acquisition_frames`, or no data flow."""
     frame_interval_s: Positive | None = None
-    """From the start of a frame to the next; null: contiguous frames."""
+    """Time from the start of a frame to the start of the next [s], at least a frame long. null, the
+    default: frames follow each other without a pause."""
     radio: Radio = Radio()
+    """The chirp and the frame. By default the paper's."""
     array: Array = Array()
+    """The antenna arrays of every terminal. By default the paper's."""
     modulation: Modulation = Modulation()
-    swarm: dict[str, Uav]
+    """The data on the chirps, and the frames that carry none. By default the paper's 8-DPSK."""
+    swarm: dict[Name, Uav]
+    """The UAVs by name, at least one of them active. A name may hold letters, digits, _ and -
+    only."""
     role_changes: tuple[RoleChange, ...] = ()
+    """Changes of roles during the flight, in the order of their frames. By default every UAV keeps
+    its role."""
     access: Access = Access()
+    """How the terminals find each other before the first frame. By default links are as stated."""
     city: City | None = None
+    """The city's mesh. null, the default: open space."""
     propagation: Propagation = Propagation()
+    """Which paths there are between the terminals and by way of the targets. By default those of
+    free space."""
     accuracy: Accuracy = Accuracy()
+    """How near to the full model a run has to come."""
     clutter: Clutter = Clutter()
+    """What is received beside lines of sight, targets, ghosts and mirror images. By default
+    nothing."""
     noise: Noise = Noise()
+    """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
     receivers: Receivers = Receivers()
+    """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
+    """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
 
     _folder: Path = PrivateAttr(default=Path())
 
@@ -142,12 +164,6 @@ class Scenario(Node):
             )
 
     def _swarm_problems(self) -> Iterator[Problem]:
-        for name in self.swarm:
-            if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-                yield Problem(
-                    (("swarm", name),),
-                    "a UAV's name may hold letters, digits, _ and - only; rename it",
-                )
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
         if not active:
             yield Problem(
@@ -336,8 +352,13 @@ class Scenario(Node):
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of a scenario file, for editors; docstrings become descriptions."""
-    return {
+    """JSON Schema of a scenario file, for editors; docstrings become descriptions, each on one
+    line."""
+    tree = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **Scenario.model_json_schema(),
     }
+    for node in (tree, *tree["$defs"].values()):
+        for entry in (node, *node.get("properties", {}).values()):
+            entry["description"] = " ".join(entry["description"].split())
+    return tree

@@ -22,7 +22,7 @@ from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
 from isac_rt.results.provenance import program_fingerprint
 from isac_rt.scenario.file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
-from isac_rt.scenario.node import Key, Node, Problem, dotted
+from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
 from isac_rt.world.area import file_digest
 
@@ -116,7 +116,7 @@ class Figure(_Free):
 class Sweep(_Free):
     """A sweep file."""
 
-    name: str = "sweep"
+    name: Name = "sweep"
     scenario: str
     """The base scenario, a path relative to the sweep's file."""
     set: dict[str, Any] = Field({})
@@ -126,7 +126,7 @@ class Sweep(_Free):
     repetitions: Annotated[int, Field(ge=1)] = 1
     """Runs of each point, with seeds spawned from `seed`; all points of one repetition have the
     same seed."""
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Seed = 1
     keep: tuple[str, ...] = ("*",)
     """Names of the quantities in the dataset, with wildcards, such as ser_* or rmse_range_m."""
     figures: tuple[Figure, ...] = ()

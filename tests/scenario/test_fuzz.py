@@ -270,6 +270,16 @@ def test_broken_footprints(tmp_path_factory, data):
     city_or_complaint(folder, source="footprints", file="f.geojson")
 
 
+@pytest.mark.parametrize("odd", [7, "x", None, [], {"type": "Feature", "geometry": 3}])
+def test_features_that_are_none(odd, tmp_path):
+    """Beside a good one, whose properties are a list: a city or a complaint."""
+    good = {**BOW_TIE, "properties": [1]}
+    (tmp_path / "f.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": [good, odd]})
+    )
+    city_or_complaint(tmp_path, source="footprints", file="f.geojson", coordinates="metres")
+
+
 def test_footprints_that_cross_themselves_or_wind_the_wrong_way(tmp_path):
     """A bow tie keeps its two halves; clockwise rings are turned: closed buildings, outward, in
     both cases."""
@@ -446,8 +456,8 @@ def test_what_cannot_run_is_refused_before_it_starts(changes, words, tmp_path, c
             }
         },
         {"swarm": {"A": {"role": "active", "position_m": [0, 0, 9], "velocity_mps": [0, 9300, 0]}}},
-        {"noise": {"tx_power_dbm": 12_000.0}},
-        {"noise": {"noise_figure_db": 12_000.0}},
+        {"noise": {"tx_power_dbm": 120.0}},
+        {"noise": {"noise_figure_db": 120.0}},
         {"noise": {"temperature_k": 290_000.0}},
         {"radio": {"filter_transition_hz": 400e6}},
         {"frame_interval_s": 45.0},

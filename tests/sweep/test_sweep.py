@@ -114,6 +114,14 @@ axes:
     ]
 
 
+@pytest.mark.parametrize("name", ["../../evil", "/abs/place", "..", '"a\\nb"'])
+def test_a_sweep_s_name_is_no_path(folder, name):
+    """Planted bug: `name: str`."""
+    (folder / "s.yaml").write_text(SWEEP.replace("name: demo", f"name: {name}"))
+    with pytest.raises(ScenarioError, match="a name may hold letters, digits, _ and - only"):
+        load_sweep(folder / "s.yaml")
+
+
 @pytest.mark.parametrize(
     "axes, said",
     [

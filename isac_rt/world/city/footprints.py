@@ -93,13 +93,21 @@ def _geojson(
     skipped = 0
     for i, feature in enumerate(features):
         what = f"{name}: feature {i}"
+        if not isinstance(feature, dict):
+            raise CityError(f"{what}: is {str(feature)[:40]}, not a GeoJSON feature; remove it")
         geometry = feature.get("geometry") if feature.get("type") == "Feature" else feature
-        if not geometry or geometry.get("type") not in _POLYGONAL:
+        if not isinstance(geometry, dict) or geometry.get("type") not in _POLYGONAL:
             skipped += 1
             continue
         try:
             shape = shapely.force_2d(shapely.geometry.shape(geometry))
-        except (ValueError, TypeError, KeyError, IndexError, shapely.errors.ShapelyError) as error:
+        except (
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            shapely.errors.ShapelyError,
+        ) as error:
             raise CityError(
                 f"{what}: its coordinates cannot be read ({error}); rings are lists of [x, y]"
             ) from None
@@ -108,7 +116,9 @@ def _geojson(
             continue
         if not np.isfinite(shapely.get_coordinates(shape)).all():
             raise CityError(f"{what}: a coordinate is NaN or infinite; correct it")
-        found.append((shape, parse_height((feature.get("properties") or {}).get(key), what), what))
+        properties = feature.get("properties")
+        height = properties.get(key) if isinstance(properties, dict) else None
+        found.append((shape, parse_height(height, what), what))
     if skipped:
         notes.append(f"{skipped} features without a polygon left out")
     return found
