@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from isac_rt.signal.if_signal import add_noise as add_noise
     from isac_rt.signal.if_signal import if_signal as if_signal
     from isac_rt.signal.if_signal import range_profiles as range_profiles
+    from isac_rt.simulation.setup import city_of as city_of
     from isac_rt.simulation.setup import prepare as prepare
     from isac_rt.simulation.setup import trace as trace
     from isac_rt.simulation.simulate import run as run
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
     from isac_rt.views.interchange import save_cube as save_cube
     from isac_rt.views.interchange import stonesoup_detections as stonesoup_detections
     from isac_rt.views.interchange import write_sigmf as write_sigmf
-    from isac_rt.world.area import city_of as city_of
 
 _NAMES = {
     "frame.cube": "IFCube Transmission",
@@ -66,7 +66,7 @@ _NAMES = {
     "scenario.file": "load to_yaml",
     "scenario.tree": "Scenario",
     "signal.if_signal": "add_noise if_signal range_profiles",
-    "simulation.setup": "prepare trace",
+    "simulation.setup": "city_of prepare trace",
     "simulation.simulate": "run standard_terminal",
     "sweep": "load_sweep open_sweep run_sweep",
     "terminal.terminal": "ActiveTerminal PassiveTerminal",
@@ -74,7 +74,6 @@ _NAMES = {
     "views.interactive": "scene_3d",
     "views.interchange": "from_sionna load_cube read_sigmf save_cube "
     "stonesoup_detections write_sigmf",
-    "world.area": "city_of",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -15,8 +15,7 @@ from isac_rt.results.recorder import Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation.setup import timetable_of
-from isac_rt.world.swarm import Swarm
+from isac_rt.simulation.setup import swarm_of, timetable_of
 
 STATES = ("acquiring", "tracking", "lost")
 TIMING = {
@@ -130,7 +129,7 @@ def _reception(w, rng, truth, maps, decoded, detections):
 def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord]:
     """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3,
     and U1 is hidden in frame 4."""
-    w, swarm, out = waveform_of(scenario), Swarm.from_scenario(scenario), []
+    w, swarm, out = waveform_of(scenario), swarm_of(scenario), []
     for f in range(scenario.frames):
         rng = np.random.default_rng([5, f])
         poses, snapshot, data = swarm.poses(f * 0.043 + 0.004), f == 2, f > 0

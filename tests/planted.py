@@ -163,7 +163,7 @@ OF_CASES = {
     ),
     "ghosts over a conducting wall": Bug(
         "propagation/raytrace.py",
-        "scatter = np.sqrt(4 * np.pi * section) / self._wavelength",
+        "scatter = np.sqrt(4 * np.pi * section) / self._free.wavelength",
         "scatter = np.sqrt(4 * np.pi * section)",
     ),
     "lambertian wall": Bug(
@@ -450,9 +450,8 @@ OF_CASES = {
     ),
     "echoes against sionna": Bug(
         "propagation/raytrace.py",
-        """allowed = bounces <= (
-            self._scenario.propagation.max_bounces""",
-        "allowed = bounces < (self._scenario.propagation.max_bounces",
+        "allowed = bounces <= (self._propagation.max_bounces",
+        "allowed = bounces < (self._propagation.max_bounces",
     ),
     "cube against mmwrt": Bug(
         "signal/direct.py",
@@ -526,9 +525,9 @@ OF_TESTS = (
         "test_hard_geometry::test_reflections_are_born_and_die_between_traces",
         Bug(
             "simulation/setup.py",
-            """self.propagation.paths(
+            """self.propagation.trace(
             poses, epoch,""",
-            "self.propagation.paths(self.swarm.poses(self.timetable.epoch(max(frame - 1, 0))), epoch,",
+            "self.propagation.trace(self.swarm.poses(self.timetable.epoch(max(frame - 1, 0))), epoch,",
         ),
     ),
     (

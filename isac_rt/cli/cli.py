@@ -684,8 +684,8 @@ def animate(
         raise InputProblem(
             f"--observer {observer}: no such observer in {folder}; choose from {', '.join(names)}"
         )
+    from isac_rt.simulation.setup import city_of
     from isac_rt.views.animate import write_animation
-    from isac_rt.world.area import city_of
 
     target = out if out is not None else folder / "run.gif"
     with ending_soon_after_interrupt(folder), _err().status("drawing"):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.legs.geometry import straight
+from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario.swarm import Uav
@@ -26,22 +30,40 @@ def radar_amplitude(wavelength: float, cross_section: Any, there: Any, on: Any) 
     return wavelength * np.sqrt(cross_section / (4 * np.pi) ** 3) / (there * on)
 
 
+@dataclass(frozen=True)
 class FreeSpace:
-    """Paths between terminals and by way of the other UAVs, with nothing in between."""
+    """Paths between terminals and by way of the other UAVs, with nothing in between.
 
-    def __init__(
-        self, uavs: dict[str, Uav], antennas: Antennas, wavelength: float, seed: int
-    ) -> None:
-        self._uavs, self._antennas, self._wavelength = uavs, antennas, wavelength
-        self._names = tuple(uavs)
-        self._sections = {name: CrossSection(uav.rcs, name, seed) for name, uav in uavs.items()}
-        self.dropped = 0
+    Attributes
+    ----------
+    uavs : by name, in the order in which paths name them
+    antennas : of every terminal
+    wavelength : [m]
+    seed : of the cross-sections' fluctuations
+    """
 
-    def paths(
-        self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]
-    ) -> dict[tuple[str, str], PathSet]:
+    uavs: dict[str, Uav]
+    antennas: Antennas
+    wavelength: float
+    seed: int
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the UAVs."""
+        return tuple(self.uavs)
+
+    @cached_property
+    def sections(self) -> dict[str, CrossSection]:
+        """Cross-section of every UAV."""
+        return {name: CrossSection(uav.rcs, name, self.seed) for name, uav in self.uavs.items()}
+
+    def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link; those that no element sends or hears are left out."""
-        return {link: self._link(poses, epoch, *link) for link in links}
+        return Traced({Link(*link): self._link(poses, epoch, *link) for link in links})
+
+    def census(self) -> Census:
+        """No clutter at all."""
+        return Census()
 
     def _link(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
         parts = [self.echoes(poses, epoch, tx, rx)]
@@ -56,10 +78,10 @@ class FreeSpace:
             poses[tx], poses[rx].position[None], poses[rx].velocity, poses[rx].acceleration
         )
         elements = element_amplitude(
-            self._antennas, poses[tx], poses[rx], leg.departure, leg.arrival
+            self.antennas, poses[tx], poses[rx], leg.departure, leg.arrival
         )
         return make_paths(
-            gain=friis_amplitude(self._wavelength, leg.length) * elements,
+            gain=friis_amplitude(self.wavelength, leg.length) * elements,
             delay=leg.length / SPEED_OF_LIGHT,
             delay_rate=leg.rate / SPEED_OF_LIGHT,
             delay_accel=leg.accel / SPEED_OF_LIGHT,
@@ -71,12 +93,12 @@ class FreeSpace:
             epoch=epoch,
             tx=tx,
             rx=rx,
-            target_names=self._names,
+            target_names=self.names,
         )
 
     def echoes(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
         """Echoes of every UAV that is neither end, straight there and straight on."""
-        others = [name for name in self._names if name not in (tx, rx)]
+        others = [name for name in self.names if name not in (tx, rx)]
         there, on = ([self._leg(poses, end, name) for name in others] for end in (tx, rx))
 
         def stack(legs: list, name: str) -> np.ndarray:
@@ -92,8 +114,8 @@ class FreeSpace:
                 for name, a, b in zip(others, there, on, strict=True)
             ]
         )
-        elements = element_amplitude(self._antennas, poses[tx], poses[rx], dep, arr)
-        relative = np.array([self._uavs[name].rcs.model == "relative" for name in others], bool)
+        elements = element_amplitude(self.antennas, poses[tx], poses[rx], dep, arr)
+        relative = np.array([self.uavs[name].rcs.model == "relative" for name in others], bool)
         return make_paths(
             gain=np.where(relative, amplitude * (elements > 0), amplitude * elements),
             delay=(d1 + d2) / SPEED_OF_LIGHT,
@@ -106,11 +128,11 @@ class FreeSpace:
             tx_radius=d1,
             rx_radius=d2,
             kind=PathKind.TARGET,
-            target=np.array([self._names.index(name) for name in others], int),
+            target=np.array([self.names.index(name) for name in others], int),
             epoch=epoch,
             tx=tx,
             rx=rx,
-            target_names=self._names,
+            target_names=self.names,
             points=np.array([poses[name].position for name in others]).reshape(-1, 1, 3),
             faces=np.full((len(others), 1), -1),
         )
@@ -125,14 +147,14 @@ class FreeSpace:
     ) -> float:
         """Amplitude of one UAV's echo: by the radar equation without the elements, or, with a
         relative cross-section, a fixed level under the link's reference path, elements included."""
-        rcs = self._uavs[name].rcs
+        rcs = self.uavs[name].rcs
         if rcs.model == "relative":
             return self.reference_amplitude(poses, tx, rx) * 10 ** (rcs.level_db / 20)
         body = poses[name]
-        section = self._sections[name].square_metres(
+        section = self.sections[name].square_metres(
             body.to_body(there.arrival), body.to_body(on.arrival)
         )
-        return float(radar_amplitude(self._wavelength, section, there.length, on.length)[0])
+        return float(radar_amplitude(self.wavelength, section, there.length, on.length)[0])
 
     def reference_amplitude(self, poses: dict[str, Pose], tx: str, rx: str) -> float:
         """Amplitude of a link's reference path as if unshadowed and on boresight at both ends.
@@ -146,12 +168,12 @@ class FreeSpace:
         """
         if tx != rx:
             distance = np.linalg.norm(poses[rx].position - poses[tx].position)
-            return float(friis_amplitude(self._wavelength, distance) * self._antennas.gain)
-        return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self._antennas.gain
+            return float(friis_amplitude(self.wavelength, distance) * self.antennas.gain)
+        return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self.antennas.gain
 
     def has_target(self, tx: str) -> bool:
         """Whether there is another UAV whose cross-section is its own."""
-        return any(name != tx and uav.rcs.model != "relative" for name, uav in self._uavs.items())
+        return any(name != tx and uav.rcs.model != "relative" for name, uav in self.uavs.items())
 
     def strongest_target(self, poses: dict[str, Pose], tx: str) -> str:
         """The UAV whose echo is the reference of a terminal's own link."""
@@ -165,7 +187,7 @@ class FreeSpace:
 
     def _own_echoes(self, poses: dict[str, Pose], tx: str) -> dict[str, float]:
         out = {}
-        for name, uav in self._uavs.items():
+        for name, uav in self.uavs.items():
             if name != tx and uav.rcs.model != "relative":
                 leg = self._leg(poses, tx, name)
                 out[name] = self.echo_amplitude(poses, tx, tx, name, leg, leg)

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from isac_rt.frame.link import Link
+
 
 class PathKind(IntEnum):
     """What a path is; its label from the mesh to the detection it causes."""
@@ -104,6 +106,11 @@ class PathSet:
         return (
             f"<PathSet {self.tx} -> {self.rx} at {self.epoch:.4f} s: {kinds or 'no paths'}{spans}>"
         )
+
+    @property
+    def link(self) -> Link:
+        """Who hears whom."""
+        return Link(self.tx, self.rx)
 
     @property
     def power(self) -> np.ndarray:

@@ -26,6 +26,7 @@ only after `isac_rt.runtime.activate()`.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -34,14 +35,15 @@ import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.legs.between import Between, LegSet, leg_set, pick
+from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.legs.between import Between, LegSet, TracedLegs, leg_set, pick
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.clearance import Clearance
 from isac_rt.propagation.legs.direct import past_edges_and_bodies
@@ -53,9 +55,9 @@ from isac_rt.propagation.legs.geometry import (
     straight,
     unfold,
 )
+from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
-from isac_rt.propagation.rcs import CrossSection
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.environment import Clutter, Propagation
 from isac_rt.world.city.mesh import City
 from isac_rt.world.city.scene import shared_scene
 from isac_rt.world.swarm import Pose, Swarm
@@ -78,96 +80,90 @@ class RayTracer:
 
     def __init__(
         self,
-        scenario: Scenario,
+        propagation: Propagation,
+        clutter: Clutter,
+        swarm: Swarm,
+        free: FreeSpace,
         city: City,
-        antennas: Antennas,
-        wavelength: float,
         carrier: float,
         instants: Sequence[float] = (),
     ) -> None:
-        self._scenario, self._city, self._antennas, self._wavelength = (
-            scenario,
-            city,
-            antennas,
-            wavelength,
-        )
-        self._names = tuple(scenario.swarm)
-        self._terminals = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
-        self._sections = {
-            name: CrossSection(uav.rcs, name, scenario.seed) for name, uav in scenario.swarm.items()
-        }
+        self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
+        self._free, self._city, self._terminals = free, city, swarm.terminals
         self._handle = shared_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
-        self._edges = ShadowEdges(city, Shadows(self._handle.scene.mi_scene), wavelength)
-        pinned = scenario.clutter.model == "field"
-        self.field = (
-            ClutterField.plan(scenario, city, self._handle.scene.mi_scene, wavelength)
-            if pinned
-            else None
-        )
+        scene, wavelength = self._handle.scene.mi_scene, free.wavelength
+        self._edges = ShadowEdges(city, Shadows(scene), wavelength)
+        self.field: ClutterField | None = None
         """The scatterers on the city's surfaces."""
-        twice = scenario.clutter.mirrors > 0
-        self.twice = (
-            TwoBounces.plan(scenario, city, self.field, wavelength)
-            if self.field is not None and twice
-            else None
-        )
+        self.two_bounces: TwoBounces | None = None
         """The same scatterers by way of mirrors."""
-        self._trajectories = Swarm.from_scenario(scenario).trajectories
-        mirrors, rays = (self._normals, self._offsets), self._handle.scene.mi_scene
-        self.between = (
-            Between(np.array(instants), self._legs_on_the_way, city, mirrors, rays, wavelength)
-            if len(instants) > 1
-            else None
-        )
+        if clutter.model == "field":
+            self.field = ClutterField.plan(clutter, swarm, city, scene, wavelength, free.seed)
+            if clutter.mirrors:
+                self.two_bounces = TwoBounces.plan(
+                    self.field, city, wavelength, free.seed, clutter.mirrors
+                )
+        self.between: Between | None = None
         """Legs from those of the traced instants; None: every frame is traced."""
+        if len(instants) > 1:
+            mirrors = self._normals, self._offsets
+            self.between = Between(
+                np.array(instants), self._legs_on_the_way, city, mirrors, scene, wavelength
+            )
         self._clearance = Clearance(city)
-        self.dropped = 0
-        """Paths left out so far because the float64 unfolding contradicts Sionna's points."""
-        self.duplicates = 0
-        """Paths left out so far because Sionna found them more than once."""
-        scene = self._handle.scene
-        scene.tx_array = scene.rx_array = rt.PlanarArray(
+        self._handle.scene.tx_array = self._handle.scene.rx_array = rt.PlanarArray(
             num_rows=1, num_cols=1, pattern="iso", polarization="V"
         )
 
-    def paths(
-        self, poses: dict[str, Pose], epoch: float, links: list[tuple[str, str]]
-    ) -> dict[tuple[str, str], PathSet]:
+    def census(self) -> Census:
+        """Scatterers and mirrors, as they were planned for the whole run."""
+        return Census(
+            None if self.field is None else len(self.field.cells),
+            None if self.field is None else self.field.num_candidates,
+            None if self.two_bounces is None else self.two_bounces.census(),
+        )
+
+    def every_frame(self) -> RayTracer:
+        """The same tracer, but one that traces every frame anew."""
+        full = copy.copy(self)
+        full.between = None
+        return full
+
+    def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link, in a fixed order.
 
         Raises
         ------
         ValueError  If a pose is not finite, which Sionna would pass over in silence.
         """
-        local = {
-            name: replace(pose, position=pose.position - self._city.origin)
-            for name, pose in poses.items()
-        }
+        local, links = self._local(poses), [Link(*link) for link in links]
         if not all(
             np.isfinite(pose.position).all() and np.isfinite(pose.velocity).all()
             for pose in local.values()
         ):
             raise ValueError("a UAV's position or velocity is not finite")
         self._clearance.check({name: pose.position for name, pose in local.items()}, epoch)
-        legs = (
+        legs, dropped = (
             self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
-        )
-        bodies = Bodies.of(self._scenario.swarm, local)
-        legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._wavelength)
-        hits = self._diffuse_hits(local, links) if self._scenario.clutter.model == "diffuse" else {}
-        return {link: self._link(local, epoch, *link, legs, hits, bodies) for link in links}
+        )[:2]
+        bodies = Bodies.of(self._swarm.uavs, local)
+        legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._free.wavelength)
+        hits = self._diffuse_hits(local, links) if self._clutter.model == "diffuse" else {}
+        paths = {link: self._link(local, epoch, *link, legs, hits, bodies) for link in links}
+        return Traced(paths, dropped)
 
-    def _legs_on_the_way(self, time: float) -> dict[tuple[str, str], LegSet]:
+    def _local(self, poses: dict[str, Pose]) -> dict[str, Pose]:
+        """The poses in local coordinates."""
+        origin = self._city.origin
+        return {
+            name: replace(pose, position=pose.position - origin) for name, pose in poses.items()
+        }
+
+    def _legs_on_the_way(self, time: float) -> TracedLegs:
         """Legs traced at an instant of the run."""
-        poses = {name: trajectory.pose(time) for name, trajectory in self._trajectories.items()}
-        return self._specular_legs(
-            {
-                name: replace(pose, position=pose.position - self._city.origin)
-                for name, pose in poses.items()
-            }
-        )
+        return self._specular_legs(self._local(self._swarm.poses(time)))
 
     def _solve(
         self,
@@ -209,12 +205,12 @@ class RayTracer:
             )
         return found
 
-    def _specular_legs(self, local: dict[str, Pose]) -> dict[tuple[str, str], LegSet]:
-        """Legs of every (terminal, UAV), by mirror reflections only."""
-        p = self._scenario.propagation
+    def _specular_legs(self, local: dict[str, Pose]) -> TracedLegs:
+        """Legs from every terminal to every UAV, by mirror reflections only."""
+        p = self._propagation
         depth = p.max_bounces if p.specular and self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
-        sinks = {name: local[name].position for name in self._names}
+        sinks = {name: local[name].position for name in self._free.names}
         beside = (
             {
                 f"{name}-{k}": place + step
@@ -234,7 +230,7 @@ class RayTracer:
         amplitude, valid, faces, points = self._read(found, max(depth, 1))
         corner = valid & ((faces >= 0).sum(axis=-1) > 1)
         slack = 4 * np.linalg.norm(ASIDE, axis=1).max()
-        out = {}
+        out, dropped, duplicates = {}, 0, 0
         for j, start in enumerate(sources):
             for i, end in enumerate(sinks):
                 which = np.flatnonzero(valid[i, j])
@@ -245,10 +241,11 @@ class RayTracer:
                     rows, which = np.append(rows, first + steps), np.append(which, found_beside)
                     loose = np.append(loose, np.full(steps.size, slack))
                 at = rows, j, which
-                out[start, end] = self._leg_set(
+                out[Link(start, end)], astray, again = self._leg_set(
                     local[start], local[end], amplitude[at], faces[at], points[at], loose
                 )
-        return out
+                dropped, duplicates = dropped + astray, duplicates + again
+        return TracedLegs(out, dropped, duplicates)
 
     def _read(
         self, found: rt.Paths, depth: int
@@ -280,10 +277,10 @@ class RayTracer:
         faces: np.ndarray,
         points: np.ndarray,
         slack: np.ndarray,
-    ) -> LegSet:
+    ) -> tuple[LegSet, int, int]:
         """Unfold chains depth by depth, drop what contradicts Sionna's points by more than `slack`,
-        drop duplicates, sort."""
-        parts = []
+        drop duplicates, sort. Also how many of either were dropped."""
+        parts, dropped, duplicates = [], 0, 0
         for count in range(faces.shape[1] + 1):
             which = np.flatnonzero((faces >= 0).sum(axis=1) == count)
             chain = faces[which][:, :count]
@@ -295,22 +292,26 @@ class RayTracer:
                 axis=1, initial=0.0
             )
             good = apart < POINT_TOLERANCE * legs.length + slack[which]
-            self.dropped += int(
-                (~good & (slack[which] == 0)).sum()
-            )  # what stands beside may well go astray at grazing angles
+            # what stands beside may well go astray at grazing angles
+            dropped += int((~good & (slack[which] == 0)).sum())
             planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)
             keep = one_of_each_chain(planes, chain, good)
-            self.duplicates += int(good.sum()) - keep.size
+            duplicates += int(good.sum()) - keep.size
             keep = keep[np.argsort(legs.length[keep], kind="stable")]
             parts.append((amplitude[which][keep], pick(legs, keep), chain[keep], planes[keep]))
-        return leg_set(parts, faces.shape[1])
+        return leg_set(parts, faces.shape[1]), dropped, duplicates
 
     def _link(
         self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies
     ) -> PathSet:
-        common: dict[str, Any] = {"epoch": epoch, "tx": tx, "rx": rx, "target_names": self._names}
+        common: dict[str, Any] = {
+            "epoch": epoch,
+            "tx": tx,
+            "rx": rx,
+            "target_names": self._free.names,
+        }
         parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
-        for number, name in enumerate(self._names):
+        for number, name in enumerate(self._free.names):
             if name not in (tx, rx):
                 parts.append(self._by_way_of(local, tx, rx, name, number, legs, common))
         if (tx, rx) in hits:
@@ -318,13 +319,15 @@ class RayTracer:
             parts.append(self._scattered(local[tx], local[rx], amplitude, face, point, common))
         if self.field is not None:
             parts.append(
-                self.field.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies)
+                self.field.paths(tx, rx, local[tx], local[rx], self._free.antennas, common, bodies)
             )
-        if self.twice is not None:
+        if self.two_bounces is not None:
             parts.extend(
-                self.twice.paths(tx, rx, local[tx], local[rx], self._antennas, common, bodies)
+                self.two_bounces.paths(
+                    tx, rx, local[tx], local[rx], self._free.antennas, common, bodies
+                )
             )
-        leakage = self._scenario.propagation.leakage
+        leakage = self._propagation.leakage
         if tx == rx and leakage.enabled:
             ahead = local[tx].rotation[:, 1][None]
             gain = np.array([10 ** (-leakage.isolation_db / 20)])
@@ -348,7 +351,7 @@ class RayTracer:
         legs = found.legs
         return make_paths(
             gain=found.amplitude
-            * element_amplitude(self._antennas, start, end, legs.departure, legs.arrival),
+            * element_amplitude(self._free.antennas, start, end, legs.departure, legs.arrival),
             delay=legs.length / SPEED_OF_LIGHT,
             delay_rate=legs.rate / SPEED_OF_LIGHT,
             delay_accel=legs.accel / SPEED_OF_LIGHT,
@@ -371,17 +374,15 @@ class RayTracer:
         there, back = legs[tx, name], legs[rx, name]
         i, j = (a.ravel() for a in np.indices((there.amplitude.size, back.amplitude.size)))
         bounces = there.bounces[i] + back.bounces[j]
-        allowed = bounces <= (
-            self._scenario.propagation.max_bounces if self._scenario.propagation.ghosts else 0
-        )
+        allowed = bounces <= (self._propagation.max_bounces if self._propagation.ghosts else 0)
         i, j, bounces = i[allowed], j[allowed], bounces[allowed]
         a, b, body = there.legs, back.legs, local[name]
-        section = self._sections[name].square_metres(
+        section = self._free.sections[name].square_metres(
             body.to_body(a.arrival[i]), body.to_body(b.arrival[j])
         )
-        scatter = np.sqrt(4 * np.pi * section) / self._wavelength
+        scatter = np.sqrt(4 * np.pi * section) / self._free.wavelength
         elements = element_amplitude(
-            self._antennas, local[tx], local[rx], a.departure[i], b.departure[j]
+            self._free.antennas, local[tx], local[rx], a.departure[i], b.departure[j]
         )
         middle = np.broadcast_to(body.position, (i.size, 1, 3))
         return make_paths(
@@ -403,7 +404,7 @@ class RayTracer:
             **common,
         )
 
-    def _diffuse_hits(self, local: dict[str, Pose], links: list[tuple[str, str]]) -> dict:
+    def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict:
         """Hit points and scattered amplitudes of every link, from one solve; points on the float64
         mesh, in a fixed order."""
         sources, sinks = (
@@ -414,7 +415,7 @@ class RayTracer:
             {name: local[name].position for name in sources},
             {name: local[name].position for name in sinks},
             max_depth=1,
-            samples_per_src=self._scenario.clutter.rays,
+            samples_per_src=self._clutter.rays,
             los=False,
             specular_reflection=False,
             diffuse_reflection=True,
@@ -445,11 +446,11 @@ class RayTracer:
             point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
         )
         there, back = straight(start, on_plane), straight(end, on_plane)
-        phase = scatterer_phase(point, self._scenario.seed)
+        phase = scatterer_phase(point, self._free.seed)
         return make_paths(
             gain=amplitude
             * np.exp(1j * phase)
-            * element_amplitude(self._antennas, start, end, there.departure, back.departure),
+            * element_amplitude(self._free.antennas, start, end, there.departure, back.departure),
             delay=(there.length + back.length) / SPEED_OF_LIGHT,
             delay_rate=(there.rate + back.rate) / SPEED_OF_LIGHT,
             delay_accel=(there.accel + back.accel) / SPEED_OF_LIGHT,

@@ -15,17 +15,18 @@ import uuid
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from isac_rt.frame.link import Link
+from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.world.swarm import Pose
 
-Link = tuple[str, str]
-Paths = dict[Link, PathSet]
 SUFFIX = ".paths.npz"
 LOW_WATER = 0.8
 """When the limit is passed the folder is brought down to this share of it, so that not every write
@@ -39,9 +40,8 @@ class PathStore:
     folder: Path
     limit: int = 4 * 1024**3
 
-    def get(self, key: str) -> tuple[Paths, int] | None:
-        """The paths of a key and how many the float64 geometry contradicted; None where they are
-        not (or no longer) here."""
+    def get(self, key: str) -> tuple[Traced, Census] | None:
+        """What was traced for a key, and by what; None where it is not (or no longer) here."""
         file = self._file(key)
         try:
             with np.load(file) as data:
@@ -51,15 +51,14 @@ class PathStore:
             return None
         return found
 
-    def put(self, key: str, paths: Paths, dropped: int) -> None:
-        """Keep the paths of a key. A folder that cannot be written is no reason to fail: nothing is
-        kept then."""
+    def put(self, key: str, traced: Traced, census: Census) -> None:
+        """Keep what was traced for a key; nothing, where the folder cannot be written."""
         file = self._file(key)
         temporary = file.with_name(f".{uuid.uuid4().hex}.tmp")
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             with temporary.open("wb") as out:
-                np.savez(out, **_pack(paths, dropped))
+                np.savez(out, **_pack(traced, census))
             os.replace(temporary, file)
             self._make_room()
         except OSError:
@@ -98,22 +97,20 @@ class CachedPropagation:
     content : all that the model's paths depend on but the instant and the links, as text
     """
 
-    def __init__(self, make: Callable[[], Any], store: PathStore, content: str) -> None:
+    def __init__(self, make: Callable[[], Propagation], store: PathStore, content: str) -> None:
         self._make, self._store, self._content = make, store, content
-        self._model: Any = None
-        self.dropped = 0
+        self._census: Census | None = None
 
-    @property
-    def field(self) -> Any:
-        """The model's scatterers; None before it is made."""
-        return getattr(self._model, "field", None)
+    @cached_property
+    def model(self) -> Propagation:
+        """Made when it is first asked for."""
+        return self._make()
 
-    @property
-    def twice(self) -> Any:
-        """Its mirror images, None as long as all paths came from the store."""
-        return getattr(self._model, "twice", None)
+    def census(self) -> Census:
+        """The model's own, or as it was kept with the paths."""
+        return self.model.census() if self._census is None else self._census
 
-    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Paths:
+    def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """As the model's own, bit for bit."""
         where = {
             name: [
@@ -128,37 +125,34 @@ class CachedPropagation:
         key = hashlib.sha256(text.encode()).hexdigest()
         found = self._store.get(key)
         if found is None:
-            if self._model is None:
-                self._model = self._make()
-            before = self._model.dropped
-            paths = self._model.paths(poses, epoch, links)
-            found = paths, self._model.dropped - before
+            found = self.model.trace(poses, epoch, links), self.model.census()
             self._store.put(key, *found)
-        self.dropped += found[1]
-        return found[0]
+        traced, self._census = found
+        return traced
 
 
-def _pack(paths: Paths, dropped: int) -> dict[str, Any]:
+def _pack(traced: Traced, census: Census) -> dict[str, Any]:
     """Flat arrays of path sets; what is no array goes into a JSON text."""
     out: dict[str, Any] = {}
     about = []
-    for i, p in enumerate(paths.values()):
+    for i, p in enumerate(traced.paths.values()):
         about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
         out |= {
             f"{i}/{f.name}": value
             for f in fields(p)
             if isinstance(value := getattr(p, f.name), np.ndarray)
         }
-    return out | {"about": np.array(json.dumps({"links": about, "dropped": dropped}))}
+    text = json.dumps({"links": about, "dropped": traced.dropped, "census": asdict(census)})
+    return out | {"about": np.array(text)}
 
 
-def _unpack(data: dict[str, np.ndarray]) -> tuple[Paths, int]:
+def _unpack(data: dict[str, np.ndarray]) -> tuple[Traced, Census]:
     about = json.loads(str(data["about"]))
     out = {}
     for i, link in enumerate(about["links"]):
         arrays = {f.name: data[f"{i}/{f.name}"] for f in fields(PathSet) if f"{i}/{f.name}" in data}
         names = tuple(link["target_names"])
-        out[link["tx"], link["rx"]] = PathSet(
+        out[Link(link["tx"], link["rx"])] = PathSet(
             **arrays, tx=link["tx"], rx=link["rx"], epoch=link["epoch"], target_names=names
         )
-    return out, about["dropped"]
+    return Traced(out, about["dropped"]), Census(**about["census"])

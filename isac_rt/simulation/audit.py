@@ -9,20 +9,21 @@ trajectory puts it at the ends of the frame, and with the direct synthesis.
 
 from __future__ import annotations
 
-import copy
 import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.store import CachedPropagation
 from isac_rt.randomness import generator
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.simulation.plan import (
@@ -39,6 +40,9 @@ from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.simulate import stage_seconds
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose
+
+if TYPE_CHECKING:
+    from isac_rt.propagation.raytrace import RayTracer
 
 PILOT_FRAMES = 5
 PILOT_INTERVALS = 3
@@ -74,10 +78,17 @@ class Item:
     seconds: float | None = None
 
 
-def tracer_of(setup: Setup) -> Any:
+def tracer_of(setup: Setup) -> RayTracer | None:
     """The ray tracer of a set-up; None in free space."""
-    model = getattr(setup.propagation, "_model", setup.propagation)
-    return model if hasattr(model, "between") else None
+    if setup.scenario.propagation.model != "ray_traced":
+        return None
+    from isac_rt.propagation.raytrace import RayTracer
+
+    model = setup.propagation
+    while isinstance(model, CachedPropagation | RayleighClutter):
+        model = model.model
+    assert isinstance(model, RayTracer)
+    return model
 
 
 def _spread(values: Sequence[int], count: int) -> list[int]:
@@ -129,7 +140,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     return {
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
-        **extent(setup.city, setup.propagation, setup.scenario.clutter),
+        **extent(setup.city, setup.propagation.census(), setup.scenario.clutter),
         "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
@@ -184,7 +195,7 @@ def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> 
 
 def _scene_items(setup: Setup) -> list[Item]:
     """Lines of the mesh and of its scatterers, with the reason for each count."""
-    out, record = [], extent(setup.city, setup.propagation, setup.scenario.clutter)
+    out, record = [], extent(setup.city, setup.propagation.census(), setup.scenario.clutter)
     if record["city_faces"] + record["city_faces_beyond_reach"]:
         gone = record["city_faces_beyond_reach"]
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
@@ -337,9 +348,9 @@ def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
 def _in_full(
     setup: Setup, frame: int, poses: dict[str, Pose], links: list[Link]
 ) -> dict[Link, PathSet]:
-    full = copy.copy(tracer_of(setup))
-    full.between = None
-    return full.paths(poses, setup.timetable.epoch(frame), links)
+    tracer = tracer_of(setup)
+    assert tracer is not None
+    return tracer.every_frame().trace(poses, setup.timetable.epoch(frame), links).paths
 
 
 def _errors(

@@ -20,13 +20,18 @@ def path_content(scenario: Scenario) -> str:
         for key, value in scenario.model_dump(mode="json").items()
         if key not in UNSEEN_BY_PATHS
     }
-    return json.dumps([tree, city_digest(scenario), program_fingerprint()], sort_keys=True)
+    return json.dumps(
+        [tree, city_digest(scenario.city, scenario.folder), program_fingerprint()], sort_keys=True
+    )
 
 
 def run_content(scenario: Scenario, snapshots: int) -> str:
     """All that the results of a run depend on, as text."""
     costs = scenario.cost_model_path()
-    files = [city_digest(scenario), "" if costs is None else file_digest(costs)]
+    files = [
+        city_digest(scenario.city, scenario.folder),
+        "" if costs is None else file_digest(costs),
+    ]
     return json.dumps(
         [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],
         sort_keys=True,

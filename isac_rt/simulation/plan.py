@@ -36,6 +36,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density, error_for
+from isac_rt.propagation.model import Census
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
 from isac_rt.signal.choice import CostModel
@@ -409,14 +410,9 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
     }
 
 
-def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
+def extent(city: City, census: Census, clutter: Clutter) -> dict[str, Any]:
     """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in
     summary.json.
-
-    Parameters
-    ----------
-    model : the propagation, whose `field` is None where there is none, or where paths came from a
-        store and it was not made; the same holds for its `twice`
 
     Returns
     -------
@@ -426,25 +422,13 @@ def extent(city: City, model: Any, clutter: Clutter) -> dict[str, Any]:
         of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and
         the shares of its power that they and all others send on, None without mirrors
     """
-    field, twice = getattr(model, "field", None), getattr(model, "twice", None)
     area = Density.of(clutter).per_metre if clutter.model == "field" else None
     return {
         "cell_area_per_metre_m": area,
         "clutter_error_db": None if area is None else round(error_for(area), 4),
         "city_faces": city.num_faces,
         "city_faces_beyond_reach": city.num_beyond,
-        "scatterers": None if field is None else len(field.cells),
-        "scatterer_cells": None if field is None else field.num_candidates,
-        "mirrors": None
-        if twice is None
-        else {
-            name: {
-                "count": len(kept),
-                "share": round(sum(m.share for m in kept), 6),
-                "share_left_out": round(twice.left_out[name], 6),
-            }
-            for name, kept in twice.mirrors.items()
-        },
+        **asdict(census),
     }
 
 

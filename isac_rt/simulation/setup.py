@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
-from isac_rt.propagation import FreeSpace, PathSet, Propagation, make_propagation
+from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_propagation
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
@@ -42,7 +43,7 @@ from isac_rt.simulation.preflight import (
     warn_of_aliases,
 )
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
-from isac_rt.world.area import city_of, flight_centre
+from isac_rt.world.area import city_about
 from isac_rt.world.city import City
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -199,9 +200,8 @@ class Setup:
 
     def frame(self, number: int) -> Frame:
         """Trace a frame; what it sends is by the usual schedule."""
-        before = self.propagation.dropped
-        poses, found = self.find(number)
-        return self.frame_of(number, poses, found, self.propagation.dropped - before)
+        poses, traced = self._traced(number)
+        return self.frame_of(number, poses, *traced)
 
     def frame_of(
         self, number: int, poses: dict[str, Pose], found: Mapping[Link, PathSet], dropped: int = 0
@@ -225,11 +225,15 @@ class Setup:
 
     def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         """Poses and all paths of a frame, however weak."""
+        poses, traced = self._traced(frame)
+        return poses, traced.paths
+
+    def _traced(self, frame: int) -> tuple[dict[str, Pose], Traced]:
         epoch = self.timetable.epoch(frame)
         poses = self.swarm.poses(epoch)
         receivers = dict.fromkeys(link.rx for link in self.timetable.links(frame))
         active = self.timetable.with_role("active", frame)
-        return poses, self.propagation.paths(
+        return poses, self.propagation.trace(
             poses, epoch, [Link(tx, rx) for tx in active for rx in receivers]
         )
 
@@ -306,7 +310,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     begin = time.perf_counter()
     waveform = waveform_of(scenario)
     antennas = antennas_of(scenario, waveform)
-    swarm = Swarm.from_scenario(scenario)
+    swarm = swarm_of(scenario)
     schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
     check_memory(antennas, timetable)
@@ -317,20 +321,45 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
     plan = plan_of(scenario, antennas, timetable, swarm)
     # the blocks, and with them the reach, are found out in the run where links are established
-    radius = np.inf if scenario.access.establish else plan.mesh_radius(flight_centre(scenario))
-    city = city_of(scenario, radius)
+    radius = np.inf if scenario.access.establish else plan.mesh_radius(swarm.middle)
+    carrier = waveform.carrier_frequency
+    city = city_about(swarm.middle, scenario.city, scenario.folder, carrier, radius)
+    free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    make = partial(
+        make_propagation,
+        scenario.propagation,
+        scenario.clutter,
+        swarm,
+        free,
+        city,
+        waveform,
+        plan.instants,
+    )
+    if store is None or scenario.propagation.model == "free_space":
+        propagation = make()
+    else:
+        content = json.dumps([path_content(scenario), city.num_faces])
+        propagation = CachedPropagation(make, store, content)
     setup = Setup(
         scenario,
         waveform,
         antennas,
         swarm,
         city,
-        _propagation(scenario, waveform, antennas, city, plan.instants, store),
-        FreeSpace(scenario.swarm, antennas, waveform.wavelength, scenario.seed),
+        propagation,
+        free,
         timetable,
         Connections(),
         plan,
-        make_expectation(scenario, waveform, antennas, city),
+        make_expectation(
+            scenario.receivers.clutter_detector,
+            scenario.clutter,
+            swarm,
+            city,
+            waveform,
+            antennas,
+            scenario.seed,
+        ),
     )
     return replace(_connected(setup), seconds=time.perf_counter() - begin)
 
@@ -389,7 +418,7 @@ def _connected(setup: Setup) -> Setup:
 
     def scene(when: float, links: list[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         poses = setup.swarm.poses(when)
-        return poses, setup.propagation.paths(poses, when, links) if links else {}
+        return poses, setup.propagation.trace(poses, when, links).paths if links else {}
 
     first = setup.swarm.poses(timetable.epoch(0))
     network = Network(
@@ -415,20 +444,27 @@ def _connected(setup: Setup) -> Setup:
     return replace(setup, timetable=timetable, connections=found, plan=plan)
 
 
-def _propagation(
-    scenario: Scenario,
-    waveform: Waveform,
-    antennas: Antennas,
-    city: City,
-    instants: tuple[float, ...],
-    store: PathStore | None,
-) -> Propagation:
-    def make() -> Propagation:
-        return make_propagation(scenario, waveform, antennas, city, instants)
+def swarm_of(scenario: Scenario) -> Swarm:
+    """The scenario's UAVs and their flights."""
+    successors = tuple(change.to_uav for change in scenario.role_changes)
+    return Swarm(scenario.swarm, scenario.flight_duration_s, successors)
 
-    if store is None or scenario.propagation.model == "free_space":
-        return make()
-    return CachedPropagation(make, store, json.dumps([path_content(scenario), city.num_faces]))
+
+def city_of(scenario: Scenario, radius: float = np.inf) -> City:
+    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object
+    again for equal scenarios."""
+    centre, carrier = swarm_of(scenario).middle, scenario.radio.carrier_hz
+    return city_about(centre, scenario.city, scenario.folder, carrier, radius)
+
+
+def propagation_in(city: City, scenario: Scenario, instants: Sequence[float] = ()) -> Propagation:
+    """The scenario's propagation model in a city, which need not be the scenario's own."""
+    waveform, swarm = waveform_of(scenario), swarm_of(scenario)
+    antennas = antennas_of(scenario, waveform)
+    free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    return make_propagation(
+        scenario.propagation, scenario.clutter, swarm, free, city, waveform, instants
+    )
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:

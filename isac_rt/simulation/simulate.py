@@ -337,7 +337,7 @@ class _Run:
                 **decisions(s.plan),
                 "links": used(self.uses, names),
                 "paths_contradicted": sum(self.contradicted.values()),
-                **extent(s.city, s.propagation, s.scenario.clutter),
+                **extent(s.city, s.propagation.census(), s.scenario.clutter),
             },
             "access": self._access(),
         }

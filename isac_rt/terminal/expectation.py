@@ -19,9 +19,9 @@ from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import City
-from isac_rt.world.swarm import Pose
+from isac_rt.world.swarm import Pose, Swarm
 
 
 @dataclass(frozen=True)
@@ -44,20 +44,23 @@ class Mistakes:
 
 
 class MeshExpectation:
-    """Expected clutter along the flights of one scenario."""
+    """Expected clutter along the flights of one run."""
 
     def __init__(
-        self, scenario: Scenario, city: City, scene: mi.Scene, antennas: Antennas, wavelength: float
+        self,
+        clutter: Clutter,
+        swarm: Swarm,
+        city: City,
+        scene: mi.Scene,
+        antennas: Antennas,
+        wavelength: float,
+        seed: int,
     ) -> None:
-        own = scenario.model_copy(
-            update={
-                "seed": int(seed_sequence(scenario.seed, "expected clutter").generate_state(1)[0])
-            }
-        )
-        self._field = ClutterField.plan(own, city, scene, wavelength)
-        self._twice = (
-            TwoBounces.plan(own, city, self._field, wavelength)
-            if scenario.clutter.mirrors
+        own = int(seed_sequence(seed, "expected clutter").generate_state(1)[0])
+        self._field = ClutterField.plan(clutter, swarm, city, scene, wavelength, own)
+        self._two_bounces = (
+            TwoBounces.plan(self._field, city, wavelength, own, clutter.mirrors)
+            if clutter.mirrors
             else None
         )
         self._city, self._antennas = city, antennas
@@ -88,7 +91,12 @@ class MeshExpectation:
         )
         once = self._field.seen(name, name, local, local, time)
         parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
-        for part in [] if self._twice is None else self._twice.seen(name, name, local, local, time):
+        by_mirrors = (
+            []
+            if self._two_bounces is None
+            else self._two_bounces.seen(name, name, local, local, time)
+        )
+        for part in by_mirrors:
             n, s = part.mirror.normal, part.seen
             met = s.departure if part.before else s.arrival
             turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
@@ -142,10 +150,16 @@ class ClutterExpectation(Protocol):
 
 
 def make_expectation(
-    scenario: Scenario, waveform: Waveform, antennas: Antennas, city: City
+    detector: str,
+    clutter: Clutter,
+    swarm: Swarm,
+    city: City,
+    waveform: Waveform,
+    antennas: Antennas,
+    seed: int,
 ) -> ClutterExpectation | None:
     """The receivers' copy of the mesh where their detector needs one; starts the JIT back end."""
-    if scenario.receivers.clutter_detector not in MESH_DETECTORS:
+    if detector not in MESH_DETECTORS:
         return None
     from isac_rt import runtime
 
@@ -153,4 +167,4 @@ def make_expectation(
     from isac_rt.world.city.scene import shared_scene
 
     scene = shared_scene(city, waveform.carrier_frequency).scene.mi_scene
-    return MeshExpectation(scenario, city, scene, antennas, waveform.wavelength)
+    return MeshExpectation(clutter, swarm, city, scene, antennas, waveform.wavelength, seed)

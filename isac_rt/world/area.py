@@ -10,19 +10,29 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.scenario.environment import City as CityTree
+from isac_rt.scenario import environment
 from isac_rt.scenario.file import plain_tree
-from isac_rt.scenario.tree import Scenario
 from isac_rt.world.city import City, load_city
-from isac_rt.world.swarm import Swarm
 
 
-def city_of(scenario: Scenario, radius: float = np.inf) -> City:
-    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object
-    again for like scenarios."""
-    centre, carrier = tuple(flight_centre(scenario).tolist()), scenario.radio.carrier_hz
-    text = "" if scenario.city is None else json.dumps(plain_tree(scenario.city), sort_keys=True)
-    return _near_city(radius, text, scenario.folder, city_digest(scenario), carrier, centre)
+def city_about(
+    centre: np.ndarray,
+    city: environment.City | None,
+    folder: Path,
+    carrier: float,
+    radius: float = np.inf,
+) -> City:
+    """A scenario's city about a place (3,), as far as `radius` [m]; the same object again for equal
+    arguments.
+
+    Parameters
+    ----------
+    folder : of the scenario
+    carrier : at which materials are taken [Hz]
+    """
+    text = "" if city is None else json.dumps(plain_tree(city), sort_keys=True)
+    digest = city_digest(city, folder)
+    return _near_city(radius, text, folder, digest, carrier, tuple(centre.tolist()))
 
 
 @lru_cache(maxsize=2)
@@ -30,26 +40,17 @@ def _near_city(radius: float, *of: Any) -> City:
     return _loaded_city(*of).within(radius)
 
 
-def flight_centre(scenario: Scenario) -> np.ndarray:
-    """(3,) mean position of the swarm over the whole flight [m]."""
-    return Swarm.from_scenario(scenario).middle(scenario.flight_duration_s)
-
-
 @lru_cache(maxsize=2)
 def _loaded_city(
     text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]
 ) -> City:
-    tree = CityTree.model_validate(json.loads(text)) if text else None
+    tree = environment.City.model_validate(json.loads(text)) if text else None
     return load_city(tree, folder, carrier, centre)
 
 
-def city_digest(scenario: Scenario) -> str:
-    """Of the city's file, "" without one."""
-    return (
-        ""
-        if scenario.city is None or scenario.city.file is None
-        else file_digest(scenario.city_path())
-    )
+def city_digest(city: environment.City | None, folder: Path) -> str:
+    """SHA-256 of the city's file, "" without one."""
+    return "" if city is None or city.file is None else file_digest(folder / city.file)
 
 
 def file_digest(file: Path) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from isac_rt.scenario.swarm import Uav
-from isac_rt.scenario.tree import Scenario
 
 
 @dataclass(frozen=True)
@@ -100,28 +100,40 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Swarm:
-    """All UAVs of a scenario by name, in the scenario's order."""
+    """All UAVs by name, and their flights.
+
+    Attributes
+    ----------
+    uavs : in the scenario's order
+    duration : of the flights [s]
+    successors : UAVs that become active later on
+    """
 
     uavs: dict[str, Uav]
-    trajectories: dict[str, Trajectory]
+    duration: float = 0.0
+    successors: tuple[str, ...] = ()
 
-    @classmethod
-    def from_scenario(cls, scenario: Scenario) -> Swarm:
-        return cls(
-            dict(scenario.swarm), {name: Trajectory(uav) for name, uav in scenario.swarm.items()}
-        )
+    @cached_property
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Of every UAV."""
+        return {name: Trajectory(uav) for name, uav in self.uavs.items()}
 
     def poses(self, time: float) -> dict[str, Pose]:
         """Every UAV's pose at `time` [s]."""
         return {name: trajectory.pose(time) for name, trajectory in self.trajectories.items()}
 
-    def middle(self, duration: float) -> np.ndarray:
-        """(3,) mean position of all UAVs over nine instants of a flight [s, m]."""
-        return np.mean(
-            [pose.position for t in np.linspace(0, duration, 9) for pose in self.poses(t).values()],
-            axis=0,
-        )
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """(3,) mean position of all UAVs over nine instants of the flights [m]."""
+        times = np.linspace(0, self.duration, 9)
+        return np.mean([p.position for t in times for p in self.poses(t).values()], axis=0)
 
-    def with_role(self, role: str) -> list[str]:
-        """Names of the UAVs of one role."""
-        return [name for name, uav in self.uavs.items() if uav.role == role]
+    @property
+    def terminals(self) -> list[str]:
+        """Names of the UAVs that send or receive."""
+        return [name for name, uav in self.uavs.items() if uav.role != "target"]
+
+    @property
+    def transmitters(self) -> list[str]:
+        """Names of the UAVs that are active at some time."""
+        return [n for n, uav in self.uavs.items() if uav.role == "active" or n in self.successors]

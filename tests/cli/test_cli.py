@@ -21,7 +21,7 @@ import isac_rt.simulation
 from isac_rt.cli.cli import main
 from isac_rt.frame.level import LinkBudget
 from isac_rt.scenario.file import to_yaml
-from isac_rt.world.swarm import Swarm
+from isac_rt.simulation.setup import swarm_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,7 +43,7 @@ def simulation(monkeypatch):
 
         return types.SimpleNamespace(
             city=empty_city("none", np.zeros(3)),
-            swarm=Swarm.from_scenario(scenario),
+            swarm=swarm_of(scenario),
             timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
         )
 

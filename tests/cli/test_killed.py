@@ -50,13 +50,13 @@ from isac_rt.cli.cli import main
 sys.path.insert(0, {tests!r})
 from fake_run import fake_run
 import numpy as np
+from isac_rt.simulation.setup import swarm_of
 from isac_rt.world.city.mesh import empty_city
-from isac_rt.world.swarm import Swarm
 import isac_rt.simulation.setup as setup
 fake = types.ModuleType("isac_rt.simulation.simulate")
 setup.prepare = lambda s: types.SimpleNamespace(
     city=empty_city("none", np.zeros(3)),
-    swarm=Swarm.from_scenario(s),
+    swarm=swarm_of(s),
     timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
 )
 setup.link_budgets = lambda setup: []

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind, PathSet
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import City, Material, load_city
-from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -46,10 +44,8 @@ def swarm_over(a, p, u, **changes) -> scenario.Scenario:
 
 
 def tracer(s: scenario.Scenario, city: City, instants=()):
-    from isac_rt.propagation.raytrace import RayTracer
 
-    w = waveform_of(s)
-    return RayTracer(s, city, antennas_of(s, w), w.wavelength, w.carrier_frequency, instants)
+    return propagation_in(city, s, instants)
 
 
 def test_sets_of_chains_are_padded_with_minus_one():
@@ -100,10 +96,14 @@ def streets():
         },
     )
     city = load_city(s.city, ".", F_C, (0.0, 0.0, 9.0))
-    swarm = Swarm.from_scenario(s)
+    swarm = swarm_of(s)
     full, between = tracer(s, city), tracer(s, city, TIMES[::6])
     frames = [
-        (t, full.paths(swarm.poses(t), t, LINKS), between.paths(swarm.poses(t), t, LINKS))
+        (
+            t,
+            full.trace(swarm.poses(t), t, LINKS).paths,
+            between.trace(swarm.poses(t), t, LINKS).paths,
+        )
         for t in TIMES
     ]
     return frames, between, full
@@ -127,7 +127,8 @@ def test_births_and_deaths_happened_and_were_counted(streets):
     _, between, full = streets
     traced = [full._legs_on_the_way(t) for t in TIMES[::6]]
     chains = [
-        {(pair, *row) for pair, legs in at.items() for row in legs.planes.tolist()} for at in traced
+        {(pair, *row) for pair, legs in at.legs.items() for row in legs.planes.tolist()}
+        for at in traced
     ]
     assert between.between.num_traced == 3
     assert between.between.changes == {
@@ -163,12 +164,12 @@ def test_a_path_dies_where_its_wall_ends():
     s = swarm_over(
         ((0, -11.3, 8.7), (0, 10.3, 0)), ((0, 7.9, 10.1), (0, 9.1, 0)), ((-30, 1, 4), (0, 1, 0))
     )
-    swarm = Swarm.from_scenario(s)
+    swarm = swarm_of(s)
     between = tracer(s, city, [TIMES[0], TIMES[-1]])
     for t in TIMES:
         poses = swarm.poses(t)
         mirror = (poses["A"].position[1] + poses["P"].position[1]) / 2
-        found = between.paths(poses, t, LINKS)["A", "P"]
+        found = between.trace(poses, t, LINKS).paths["A", "P"]
         specular = int((found.kind == PathKind.SPECULAR).sum())
         assert abs(mirror - 3) > 0.05  # the case is a sure one
         assert specular == (mirror < 3), t
@@ -194,14 +195,14 @@ def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
         ((-1.2, 21.3, 10.1), (8.3, 0, 0)),
         ((-30, 1, 4), (0, 1, 0)),
     )
-    swarm = Swarm.from_scenario(s)
+    swarm = swarm_of(s)
     between = tracer(s, city, [TIMES[0], TIMES[-1]])
     seen = []
     for t in TIMES:
         poses = swarm.poses(t)
         a, p = poses["A"].position, poses["P"].position
         crossing = a[0] + (p[0] - a[0]) * abs(a[1]) / (abs(a[1]) + p[1])
-        found = between.paths(poses, t, LINKS)["A", "P"]
+        found = between.trace(poses, t, LINKS).paths["A", "P"]
         seen.append(bool(((found.kind == PathKind.LINE_OF_SIGHT) & ~found.bent).any()))
         assert abs(crossing - 2) > 0.01
         assert seen[-1] == (crossing < 2), t

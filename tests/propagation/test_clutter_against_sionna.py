@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import make_propagation
 from isac_rt.propagation.clutter.cells import area_for
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation.clutter import sionna_power
 from isac_rt.world.city import load_city
 from isac_rt.world.city.mesh import distance_to_triangles
-from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -71,12 +68,11 @@ def flown(name: str, per_metre: float):
             "clutter": {"model": "field", "cell_area_per_metre_m": per_metre},
         }
     )
-    waveform = waveform_of(s)
     city = load_city(s.city, ".", F_C, (np.array(a) + np.array(p)) / 2)
     return (
         city,
-        make_propagation(s, waveform, antennas_of(s, waveform), city),
-        Swarm.from_scenario(s),
+        propagation_in(city, s),
+        swarm_of(s),
     )
 
 

@@ -12,11 +12,9 @@ import trimesh
 from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import PathKind, make_propagation
+from isac_rt.propagation import PathKind
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import City, load_city
-from isac_rt.world.swarm import Swarm
 
 pytestmark = pytest.mark.sionna
 C, F_C = 299_792_458.0, 77e9
@@ -55,8 +53,7 @@ def flown(waypoints, model="field", **clutter):
         "clutter": {"model": model, **clutter},
     }
     s = scenario.Scenario.model_validate(tree)
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), crossing()), Swarm.from_scenario(s)
+    return propagation_in(crossing(), s), swarm_of(s)
 
 
 def profile(length: np.ndarray, gain: np.ndarray, first: float = 0.0) -> np.ndarray:
@@ -165,7 +162,7 @@ def test_retraced_clutter_is_not_coherent():
 
 
 def traced(model, flight, time: float):
-    paths = model.paths({"A": flight.pose(time)}, time, [("A", "A")])["A", "A"]
+    paths = model.trace({"A": flight.pose(time)}, time, [("A", "A")]).paths["A", "A"]
     return paths.select(paths.kind == PathKind.DIFFUSE)
 
 

@@ -12,9 +12,8 @@ import pytest
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import make_propagation
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import load_city
-from isac_rt.world.swarm import Swarm
 
 pytestmark = [pytest.mark.sionna, pytest.mark.slow]
 FRAME = 7.7824e-3
@@ -41,8 +40,8 @@ def tracer(city, **clutter):
     )
     w = waveform_of(s)
     return (
-        make_propagation(s, w, antennas_of(s, w), city),
-        Swarm.from_scenario(s),
+        propagation_in(city, s),
+        swarm_of(s),
         antennas_of(s, w),
     )
 

@@ -18,12 +18,13 @@ from scipy.integrate import dblquad
 from isac_rt import randomness, scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import PathKind, make_propagation
+from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.randomness import seed_sequence
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import City, Material, load_city
-from isac_rt.world.swarm import Pose, Swarm
+from isac_rt.world.swarm import Pose
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
 LAMBDA = C / F_C
@@ -99,7 +100,7 @@ def test_cells_do_not_know_the_order_of_faces(seed):
 def test_cells_are_the_same_in_every_process():
     """Planted bug: Python's own hash(), which is salted, in the seed."""
     program = (
-        "import sys; sys.path.insert(0, 'tests'); import test_clutter_field as t; "
+        "import sys; sys.path.insert(0, 'tests/propagation'); import test_clutter_field as t; "
         "print(t.digest(t.all_cells(t.canyon())))"
     )
     root = Path(__file__).parents[2]
@@ -223,8 +224,7 @@ def flown(
         "clutter": {"model": "field", **clutter},
     }
     s = scenario.Scenario.model_validate(tree)
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), city), Swarm.from_scenario(s)
+    return propagation_in(city, s), swarm_of(s)
 
 
 def mean_power(model, tx: str, rx: str, poses: dict[str, Pose]) -> float:
@@ -394,8 +394,7 @@ def test_each_scatterer_against_an_oracle(name):
 
 def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     """A terminal's own copy of the mesh and its pose; isotropic elements of 0 dBi."""
-    from isac_rt.terminal.expectation import MeshExpectation
-    from isac_rt.world.city.scene import shared_scene
+    from isac_rt.terminal.expectation import make_expectation
 
     tree = {
         "frames": 40,
@@ -414,10 +413,9 @@ def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     }
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s)
-    scene = shared_scene(city, w.carrier_frequency).scene.mi_scene
-    return MeshExpectation(s, city, scene, antennas_of(s, w), w.wavelength), Swarm.from_scenario(
-        s
-    ).poses(0.0)["A"]
+    swarm, antennas = swarm_of(s), antennas_of(s, w)
+    copy = make_expectation("map", s.clutter, swarm, city, w, antennas, s.seed)
+    return copy, swarm.poses(0.0)["A"]
 
 
 @pytest.mark.sionna
@@ -477,7 +475,7 @@ def test_knots_of_a_flight_and_their_blend():
         "swarm": {"A": {"role": "active", "position_m": list(start), "velocity_mps": list(speed)}}
     }
     flight = Flight(
-        Swarm.from_scenario(scenario.Scenario.model_validate(tree)).trajectories["A"],
+        swarm_of(scenario.Scenario.model_validate(tree)).trajectories["A"],
         duration,
         origin,
     )
@@ -527,9 +525,9 @@ def test_all_links_see_one_field_and_a_frame_is_the_same_alone():
     links = [("A", "A"), ("A", "P"), ("P", "A")]
     model, swarm = flown(canyon(), **flights, cell_area_per_metre_m=0.3)
     times = [0.004, 0.21, 0.43]
-    runs = [[model.paths(swarm.poses(t), t, links) for t in times]]
+    runs = [[model.trace(swarm.poses(t), t, links).paths for t in times]]
     other, _ = flown(permuted(canyon(), 8), **flights, cell_area_per_metre_m=0.3)
-    runs.append([other.paths(swarm.poses(t), t, links) for t in times[::-1]][::-1])
+    runs.append([other.trace(swarm.poses(t), t, links).paths for t in times[::-1]][::-1])
     for one, two in zip(*runs, strict=True):
         for link in links:
             a, b = (p[link].select(p[link].kind == PathKind.DIFFUSE) for p in (one, two))

@@ -11,10 +11,7 @@ from scipy import stats
 from test_clutter_coherence import F_C, LAMBDA, C, crossing
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import make_propagation
-from isac_rt.world.swarm import Swarm
+from isac_rt.simulation.setup import propagation_in, swarm_of
 
 pytestmark = pytest.mark.sionna
 CELL = 0.25
@@ -36,10 +33,7 @@ def flown(flight: dict, seed: int = 3):
             "clutter": {"model": "field", "cell_area_per_metre_m": 0.3, "smallest_cell_m2": 0.2},
         }
     )
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), crossing()), Swarm.from_scenario(
-        s
-    ).trajectories["A"]
+    return propagation_in(crossing(), s), swarm_of(s).trajectories["A"]
 
 
 def at(model, flight, time: float):

@@ -29,13 +29,12 @@ from test_clutter_field import (
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import make_propagation
 from isac_rt.randomness import generator
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation.clutter import sionna_power
-from isac_rt.terminal.expectation import MeshExpectation, Mistakes
+from isac_rt.terminal.expectation import Mistakes, make_expectation
 from isac_rt.world.city import City, Material, load_city
-from isac_rt.world.city.scene import shared_scene
-from isac_rt.world.swarm import Pose, Swarm
+from isac_rt.world.swarm import Pose
 
 pytestmark = pytest.mark.sionna
 
@@ -179,8 +178,8 @@ def test_each_way_against_an_oracle(pattern):
     for tx, rx in (("A", "P"), ("A", "A")):
         start, end = bodies[tx], bodies[rx]
         common = {"epoch": 0.0, "tx": tx, "rx": rx, "target_names": ()}
-        sets = model.twice.paths(tx, rx, start, end, model._antennas, common)
-        for part, paths in zip(model.twice.seen(tx, rx, start, end, 0.0), sets, strict=True):
+        sets = model.two_bounces.paths(tx, rx, start, end, model._free.antennas, common)
+        for part, paths in zip(model.two_bounces.seen(tx, rx, start, end, 0.0), sets, strict=True):
             if part.mirror.faces[0] < 2:  # the ground in the wall
                 continue
             for i in range(0, len(part.seen.index), 7):
@@ -259,7 +258,7 @@ def test_power_of_a_wall_by_way_of_the_ground_is_its_integral():
     for tx, rx, start, end in (("A", "A", a, a), ("A", "P", a, p)):
         by_ground = [
             s
-            for s in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.0)
+            for s in model.two_bounces.seen(tx, rx, poses[tx], poses[rx], 0.0)
             if (s.mirror.normal[2] ** 2 > 0.5)
         ]
         assert [s.before for s in by_ground] == [True, False]
@@ -296,7 +295,7 @@ def test_mirrors_are_those_that_send_on_the_most():
         (1 - 0.43**2) * solid(-20, 20, -20, 11, 7) / (4 * np.pi),
         (1 - 0.2**2) * solid(8, 13, -6, 6, 11) / (4 * np.pi),
     ]
-    mirrors = model.twice.mirrors["A"]
+    mirrors = model.two_bounces.mirrors["A"]
     assert [int(m.faces[0]) // 2 for m in mirrors] == [1, 0, 2]
     assert [m.share for m in mirrors] == [
         pytest.approx(expected[k], rel=0.05, abs=0) for k in (1, 0, 2)
@@ -329,9 +328,8 @@ def street(material: str):
             "clutter": {"model": "field", "cell_area_per_metre_m": 0.024, "mirrors": 12},
         }
     )
-    w = waveform_of(s)
     city = load_city(s.city, ".", F_C, (0.4, -1.3, 12.0))
-    return city, make_propagation(s, w, antennas_of(s, w), city), Swarm.from_scenario(s)
+    return city, propagation_in(city, s), swarm_of(s)
 
 
 @pytest.mark.parametrize(
@@ -358,7 +356,7 @@ def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
             city, poses[source].position, poses[sink].position, edges, rays, by_mirror=True
         )
         ours = np.zeros(edges.size - 1)
-        for part in model.twice.seen(tx, rx, poses[tx], poses[rx], 0.13):
+        for part in model.two_bounces.seen(tx, rx, poses[tx], poses[rx], 0.13):
             if part.before == before:
                 ours += np.histogram(
                     part.seen.length, edges, weights=part.seen.magnitude.astype(float) ** 2
@@ -472,15 +470,17 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
             },
         }
     )
-    w = waveform_of(s)
     city = crossing()
     model, flight = (
-        make_propagation(s, w, antennas_of(s, w), city),
-        Swarm.from_scenario(s).trajectories["A"],
+        propagation_in(city, s),
+        swarm_of(s).trajectories["A"],
     )
     cells = model.field.cells
     amplitude = np.asarray(cells.amplitude, complex)
-    strength, walls = amplitude * np.sqrt(cells.area), [m.faces for m in model.twice.mirrors["A"]]
+    strength, walls = (
+        amplitude * np.sqrt(cells.area),
+        [m.faces for m in model.two_bounces.mirrors["A"]],
+    )
     separate = Separate(city, cells.points, strength, city.normals[cells.face], walls)
     worst, count = 1.0, 0
     for time in (0.13, 0.97, 1.71):
@@ -490,16 +490,20 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
             pose = flight.pose(when)
             local = replace(pose, position=pose.position - city.origin)
             total = np.zeros(1000, complex)
-            shares = {id(m): np.zeros(len(cells), np.float32) for m in model.twice.mirrors["A"]}
+            shares = {
+                id(m): np.zeros(len(cells), np.float32) for m in model.two_bounces.mirrors["A"]
+            }
             for m, (index, share) in zip(
-                model.twice.mirrors["A"], model.twice._share("A", local, when), strict=True
+                model.two_bounces.mirrors["A"],
+                model.two_bounces._share("A", local, when),
+                strict=True,
             ):
                 shares[id(m)][index] = share
             straight = model.field.sight.share("A", local, when)
-            for part in model.twice.seen("A", "A", local, local, when):
+            for part in model.two_bounces.seen("A", "A", local, local, when):
                 if part.before:
                     q, n = part.seen, city.normals[cells.face[part.seen.index]]
-                    points, _ = model.twice._chain(part, local, local)
+                    points, _ = model.two_bounces._chain(part, local, local)
                     into = points[:, 0] - points[:, 1]
                     cosines = (
                         np.abs((into * n).sum(1))
@@ -536,15 +540,16 @@ def test_what_a_terminal_expects_of_mirrors():
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s)
     antennas, city = antennas_of(s, w), joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
-    model = make_propagation(s, w, antennas, city)
-    copy = MeshExpectation(s, city, shared_scene(city, F_C).scene.mi_scene, antennas, LAMBDA)
-    pose = Swarm.from_scenario(s).poses(0.0)["A"]
-    parts = copy._twice.seen("A", "A", pose, pose, 0.0)
+    model = propagation_in(city, s)
+    swarm = swarm_of(s)
+    copy = make_expectation("map", s.clutter, swarm, city, w, antennas, s.seed)
+    pose = swarm.poses(0.0)["A"]
+    parts = copy._two_bounces.seen("A", "A", pose, pose, 0.0)
     once = len(copy._field.seen("A", "A", pose, pose, 0.0).index)
     right, wrong = (
         copy.clutter("A", pose, 0.0, 1.0, Mistakes(mesh_std=std, seed=5)) for std in (0.0, 1e-4)
     )
-    ours = sum(power(part) for part in model.twice.seen("A", "A", pose, pose, 0.0))
+    ours = sum(power(part) for part in model.two_bounces.seen("A", "A", pose, pose, 0.0))
     assert abs(10 * np.log10(right.power[once:].sum() / ours)) < 0.2
     error = 1e-4 * generator(5, "mesh error").standard_normal(city.num_faces)
     begin = once

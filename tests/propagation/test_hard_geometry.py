@@ -18,13 +18,12 @@ from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load, to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
-from isac_rt.simulation.setup import prepare, timetable_of
+from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.truths import WAVELENGTH, chain_length
 from isac_rt.world.city import City, load_city
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, clean
-from isac_rt.world.swarm import Swarm
 
 C = 299_792_458.0
 NANOMETRE = 1e-9  # rounding of float64 over a kilometre is a thousandth of it
@@ -35,7 +34,7 @@ CONCRETE = stage.material()
 def found(
     mesh: City, a, p, u=FAR, bounces: int = 1, link=("A", "P"), moving: bool = False
 ) -> PathSet:
-    return stage.tracer(mesh, bounces).paths(stage.swarm(a, p, u, moving), 0.0, [link])[link]
+    return stage.tracer(mesh, bounces).trace(stage.swarm(a, p, u, moving), 0.0, [link]).paths[link]
 
 
 def wall(material=CONCRETE) -> City:
@@ -75,7 +74,7 @@ def test_a_transmitter_close_to_a_wall_or_on_it(gap):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for epoch in (0.0, 0.1):
-            paths = model.paths(poses, epoch, [("A", "P")])["A", "P"]
+            paths = model.trace(poses, epoch, [("A", "P")]).paths["A", "P"]
     said = [str(w.message) for w in said if issubclass(w.category, ClearanceWarning)]
     assert len(said) == (gap < CLEARANCE)
     if said:
@@ -88,7 +87,7 @@ def test_a_transmitter_close_to_a_wall_or_on_it(gap):
     )  # in the wall's plane, beside the wall
     with warnings.catch_warnings():
         warnings.simplefilter("error", ClearanceWarning)
-        stage.tracer(wall(), 1).paths(beyond, 0.0, [("A", "P")])
+        stage.tracer(wall(), 1).trace(beyond, 0.0, [("A", "P")])
 
 
 @pytest.mark.sionna
@@ -205,9 +204,11 @@ def test_a_target_behind_another_and_a_body_in_the_way():
     )
     assert 0.0 < sight < 1.1
     clear = {"swarm": {"U": {"role": "target", "position_m": [2, 0, 0], "body_radius_m": 0.0}}}
-    through = stage.tracer(GROUND, 0, **clear).paths(
-        stage.swarm(a, behind, a + 0.4 * (behind - a), False), 0.0, [("A", "P")]
-    )["A", "P"]
+    through = (
+        stage.tracer(GROUND, 0, **clear)
+        .trace(stage.swarm(a, behind, a + 0.4 * (behind - a), False), 0.0, [("A", "P")])
+        .paths["A", "P"]
+    )
     sight = np.abs(through.gain[through.kind == PathKind.LINE_OF_SIGHT])
     assert sight == pytest.approx(
         [WAVELENGTH / (4 * np.pi * np.linalg.norm(behind - a))], rel=1e-6, abs=0
@@ -258,7 +259,7 @@ def test_two_bodies_at_one_point_are_refused_before_the_run():
         prepare(meeting)
     passing = flight(A=((0, 0, 9), (0, 0, 0)), U=((0.3, 20, 9), (0, -10.0, 0)))
     w = waveform_of(passing)
-    check_flights(Swarm.from_scenario(passing), timetable_of(passing, w, np.zeros((3, 120), int)))
+    check_flights(swarm_of(passing), timetable_of(passing, w, np.zeros((3, 120), int)))
 
 
 def aliases(s):
@@ -267,7 +268,7 @@ def aliases(s):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         warn_of_aliases(
-            Swarm.from_scenario(s),
+            swarm_of(s),
             timetable_of(s, w, np.zeros((3, 120), int)),
             antennas_of(s, w),
             s.receivers.velocity_method,

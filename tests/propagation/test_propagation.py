@@ -441,7 +441,7 @@ def element(p: Pose, towards: np.ndarray, gain=3.7) -> float:
 def test_line_of_sight_is_friis():
     """|gain|^2 = G G (lambda / 4 pi d)^2, phase zero. Seen failing with the receiver's element
     along the departure."""
-    paths = free_space().paths(POSES, 0.5, [("A", "P")])["A", "P"]
+    paths = free_space().trace(POSES, 0.5, [("A", "P")]).paths["A", "P"]
     (k,) = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
     d = np.linalg.norm(RX.position - TX.position)
     expected = (
@@ -462,7 +462,7 @@ def test_line_of_sight_is_friis():
 def test_echo_is_the_radar_equation(rx):
     """P = G G lambda^2 sigma / ((4 pi)^3 r1^2 r2^2), monostatic and bistatic. Seen failing with (4
     pi)^2."""
-    paths = free_space().paths(POSES, 0.0, [("A", rx)])["A", rx]
+    paths = free_space().trace(POSES, 0.0, [("A", rx)]).paths["A", rx]
     (k,) = np.flatnonzero((paths.kind == PathKind.TARGET) & (paths.target == 2))
     r1, r2 = (np.linalg.norm(BODY.position - POSES[end].position) for end in ("A", rx))
     gains = element(POSES["A"], BODY.position) * element(POSES[rx], BODY.position)
@@ -477,7 +477,7 @@ def test_echo_is_the_radar_equation(rx):
 def test_echo_moves_as_its_exact_delay():
     """Delay rate and acceleration of the bistatic echo by differences, all three bodies in curved
     flight."""
-    paths = free_space().paths(POSES, 0.0, [("A", "P")])["A", "P"]
+    paths = free_space().trace(POSES, 0.0, [("A", "P")]).paths["A", "P"]
     (k,) = np.flatnonzero(paths.target == 2)
 
     def length(t):
@@ -494,7 +494,7 @@ def test_links_hold_the_right_paths():
     """The own link has every other UAV and no line of sight; a link to a PT has no echo of its two
     ends. An echo has one point, the body's, and it lies on no face. Planted bug: a face more than
     there are points."""
-    found = free_space().paths(POSES, 0.0, [("A", "A"), ("A", "P")])
+    found = free_space().trace(POSES, 0.0, [("A", "A"), ("A", "P")]).paths
     assert found["A", "A"].faces.tolist() == [[-1], [-1]]
     assert np.array_equal(found["A", "A"].points, [[POSES["P"].position], [POSES["U"].position]])
     assert found["A", "A"].kind.tolist() == [PathKind.TARGET] * 2
@@ -508,8 +508,8 @@ def test_what_no_element_hears_is_left_out():
     away = POSES["P"].rotation[:, 1] * -1
     turned = POSES | {"P": Pose(RX.position, RX.velocity, RX.acceleration, attitude(away))}
     model = free_space(pattern="sector")
-    assert len(model.paths(POSES, 0.0, [("A", "P")])["A", "P"]) == 2
-    assert len(model.paths(turned, 0.0, [("A", "P")])["A", "P"]) == 0
+    assert len(model.trace(POSES, 0.0, [("A", "P")]).paths["A", "P"]) == 2
+    assert len(model.trace(turned, 0.0, [("A", "P")]).paths["A", "P"]) == 0
 
 
 @pytest.mark.parametrize(("rx", "reference"), [("P", "sight"), ("A", "echo")])
@@ -519,7 +519,7 @@ def test_relative_echo_stands_at_its_level(rx, reference):
     uavs = UAVS | {
         "U": Uav(role="target", position_m=(0, 0, 0), rcs=Rcs(model="relative", level_db=-21.3))
     }
-    paths = free_space(uavs).paths(POSES, 0.0, [("A", rx)])["A", rx]
+    paths = free_space(uavs).trace(POSES, 0.0, [("A", rx)]).paths["A", rx]
     (k,) = np.flatnonzero(paths.target == 2)
     d = np.linalg.norm(RX.position - TX.position)
     sight = 3.7**2 * (LAMBDA / (4 * np.pi * d)) ** 2
@@ -546,10 +546,12 @@ def test_free_space_is_reciprocal_and_knows_no_place():
     """Exchanging the ends, and moving everything rigidly, change neither gain nor delay nor their
     rates."""
     names = ("gain", "delay", "delay_rate", "delay_accel")
-    here, back = (free_space().paths(POSES, 0.0, [link])[link] for link in (("A", "P"), ("P", "A")))
+    here, back = (
+        free_space().trace(POSES, 0.0, [link]).paths[link] for link in (("A", "P"), ("P", "A"))
+    )
     turn, shift = rotation(2), np.array([83.0, -47.0, 19.0])
     poses = {n: moved(p, turn, shift) for n, p in POSES.items()}
-    there = free_space().paths(poses, 0.0, [("A", "P")])["A", "P"]
+    there = free_space().trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     for other in (back, there):
         for name in names:
             assert getattr(other, name) == near(getattr(here, name), 1e-10)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import FreeSpace, PathKind, PathSet, make_propagation
+from isac_rt.propagation import FreeSpace, PathKind, PathSet
+from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import City, Material, load_city
 from isac_rt.world.city.mesh import empty_city
 from isac_rt.world.swarm import Pose, attitude
@@ -65,8 +66,7 @@ def tracer(mesh: City, bounces: int = 2, **changes):
         },
     } | changes
     s = scenario.Scenario.model_validate(tree)
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), mesh), s
+    return propagation_in(mesh, s), s
 
 
 def builtin(name: str, centre=(0.31, -0.17, 0.9)) -> City:
@@ -258,7 +258,7 @@ def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
     *places, bounces = SCENES[name]
     poses, city = swarm_of(*places), builtin(name)
     model, s = tracer(city, bounces)
-    found = model.paths(poses, 0.0, LINKS)
+    found = model.trace(poses, 0.0, LINKS).paths
     images = Images(city)
     legs = {
         (a, b): images.paths(poses[a].position, poses[b].position, bounces)
@@ -336,7 +336,7 @@ def test_rates_follow_the_exact_delays():
             )
             for n, p in poses.items()
         }
-        p = model.paths(moved, t, LINKS)["A", "P"]
+        p = model.trace(moved, t, LINKS).paths["A", "P"]
         return {
             (tuple(np.where(f < 0, -1, city.plane_of_face[f])), k): i
             for i, (f, k) in enumerate(zip(p.faces, p.target, strict=True))
@@ -359,10 +359,12 @@ def test_empty_scene_is_free_space():
     """Line of sight and echoes of the closed forms, and nothing else."""
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     model, s = tracer(empty_city("none", np.array([3.0, 4.0, 5.0])))
-    closed = FreeSpace(s.swarm, antennas_of(s, waveform_of(s)), LAMBDA, s.seed).paths(
-        poses, 0.25, LINKS
+    closed = (
+        FreeSpace(s.swarm, antennas_of(s, waveform_of(s)), LAMBDA, s.seed)
+        .trace(poses, 0.25, LINKS)
+        .paths
     )
-    for link, paths in model.paths(poses, 0.25, LINKS).items():
+    for link, paths in model.trace(poses, 0.25, LINKS).paths.items():
         assert paths.kind.tolist() == closed[link].kind.tolist()
         assert paths.target.tolist() == closed[link].target.tolist()
         for name in ("delay", "delay_rate", "delay_accel", "tx_radius", "rx_radius"):
@@ -399,7 +401,7 @@ def test_two_rays_over_a_plane(material, h):
     city = rectangle((-150, -150, 0), (300, 0, 0), (0, 300, 0), material)
     a, p = np.array([-9.7, 3.1, h]), np.array([13.9, -4.3, 0.7 * h])
     model, _ = tracer(city, 1)
-    paths = model.paths(swarm_of(a, p, (0.5, 40.0, 11.0)), 0.0, [("A", "P")])["A", "P"]
+    paths = model.trace(swarm_of(a, p, (0.5, 40.0, 11.0)), 0.0, [("A", "P")]).paths["A", "P"]
     (k,) = np.flatnonzero(paths.kind == PathKind.SPECULAR)
     length = np.hypot(np.hypot(23.6, 7.4), 1.7 * h)
     assert C * paths.delay[k] == pytest.approx(length, abs=LENGTH)
@@ -415,11 +417,11 @@ def test_a_wall_shadows():
     wall = rectangle((5.0, -20.0, 0.0), (0, 23.0, 0), (0, 0, 30.0), slab())
     model, _ = tracer(wall, 1)
     behind = swarm_of((0.3, 1.1, 9.3), (11.7, 0.4, 8.1), (13.3, -2.2, 7.9))
-    found = model.paths(behind, 0.0, LINKS)
+    found = model.trace(behind, 0.0, LINKS).paths
     assert len(found["A", "P"]) == 0
     assert found["A", "A"].kind.tolist() == [PathKind.SPECULAR]
     beside = swarm_of((0.3, 8.1, 9.3), (11.7, 7.4, 8.1), (13.3, 5.2, 7.9))
-    kinds = model.paths(beside, 0.0, LINKS)["A", "P"].kind.tolist()
+    kinds = model.trace(beside, 0.0, LINKS).paths["A", "P"].kind.tolist()
     assert PathKind.LINE_OF_SIGHT in kinds
     assert PathKind.TARGET in kinds
 
@@ -431,9 +433,9 @@ def test_a_wall_returns_once_to_its_radar(place):
     y, z = place
     wall = rectangle((31.7, -20, -20), (0, 40, 0), (0, 0, 40), slab(conductivity=1e7))
     model, _ = tracer(wall)
-    paths = model.paths(
+    paths = model.trace(
         swarm_of((0.3, y, z), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4)), 0.0, [("A", "A")]
-    )["A", "A"]
+    ).paths["A", "A"]
     (k,) = np.flatnonzero(paths.kind == PathKind.SPECULAR)
     assert C * paths.delay[k] == pytest.approx(2 * 31.4, abs=LENGTH)
     assert abs(paths.gain[k]) == pytest.approx(
@@ -452,7 +454,9 @@ def test_points_and_lengths_do_not_depend_on_the_origin():
     for origin in (np.zeros(3), far):
         city = rectangle(origin + np.array([11.3, -20, 0]), (0, 40, 0), (0, 0, 30), slab(), origin)
         model, _ = tracer(city)
-        results.append(model.paths(swarm_of(*(v + origin for v in here)), 0.0, LINKS)["A", "P"])
+        results.append(
+            model.trace(swarm_of(*(v + origin for v in here)), 0.0, LINKS).paths["A", "P"]
+        )
     near, other = results
     assert len(near) == len(other) > 3
     assert C * other.delay == pytest.approx(C * near.delay, abs=1e-8)
@@ -484,11 +488,11 @@ def test_a_corner_returns_one_image_to_its_radar(walls):
     )
     model, _ = tracer(mesh, walls)
     radar, distance = corner + turn @ away, np.linalg.norm(away[:walls])
-    paths = model.paths(
+    paths = model.trace(
         swarm_of(radar, radar + np.array([1.0, 2.0, 1.5]), radar - np.array([2.0, 1.1, 0.7])),
         0.0,
         [("A", "A")],
-    )["A", "A"]
+    ).paths["A", "A"]
     found = np.flatnonzero(
         (paths.kind == PathKind.SPECULAR)
         & (paths.bounces == walls)
@@ -513,9 +517,9 @@ def test_a_wall_far_from_the_origin_reflects_once():
         far + np.array([1.7, 17.4, 8.1]),
         far + np.array([-3.3, -2.2, 7.9]),
     )
-    paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
+    paths = model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     assert paths.counts()["specular"] == 1
-    assert model.duplicates > 0
+    assert model._specular_legs(model._local(poses)).duplicates > 0
 
 
 def test_leakage():
@@ -525,7 +529,7 @@ def test_leakage():
     }
     model, s = tracer(empty_city("none", np.zeros(3)), **leakage)
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
-    found = model.paths(poses, 0.0, LINKS)
+    found = model.trace(poses, 0.0, LINKS).paths
     own = found["A", "A"]
     (k,) = np.flatnonzero(own.kind == PathKind.LEAKAGE)
     assert own.power[k] == pytest.approx(10**-5.73, rel=1e-12)
@@ -543,7 +547,7 @@ def test_antenna_patterns_weigh_each_path_by_its_own_directions():
     city, poses = builtin("box"), swarm_of(*places)
     plain, _ = tracer(city, bounces)
     shaped, _ = tracer(city, bounces, array={"element_pattern": "cosine", "element_gain_dbi": 5.0})
-    a, b = (m.paths(poses, 0.0, LINKS)["A", "P"] for m in (plain, shaped))
+    a, b = (m.trace(poses, 0.0, LINKS).paths["A", "P"] for m in (plain, shaped))
     gain = 10**0.5
     ends = [
         np.clip(d @ poses[n].rotation[:, 1], 0, None)
@@ -592,7 +596,7 @@ def test_composed_echoes_are_those_of_sionnas_rcs_solver():
     valid = np.asarray(theirs.valid).ravel()
     tau = np.asarray(theirs.tau, float).ravel()[valid]
     gain = (np.asarray(theirs.a[0], float) + 1j * np.asarray(theirs.a[1], float)).ravel()[valid]
-    ours = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
+    ours = model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     ours = ours.select(ours.target == 2)
     assert len(ours) == len(tau) > 4
     i, j = np.argsort(ours.delay), np.argsort(tau)
@@ -633,7 +637,7 @@ def test_diffuse_power_of_a_wall():
     wall = rectangle(*WALL, slab(conductivity=1e7, scattering=0.43))
     model, _ = tracer(wall, **DIFFUSE)
     poses = swarm_of((1.3, -0.7, 2.1), (-13.1, 4.3, -6.6), (7.0, 12.0, 3.0))
-    for (tx, rx), paths in model.paths(poses, 0.0, LINKS).items():
+    for (tx, rx), paths in model.trace(poses, 0.0, LINKS).paths.items():
         scattered = paths.power[paths.kind == PathKind.DIFFUSE]
         assert scattered.size > 10_000
         assert scattered.sum() == pytest.approx(
@@ -650,7 +654,7 @@ def test_diffuse_scatterers_stand_on_the_wall():
     poses = swarm_of((1.3, -0.7, 2.1), (-13.1, 4.3, -6.6), (7.0, 12.0, 3.0))
     found = {
         link: p.select(p.kind == PathKind.DIFFUSE)
-        for link, p in model.paths(poses, 0.0, LINKS).items()
+        for link, p in model.trace(poses, 0.0, LINKS).paths.items()
     }
     a, p = poses["A"], poses["P"]
     two_way, one_way = found["A", "A"], found["A", "P"]
@@ -686,7 +690,9 @@ def test_diffuse_scatterers_stand_on_the_wall():
 def test_the_same_frame_gives_the_same_paths_in_the_same_order():
     *places, bounces = SCENES["simple_street_canyon"]
     poses, city = swarm_of(*places), builtin("simple_street_canyon")
-    first, second = (tracer(city, bounces, **DIFFUSE)[0].paths(poses, 0.0, LINKS) for _ in range(2))
+    first, second = (
+        tracer(city, bounces, **DIFFUSE)[0].trace(poses, 0.0, LINKS).paths for _ in range(2)
+    )
     for link in LINKS:
         for name in ("gain", "delay", "delay_rate", "faces", "kind", "target"):
             assert np.array_equal(getattr(first[link], name), getattr(second[link], name))
@@ -699,15 +705,15 @@ def test_inputs_and_limits_that_sionna_does_not_check(monkeypatch):
     poses = swarm_of((1.3, -0.7, 2.1), (-13.1, 4.3, -6.6), (7.0, 12.0, 3.0))
     for bad in (pose((np.nan, 0, 0)), pose((1, 2, 3), velocity=(np.inf, 0, 0))):
         with pytest.raises(ValueError, match="not finite"):
-            model.paths(poses | {"U": bad}, 0.0, LINKS)
+            model.trace(poses | {"U": bad}, 0.0, LINKS)
     monkeypatch.setattr(raytrace, "MOST_PATHS", 1000)
     with pytest.raises(
         ValueError, match=r"limit of 1000 paths; lower propagation\.rays or clutter\.rays"
     ):
-        model.paths(poses, 0.0, LINKS)
+        model.trace(poses, 0.0, LINKS)
 
 
 def test_clutter_in_an_empty_city_is_no_error():
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     model, _ = tracer(empty_city("none", np.zeros(3)), **DIFFUSE)
-    assert len(model.paths(poses, 0.0, LINKS)["A", "P"]) == 2
+    assert len(model.trace(poses, 0.0, LINKS).paths["A", "P"]) == 2

@@ -13,11 +13,10 @@ from test_clutter_field import METAL, flown, rectangle
 from test_diffraction import chopped
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import PathKind, make_propagation
+from isac_rt.propagation import PathKind
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
+from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import City
 from isac_rt.world.city.mesh import empty_city
 from isac_rt.world.swarm import Pose
@@ -49,8 +48,7 @@ def tracer(city: City, **radii):
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
         }
     )
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), city)
+    return propagation_in(city, s)
 
 
 def pose(position, velocity=(0.0, 0.0, 0.0)) -> Pose:
@@ -110,11 +108,11 @@ def test_line_of_sight_and_echo_of_a_half_plane():
         d1, d2 = d * 31 / 78, d * 47 / 78
         nu = clearance * np.sqrt(2 * (d1 + d2) / (LAMBDA * d1 * d2))
         poses = {"A": a, "P": end, "U": pose((60.0, -40.0, 3.0))}
-        los = one(model.paths(poses, 0.0, [("A", "P")])["A", "P"], PathKind.LINE_OF_SIGHT)
+        los = one(model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"], PathKind.LINE_OF_SIGHT)
         expected = fresnel(nu) * wave(d)
         worst = max(worst, abs(field(los) / (LAMBDA / (4 * np.pi * d)) - expected))
         echo = one(
-            model.paths(poses | {"U": end, "P": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "A")])[
+            model.trace(poses | {"U": end, "P": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "A")]).paths[
                 "A", "A"
             ],
             PathKind.TARGET,
@@ -139,7 +137,7 @@ def test_delay_rate_of_a_bent_path_is_its_delays():
             n: replace(q, position=q.position + t * q.velocity) for n, q in {"A": a, "P": p}.items()
         }
         return one(
-            model.paths(moved | {"U": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "P")])["A", "P"],
+            model.trace(moved | {"U": pose((60.0, -40.0, 3.0))}, 0.0, [("A", "P")]).paths["A", "P"],
             PathKind.LINE_OF_SIGHT,
         )
 
@@ -200,10 +198,12 @@ def test_bodies_shadow_what_is_behind_them_and_not_themselves():
     unit = np.sqrt(LAMBDA * along * (d - along) / (2 * d))
     nu = np.linalg.norm(w - along * e) / unit
     links = [("A", "P"), ("A", "A"), ("P", "P")]
-    bare = tracer(empty_city("none", np.zeros(3))).paths({"A": a, "P": p, "U": u}, 0.0, links)
+    bare = tracer(empty_city("none", np.zeros(3))).trace({"A": a, "P": p, "U": u}, 0.0, links).paths
     for radius in (0.0, 0.17, 0.43):
-        paths = tracer(empty_city("none", np.zeros(3)), A=0.31, P=0.23, U=radius).paths(
-            {"A": a, "P": p, "U": u}, 0.0, links
+        paths = (
+            tracer(empty_city("none", np.zeros(3)), A=0.31, P=0.23, U=radius)
+            .trace({"A": a, "P": p, "U": u}, 0.0, links)
+            .paths
         )
         factor = chopped(nu, radius / unit) if radius else 1.0
         assert abs(factor - 1) > 0.05 or not radius

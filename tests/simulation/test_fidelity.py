@@ -26,8 +26,7 @@ from isac_rt.simulation.plan import (
     straight_bound,
 )
 from isac_rt.simulation.setup import plan_of as plan_of_scenario
-from isac_rt.simulation.setup import timetable_of
-from isac_rt.world.swarm import Swarm
+from isac_rt.simulation.setup import swarm_of, timetable_of
 
 SCENES = Path(__file__).parents[2] / "scenes"
 K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [rad/m]
@@ -37,7 +36,7 @@ def plan_of(scene: str = "paper_swarm_consistent.yaml", *overrides: str) -> Plan
     s = load(SCENES / scene, overrides)
     w = waveform_of(s)
     timetable = timetable_of(s, w, schedule_of(s, w, generator(s.seed, "schedule")))
-    return plan_of_scenario(s, antennas_of(s, w), timetable, Swarm.from_scenario(s))
+    return plan_of_scenario(s, antennas_of(s, w), timetable, swarm_of(s))
 
 
 def some_paths(count: int, seed: int, **changes) -> PathSet:

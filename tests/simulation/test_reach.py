@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt.propagation import PathKind, PathSet, make_propagation
+from isac_rt.propagation import PathKind, PathSet
 from isac_rt.propagation.clutter.cells import Density, area_for, error_for
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.plan import extent, mechanisms
-from isac_rt.simulation.setup import prepare
-from isac_rt.world.area import city_of
+from isac_rt.simulation.setup import city_of, prepare, propagation_in
 from isac_rt.world.city.mesh import City
 
 SHORT = {"groups": 1, "samples_per_chirp": 256, "chirps_per_frame": 12}
@@ -77,14 +76,14 @@ def test_a_cut_mesh_returns_all_that_is_heard(seed: int):
     whole = city_of(setup.scenario)
     assert setup.city.num_faces + setup.city.num_beyond == whole.num_faces
     assert setup.city.num_beyond > 0.3 * whole.num_faces
-    full = make_propagation(setup.scenario, setup.waveform, setup.antennas, whole, ())
-    part = make_propagation(setup.scenario, setup.waveform, setup.antennas, setup.city, ())
+    full = propagation_in(whole, setup.scenario)
+    part = propagation_in(setup.city, setup.scenario)
     seen = set()
     for frame in (0, 2):
         epoch = setup.timetable.epoch(frame)
         poses = setup.swarm.poses(epoch)
         links = [("A", "A"), ("A", "P")]
-        expected, got = (model.paths(poses, epoch, links) for model in (full, part))
+        expected, got = (model.trace(poses, epoch, links).paths for model in (full, part))
         for link in links:
             a, b = (
                 one[link].select(one[link].delay <= setup.plan.longest_delay)
@@ -153,7 +152,7 @@ def test_the_plan_counts_what_the_summary_counts():
     s = district(315, frames=2)
     setup = prepare(s)
     planned, done = make_plan(setup), simulate.summarise(s)["fidelity"]
-    record = extent(setup.city, setup.propagation, s.clutter)
+    record = extent(setup.city, setup.propagation.census(), s.clutter)
     assert record["scatterers"] == len(setup.propagation.field.cells) > 0
     for key, value in {**record, **mechanisms(s.propagation, s.clutter)}.items():
         assert planned[key] == done[key] == value, key
@@ -184,9 +183,9 @@ def test_the_plan_counts_mirrors():
         and planned["clutter_bounces"] == done["clutter_bounces"] == 2
     )
     assert set(planned["mirrors"]) == {"A", "P"}
-    most = extent(setup.city, prepare(all_of_them).propagation, s.clutter)["mirrors"]
+    most = extent(setup.city, prepare(all_of_them).propagation.census(), s.clutter)["mirrors"]
     for name, row in planned["mirrors"].items():
-        assert row["count"] == len(setup.propagation.twice.mirrors[name]) == 3
+        assert row["count"] == len(setup.propagation.two_bounces.mirrors[name]) == 3
         whole = most[name]["share"] + most[name]["share_left_out"]
         assert row["share"] + row["share_left_out"] == pytest.approx(
             whole, abs=3e-6, rel=0

@@ -16,10 +16,10 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.results.files import ResultsError
 from isac_rt.results.metrics import truth_of
+from isac_rt.simulation.setup import swarm_of
 from isac_rt.studies import paper as experiments
 from isac_rt.studies.paper import fig1, fig5, fig13, flight, onepath, table1, table2, tracks
 from isac_rt.studies.paper.outcome import Outcome, Verdict, blank, proportion, style, write
-from isac_rt.world.swarm import Swarm
 
 
 def silent(done, total):
@@ -223,7 +223,7 @@ def test_the_papers_grids_have_uniform_errors_and_the_filter_lowers_them():
     cell/sqrt(12) (uniform over many cells; 20 % for 100 frames), and an EKF that knows that must do
     better. Planted bug: the detections left unrounded."""
     scene = flight.scenario("consistent")
-    w, swarm = waveform_of(scene), Swarm.from_scenario(scene)
+    w, swarm = waveform_of(scene), swarm_of(scene)
     frames, every = 100, 5
     truth = []
     for k in range(frames):

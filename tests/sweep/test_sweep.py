@@ -20,6 +20,7 @@ import xarray as xr
 
 import isac_rt
 from isac_rt.cli.cli import main
+from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.scenario.file import ScenarioError, load
@@ -550,15 +551,17 @@ def test_no_scheduler_at_the_address(folder, capsys):
 
 
 class Counted:
-    """A propagation model that counts its calls."""
+    """A propagation model that counts its calls, leaves two paths out and holds scatterers."""
 
     def __init__(self, model) -> None:
-        self.model, self.calls, self.dropped = model, 0, 0
+        self.model, self.calls = model, 0
 
-    def paths(self, *arguments):
+    def trace(self, *arguments):
         self.calls += 1
-        self.dropped += 2
-        return self.model.paths(*arguments)
+        return self.model.trace(*arguments)._replace(dropped=2)
+
+    def census(self):
+        return Census(7, 9, {"AT": {"count": 1, "share": 0.1, "share_left_out": 0.25}})
 
 
 def test_cached_paths_are_the_same_and_made_once(folder, tmp_path):
@@ -569,11 +572,11 @@ def test_cached_paths_are_the_same_and_made_once(folder, tmp_path):
     links = setup.timetable.links(0)
     poses, epoch = setup.swarm.poses(0.1), 0.1
     first = CachedPropagation(lambda: model, store, "x")
-    one, two = (
-        first.paths(poses, epoch, links),
-        CachedPropagation(lambda: model, store, "x").paths(poses, epoch, links),
-    )
-    assert model.calls == 1 and first.dropped == 2
+    second = CachedPropagation(lambda: pytest.fail("made without need"), store, "x")
+    (one, dropped), (two, again) = (m.trace(poses, epoch, links) for m in (first, second))
+    assert model.calls == 1
+    assert dropped == again == 2
+    assert first.census() == second.census() == model.census()
     for link in links:
         for name, value in vars(one[link]).items():
             assert np.array_equal(
@@ -584,7 +587,7 @@ def test_cached_paths_are_the_same_and_made_once(folder, tmp_path):
         ("x", 0.2, poses),
         ("x", epoch, setup.swarm.poses(0.2)),
     ):
-        CachedPropagation(lambda: model, store, content).paths(where, time_, links)
+        CachedPropagation(lambda: model, store, content).trace(where, time_, links)
     assert model.calls == 4
 
 
@@ -592,16 +595,16 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     """The least recently used go first; damaged and vanished files are traced again; an unwritable
     folder is no error."""
     setup = prepare(load(folder / "base.yaml"))
-    paths = setup.frame(0).paths
+    traced, census = Traced(setup.frame(0).paths, 1), Census()
     one = PathStore(tmp_path / "probe")
-    one.put("aa", paths, 1)
+    one.put("aa", traced, census)
     size = next((tmp_path / "probe").rglob("*.npz")).stat().st_size
     store = PathStore(tmp_path / "paths", limit=int(4.5 * size))
     for i, key in enumerate(["a1", "b2", "c3", "d4"]):
-        store.put(key, paths, 0)
+        store.put(key, traced, census)
         os.utime(store._file(key), (i, i))
     assert store.get("a1") is not None  # touched: now the latest
-    store.put("e5", paths, 0)
+    store.put("e5", traced, census)
     assert [k for k in ("a1", "b2", "c3", "d4", "e5") if store.get(k) is not None] == [
         "a1",
         "d4",
@@ -610,7 +613,7 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     store._file("d4").write_bytes(store._file("d4").read_bytes()[:200])
     assert store.get("d4") is None
     (tmp_path / "file").write_text("")
-    PathStore(tmp_path / "file" / "below").put("a", paths, 0)
+    PathStore(tmp_path / "file" / "below").put("a", traced, census)
 
 
 def test_a_city_is_loaded_once_while_it_stays_the_same(tmp_path):

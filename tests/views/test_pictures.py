@@ -16,9 +16,8 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.results.files import ResultsError, save
 from isac_rt.results.recorder import Results
 from isac_rt.scenario.file import load
-from isac_rt.simulation.setup import prepare, trace
+from isac_rt.simulation.setup import city_of, prepare, trace
 from isac_rt.views.animate import animate, tracked_positions, write_animation
-from isac_rt.world.area import city_of
 
 ROOT = Path(__file__).parents[2]
 

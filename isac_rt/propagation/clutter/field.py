@@ -16,8 +16,9 @@ and TM parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobe
 kept: what comes in vertical goes out vertical, as with Sionna's default. Gamma belongs to the way
 in, so the two directions of a link differ a little.
 
-One bounce; `twice` adds a mirror before or after it. Delay, rate, acceleration and directions are
-float64 closed forms of the point and the poses.
+One bounce; `two_bounces` adds a mirror before or after it. Delay, rate, acceleration and directions
+are float64 closed forms of the point and the poses.
+
 Import only after `isac_rt.runtime.activate()`.
 
 References
@@ -44,7 +45,7 @@ from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Shadows, Sig
 from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose, Swarm
@@ -114,8 +115,8 @@ class Seen:
 
 
 class ClutterField:
-    """The scatterers of one run. All links and frames see the same ones; `plan` makes it from a
-    scenario."""
+    """The scatterers of one run. All links and frames see the same ones; `plan` makes
+    it."""
 
     def __init__(
         self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int
@@ -129,27 +130,29 @@ class ClutterField:
 
     @classmethod
     def plan(
-        cls, scenario: Scenario, city: City, scene: mi.Scene, wavelength: float
+        cls,
+        clutter: Clutter,
+        swarm: Swarm,
+        city: City,
+        scene: mi.Scene,
+        wavelength: float,
+        seed: int,
     ) -> ClutterField:
         """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
         place of its flight."""
-        duration = scenario.flight_duration_s
-        trajectories = Swarm.from_scenario(scenario).trajectories
-        names = [name for name, uav in scenario.swarm.items() if uav.role != "target"]
-        flights = {name: Flight(trajectories[name], duration, city.origin) for name in names}
+        flights = {
+            name: Flight(swarm.trajectories[name], swarm.duration, city.origin)
+            for name in swarm.terminals
+        }
         places = np.concatenate([flight.knots for flight in flights.values()])
-        density = Density.of(scenario.clutter)
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
-        candidates = cut(city, scatters, places, density, scenario.seed)
+        candidates = cut(city, scatters, places, Density.of(clutter), seed)
         shadows = Shadows(scene)
-        active = {n for n in names if scenario.swarm[n].role == "active"} | {
-            change.to_uav for change in scenario.role_changes
-        }
         kept = _ever_seen(
             shadows,
-            [flights[n] for n in names if n in active],
+            [flights[name] for name in swarm.transmitters],
             candidates.points,
             city.normals[candidates.face],
         )

@@ -25,29 +25,17 @@ transmitter's chirps it carries their data, as the paper does not say.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from scipy.signal import lfilter
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.randomness import generator
-from isac_rt.scenario.tree import Clutter
+from isac_rt.scenario.environment import Clutter
 from isac_rt.world.swarm import Pose
-
-Link = tuple[str, str]
-
-
-class _Paths(Protocol):
-    @property
-    def dropped(self) -> int: ...
-
-    def paths(
-        self, poses: dict[str, Pose], epoch: float, links: list[Link]
-    ) -> dict[Link, PathSet]: ...
 
 
 def rayleigh_cells(
@@ -86,45 +74,40 @@ class RayleighClutter:
     """A propagation model with the paper's clutter on every link."""
 
     def __init__(
-        self,
-        model: _Paths,
-        reference: FreeSpace,
-        clutter: Clutter,
-        waveform: Waveform,
-        antennas: Antennas,
-        seed: int,
+        self, model: Propagation, reference: FreeSpace, clutter: Clutter, waveform: Waveform
     ) -> None:
-        self._model, self._reference, self._clutter = model, reference, clutter
-        self._waveform, self._antennas, self._seed = waveform, antennas, seed
+        self.model, self._reference, self._clutter = model, reference, clutter
+        self._waveform, self._half_view = waveform, reference.antennas.half_view
 
-    @property
-    def dropped(self) -> int:
-        """Of the model below."""
-        return self._model.dropped
+    def census(self) -> Census:
+        """What the model below holds."""
+        return self.model.census()
 
-    def paths(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> dict[Link, PathSet]:
+    def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """The model's paths and the clutter's; the draw depends on seed, link and, unless drawn
         once, epoch."""
-        found = self._model.paths(poses, epoch, links)
-        return {link: merge([p, self._scatterers(p, poses, epoch)]) for link, p in found.items()}
+        paths, dropped = self.model.trace(poses, epoch, links)
+        return Traced(
+            {link: merge([p, self._scatterers(p, poses)]) for link, p in paths.items()}, dropped
+        )
 
-    def _scatterers(self, paths: PathSet, poses: dict[str, Pose], epoch: float) -> PathSet:
-        tx, rx = paths.tx, paths.rx
-        passes = 2 if tx == rx else 1
-        other = self._reference.strongest_target(poses, tx) if tx == rx else rx
+    def _scatterers(self, paths: PathSet, poses: dict[str, Pose]) -> PathSet:
+        (tx, rx), epoch, own = paths.link, paths.epoch, paths.link.own
+        passes = paths.link.passes
+        other = self._reference.strongest_target(poses, tx) if own else rx
         between = poses[other].position - poses[tx].position
         distance = float(np.linalg.norm(between))
         when = "run" if self._clutter.redraw == "once" else repr(float(epoch))
-        rng = generator(self._seed, "rayleigh clutter", tx, rx, when)
+        rng = generator(self._reference.seed, "rayleigh clutter", tx, rx, when)
         ranges, amplitudes = rayleigh_cells(
             self._clutter, self._waveform.range_cell(passes), distance, rng
         )
         departure = arrival = np.tile(between / distance, (ranges.size, 1))
-        if tx != rx:
+        if not own:
             arrival = -departure
         if self._clutter.direction == "field_of_view":
             departure = arrival = poses[tx].to_world(self._directions(ranges.size, rng))
-            if tx != rx:
+            if not own:
                 arrival = poses[rx].to_world(self._directions(ranges.size, rng))
         return make_paths(
             gain=self._reference.reference_amplitude(poses, tx, rx) * amplitudes,
@@ -141,8 +124,6 @@ class RayleighClutter:
     def _directions(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within half the
         field of view."""
-        azimuth, elevation = rng.uniform(
-            -self._antennas.half_view, self._antennas.half_view, (2, count)
-        )
+        azimuth, elevation = rng.uniform(-self._half_view, self._half_view, (2, count))
         flat = np.cos(elevation)
         return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=1)

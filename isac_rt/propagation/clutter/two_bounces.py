@@ -36,7 +36,6 @@ from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.scenario.tree import Scenario
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose
 
@@ -45,7 +44,7 @@ KNOTS_KEPT = 16
 
 
 @dataclass(frozen=True)
-class SeenTwice:
+class SeenByMirror:
     """What K scatterers do between two terminals by way of one mirror.
 
     Attributes
@@ -63,7 +62,7 @@ class SeenTwice:
 
 
 class TwoBounces:
-    """Mirror images of one field for all terminals of a run; `plan` makes it from a scenario."""
+    """Mirror images of one field for all terminals of a run; `plan` makes it."""
 
     def __init__(
         self,
@@ -81,19 +80,29 @@ class TwoBounces:
 
     @classmethod
     def plan(
-        cls, scenario: Scenario, city: City, field: ClutterField, wavelength: float
+        cls, field: ClutterField, city: City, wavelength: float, seed: int, most: int
     ) -> TwoBounces:
-        """Choose each terminal's mirrors for the whole of its flight."""
-        shadows, most = field.sight.shadows, scenario.clutter.mirrors
+        """Choose each terminal's mirrors, at most `most`, for the whole of its flight."""
         mirrors = {
-            n: strongest(city, shadows, flight, wavelength, scenario.seed, most)
-            for n, flight in field.sight.flights.items()
+            name: strongest(city, field.sight.shadows, flight, wavelength, seed, most)
+            for name, flight in field.sight.flights.items()
         }
         return cls(field, city, mirrors, wavelength)
 
+    def census(self) -> dict[str, dict[str, float]]:
+        """By terminal how many mirrors it has, and what these and all others send on."""
+        return {
+            name: {
+                "count": len(kept),
+                "share": round(sum(m.share for m in kept), 6),
+                "share_left_out": round(self.left_out[name], 6),
+            }
+            for name, kept in self.mirrors.items()
+        }
+
     def seen(
         self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None
-    ) -> list[SeenTwice]:
+    ) -> list[SeenByMirror]:
         """What is in sight of both ends, once for each mirror and order; poses in local
         coordinates."""
         out = []
@@ -152,7 +161,7 @@ class TwoBounces:
             )
         return out
 
-    def _chain(self, part: SeenTwice, start: Pose, end: Pose) -> tuple[np.ndarray, np.ndarray]:
+    def _chain(self, part: SeenByMirror, start: Pose, end: Pose) -> tuple[np.ndarray, np.ndarray]:
         """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of
         a mirror go by its largest."""
         place = self._field.cells.points[part.seen.index]
@@ -210,7 +219,7 @@ class TwoBounces:
         start: Pose,
         end: Pose,
         before: bool,
-    ) -> SeenTwice:
+    ) -> SeenByMirror:
         motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
         motion[0 if before else 1] = mirror.image(start if before else end)
         count = index.size
@@ -256,11 +265,11 @@ class TwoBounces:
         some = np.flatnonzero(size > 0)
         turn = (gain[some] / size[some]).astype(np.complex64)
         kept = [np.asarray(a)[some] for a in (index, size.astype(np.float32), *out)]
-        return SeenTwice(Seen(*kept), turn, mirror, before)
+        return SeenByMirror(Seen(*kept), turn, mirror, before)
 
     def _shaded(
-        self, part: SeenTwice, tx: str, rx: str, start: Pose, end: Pose, bodies: Bodies
-    ) -> SeenTwice:
+        self, part: SeenByMirror, tx: str, rx: str, start: Pose, end: Pose, bodies: Bodies
+    ) -> SeenByMirror:
         """The same past the swarm's bodies, on both ways."""
         s = part.seen
         points, _ = self._chain(part, start, end)

@@ -14,17 +14,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
 
+from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.sight import LIFT, _rows
 from isac_rt.propagation.legs.geometry import EDGE, Legs, unfold
 from isac_rt.propagation.legs.reflection import mirror_amplitude
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose
 
-Pair = tuple[str, str]
 PROPER = 1e-9
 """Share of its length by which a path may differ from the sum of its segments; one that differs by
 more runs through a mirror."""
@@ -51,6 +52,15 @@ class LegSet:
     @property
     def bounces(self) -> np.ndarray:
         return (self.faces >= 0).sum(axis=1)
+
+
+class TracedLegs(NamedTuple):
+    """Legs of all pairs at one instant; chains that contradict the ray tracer's points, and chains
+    that it found more than once, are left out and counted."""
+
+    legs: dict[Link, LegSet]
+    dropped: int = 0
+    duplicates: int = 0
 
 
 def pick(legs: Legs, which: np.ndarray) -> Legs:
@@ -117,7 +127,7 @@ class Between:
     def __init__(
         self,
         instants: np.ndarray,
-        trace: Callable[[float], dict[Pair, LegSet]],
+        trace: Callable[[float], TracedLegs],
         city: City,
         mirrors: tuple[np.ndarray, np.ndarray],
         scene: mi.Scene,
@@ -125,7 +135,7 @@ class Between:
     ) -> None:
         self._instants, self._trace, self._city, self._mirrors = instants, trace, city, mirrors
         self._scene, self._wavelength = scene, wavelength
-        self._kept: dict[int, dict[Pair, LegSet]] = {}
+        self._kept: dict[int, TracedLegs] = {}
         self._interval: tuple[int, list[_Chains]] = (0, [])
         self.num_traced = 0
         """Instants traced so far."""
@@ -135,15 +145,16 @@ class Between:
         self.num_chains: dict[int, float] = {}
         """Legs there were on average at these two instants."""
 
-    def legs(self, local: Mapping[str, Pose], time: float) -> dict[Pair, LegSet]:
-        """Legs of every pair at an instant of the run, for the poses at that instant."""
+    def legs(self, local: Mapping[str, Pose], time: float) -> TracedLegs:
+        """Legs of every pair at an instant of the run, for the poses at that instant. Chains count
+        as left out at the instants that are traced only."""
         if not self._instants[0] - 1e-9 <= time <= self._instants[-1] + 1e-9:
             return self._trace(time)  # before or after all frames: there is nothing to be between
         number = int(np.argmin(np.abs(self._instants - time)))
         if abs(self._instants[number] - time) < 1e-9:
             return self._traced(number)
         after = int(np.clip(np.searchsorted(self._instants, time), 1, len(self._instants) - 1))
-        first, second = self._traced(after - 1), self._traced(after)
+        first, second = self._traced(after - 1).legs, self._traced(after).legs
         if self._interval[0] != after:
             self._interval = after, _chains(first, second)
             self.changes[after - 1] = _changes(self._interval[1])
@@ -156,9 +167,10 @@ class Between:
             for chains in self._interval[1]
         ]
         self._test(found)
-        return self._settled(found, list(first), next(iter(first.values())).faces.shape[1])
+        depth = next(iter(first.values())).faces.shape[1]
+        return TracedLegs(self._settled(found, list(first), depth))
 
-    def _traced(self, number: int) -> dict[Pair, LegSet]:
+    def _traced(self, number: int) -> TracedLegs:
         if number not in self._kept:
             while len(self._kept) > 2:
                 del self._kept[next(iter(self._kept))]
@@ -167,7 +179,7 @@ class Between:
         return self._kept[number]
 
     def _unfolded(
-        self, chains: _Chains, local: Mapping[str, Pose], pairs: list[Pair], nearest_first: bool
+        self, chains: _Chains, local: Mapping[str, Pose], pairs: list[Link], nearest_first: bool
     ) -> _Unfolded:
         """Where the chains run for these poses, and which of them may be there."""
         start, end = (
@@ -221,7 +233,7 @@ class Between:
         ray.maxt = mi.Float(length.astype(np.float32))  # type: ignore[assignment]
         return np.asarray(self._scene.ray_test(ray))
 
-    def _settled(self, found: list[_Unfolded], pairs: list[Pair], depth: int) -> dict[Pair, LegSet]:
+    def _settled(self, found: list[_Unfolded], pairs: list[Link], depth: int) -> dict[Link, LegSet]:
         """What lives, sorted by pair, bounces and length, with its amplitudes."""
         parts, owners = [], []
         for part in found:
@@ -277,7 +289,7 @@ class _Unfolded:
     doubtful: np.ndarray
 
 
-def _chains(first: Mapping[Pair, LegSet], second: Mapping[Pair, LegSet]) -> list[_Chains]:
+def _chains(first: Mapping[Link, LegSet], second: Mapping[Link, LegSet]) -> list[_Chains]:
     """The chains of two instants, by number of bounces."""
     out = []
     for count in range(next(iter(first.values())).faces.shape[1] + 1):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from isac_rt.frame.link import Link
 from isac_rt.propagation.legs.between import LegSet, leg_set, pick
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.diffraction import edge_factor
@@ -18,16 +19,15 @@ from isac_rt.propagation.legs.geometry import Legs, straight
 from isac_rt.world.swarm import Pose
 
 Direct = tuple[np.ndarray, Legs]
-Pair = tuple[str, str]
 
 
 def past_edges_and_bodies(
-    legs: dict[Pair, LegSet],
+    legs: dict[Link, LegSet],
     poses: dict[str, Pose],
     edges: ShadowEdges,
     bodies: Bodies,
     wavelength: float,
-) -> dict[Pair, LegSet]:
+) -> dict[Link, LegSet]:
     """Traced legs of all pairs with straight ones that bend (in place of those that are there or
     not), past the swarm's bodies."""
     direct, out = direct_legs(poses, list(legs), edges, bodies, wavelength), {}
@@ -50,17 +50,19 @@ def past_edges_and_bodies(
 
 def direct_legs(
     poses: dict[str, Pose],
-    pairs: list[tuple[str, str]],
+    pairs: list[Link],
     edges: ShadowEdges,
     bodies: Bodies,
     wavelength: float,
-) -> dict[tuple[str, str], Direct]:
+) -> dict[Link, Direct]:
     """Amplitude (0 or 1,) and leg of every pair of bodies at different places.
 
     `points` (.., 1, 3) of a leg holds the edge round which it bends, else NaN.
     """
     apart = [
-        (a, b) for a, b in pairs if np.linalg.norm(poses[b].position - poses[a].position) > 1e-9
+        pair
+        for pair in pairs
+        if np.linalg.norm(poses[pair.rx].position - poses[pair.tx].position) > 1e-9
     ]
     starts, ends = (
         np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1)

@@ -6,7 +6,6 @@ two found included, the largest of the frames between.
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -50,13 +49,13 @@ def _of(
     setup = prepare(scenario)
     size = setup.city.num_faces if size is None else size
     between = tracer_of(setup)
-    full = copy.copy(between)
-    full.between = None
+    assert between is not None
+    full = between.every_frame()
     errors = []
     for frame in range(1, scenario.frames - 1, 3):
         poses, found = setup.find(frame)
         when = setup.timetable.epoch(frame)
-        truth = full.paths(poses, when, list(found))
+        truth = full.trace(poses, when, list(found)).paths
         errors += [
             gain_error(found[link], truth[link]) for link in found if truth[link].power.any()
         ]
@@ -90,4 +89,4 @@ def _of(
 def _seconds(setup: Setup, tracer: Any, repeats: int) -> float:
     poses, found = setup.find(1)
     when = setup.timetable.epoch(1)
-    return cpu_seconds(lambda: tracer.paths(poses, when, list(found)), repeats)
+    return cpu_seconds(lambda: tracer.trace(poses, when, list(found)).paths, repeats)

@@ -17,8 +17,9 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
+from isac_rt.simulation.setup import swarm_of
 from isac_rt.studies.paper.outcome import Progress
-from isac_rt.world.swarm import Pose, Swarm
+from isac_rt.world.swarm import Pose
 
 SCENES = Path(__file__).parents[3] / "scenes"
 VARIANTS = {"printed": "paper_swarm.yaml", "consistent": "paper_swarm_consistent.yaml"}
@@ -40,7 +41,7 @@ def views(scene: Scenario) -> dict[tuple[str, str], np.ndarray]:
     """Whether each UAV has each other in its own field of view, frame by frame, from the poses
     alone: {(who, whom): (frames,)}."""
     w = waveform_of(scene)
-    antennas, swarm = antennas_of(scene, w), Swarm.from_scenario(scene)
+    antennas, swarm = antennas_of(scene, w), swarm_of(scene)
     poses = [swarm.poses((k + 0.5) * w.frame_duration) for k in range(scene.frames)]
     pairs = [(a, b) for a in UAVS for b in UAVS if a != b]
     return {(a, b): np.array([sees(antennas, p[a], p[b]) for p in poses]) for a, b in pairs}
@@ -63,7 +64,7 @@ def span(seen: np.ndarray) -> str:
 
 def closing_speed(scene: Scenario, who: str, whom: str) -> tuple[float, float]:
     """Smallest and largest |radial velocity| between two UAVs over the frames [m/s]."""
-    w, swarm = waveform_of(scene), Swarm.from_scenario(scene)
+    w, swarm = waveform_of(scene), swarm_of(scene)
     rates = []
     for k in range(scene.frames):
         p = swarm.poses((k + 0.5) * w.frame_duration)

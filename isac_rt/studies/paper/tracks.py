@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from isac_rt.frame.antennas import azimuth_elevation
 from isac_rt.frame.waveform import waveform_of
+from isac_rt.simulation.setup import swarm_of
 from isac_rt.studies.paper.flight import errors, scenario
 from isac_rt.studies.paper.outcome import Judgement, Verdict, blank, proportion, style
 from isac_rt.terminal.filter import birth, measure, measurement_covariance, predict, update
-from isac_rt.world.swarm import Swarm
 
 Pairs = dict[str, tuple[np.ndarray, np.ndarray]]
 """Absolute errors before and after the filter, by quantity."""
@@ -63,7 +63,7 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
     their raw errors are a hundredth.
     """
     scene = scenario("consistent")
-    w, swarm, passes = waveform_of(scene), Swarm.from_scenario(scene), 2 if observer == "AT" else 1
+    w, swarm, passes = waveform_of(scene), swarm_of(scene), 2 if observer == "AT" else 1
     step = np.array([w.range_cell(passes), w.velocity_cell(passes), np.deg2rad(ANGLE_STEP_DEG)])
     std = np.append(step, step[2]) / np.sqrt(12)
     out: dict[str, tuple[list[float], list[float]]] = {quantity: ([], []) for quantity in UNITS}

@@ -16,6 +16,7 @@ from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.swarm import Rcs
 from isac_rt.scenario.tree import Clutter
+from isac_rt.simulation.setup import propagation_in
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, slab_reflection
@@ -38,9 +39,11 @@ def _gap(i: int, j: int) -> float:
 def _free(tx: str, rx: str, gain: float = 1.0):
     s = stage.scenario(traced=False)
     antennas = replace(stage.FEW, gain=gain)
-    return FreeSpace(s.swarm, antennas, WAVELENGTH, s.seed).paths(
-        stage.swarm(*PLACES), 0.0, [(tx, rx)]
-    )[tx, rx]
+    return (
+        FreeSpace(s.swarm, antennas, WAVELENGTH, s.seed)
+        .trace(stage.swarm(*PLACES), 0.0, [(tx, rx)])
+        .paths[tx, rx]
+    )
 
 
 @case("(lambda / 4 pi d)^2 G G", "1e-9 dB", "float64 rounding")
@@ -94,7 +97,7 @@ def two_rays_across_the_breakpoint() -> Errors:
     model = stage.tracer(_ground(sigma, eps), 1)
     for distance in (7.3, 23.9, 61.7, 97.1, 203.0, 411.0):
         poses = stage.swarm((0, 0, low), (distance, 0, high), (3.0, 40.0, 11.0), moving=False)
-        paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
+        paths = model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
         paths = paths.select(paths.target < 0)
         turn = (truths.CARRIER * (paths.delay - paths.delay[0])) % 1.0
         field = (paths.gain * np.exp(-2j * np.pi * turn)).sum() / np.abs(paths.gain[0])
@@ -114,7 +117,7 @@ def conducting_plate() -> float:
         (31.7, -20, -20), (0, 40, 0), (0, 0, 40), stage.material(conductivity=stage.METAL)
     )
     poses = stage.swarm((0.3, 0.0, 0.0), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4))
-    paths = stage.tracer(plate).paths(poses, 0.0, [("A", "A")])["A", "A"]
+    paths = stage.tracer(plate).trace(poses, 0.0, [("A", "A")]).paths["A", "A"]
     paths = paths.select(paths.kind == PathKind.SPECULAR)
     if len(paths) != 1:
         return np.inf
@@ -147,9 +150,13 @@ def conducting_corner() -> float:
     )
     away = np.array([9.3, 13.1, 0.0])
     radar = corner + away + np.array([0, 0, 1.7])
-    paths = stage.tracer(mesh, 2).paths(
-        stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7])), 0.0, [("A", "A")]
-    )["A", "A"]
+    paths = (
+        stage.tracer(mesh, 2)
+        .trace(
+            stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7])), 0.0, [("A", "A")]
+        )
+        .paths["A", "A"]
+    )
     paths = paths.select((paths.kind == PathKind.SPECULAR) & (paths.bounces == 2))
     if len(paths) != 1:
         return np.inf
@@ -177,7 +184,7 @@ def reflection_of_a_slab() -> Errors:
         model = stage.tracer(mesh, 1)
         for h in (0.9, 7.3, 31.0):
             poses = stage.swarm((-9.7, 3.1, h), (13.9, -4.3, 0.7 * h), (0.5, 40.0, 11.0))
-            paths = model.paths(poses, 0.0, [("A", "P")])["A", "P"]
+            paths = model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
             paths = paths.select(paths.kind == PathKind.SPECULAR)
             length = np.sqrt(23.6**2 + 7.4**2 + (1.7 * h) ** 2)
             truth = slab_reflection(eps, sigma, thickness, 1.7 * h / length)[1]
@@ -196,9 +203,11 @@ def ghosts_over_a_conducting_wall() -> float:
         (-60, 25.0, -40), (120, 0, 0), (0, 0, 80), stage.material(conductivity=stage.METAL)
     )
     a, u = np.array([1.3, -2.7, 0.9]), np.array([9.1, 6.3, 0.9])
-    paths = stage.tracer(wall, 2).paths(stage.swarm(a, (-30.0, -20.0, 3.0), u), 0.0, [("A", "A")])[
-        "A", "A"
-    ]
+    paths = (
+        stage.tracer(wall, 2)
+        .trace(stage.swarm(a, (-30.0, -20.0, 3.0), u), 0.0, [("A", "A")])
+        .paths["A", "A"]
+    )
     paths = paths.select(paths.target == 2)
     image = np.array([u[0], 50 - u[1], u[2]])
     direct, folded = np.linalg.norm(u - a), np.linalg.norm(image - a)
@@ -222,11 +231,7 @@ def _field_tracer(poses: dict, city: City, **clutter: Any) -> Any:
     s = stage.scenario(
         swarm=where, frames=40, propagation={"max_bounces": 0}, clutter={"model": "field"} | clutter
     )
-    from isac_rt.frame.waveform import waveform_of
-    from isac_rt.propagation.raytrace import RayTracer
-
-    w = waveform_of(s)
-    return RayTracer(s, city, stage.FEW, w.wavelength, w.carrier_frequency)
+    return propagation_in(city, s)
 
 
 def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
@@ -285,7 +290,9 @@ def lambertian_wall_by_way_of_the_ground() -> float:
         "A": stage.pose((1.3, 28.3, 2.1), boresight=(0, 1, 0)),
         "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0)),
     }
-    ways = _field_tracer(poses, city, mirrors=2).twice.seen("A", "P", poses["A"], poses["P"], 0.0)
+    ways = _field_tracer(poses, city, mirrors=2).two_bounces.seen(
+        "A", "P", poses["A"], poses["P"], 0.0
+    )
     worst, count = 0.0, 0
     for part in ways:
         if abs(part.mirror.normal[2]) > 0.5:

@@ -12,15 +12,13 @@ import numpy as np
 import trimesh
 from scipy import ndimage, stats
 
-from isac_rt.frame.antennas import antennas_of
-from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import make_propagation
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation import truths
 from isac_rt.studies.validation.case import Errors, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH
 from isac_rt.world.city import City, load_city
-from isac_rt.world.swarm import Pose, Swarm
+from isac_rt.world.swarm import Pose
 
 CELL = 0.25
 SHARE = 0.4
@@ -71,10 +69,9 @@ class Flight:
             "clutter": {"model": "field", **clutter},
         }
         s = Scenario.model_validate(tree)
-        w = waveform_of(s)
         self.city = _crossing()
-        self.field = make_propagation(s, w, antennas_of(s, w), self.city).field  # type: ignore[attr-defined]
-        self.way = Swarm.from_scenario(s).trajectories["A"]
+        self.field = propagation_in(self.city, s).field  # type: ignore[attr-defined]
+        self.way = swarm_of(s).trajectories["A"]
 
     def pose(self, time: float) -> Pose:
         """In local coordinates."""
@@ -331,11 +328,11 @@ def mean_power_of_a_street() -> float:
             "clutter": {"model": "field", "cell_area_per_metre_m": 0.024},
         }
     )
-    w, swarm = waveform_of(s), Swarm.from_scenario(s)
+    swarm = swarm_of(s)
     city = load_city(
         s.city, ".", truths.CARRIER, (np.array(way["A"][0]) + np.array(way["P"][0])) / 2
     )
-    field = make_propagation(s, w, antennas_of(s, w), city).field  # type: ignore[attr-defined]
+    field = propagation_in(city, s).field  # type: ignore[attr-defined]
     cells, totals = [], []
     for time in (0.02, 400 * FRAME - 0.02):
         poses = {

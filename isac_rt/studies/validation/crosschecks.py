@@ -43,7 +43,7 @@ def paths_of_a_canyon_against_sionna() -> float:
         (0.31, -0.17, 0.9),
     )
     poses = stage.swarm(*PLACES, moving=False)
-    ours = stage.tracer(city, 2).paths(poses, 0.0, [("A", "P")])["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     ours = ours.select(ours.target < 0)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(
@@ -82,7 +82,7 @@ def echoes_against_sionna() -> float:
         tree.City(source="builtin", name="floor_wall"), ".", truths.CARRIER, (0.31, -0.17, 0.9)
     )
     poses = stage.swarm((1.13, -0.41, 2.71), (1.71, 0.33, 0.31), (1.31, 0.43, 1.63))
-    ours = stage.tracer(city, 2).paths(poses, 0.0, [("A", "P")])["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     ours = ours.select(ours.target == 2)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(

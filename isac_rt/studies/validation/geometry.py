@@ -54,9 +54,11 @@ def _over(planes: tuple, distances: tuple[float, ...] = (1.013, 9.87, 101.3, 997
 
 def _free_space(poses: dict[str, Pose], tx: str, rx: str):
     s = stage.scenario(traced=False)
-    return FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed).paths(poses, 0.0, [(tx, rx)])[
-        tx, rx
-    ]
+    return (
+        FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed)
+        .trace(poses, 0.0, [(tx, rx)])
+        .paths[tx, rx]
+    )
 
 
 def _doppler_error(found: float, length) -> float:
@@ -325,9 +327,11 @@ def every_path_of_a_box() -> float:
         if np.abs(index).sum() <= 2:
             image = [_image(a[i], low[i], high[i], index[i]) for i in range(3)]
             lattice.append(np.linalg.norm(p - np.array(image)))
-    paths = stage.tracer(city, 2).paths(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [("A", "P")])[
-        "A", "P"
-    ]
+    paths = (
+        stage.tracer(city, 2)
+        .trace(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [("A", "P")])
+        .paths["A", "P"]
+    )
     found = np.sort(C * paths.delay[paths.target < 0])
     return float(np.abs(found - np.sort(lattice)).max()) if found.size == len(lattice) else np.inf
 
@@ -351,7 +355,7 @@ def a_wall_10_km_off_reflects_once() -> float:
         far + np.array([1.7, 17.4, 8.1]),
         far + np.array([-3.3, -2.2, 7.9]),
     )
-    paths = stage.tracer(city, 1).paths(poses, 0.0, [("A", "P")])["A", "P"]
+    paths = stage.tracer(city, 1).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
     return abs(paths.counts()["specular"] - 1)
 
 

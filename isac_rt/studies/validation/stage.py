@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, antennas_of
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, Transmission
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, waveform_of
-from isac_rt.propagation import PathKind, PathSet, Propagation, make_paths, make_propagation
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation import PathKind, PathSet, Propagation, make_paths
 from isac_rt.randomness import seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.noise import add_white_noise
+from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import City, Material
 from isac_rt.world.swarm import Pose, attitude
 
@@ -71,8 +72,7 @@ def scenario(traced: bool = True, **changes: Any) -> Scenario:
 def tracer(mesh: City, bounces: int = 2, **changes: Any) -> Propagation:
     """A ray tracer in a mesh, whatever city the scenario names."""
     s = scenario(**({"propagation": {"max_bounces": bounces}} | changes))
-    w = waveform_of(s)
-    return make_propagation(s, w, antennas_of(s, w), mesh)
+    return propagation_in(mesh, s)
 
 
 def material(
