@@ -258,7 +258,7 @@ def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
     *places, bounces = SCENES[name]
     poses, city = swarm_of(*places), builtin(name)
     model, s = tracer(city, bounces)
-    found = model.trace(poses, 0.0, LINKS).paths
+    found, dropped = model.trace(poses, 0.0, LINKS)
     images = Images(city)
     legs = {
         (a, b): images.paths(poses[a].position, poses[b].position, bounces)
@@ -287,7 +287,7 @@ def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
         ]  # the same lattice, of which 12 images lie behind edges
     one_way = found["A", "P"].bounces[found["A", "P"].target < 0]
     assert np.bincount(one_way).tolist() == FOUND[name]
-    assert model.dropped == 0
+    assert dropped == 0
 
 
 def check_points(paths: PathSet, poses: dict[str, Pose], images: Images) -> None:
