@@ -4,6 +4,7 @@ angles, a late clock."""
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -14,16 +15,53 @@ from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT as C
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
-from isac_rt.receive import Prediction, receive_passive
+from isac_rt.receive import receive_passive
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper import fig5, onepath
-from isac_rt.studies.paper.outcome import Judgement, Verdict, proportion
+from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
+from isac_rt.studies.waves import prediction
 
 SPACING = 0.5774
 """Of the paper's receive elements [carrier wavelengths]."""
+
+say = Sentences("""
+model: The approximations that make the IF a product of range, Doppler and angle are negligible
+  relative RMS error without data {text} (migration and the Doppler within a chirp); with data at
+  least {worst:.2f} at any velocity, because the phases of the data delay are left out
+
+travel: A delay interval of one cell exceeds what a target moves in a frame
+  {cells:.4f} cells at the unambiguous velocity; what is needed besides is a prediction within half
+  a cell (Fig. 12)
+
+phases: The interval of the phases must exceed what the velocity error turns in p < 2 L_tx slots
+  read as angles, 2 pi p f |dv|/c < pi/D at a PT (the paper compares complex numbers, and the AT's
+  4 pi is not the PT's); tolerated without noise for D = 2, 4, 8, 16: {text} m/s
+
+velocity: The maximum unambiguous velocity is L_tx times that of conventional TDM-MIMO
+  {text}; it still falls as L_tx grows, since the guard interval 2 L_tx T_d lengthens the slot
+
+dictionary: The redundant DFT dictionary gives the angles
+  exp(-j pi l sin) belongs to half a wavelength; at {spacing} wavelengths it turns {text} degrees
+
+departure: A PT estimates angles of departure
+  its two transmit elements per axis stand {apart:.2f} wavelengths apart: {answers} answers within
+  the field of view
+
+far: UAVs are far-field points
+  2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture:.1f} mm; the least distance of
+  the flight is 4 m (wavefronts are spherical here all the same)
+
+late: A constant synchronisation delay biases the range and leaves the data alone
+  the range is off by c times the delay to within {bias:.1f} mm; symbol error rates at {snr:g} dB, 7
+  receive antennas: {inside}; on condition that path and clock together stay below half of the
+  range: {beyond}, and no acquisition
+
+half: Range below N/2 cells and data below N/2 cells keep every chirp in its resource block
+  chirps that keep an echo from 120 m: {inside}; from 200 m, beyond the {half:.1f} m: {outside}
+""")
 
 
 # ---------------------------------------------------------------- the separable model
@@ -43,15 +81,12 @@ def model_error(velocity: float, modulated: bool, seed: int) -> float:
     is taken out, one group."""
     w = Waveform(num_groups=1)
     schedule = conventional_schedule(1, w.num_chirps, w.num_tx)
-    payload = (
-        random_payload(w, schedule, 8, generator(seed, "claims", "model"))
-        if modulated
-        else unmodulated(w)
-    )
-    length, rate = 100.0, 2 * velocity
-    exact = onepath.frame(
-        w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C
-    ).samples[:, 0]
+    payload = unmodulated(w)
+    if modulated:
+        payload = random_payload(w, schedule, 8, generator(seed, "claims", "model"))
+    length, rate, arrays = 100.0, 2 * velocity, onepath.antennas(w, 1)
+    cube = onepath.frame(w, schedule, payload, arrays, delay=length / C, rate=rate / C)
+    exact = cube.samples[:, 0]
     # the paper's range is that at the start of the frame
     paper = separable(w, payload, length - rate * w.frame_duration / 2, rate)
     factor = np.vdot(paper, exact) / np.vdot(paper, paper).real
@@ -60,25 +95,12 @@ def model_error(velocity: float, modulated: bool, seed: int) -> float:
 
 def model(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """How good the approximation after equation (8) is."""
-    rows = [
-        {"velocity_mps": v, "data": data, "relative_rms_error": model_error(v, data, seed)}
-        for data in (False, True)
-        for v in (0.0, 0.5, 1.0, 5.0, 15.0)
-    ]
-    table = pd.DataFrame(rows)
-    still = table[~table.data].set_index("velocity_mps").relative_rms_error
-    worst = table[table.data].relative_rms_error.min()
-    text = ", ".join(f"{e:.2g} at {v:g} m/s" for v, e in still.items() if v)
-    return table, (
-        Verdict(
-            "The approximations that make the IF a product of range, Doppler and angle are "
-            "negligible",
-            "does not hold",
-            f"relative RMS error without data {text} (migration and the Doppler within a chirp); "
-            f"with data at least {worst:.2f} "
-            "at any velocity, because the phases of the data delay are left out",
-        ),
-    )
+    points = [(v, data) for data in (False, True) for v in (0.0, 0.5, 1.0, 5.0, 15.0)]
+    rows = [(v, data, model_error(v, data, seed)) for v, data in points]
+    worst = min(e for _, data, e in rows if data)
+    text = ", ".join(f"{e:.2g} at {v:g} m/s" for v, data, e in rows if v and not data)
+    verdict = say("model", False, text=text, worst=worst)
+    return table("velocity_mps data relative_rms_error", rows), (verdict,)
 
 
 # ---------------------------------------------------------------- intervals of the modulation
@@ -90,40 +112,23 @@ def travel_cells(w: Waveform) -> float:
     return 2 * C / (4 * w.slot_duration * w.carrier_frequency) * w.frame_duration / C / w.delay_step
 
 
-def prediction(length: float, rate: float) -> Prediction:
-    """A prediction of one path."""
-    return Prediction(
-        range=np.array([length]),
-        velocity=np.array([rate]),
-        direction=np.zeros((1, 2)),
-        range_std=np.array([0.02]),
-        velocity_std=np.array([0.1]),
-        weight=np.ones(1),
-    )
-
-
 def tolerated_error(order: int, seed: int, steps: int = 9) -> tuple[float, float]:
     """Velocity error [m/s] up to which a PT decides all DPSK symbols of a noiseless frame, by
     bisection, and the closed form c/(2 p f D) with p the longest time between two chirps of an
     antenna."""
     w = Waveform(num_groups=1)
-    schedule = pseudo_random_schedule(
-        1, w.num_chirps, w.num_tx, generator(seed, "claims", "interval", "schedule")
-    )
+    rng = generator(seed, "claims", "interval", "schedule")
+    schedule = pseudo_random_schedule(1, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, order, generator(seed, "claims", "interval", order))
-    length, rate = 43.817, 7.3
-    cube = onepath.frame(
-        w, schedule, payload, onepath.antennas(w, 1), delay=length / C, rate=rate / C
-    )
+    length, rate, arrays = 43.817, 7.3, onepath.antennas(w, 1)
+    cube = onepath.frame(w, schedule, payload, arrays, delay=length / C, rate=rate / C)
     gap = max(int(np.diff(np.flatnonzero(schedule[0] == tx)).max()) for tx in range(w.num_tx))
     limit = C / (2 * gap * w.slot_duration * w.effective_carrier * order)
     low, high = 0.5 * limit, 1.5 * limit
     for _ in range(steps):
         middle = (low + high) / 2
-        right = (
-            demodulate(cube, prediction(length, rate + middle), order).transitions
-            == payload.transitions
-        ).all()
+        found = demodulate(cube, prediction(length, rate + middle), order)
+        right = (found.transitions == payload.transitions).all()
         low, high = (middle, high) if right else (low, middle)
     return (low + high) / 2, limit
 
@@ -131,31 +136,12 @@ def tolerated_error(order: int, seed: int, steps: int = 9) -> tuple[float, float
 def intervals(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """The two conditions on the modulation's intervals."""
     cells = travel_cells(Waveform())
-    rows = []
-    for order in (2, 4, 8, 16):
-        measured, formula = tolerated_error(order, seed)
-        rows.append({"D": order, "tolerated_velocity_error_mps": measured, "formula_mps": formula})
-    table = pd.DataFrame(rows)
-    close = bool((np.abs(table.tolerated_velocity_error_mps / table.formula_mps - 1) < 0.05).all())
-    text = ", ".join(
-        f"{r.tolerated_velocity_error_mps:.2f} (formula {r.formula_mps:.2f})"
-        for r in table.itertuples()
-    )
-    return table, (
-        Verdict(
-            "A delay interval of one cell exceeds what a target moves in a frame",
-            "holds" if cells < 1 else "does not hold",
-            f"{cells:.4f} cells at the unambiguous velocity; what is needed besides is a "
-            "prediction within half a cell (Fig. 12)",
-        ),
-        Verdict(
-            "The interval of the phases must exceed what the velocity error turns in p < 2 L_tx "
-            "slots",
-            "holds under a condition" if close else "does not hold",
-            "read as angles, 2 pi p f |dv|/c < pi/D at a PT (the paper compares complex numbers, "
-            "and the AT's 4 pi is not the PT's); "
-            f"tolerated without noise for D = 2, 4, 8, 16: {text} m/s",
-        ),
+    rows = [(order, *tolerated_error(order, seed)) for order in (2, 4, 8, 16)]
+    close = all(abs(measured / formula - 1) < 0.05 for _, measured, formula in rows)
+    text = ", ".join(f"{measured:.2f} (formula {formula:.2f})" for _, measured, formula in rows)
+    return table("D tolerated_velocity_error_mps formula_mps", rows), (
+        say("travel", cells < 1, cells=cells),
+        say("phases", False, close, text=text),
     )
 
 
@@ -167,12 +153,10 @@ def unambiguous(num_tx: int, random: bool, seed: int) -> tuple[float, float]:
     0.93 of c/(4 T f) [m/s]."""
     w = Waveform(num_groups=1, num_tx=num_tx)
     arrays = Antennas(tx_x=num_tx, tx_z=1, rx_x=1, rx_z=1, spacing=SPACING * w.wavelength)
-    rng = generator(seed, "claims", "ambiguity", num_tx)
-    schedule = (
-        pseudo_random_schedule(1, w.num_chirps, num_tx, rng)
-        if random
-        else conventional_schedule(1, w.num_chirps, num_tx)
-    )
+    schedule = conventional_schedule(1, w.num_chirps, num_tx)
+    if random:
+        rng = generator(seed, "claims", "ambiguity", num_tx)
+        schedule = pseudo_random_schedule(1, w.num_chirps, num_tx, rng)
     velocity, pilot = 0.93 * w.max_velocity(2), unmodulated(w)
     cube = onepath.frame(w, schedule, pilot, arrays, delay=2 * 23.7 / C, rate=2 * velocity / C)
     spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, 256)
@@ -186,33 +170,13 @@ def ambiguities(seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     paper's."""
     rows = []
     for num_tx in (2, 3, 4, 6):
-        (plain, _), (random, error) = (
-            unambiguous(num_tx, False, seed),
-            unambiguous(num_tx, True, seed),
-        )
-        rows.append(
-            {
-                "L_tx": num_tx,
-                "conventional_mps": plain,
-                "pseudo_random_mps": random,
-                "ratio": random / plain,
-                "error_mps": error,
-            }
-        )
-    table = pd.DataFrame(rows)
-    exact = bool((np.abs(table.ratio - table.L_tx) < 1e-9).all())
-    text = "; ".join(
-        f"L_tx = {r.L_tx}: {r.conventional_mps:.2f} to {r.pseudo_random_mps:.2f} m/s"
-        for r in table.itertuples()
-    )
-    return table, (
-        Verdict(
-            "The maximum unambiguous velocity is L_tx times that of conventional TDM-MIMO",
-            "holds" if exact else "does not hold",
-            f"{text}; it still falls as L_tx grows, since the guard interval 2 L_tx T_d lengthens "
-            "the slot",
-        ),
-    )
+        plain, _ = unambiguous(num_tx, False, seed)
+        random, error = unambiguous(num_tx, True, seed)
+        rows.append((num_tx, plain, random, random / plain, error))
+    exact = all(abs(row[3] - row[0]) < 1e-9 for row in rows)
+    text = "; ".join(f"L_tx = {row[0]}: {row[1]:.2f} to {row[2]:.2f} m/s" for row in rows)
+    found = table("L_tx conventional_mps pseudo_random_mps ratio error_mps", rows)
+    return found, (say("velocity", exact, text=text),)
 
 
 def kept_chirps(length: float, seed: int) -> tuple[int, int]:
@@ -231,57 +195,30 @@ def kept_chirps(length: float, seed: int) -> tuple[int, int]:
 def paper_angle(angle: float, elements: int = 16, redundancy: int = 64) -> float:
     """The angle [deg] that the paper's redundant dictionary, exp(-j pi l sin), finds for a wave
     from `angle` [deg]."""
-    element = np.arange(elements)
-    grid = np.deg2rad(
-        (np.arange(redundancy * elements) - redundancy * elements / 2)
-        * 180
-        / (redundancy * elements)
-    )
+    element, size = np.arange(elements), redundancy * elements
+    grid = np.deg2rad((np.arange(size) - size / 2) * 180 / size)
     wave = np.exp(2j * np.pi * SPACING * element * np.sin(np.deg2rad(angle)))
-    return float(
-        np.rad2deg(
-            grid[np.abs(np.exp(-1j * np.pi * np.outer(np.sin(grid), element)) @ wave).argmax()]
-        )
-    )
+    match = np.abs(np.exp(-1j * np.pi * np.outer(np.sin(grid), element)) @ wave)
+    return float(np.rad2deg(grid[match.argmax()]))
 
 
 def departure_answers(sine: float = 0.137) -> int:
     """Angles of departure within the field of view that two transmit elements 8 spacings apart
     cannot tell from `sine`."""
-    period = 1 / (8 * SPACING)
-    limit = np.sin(np.pi / 3)
-    answers = sine + period * np.arange(-40, 41)
-    return int((np.abs(answers) <= limit).sum())
+    answers = sine + 1 / (8 * SPACING) * np.arange(-40, 41)
+    return int((np.abs(answers) <= np.sin(np.pi / 3)).sum())
 
 
 def angles() -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """The paper's dictionaries against the paper's own array."""
-    table = pd.DataFrame(
-        [{"angle_deg": a, "paper_deg": paper_angle(a)} for a in (10.0, 20.0, 45.0, 59.0)]
-    )
-    text = ", ".join(f"{r.angle_deg:.0f} to {r.paper_deg:.1f}" for r in table.itertuples())
+    rows = [(a, paper_angle(a)) for a in (10.0, 20.0, 45.0, 59.0)]
+    text = ", ".join(f"{a:.0f} to {found:.1f}" for a, found in rows)
     w = Waveform()
     aperture = 15 * SPACING * w.wavelength
-    far = 2 * aperture**2 / w.wavelength
-    return table, (
-        Verdict(
-            "The redundant DFT dictionary gives the angles",
-            "does not hold",
-            f"exp(-j pi l sin) belongs to half a wavelength; at {SPACING} wavelengths it turns "
-            f"{text} degrees",
-        ),
-        Verdict(
-            "A PT estimates angles of departure",
-            "does not hold",
-            f"its two transmit elements per axis stand {8 * SPACING:.2f} wavelengths apart: "
-            f"{departure_answers()} answers within the field of view",
-        ),
-        Verdict(
-            "UAVs are far-field points",
-            "holds",
-            f"2 D^2/lambda is {far:.2f} m for the virtual aperture of {aperture * 1e3:.1f} mm; "
-            "the least distance of the flight is 4 m (wavefronts are spherical here all the same)",
-        ),
+    return table("angle_deg paper_deg", rows), (
+        say("dictionary", False, spacing=SPACING, text=text),
+        say("departure", False, apart=8 * SPACING, answers=departure_answers()),
+        say("far", True, far=2 * aperture**2 / w.wavelength, aperture=aperture * 1e3),
     )
 
 
@@ -298,39 +235,25 @@ def late_frames(offset: float, snr_db: float, frames: int, seed: int) -> tuple[f
     symbols : delay errors and symbols, DPSK errors and symbols, all of them decided
     """
     w = Waveform()
-    arrays = onepath.antennas(w, 4)
-    schedule = pseudo_random_schedule(
-        w.num_groups, w.num_chirps, w.num_tx, generator(seed, "claims", "late")
-    )
+    arrays, rng = onepath.antennas(w, 4), generator(seed, "claims", "late")
+    schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     length, rate = 43.817, 3.7
-    path = {"delay": length / C, "rate": rate / C, "clock_offset": offset}
-    pilot = onepath.frame(
-        w,
-        schedule,
-        unmodulated(w),
-        arrays,
-        **path,
-        snr_db=10.0,
-        seed=seed,
-        purpose=("late", "pilot"),
-    )
+    received = partial(onepath.frame, w, schedule, arrays=arrays, delay=length / C, rate=rate / C)
+    pilot = received(unmodulated(w), clock_offset=offset)
+    onepath.noisy(pilot, 10.0, seed, "late", "pilot")
     found = receive_passive(pilot, arrays, Receivers(), 8, None, False).detections
     i = np.flatnonzero(found.is_reference)
-    known = (
-        prediction(float(found.range[i[0]]), float(found.velocity[i[0]]))
-        if i.size
-        else prediction(length + offset * C, rate)
-    )
+    known = prediction(length + offset * C, rate)
+    if i.size:
+        known = prediction(float(found.range[i[0]]), float(found.velocity[i[0]]))
     count = np.zeros(4, int)
     for k in range(frames):
         payload = random_payload(w, schedule, 8, generator(seed, "claims", "late", k))
-        cube = onepath.frame(
-            w, schedule, payload, arrays, **path, snr_db=snr_db, seed=seed, purpose=("late", k)
-        )
+        cube = received(payload, clock_offset=offset)
+        onepath.noisy(cube, snr_db, seed, "late", k)
         got = demodulate(cube, known, 8)
-        for at, (sent, decided) in enumerate(
-            ((payload.delay_symbols, got.delay), (payload.transitions, got.transitions))
-        ):
+        pairs = (payload.delay_symbols, got.delay), (payload.transitions, got.transitions)
+        for at, (sent, decided) in enumerate(pairs):
             count[2 * at : 2 * at + 2] += (sent != decided).sum(), sent.size
     return float(found.range[i[0]]) - length if i.size else float("nan"), count
 
@@ -343,62 +266,40 @@ LATE_SNR = -25.0
 """With 7 receive antennas: some symbols fail, so that a difference could be seen."""
 
 
-def late_clock(quick: bool, seed: int, report) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
+def late_clock(
+    quick: bool, seed: int, report: Progress
+) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """What a constant delay of the clocks does to range and to data."""
     frames, rows = 3 if quick else 16, []
     for k, offset in enumerate((*OFFSETS, TOO_LATE)):
-        bias, n = late_frames(offset, LATE_SNR, frames, seed)
-        rows.append(
-            {
-                "clock_offset_ns": offset * 1e9,
-                "range_bias_m": bias,
-                "expected_bias_m": offset * C,
-                "delay_errors": n[0],
-                "delay_symbols": n[1],
-                "dpsk_errors": n[2],
-                "dpsk_symbols": n[3],
-            }
-        )
+        bias, counts = late_frames(offset, LATE_SNR, frames, seed)
+        rows.append((offset * 1e9, bias, offset * C, *counts))
         report(k + 1, len(OFFSETS) + 1)
-    table = pd.DataFrame(rows)
-    inside = table.iloc[: len(OFFSETS)]
+    symbols = "delay_errors delay_symbols dpsk_errors dpsk_symbols"
+    found = table(f"clock_offset_ns range_bias_m expected_bias_m {symbols}", rows)
+    inside = found.iloc[: len(OFFSETS)]
     biased = float(np.abs(inside.range_bias_m - inside.expected_bias_m).max())
 
     def rates(part: Iterable) -> str:
         return "; ".join(
-            f"{r.clock_offset_ns:.0f} ns: delay {proportion(r.delay_errors, r.delay_symbols)}, "
-            f"DPSK {proportion(r.dpsk_errors, r.dpsk_symbols)}"
-            for r in part
+            f"{r[0]:.0f} ns: delay {proportion(*r[3:5])}, DPSK {proportion(*r[5:])}" for r in part
         )
 
     same = True
-    for kind in (
-        "delay",
-        "dpsk",
-    ):  # each rate within four deviations of that without an offset, both being random
+    # each rate within four deviations of that without an offset, both being random
+    for kind in ("delay", "dpsk"):
         p = inside[f"{kind}_errors"] / inside[f"{kind}_symbols"]
         spread = np.sqrt(2 * p.mean() * (1 - p.mean()) / inside[f"{kind}_symbols"].iloc[0])
         same &= bool((np.abs(p - p.iloc[0]) <= 4 * spread).all())
-    judged: Judgement = "holds under a condition" if biased < 0.05 and same else "does not hold"
-    return table, (
-        Verdict(
-            "A constant synchronisation delay biases the range and leaves the data alone",
-            judged,
-            f"the range is off by c times the delay to within {biased * 1e3:.1f} mm; symbol error "
-            f"rates at {LATE_SNR:g} dB, 7 receive antennas: {rates(inside.itertuples())}; on "
-            "condition that path and clock together stay below half of the range: "
-            f"{rates(table.iloc[len(OFFSETS) :].itertuples())}, and no acquisition",
-        ),
+    fields = {"inside": rates(rows[: len(OFFSETS)]), "beyond": rates(rows[len(OFFSETS) :])}
+    return found, (
+        say("late", False, biased < 0.05 and same, bias=biased * 1e3, snr=LATE_SNR, **fields),
     )
 
 
 def beyond_half(seed: int) -> Verdict:
     """Data and range share the band."""
     inside, outside = kept_chirps(2 * 120.0, seed), kept_chirps(2 * 200.0, seed)
-    half = Waveform().max_delay * C / 4
-    return Verdict(
-        "Range below N/2 cells and data below N/2 cells keep every chirp in its resource block",
-        "holds" if inside[0] == inside[1] and outside[0] < outside[1] else "does not hold",
-        f"chirps that keep an echo from 120 m: {proportion(*inside)}; from 200 m, beyond the "
-        f"{half:.1f} m: {proportion(*outside)}",
-    )
+    texts = {"inside": proportion(*inside), "outside": proportion(*outside)}
+    good = inside[0] == inside[1] and outside[0] < outside[1]
+    return say("half", good, half=Waveform().max_delay * C / 4, **texts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -73,6 +73,47 @@ class Outcome:
     figure: Figure | None
     verdicts: tuple[Verdict, ...]
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def judged(always: bool, sometimes: bool = False) -> Judgement:
+    """What a claim deserves that holds always, or under a condition that its finding names."""
+    return "holds" if always else "holds under a condition" if sometimes else "does not hold"
+
+
+class Sentences:
+    r"""Claims of the paper and templates of their findings, by a key.
+
+    Parameters
+    ----------
+    text : blocks apart by an empty line. "key: claim" in the first lines, the template below it,
+        indented; fields stand in braces as for `str.format`
+
+    Examples
+    --------
+    >>> say = Sentences("far: UAVs are far-field points\n  2 D^2/lambda is {far:.2f} m")
+    >>> say("far", True, far=1.2345)
+    Verdict(claim='UAVs are far-field points', verdict='holds', finding='2 D^2/lambda is 1.23 m')
+    """
+
+    def __init__(self, text: str) -> None:
+        self._known: dict[str, tuple[str, str]] = {}
+        for block in text.strip().split("\n\n"):
+            key, rest = block.split(": ", 1)
+            lines = rest.split("\n")
+            claim = " ".join(line for line in lines if not line.startswith("  "))
+            self._known[key] = claim, " ".join(x.strip() for x in lines if x.startswith("  "))
+
+    def __call__(
+        self, key: str, always: bool, sometimes: bool = False, /, **fields: object
+    ) -> Verdict:
+        """The verdict on one claim (`judged`); `fields` fill its claim and its finding."""
+        claim, finding = (words.format(**fields) for words in self._known[key])
+        return Verdict(claim, judged(always, sometimes), finding)
+
+
+def table(columns: str, rows: Iterable[Sequence[object]]) -> pd.DataFrame:
+    """Rows as a table; names of the columns apart by spaces."""
+    return pd.DataFrame(list(rows), columns=columns.split())
 
 
 def proportion(successes: int, trials: int, confidence: float = 0.95) -> str:
