@@ -3,7 +3,6 @@ streams, stages before the data, feedback."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,7 +30,6 @@ from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proporti
 from isac_rt.studies.waves import STILL, prediction, sender, waves
 from isac_rt.world.swarm import Pose
 
-SKIRT = onepath.FILTER_TRANSITION
 KEPT_DB = 20.0
 """A neighbour this far down counts as kept out."""
 SYMBOLS = "delay_errors delay_symbols dpsk_errors dpsk_symbols"
@@ -85,7 +83,7 @@ def blocks(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     w, sets, rows = Waveform(), 3 if quick else 12, []
     for spacing in (-3, -2, -1, 1, 2, 3):
         draws = (generator(seed, "claims", "blocks", spacing + 9, k) for k in range(sets))
-        every = [isolation(w, spacing, 0.0, rng, transition=SKIRT, chirps=6) for rng in draws]
+        every = [isolation(w, spacing, 0.0, rng, chirps=6) for rng in draws]
         power, peak = np.array([(x.power_db, x.peak_db) for x in every]).T
         half = stats.t.ppf(0.975, sets - 1) / np.sqrt(sets)
         spread = half * power.std(ddof=1), half * peak.std(ddof=1)
@@ -104,7 +102,7 @@ def tolerance(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]
     """Isolation of both neighbours against their timing error, for short and long delays."""
     w, rows = Waveform(), []
     grid = np.linspace(-2.125, 0.375, 21 if quick else 51)
-    alike = partial(isolation, transition=SKIRT, chirps=1, modulated=False, oversampling=32)
+    alike = partial(isolation, chirps=1, modulated=False, oversampling=32)
     for spacing in (1, -1):
         for cells in (8.3, 511.7, 1015.3):
             for k, error in enumerate(spacing * grid):
@@ -143,9 +141,7 @@ def crowd(
             sent = sender(arrays, schedule, random_payload(w, schedule, 8, rng))
             path = waves(epoch, length / C, rate / C, gain=10 ** (level / 20))
             links.append((replace(sent, name=f"AT{i}", first_block=block), path))
-        cube = if_signal(
-            w, links, STILL, arrays, start_time=0.0, filter_transition=SKIRT, method="direct"
-        )
+        cube = if_signal(w, links, STILL, arrays, start_time=0.0, method="direct")
         onepath.noisy(cube, snr_db, seed, "claims", "crowd", purpose, "noise", k)
         got = receive_passive(cube, arrays, Receivers(), 8, prediction(43.817, -5.3), True)
         total += count_symbols(links[0][0].payload, got)
@@ -232,15 +228,13 @@ def _network(seed: int, snr_db: float) -> tuple[Network, dict[str, Clock]]:
     place = {name: rng.uniform([-40, -20, 20], [40, 60, 40]) for name in ("A", "P", "Q")}
     speed = {name: rng.uniform(-6, 6, 3) for name in place}
 
-    def scene(
-        time: float, links: Sequence[tuple[str, str]]
-    ) -> tuple[dict[str, Pose], dict[tuple[str, str], PathSet]]:
+    def scene(time: float, links: Sequence[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         poses = {
             name: Pose(place[name] + time * speed[name], speed[name], np.zeros(3), np.eye(3))
             for name in place
         }
-        paths: dict[tuple[str, str], PathSet] = {}
-        for link in itertools.starmap(Link, links):
+        paths: dict[Link, PathSet] = {}
+        for link in links:
             away = poses[link.rx].position - poses[link.tx].position
             length = float(np.linalg.norm(away))
             u = away / length
@@ -259,7 +253,6 @@ def _network(seed: int, snr_db: float) -> tuple[Network, dict[str, Clock]]:
         wishes={"A": int(rng.integers(0, 17))},
         listeners={"A": ("P", "Q")},
         noise_power=dict.fromkeys(place, 10 ** (-snr_db / 10)),
-        filter_transition=SKIRT,
         clocks=clocks,
         seed=seed,
     )

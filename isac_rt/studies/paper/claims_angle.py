@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
@@ -66,8 +66,7 @@ def noisy_frame(
 
 def direction(rng: np.random.Generator) -> np.ndarray:
     """A unit vector whose two direction cosines are uniform over +-0.6."""
-    u = rng.uniform(-0.6, 0.6, 2)
-    return np.array([u[0], np.sqrt(1 - u @ u), u[1]])
+    return unit_vector(rng.uniform(-0.6, 0.6, 2))
 
 
 def angle_hits(scheme: str, targets: int, seed: int) -> tuple[int, int]:

@@ -16,9 +16,6 @@ from isac_rt.randomness import seed_sequence
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.studies.waves import AHEAD, STILL, sender, waves
 
-FILTER_TRANSITION = 4e5
-"""Skirt of the IF filter [Hz], as in the scenes."""
-
 
 def antennas(waveform: Waveform, per_arm: int) -> Antennas:
     """The paper's transmit L and a receive L with `per_arm` elements on each arm."""
@@ -47,9 +44,7 @@ def frame(
     """
     sent = replace(sender(arrays, schedule, payload), clock_offset=clock_offset)
     path = waves(waveform.frame_duration / 2, delay, rate, ends=ends)
-    return if_signal(
-        waveform, [(sent, path)], STILL, arrays, start_time=0.0, filter_transition=FILTER_TRANSITION
-    )
+    return if_signal(waveform, [(sent, path)], STILL, arrays, start_time=0.0)
 
 
 def noisy(cube: IFCube, snr_db: float, seed: int, *purpose: str | int) -> IFCube:
