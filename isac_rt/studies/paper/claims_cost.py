@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from scipy.stats import linregress
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, random_payload
@@ -19,9 +20,27 @@ from isac_rt.randomness import generator
 from isac_rt.receive.omp import omp
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions
-from isac_rt.studies.paper.outcome import Judgement, Progress, Verdict
+from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, table
 
 SCALES = (1, 2, 4, 8)
+
+say = Sentences("""
+removal: Compensating the delays and removing the phases costs O(M N L_rx P) each
+  processor time of both with the range DFT grows as {text}
+
+delays: Deciding the delay symbols costs O(M K P)
+  once the peaks are known; finding them searches the cells: time grows as {text}
+
+phases: Deciding the phases costs O(M L_rx K P)
+  time grows as {text} (here the line of sight alone is decided on)
+
+omp: OMP costs O(M K P log P + M K^2 P/L_tx)
+  that is one vector; it runs for every range row and antenna pair, N L times: time grows as {text}
+
+load: OMP's load remains acceptable
+  only at the rows with a detection: {each:.1f} us per vector of 40 chirps here, {all:.0f} ms for
+  all {rows} of a frame of {frame:.2f} ms
+""")
 
 
 @dataclass(frozen=True)
@@ -62,14 +81,9 @@ def growth(
             call()
             times.append(time.process_time() - start)
         seconds.append(max(min(times), 1e-7))
-    x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(seconds))
-    design = np.stack([x, np.ones_like(x)], axis=1)
-    (slope, offset), *_ = np.linalg.lstsq(design, y, rcond=None)
-    rest = y - design @ np.array([slope, offset])
-    deviation = np.sqrt((rest @ rest) / max(len(x) - 2, 1) / ((x - x.mean()) @ (x - x.mean())))
-    return Growth(
-        step, number, np.asarray(sizes), np.asarray(seconds), float(slope), float(deviation)
-    )
+    fit = linregress(np.log(np.asarray(sizes, float)), np.log(np.asarray(seconds)))
+    measured = np.asarray(sizes), np.asarray(seconds)
+    return Growth(step, number, *measured, float(fit.slope), float(fit.stderr))
 
 
 def _cube(
@@ -125,10 +139,8 @@ def decisions(seed: int, repeats: int) -> list[Growth]:
     picked."""
 
     def delays(chirps: int = 240, paths: int = 4, samples: int = 512) -> Callable[[], object]:
-        w, rng = (
-            Waveform(num_samples=samples, num_chirps=chirps, num_groups=1),
-            generator(seed, "claims", "cost", "delays"),
-        )
+        w = Waveform(num_samples=samples, num_chirps=chirps, num_groups=1)
+        rng = generator(seed, "claims", "cost", "delays")
         power = rng.exponential(size=(chirps, samples)).astype(np.float32)
         others = [(0.5, rng.integers(0, 40, chirps)) for _ in range(paths - 1)]
         return lambda: decide(power, others, w)
@@ -139,24 +151,13 @@ def decisions(seed: int, repeats: int) -> list[Growth]:
         picked = rng.standard_normal((1, receivers, chirps, 2)).view(np.complex128)[..., 0]
         return lambda: decide_transitions(picked, schedule, 3, 8)
 
+    delay, phase = "delay decisions", "DPSK decisions"
     return [
-        growth("delay decisions", "K", [2, 4, 8, 16], lambda n: delays(paths=n), repeats),
-        growth(
-            "delay decisions", "P", [240 * k for k in SCALES], lambda n: delays(chirps=n), repeats
-        ),
-        growth(
-            "delay decisions", "N", [512 * k for k in SCALES], lambda n: delays(samples=n), repeats
-        ),
-        growth(
-            "DPSK decisions", "P", [960 * k for k in SCALES], lambda n: phases(chirps=n), repeats
-        ),
-        growth(
-            "DPSK decisions",
-            "L_rx",
-            [16 * k for k in SCALES],
-            lambda n: phases(receivers=n),
-            repeats,
-        ),
+        growth(delay, "K", [2, 4, 8, 16], lambda n: delays(paths=n), repeats),
+        growth(delay, "P", [240 * k for k in SCALES], lambda n: delays(chirps=n), repeats),
+        growth(delay, "N", [512 * k for k in SCALES], lambda n: delays(samples=n), repeats),
+        growth(phase, "P", [960 * k for k in SCALES], lambda n: phases(chirps=n), repeats),
+        growth(phase, "L_rx", [16 * k for k in SCALES], lambda n: phases(receivers=n), repeats),
     ]
 
 
@@ -168,18 +169,12 @@ def cost(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tuple[
         found += part(seed, repeats)
         report(i + 1, len(parts))
     rows = [
-        {
-            "step": g.step,
-            "number": g.number,
-            "size": n,
-            "cpu_seconds": s,
-            "exponent": g.exponent,
-            "exponent_std": g.deviation,
-        }
+        (g.step, g.number, size, seconds, g.exponent, g.deviation)
         for g in found
-        for n, s in zip(g.sizes, g.seconds, strict=True)
+        for size, seconds in zip(g.sizes, g.seconds, strict=True)
     ]
-    return pd.DataFrame(rows), _verdicts({(g.step, g.number): g for g in found})
+    verdicts = _verdicts({(g.step, g.number): g for g in found})
+    return table("step number size cpu_seconds exponent exponent_std", rows), verdicts
 
 
 _ALLOWED = 0.5
@@ -197,68 +192,32 @@ def _verdicts(by: dict[tuple[str, str], Growth]) -> tuple[Verdict, ...]:
             for n in numbers.split()
         )
 
-    def judge(good: bool, condition: bool = False) -> Judgement:
-        return "does not hold" if not good else "holds under a condition" if condition else "holds"
-
     removal = "range DFT and data removal"
     vectors = by["OMP", "vectors"]
     each = float(vectors.seconds[-1] / vectors.sizes[-1])
     w = Waveform()
     rows = w.num_delay_symbols * 45 * w.num_groups
+    load = {"each": each * 1e6, "all": rows * each * 1e3, "frame": w.frame_duration * 1e3}
+    delays, phases = linear("delay decisions", "K P"), linear("DPSK decisions", "P L_rx")
     return (
-        Verdict(
-            "Compensating the delays and removing the phases costs O(M N L_rx P) each",
-            judge(linear(removal, "N P L_rx M")),
-            f"processor time of both with the range DFT grows as {text(removal, 'N P L_rx M')}",
-        ),
-        Verdict(
-            "Deciding the delay symbols costs O(M K P)",
-            judge(linear("delay decisions", "K P"), True),
-            "once the peaks are known; finding them searches the cells: time grows as "
-            f"{text('delay decisions', 'K P N')}",
-        ),
-        Verdict(
-            "Deciding the phases costs O(M L_rx K P)",
-            judge(linear("DPSK decisions", "P L_rx")),
-            f"time grows as {text('DPSK decisions', 'P L_rx')} (here the line of sight alone is "
-            "decided on)",
-        ),
-        Verdict(
-            "OMP costs O(M K P log P + M K^2 P/L_tx)",
-            "does not hold",
-            "that is one vector; it runs for every range row and antenna pair, N L times: time "
-            f"grows as {text('OMP', 'vectors K P')}",
-        ),
-        Verdict(
-            "OMP's load remains acceptable",
-            "holds under a condition",
-            f"only at the rows with a detection: {each * 1e6:.1f} us per vector of 40 chirps here, "
-            f"{rows * each * 1e3:.0f} ms for all "
-            f"{rows} of a frame of {w.frame_duration * 1e3:.2f} ms",
-        ),
+        say("removal", linear(removal, "N P L_rx M"), text=text(removal, "N P L_rx M")),
+        say("delays", False, delays, text=text("delay decisions", "K P N")),
+        say("phases", phases, text=text("DPSK decisions", "P L_rx")),
+        say("omp", False, text=text("OMP", "vectors K P")),
+        say("load", False, True, rows=rows, **load),
     )
 
 
-def draw(ax: Axes, table: pd.DataFrame) -> None:
+def draw(ax: Axes, found: pd.DataFrame) -> None:
     """Time over the smallest size's, against size over the smallest."""
-    for i, ((step, number), part) in enumerate(table.groupby(["step", "number"], sort=False)):
-        ax.plot(
-            part["size"] / part["size"].iloc[0],
-            part.cpu_seconds / part.cpu_seconds.iloc[0],
-            "osD^v*<>"[i % 8] + "-",
-            ms=4,
-            lw=0.9,
-            color=f"C{i % 10}",
-            label=f"{step}: {number} ({part.exponent.iloc[0]:.2f})",
-        )
+    for i, ((step, number), part) in enumerate(found.groupby(["step", "number"], sort=False)):
+        first, look = part.iloc[0], "osD^v*<>"[i % 8] + "-"
+        x, y = part["size"] / first["size"], part.cpu_seconds / first.cpu_seconds
+        label = f"{step}: {number} ({first.exponent:.2f})"
+        ax.plot(x, y, look, ms=4, lw=0.9, color=f"C{i % 10}", label=label)
     ax.plot([1, 8], [1, 8], "k--", lw=1, label="linear")
-    ax.set(
-        xscale="log",
-        yscale="log",
-        xlabel="size over the smallest",
-        ylabel="time over the smallest's",
-        title="Complexity (exponent)",
-    )
+    ax.set(xscale="log", xlabel="size over the smallest", title="Complexity (exponent)")
+    ax.set(yscale="log", ylabel="time over the smallest's")
     ax.set_xticks(SCALES, [str(k) for k in SCALES])
     ax.minorticks_off()
     ax.legend(fontsize=5.8, loc="upper left")

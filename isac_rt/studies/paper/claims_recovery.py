@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
+from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
 from isac_rt.receive.omp import omp, sparse_enough
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.studies.paper.outcome import Progress, Verdict, proportion
+from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
 
 CHIRPS, ANTENNAS = 120, 3
 SPARSITIES = (1, 2, 3, 4, 6, 8, 10, 12, 16, 20)
@@ -21,14 +21,41 @@ SCHEDULES = 20
 LEVELS = {"equal": 0.0, "spread over 20 dB": 20.0}
 
 
+say = Sentences("""
+latin: In every cycle the antennas over blocks and slots form a Latin matrix
+  cycles that do, L_tx = 1 to 8, M = 1 to L_tx: {share}; the stricter order costs a group nothing:
+  its median coherence is {three:.3f} in Fig. 5(d) and {one:.3f} in (b), 200 schedules each
+
+fallback: In scenes that are not sparse one switches to Fig. 5(c)
+  the paper gives no rule; here the receiver of sparse samples asks whether as many atoms as it
+  recovers dependably explain two thirds of what is above the noise. Frames called sparse by paths
+  in a range cell: {text}. With all M = L_tx groups at hand no switch is needed (the union)
+
+price: CS trades computation for an unambiguous velocity L_tx times as large
+  the price is sparsity as well: six equal tones in a range cell, recovered from P/L_tx of {chirps}
+  chirps: {text}
+
+rip: The sampled DFT satisfies the RIP with very high probability, so that OMP converges
+  of {count} random schedules the coherence is {median:.3f} (95 % within {low:.3f} to {high:.3f};
+  Welch's bound {bound:.3f}, round robin {plain:.0f}): recovery is certain for {certain} tones at
+  most; isometry constants below 1/3 up to sparsity {small}. For supports at random OMP is
+  dependable (95 %) up to {limits} tones in a range cell
+
+dense: Where the scene is not sparse reconstruction fails
+  of 40 chirps, tones of equal strength: 4 tones {few}, 20 tones {many}
+
+union: The conventional scheme of Fig. 5(c) needs no sparsity
+  by the union of its groups, whose plain DFT has 60 tones to {rest:.1g} RMS; but so has the union
+  of the pseudo-random groups of Fig. 5(d). Group by group (c) takes any number of tones, and is
+  ambiguous beyond 1/3 of the velocity (Fig. 5)
+""")
+
+
 def slots(random: bool, rng: np.random.Generator, num_tx: int = ANTENNAS) -> np.ndarray:
     """Slots (P/L_tx,) of antenna 0 in one group."""
-    s: Schedule = (
-        pseudo_random_schedule(1, CHIRPS, num_tx, rng)
-        if random
-        else conventional_schedule(1, CHIRPS, num_tx)
-    )
-    return np.flatnonzero(s[0] == 0)
+    shape = (1, CHIRPS, num_tx)
+    chosen = pseudo_random_schedule(*shape, rng) if random else conventional_schedule(*shape)
+    return np.flatnonzero(chosen[0] == 0)
 
 
 def coherence(chosen: np.ndarray, num_chirps: int = CHIRPS) -> float:
@@ -104,37 +131,19 @@ def latin(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
             cycles = np.concatenate([s.transpose(1, 0, 2) for s in many])
             in_group = (np.sort(cycles, axis=2) == np.arange(num_tx)).all(axis=(1, 2))
             in_slot = (np.diff(np.sort(cycles, axis=1), axis=1) > 0).all(axis=(1, 2))
-            rows.append(
-                {
-                    "L_tx": num_tx,
-                    "M": groups,
-                    "cycles": len(cycles),
-                    "latin": int((in_group & in_slot).sum()),
-                }
-            )
-    table = pd.DataFrame(rows)
-    good, total = int(table.latin.sum()), int(table.cycles.sum())
+            latin_cycles = int((in_group & in_slot).sum())
+            rows.append((num_tx, groups, len(cycles), latin_cycles))
+    found = table("L_tx M cycles latin", rows)
+    good, total = int(found.latin.sum()), int(found.cycles.sum())
     rng = generator(seed, "claims", "latin", "coherence")
-    mu = {
-        m: np.median(
-            [
-                coherence(
-                    np.flatnonzero(pseudo_random_schedule(m, CHIRPS, ANTENNAS, rng)[m - 1] == 0)
-                )
-                for _ in range(200)
-            ]
-        )
-        for m in (1, 3)
-    }
-    return table, (
-        Verdict(
-            "In every cycle the antennas over blocks and slots form a Latin matrix",
-            "holds" if good == total else "does not hold",
-            f"cycles that do, L_tx = 1 to 8, M = 1 to L_tx: {proportion(good, total)}; the "
-            f"stricter order costs a group nothing: its median coherence is {mu[3]:.3f} in Fig. "
-            f"5(d) and {mu[1]:.3f} in (b), 200 schedules each",
-        ),
-    )
+
+    def last(groups: int) -> np.ndarray:
+        schedule = pseudo_random_schedule(groups, CHIRPS, ANTENNAS, rng)
+        return np.flatnonzero(schedule[groups - 1] == 0)
+
+    one, three = (np.median([coherence(last(m)) for _ in range(200)]) for m in (1, 3))
+    share = proportion(good, total)
+    return found, (say("latin", good == total, share=share, one=one, three=three),)
 
 
 def judged_sparse(tones: int, frames: int, seed: int) -> int:
@@ -165,26 +174,11 @@ FALLBACK_TONES = (1, 2, 3, 4, 6, 8, 12, 16)
 def fallback(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
     """How the receiver's rule for falling back to the conventional schedule decides."""
     frames = 25 if quick else 100
-    table = pd.DataFrame(
-        [
-            {"tones": k, "called_sparse": judged_sparse(k, frames, seed), "frames": frames}
-            for k in FALLBACK_TONES
-        ]
-    )
-    ends = bool(table.called_sparse.iloc[0] == frames and table.called_sparse.iloc[-1] == 0)
-    text = ", ".join(
-        f"{r.tones}: {proportion(r.called_sparse, r.frames)}" for r in table.itertuples()
-    )
-    return table, (
-        Verdict(
-            "In scenes that are not sparse one switches to Fig. 5(c)",
-            "holds under a condition" if ends else "does not hold",
-            "the paper gives no rule; here the receiver of sparse samples asks whether as many "
-            "atoms as it recovers dependably explain two thirds of what is above the noise. "
-            f"Frames called sparse by paths in a range cell: {text}. With all M = L_tx groups at "
-            "hand no switch is needed (the union)",
-        ),
-    )
+    rows = [(k, judged_sparse(k, frames, seed), frames) for k in FALLBACK_TONES]
+    ends = rows[0][1] == frames and rows[-1][1] == 0
+    text = ", ".join(f"{k}: {proportion(found, of)}" for k, found, of in rows)
+    verdict = say("fallback", False, ends, text=text)
+    return table("tones called_sparse frames", rows), (verdict,)
 
 
 def united_error(sparsity: int, trials: int, seed: int) -> float:
@@ -205,46 +199,24 @@ def recovery(
     samples = [slots(True, rng) for _ in range(schedules)]
     mu = np.array([coherence(s) for s in samples])
     plain = coherence(slots(False, rng))
-    delta = pd.DataFrame(
-        [
-            {
-                "sparsity": k,
-                "isometry_at_least": max(
-                    isometry(s, k, 100 if quick else 300, rng) for s in samples[:10]
-                ),
-            }
-            for k in SPARSITIES
-            if k <= 12
-        ]
-    )
-    cases: list[tuple[str, float, bool]] = [
-        *((name, db, False) for name, db in LEVELS.items()),
-        ("equal, off the grid", 0.0, True),
-    ]
+    supports, few = 100 if quick else 300, [k for k in SPARSITIES if k <= 12]
+    worst = [(k, max(isometry(s, k, supports, rng) for s in samples[:10])) for k in few]
+    delta = table("sparsity isometry_at_least", worst)
+    cases = [(name, db, False) for name, db in LEVELS.items()]
+    cases += [("equal, off the grid", 0.0, True)]
     rows = []
     for name, spread, off in cases:
         for k in SPARSITIES:
             good = recovered(k, trials, spread, off, seed)
-            low, high = binomial_interval(good, trials)
-            rows.append(
-                {
-                    "levels": name,
-                    "sparsity": k,
-                    "recovered": good,
-                    "trials": trials,
-                    "share": good / trials,
-                    "low": low,
-                    "high": high,
-                }
-            )
+            rows.append((name, k, good, trials, good / trials, *binomial_interval(good, trials)))
             report(len(rows), len(cases) * len(SPARSITIES))
-    table = pd.DataFrame(rows)
+    found = table("levels sparsity recovered trials share low high", rows)
     tables = {
-        "recovery": table,
+        "recovery": found,
         "coherence": pd.DataFrame({"schedule": np.arange(schedules), "coherence": mu}),
         "isometry": delta,
     }
-    return tables, _verdicts(mu, plain, delta, table, trials, seed)
+    return tables, _verdicts(mu, plain, delta, found, seed)
 
 
 def against_coherence(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdict, ...]]:
@@ -256,90 +228,54 @@ def against_coherence(quick: bool, seed: int) -> tuple[pd.DataFrame, tuple[Verdi
         rng = generator(seed, "claims", "coherence", num_tx)
         mu = [coherence(slots(True, rng, num_tx)) for _ in range(schedules)]
         good = recovered(6, trials, 0.0, False, seed, num_tx)
-        rows.append(
-            {
-                "L_tx": num_tx,
-                "chirps": CHIRPS // num_tx,
-                "coherence": np.median(mu),
-                "recovered": good,
-                "trials": trials,
-            }
-        )
-    table = pd.DataFrame(rows)
-    falls = bool(
-        (table.coherence.diff().dropna() > 0).all()
-        and table.recovered.iloc[-1] < table.recovered.iloc[0]
-    )
+        rows.append((num_tx, CHIRPS // num_tx, np.median(mu), good, trials))
+    found = table("L_tx chirps coherence recovered trials", rows)
+    rises = bool((found.coherence.diff().dropna() > 0).all())
+    falls = rises and rows[-1][3] < rows[0][3]
     text = "; ".join(
-        f"L_tx = {r.L_tx}: coherence {r.coherence:.2f}, {proportion(r.recovered, r.trials)}"
-        for r in table.itertuples()
+        f"L_tx = {n}: coherence {mu:.2f}, {proportion(good, of)}" for n, _, mu, good, of in rows
     )
-    return table, (
-        Verdict(
-            "CS trades computation for an unambiguous velocity L_tx times as large",
-            "holds under a condition" if falls else "holds",
-            "the price is sparsity as well: six equal tones in a range cell, recovered from "
-            f"P/L_tx of {CHIRPS} chirps: {text}",
-        ),
-    )
+    return found, (say("price", not falls, True, chirps=CHIRPS, text=text),)
 
 
-def dependable(table: pd.DataFrame, levels: str, share: float = 0.95) -> int:
+def dependable(found: pd.DataFrame, levels: str, share: float = 0.95) -> int:
     """Largest sparsity up to which the lower end of every interval is at least `share`; 0 if there
     is none."""
-    part = table[table.levels == levels].sort_values("sparsity")
-    good = (part.low >= share).to_numpy()
-    return (
-        0
-        if not good[0]
-        else int(part.sparsity.iloc[good.size - 1 if good.all() else int(np.argmin(good)) - 1])
-    )
+    part = found[found.levels == levels].sort_values("sparsity")
+    good = np.append(part.low >= share, False)
+    return 0 if not good[0] else int(part.sparsity.iloc[int(np.argmin(good)) - 1])
 
 
 def _verdicts(
-    mu: np.ndarray, plain: float, delta: pd.DataFrame, table: pd.DataFrame, trials: int, seed: int
+    mu: np.ndarray, plain: float, delta: pd.DataFrame, found: pd.DataFrame, seed: int
 ) -> tuple[Verdict, ...]:
-    guaranteed = int((1 / np.median(mu) + 1) / 2)
-    bound = np.sqrt((CHIRPS - CHIRPS / ANTENNAS) / (CHIRPS / ANTENNAS * (CHIRPS - 1)))
-    small = (
-        delta[delta.isometry_at_least < 1 / 3].sparsity.max()
-        if (delta.isometry_at_least < 1 / 3).any()
-        else 0
-    )
-    limits = {name: dependable(table, name) for name in table.levels.unique()}
-    at = {k: table[(table.levels == "equal") & (table.sparsity == k)].iloc[0] for k in (4, 20)}
-    rest = united_error(60, 200, seed)
-    text = ", ".join(f"{k} ({name})" for name, k in limits.items())
+    few = delta[delta.isometry_at_least < 1 / 3].sparsity
+    equal = found[found.levels == "equal"].set_index("sparsity")
+    texts = [proportion(int(equal.recovered[k]), int(equal.trials[k])) for k in (4, 20)]
+    limits = (f"{dependable(found, name)} ({name})" for name in found.levels.unique())
     return (
-        Verdict(
-            "The sampled DFT satisfies the RIP with very high probability, so that OMP converges",
-            "holds under a condition",
-            f"of {mu.size} random schedules the coherence is {np.median(mu):.3f} (95 % within "
-            f"{np.quantile(mu, 0.025):.3f} to {np.quantile(mu, 0.975):.3f}; Welch's bound "
-            f"{bound:.3f}, round robin {plain:.0f}): recovery is certain for {guaranteed} tones "
-            f"at most; isometry constants below 1/3 up to sparsity {small}. For supports at "
-            f"random OMP is dependable (95 %) up to {text} tones in a range cell",
+        say(
+            "rip",
+            False,
+            True,
+            count=mu.size,
+            median=np.median(mu),
+            low=np.quantile(mu, 0.025),
+            high=np.quantile(mu, 0.975),
+            bound=np.sqrt((CHIRPS - CHIRPS / ANTENNAS) / (CHIRPS / ANTENNAS * (CHIRPS - 1))),
+            plain=plain,
+            certain=int((1 / np.median(mu) + 1) / 2),
+            small=few.max() if few.size else 0,
+            limits=", ".join(limits),
         ),
-        Verdict(
-            "Where the scene is not sparse reconstruction fails",
-            "holds" if at[20].high < 0.05 else "does not hold",
-            "of 40 chirps, tones of equal strength: 4 tones "
-            f"{proportion(int(at[4].recovered), trials)}, 20 tones "
-            f"{proportion(int(at[20].recovered), trials)}",
-        ),
-        Verdict(
-            "The conventional scheme of Fig. 5(c) needs no sparsity",
-            "holds under a condition",
-            f"by the union of its groups, whose plain DFT has 60 tones to {rest:.1g} RMS; but so "
-            "has the union of the pseudo-random groups of Fig. 5(d). Group by group (c) takes any "
-            "number of tones, and is ambiguous beyond 1/3 of the velocity (Fig. 5)",
-        ),
+        say("dense", equal.high[20] < 0.05, few=texts[0], many=texts[1]),
+        say("union", False, True, rest=united_error(60, 200, seed)),
     )
 
 
-def draw(ax: Axes, table: pd.DataFrame) -> None:
+def draw(ax: Axes, found: pd.DataFrame) -> None:
     """Share of recovered vectors against sparsity."""
-    for mark, (name, part) in zip("osD", table.groupby("levels", sort=False), strict=True):
+    for mark, (name, part) in zip("osD", found.groupby("levels", sort=False), strict=True):
         error = np.abs(part[["low", "high"]].to_numpy().T - part.share.to_numpy())
         ax.errorbar(part.sparsity, part.share, yerr=error, fmt="-" + mark, capsize=2, label=name)
     ax.set(

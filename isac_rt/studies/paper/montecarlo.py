@@ -281,11 +281,11 @@ class Steps:
         self._progress, self._total, self._before = progress, total, 0
 
     def part(self, size: int) -> Progress:
-        """The progress of a run of at most `size` steps; the runs before it count as done."""
+        """The progress of a run that makes up `size` steps; the runs before it count as done."""
         start = self._before
         self._before += size
         self._progress(start, self._total)
-        return lambda done, _: self._progress(min(start + done, self._total), self._total)
+        return lambda done, of: self._progress(start + round(size * done / of), self._total)
 
 
 def delay_error_rate(snr_db: np.ndarray, num_samples: int, cells: int, num_rx: int) -> np.ndarray:
