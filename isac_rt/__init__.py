@@ -18,6 +18,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from isac_rt.frame.cube import IFCube as IFCube
+    from isac_rt.frame.cube import ReceiveArray as ReceiveArray
+    from isac_rt.frame.cube import Reference as Reference
     from isac_rt.frame.cube import Transmission as Transmission
     from isac_rt.frame.waveform import Waveform as Waveform
     from isac_rt.propagation.pathset import PathKind as PathKind
@@ -36,6 +38,11 @@ if TYPE_CHECKING:
     from isac_rt.signal.if_signal import add_noise as add_noise
     from isac_rt.signal.if_signal import if_signal as if_signal
     from isac_rt.signal.if_signal import range_profiles as range_profiles
+    from isac_rt.signal.methods import Auto as Auto
+    from isac_rt.signal.methods import Direct as Direct
+    from isac_rt.signal.methods import Exact as Exact
+    from isac_rt.signal.methods import Gridded as Gridded
+    from isac_rt.signal.methods import Separable as Separable
     from isac_rt.simulation.setup import city_of as city_of
     from isac_rt.simulation.setup import prepare as prepare
     from isac_rt.simulation.setup import trace as trace
@@ -57,7 +64,7 @@ if TYPE_CHECKING:
     from isac_rt.views.interchange import write_sigmf as write_sigmf
 
 _NAMES = {
-    "frame.cube": "IFCube Transmission",
+    "frame.cube": "IFCube ReceiveArray Reference Transmission",
     "frame.waveform": "Waveform",
     "propagation.pathset": "PathKind PathSet",
     "receive": "Detections Prediction Reception receive_active receive_passive",
@@ -66,6 +73,7 @@ _NAMES = {
     "scenario.file": "load to_yaml",
     "scenario.tree": "Scenario",
     "signal.if_signal": "add_noise if_signal range_profiles",
+    "signal.methods": "Auto Direct Exact Gridded Separable",
     "simulation.setup": "city_of prepare trace",
     "simulation.simulate": "run standard_terminal",
     "sweep": "load_sweep open_sweep run_sweep",

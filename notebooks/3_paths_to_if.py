@@ -43,14 +43,9 @@ path
 w = setup.waveform
 sent = frame.sent["AT"]
 start = setup.timetable.start_time(0, "AT")
-cube = irt.if_signal(
-    w,
-    [(sent, path)],
-    frame.poses["PT1"],
-    setup.antennas,
-    start_time=start,
-    method="exact",
-)
+receiver = irt.ReceiveArray(frame.poses["PT1"], setup.antennas)
+reference = irt.Reference(start)
+cube = irt.if_signal(w, [(sent, path)], receiver, reference, irt.Exact())
 chirps = np.flatnonzero(cube.schedule[0] == 0)
 signal = cube.samples[0, 0, chirps]
 signal = signal / np.abs(signal).mean()
@@ -101,14 +96,13 @@ ax.set(xscale="log", xlabel="relative RMS that is left")
 ax.invert_yaxis()
 
 # %% [markdown]
-# The fast methods against the exact one. What "gridded" leaves here is the curvature of the line of
+# The fast methods against the exact one. What `Gridded` leaves here is the curvature of the line of
 # sight's wavefront over both arrays at
-# once; the default, "auto", gives lines of sight to "direct".
+# once; the default, `Auto`, gives lines of sight to `Direct`.
 
 # %%
 links = [(sent, frame.paths["AT", "PT1"])]
-heard = (w, links, frame.poses["PT1"], setup.antennas)
-exact = irt.if_signal(*heard, start_time=start, method="exact").samples
-for method in ("direct", "gridded"):
-    fast = irt.if_signal(*heard, start_time=start, method=method).samples
-    print(method, f"{np.linalg.norm(fast - exact) / np.linalg.norm(exact):.1e}")
+exact = irt.if_signal(w, links, receiver, reference, irt.Exact()).samples
+for method in (irt.Direct(), irt.Gridded()):
+    fast = irt.if_signal(w, links, receiver, reference, method).samples
+    print(method.name, f"{np.linalg.norm(fast - exact) / np.linalg.norm(exact):.1e}")

@@ -272,7 +272,7 @@ OF_CASES = {
         "(self.slope * tau * (time - tau)) % 1.0",
     ),
     "exact model in motion": Bug(
-        "signal/direct.py", "t.delay[k] + t.rate[k] * time", "t.delay[k] - t.rate[k] * time"
+        "signal/exact.py", "t.delay[k] + t.rate[k] * time", "t.delay[k] - t.rate[k] * time"
     ),
     "direct method": Bug(
         "signal/direct.py",
@@ -285,7 +285,7 @@ OF_CASES = {
         "cycles = element * (carrier - splat(slope) * element)",
     ),
     "automatic choice": Bug(
-        "signal/if_signal.py",
+        "signal/methods.py",
         "add_direct(samples, waveform, tones.select(alone), fresh",
         "add_direct(samples, waveform, tones.select(alone[::-1]), fresh",
     ),
@@ -305,7 +305,7 @@ OF_CASES = {
         "velocity = velocity - 1.9 * (",
     ),
     "signs": Bug(
-        "signal/if_signal.py",
+        "signal/tones.py",
         '"rate": s.delay_rate + s.delay_accel * later + t.clock_drift',
         '"rate": -s.delay_rate + s.delay_accel * later + t.clock_drift',
     ),
@@ -315,11 +315,11 @@ OF_CASES = {
         "outside = max(-beat, beat - w[7]) / (2 * w[8])",
     ),
     "spherical waves": Bug(
-        "signal/if_signal.py",
+        "signal/tones.py",
         "square - 2 * far * along[some]",
         "0 * square - 2 * far * along[some]",
     ),
-    "clock errors": Bug("signal/if_signal.py", "moved + t.clock_offset", "moved - t.clock_offset"),
+    "clock errors": Bug("signal/tones.py", "moved + t.clock_offset", "moved - t.clock_offset"),
     "births and deaths": Bug("signal/direct.py", "or time >= end[k]", "or time >= end[k] + 1e9"),
     "data are taken out": Bug(
         "receive/spectrum.py",
@@ -327,7 +327,7 @@ OF_CASES = {
         "tones(-shift[m] / num_samples, num_rows).T",
     ),
     "resource blocks": Bug(
-        "signal/if_signal.py",
+        "signal/tones.py",
         "(t.first_block - first_block) * w.group_spacing",
         "(first_block - t.first_block) * w.group_spacing",
     ),
@@ -541,7 +541,7 @@ OF_TESTS = (
     (
         "test_hard_signal::test_beyond_the_filter_there_is_nothing",
         Bug(
-            "signal/direct.py",
+            "signal/exact.py",
             "np.maximum(-beat, beat - w.sampling_rate) / w.filter_transition",
             "np.maximum(-beat, beat - w.sampling_rate) / (2 * w.filter_transition)",
         ),
@@ -557,14 +557,14 @@ OF_TESTS = (
     (
         "test_hard_signal::test_a_target_at_half_a_metre",
         Bug(
-            "signal/if_signal.py",
+            "signal/tones.py",
             "near = np.flatnonzero(np.isfinite(radius))",
             "near = np.flatnonzero(np.zeros_like(radius, bool))",
         ),
     ),
     (
         "test_hard_signal::test_one_path_80_db_above_another",
-        Bug("signal/choice.py", "(strong & top) | sight", "(strong & top & sight)"),
+        Bug("signal/methods.py", "(strong & top) | sight", "(strong & top & sight)"),
     ),
     (
         "test_hard_signal::test_a_million_paths",
@@ -598,8 +598,8 @@ OF_TESTS = (
         "test_killed::test_reruns_are_equal_bit_by_bit_whatever_the_threads",
         Bug(
             "simulation/setup.py",
-            'return seed_sequence(seed, "noise", *link, self.number).generate_state(2)',
-            'return vars(np).setdefault("_shared", np.random.default_rng(seed)).integers(2**32, size=2, dtype=np.uint32)',
+            'words = seed_sequence(seed, "noise", *link, self.number).generate_state(2)',
+            'words = vars(np).setdefault("_shared", np.random.default_rng(seed)).integers(2**32, size=2, dtype=np.uint32)',
         ),
     ),
     (

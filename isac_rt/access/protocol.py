@@ -30,7 +30,7 @@ from isac_rt.access.identify import choose_run, consensus, hot_chirps, needed_ch
 from isac_rt.access.ook import Codebook, Message, keyed, read
 from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, Round, estimate_clock, round_of
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import Schedule
@@ -41,6 +41,7 @@ from isac_rt.receive import receive_passive
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.signal.methods import Auto
 from isac_rt.world.swarm import Pose
 
 Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, PathSet]]]
@@ -231,15 +232,13 @@ class _Air:
                 t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift
             )
             links.append((shifted, paths[Link(t.name, name)]))
+        start = self.time - w.frame_duration / 2 + first_block * w.group_spacing
         cube = if_signal(
             w,
             links,
-            poses[name],
-            n.antennas,
-            start_time=self.time - w.frame_duration / 2 + first_block * w.group_spacing,
-            schedule=n.schedule,
-            first_block=first_block,
-            noise_power=n.noise_power[name],
+            ReceiveArray(poses[name], n.antennas),
+            Reference(start, first_block, n.schedule),
+            Auto(n.noise_power[name]),
         )
         words = seed_sequence(n.seed, "access", "noise", name, self.frame).generate_state(2)
         return add_noise(cube, n.noise_power[name], words)

@@ -44,6 +44,36 @@ class Transmission:
     first_block: int = 0
 
 
+@dataclass(frozen=True)
+class ReceiveArray:
+    """Where and with what a receiver listens.
+
+    Attributes
+    ----------
+    pose : at the epoch (the middle of the frame)
+    antennas : its arrays, of which the receive elements count
+    """
+
+    pose: Pose
+    antennas: Antennas
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference chirps with which a receiver dechirps a frame.
+
+    Attributes
+    ----------
+    start_time : of the first reference chirp [s], block `first_block` of its slot
+    first_block : resource block of the first reference chirp; None: that of the first transmission
+    schedule : of the cube; None: that of the first transmission
+    """
+
+    start_time: float
+    first_block: int | None = None
+    schedule: Schedule | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class IFCube:
     """What a receiver's converters deliver in one frame. It never holds the payload.

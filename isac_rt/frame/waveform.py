@@ -57,8 +57,7 @@ class Waveform:
         if self.num_chirps % self.num_tx:
             raise ValueError(
                 f"{self.num_chirps} chirps per frame are not a multiple of the {self.num_tx} "
-                "transmit "
-                "antennas; every antenna needs the same number of slots"
+                "transmit antennas; every antenna needs the same number of slots"
             )
         if not 1 <= self.num_groups <= self.num_tx:
             raise ValueError(

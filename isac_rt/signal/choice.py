@@ -1,5 +1,5 @@
-"""What a synthesis costs and how far off it may be, and from both what `auto` does with a cube's
-paths.
+"""What a synthesis costs and how far off it may be, from which `isac_rt.signal.methods.Auto`
+chooses.
 
 Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K paths, fitted by
 `isac-rt bench --fit FILE`:
@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.signal.gridded import ACCURATE, DEFAULT, LANES, Setting
 
 FORMAT = "isac_rt cost model 1"
@@ -35,7 +34,7 @@ SHIPPED = Path(__file__).with_name("cost_model.json")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting of the gridded method that `auto` may take.
+    """A setting of the gridded method that `Auto` may take.
 
     Attributes
     ----------
@@ -114,57 +113,3 @@ def read(file: Path) -> CostModel:
     if not (np.isfinite(values).all() and (values > 0).all()):
         raise ValueError(f"{file}: costs must be above 0 ns; {remedy}")
     return CostModel("shipped" if file == SHIPPED else file.name, chirp, path)
-
-
-def choose(
-    model: CostModel,
-    shape: tuple[int, ...],
-    power: np.ndarray,
-    speed: np.ndarray,
-    sight: np.ndarray,
-    *,
-    noise_power: float,
-    max_error: float,
-    max_direct: int,
-    num_paths: int | None = None,
-) -> tuple[Setting, np.ndarray]:
-    """The cheapest way of making a cube within an error: the setting of the grid, and which paths
-    go direct past it.
-
-    With a setting go direct: lines of sight (their joint curvature is not gridded); paths too fast
-    for `max_error`; and of those whose error, integrated coherently over the cube, could exceed the
-    noise of a cell, the `max_direct` strongest. All direct is a way too.
-
-    Parameters
-    ----------
-    power, speed, sight : (K,) of each path: received power [W], c |delay rate| / 2 [m/s], whether
-        it is a line of sight
-    noise_power : per sample [W]
-    max_error : relative RMS error of the samples, at least that of the direct method (1e-6)
-    num_paths : whose cost decides, where those given are some of them
-    """
-    scale = 1.0 if num_paths is None else num_paths / max(power.size, 1)
-    best, least = (
-        (DEFAULT, np.ones(power.size, bool)),
-        model.seconds(DIRECT, shape, scale * power.size),
-    )
-    top = np.zeros(power.size, bool)
-    top[np.argsort(-power, kind="stable")[:max_direct]] = True
-    for candidate in CANDIDATES:
-        error = candidate.error_at(speed)
-        strong = power * error**2 * float(np.prod(shape)) > noise_power
-        alone = (strong & top) | sight | (error > max_error)
-        if alone.all():
-            continue
-        cost = model.seconds(candidate.name, shape, scale * int((~alone).sum()))
-        if alone.any():
-            cost += model.seconds(DIRECT, shape, scale * int(alone.sum()))
-        if cost < least:
-            best, least = (candidate.setting, alone), cost
-    return best
-
-
-def speed_of(rate: np.ndarray, accel: np.ndarray, duration: float) -> np.ndarray:
-    """c/2 times the largest rate of delay within a frame [m/s], from rate and acceleration at its
-    middle."""
-    return (np.abs(rate) + np.abs(accel) * duration / 2) * (SPEED_OF_LIGHT / 2)

@@ -1,16 +1,6 @@
-r"""IF samples of a flat list of paths: the exact model and the direct kernel.
-
-Cycles of the IF of one path (reference times conjugate of the received chirp), notes section 2:
-
-.. math:: \Phi = f_c\tau + \alpha\tau\,(u - \tau/2)
-
-with the delay tau counted from the reference chirp and u the time since its start. Every delay is
-float64 and every phase is reduced to one cycle in float64; f_c t is never formed.
-"""
+"""IF samples of a flat list of paths, one by one: the direct kernel."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -28,128 +18,10 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
+from isac_rt.signal.tones import Tones, sources
 
 FAST = {"contract", "nnan", "ninf", "nsz"}
 """Freedoms of the compiler that do not depend on the vector width."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tones:
-    """K paths of Q links as plain arrays. Times are seconds since the middle of the frame.
-
-    Attributes
-    ----------
-    link : (K,) int64
-    factor : (K,) complex128, conj(path gain)
-    delay, rate, accel : (K,) float64, the clock of the transmitter included
-    begin, end : (K,) when the path lives
-    tx_delay, rx_delay : (K, L_tx), (K, L_rx) what an element adds to the delay [s]
-    cross_row : (K,) int64 row of `cross`
-    cross : (R, L_tx, L_rx) joint part of the element delays [s]; row 0 is zero
-    symbol_delay : (Q, M, P) delay of the data [s]
-    send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
-    antenna : (Q, M, P) int64 transmit element
-    """
-
-    link: np.ndarray
-    factor: np.ndarray
-    delay: np.ndarray
-    rate: np.ndarray
-    accel: np.ndarray
-    begin: np.ndarray
-    end: np.ndarray
-    tx_delay: np.ndarray
-    rx_delay: np.ndarray
-    cross_row: np.ndarray
-    cross: np.ndarray
-    symbol_delay: np.ndarray
-    send: np.ndarray
-    antenna: np.ndarray
-
-    def __len__(self) -> int:
-        return self.delay.shape[0]
-
-    def select(self, which: np.ndarray) -> Tones:
-        """The paths that a mask or an index array chooses."""
-        per_path = (
-            "link",
-            "factor",
-            "delay",
-            "rate",
-            "accel",
-            "begin",
-            "end",
-            "tx_delay",
-            "rx_delay",
-            "cross_row",
-        )
-        return Tones(**{k: v[which] if k in per_path else v for k, v in vars(self).items()})
-
-
-def filter_gain(waveform: Waveform, beat: np.ndarray) -> np.ndarray:
-    """Amplitude gain of the IF filter at `beat` [Hz]: 1 on [0, f_s], a raised-cosine skirt of width
-    `filter_transition` on both sides."""
-    w = waveform
-    outside = np.clip(np.maximum(-beat, beat - w.sampling_rate) / w.filter_transition, 0.0, 1.0)
-    return 0.5 + 0.5 * np.cos(np.pi * outside)
-
-
-def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
-    """The model itself in float64, path by path, sample by sample: the oracle of the faster
-    methods.
-
-    Returns
-    -------
-    samples : (M, L_rx, P, N) complex128
-
-    Notes
-    -----
-    Temporary memory is a few (P, N) arrays. The gain of the filter follows the beat at the middle
-    of each chirp, seen from the arrays' centroids; the filter's own transient is not modelled. Nor
-    is the end of a chirp: at the edge of the skirt (a negative beat) the received chirp ends
-    transition/slope before the window does, 0.7 samples for 0.4 MHz.
-    """
-    w, t = waveform, tones
-    out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
-    for k in range(len(t)):
-        q = t.link[k]
-        for m in range(w.num_groups):
-            time = w.chirp_time[m][:, None] - w.frame_duration / 2 + w.fast_time
-            path = t.delay[k] + t.rate[k] * time + t.accel[k] * time**2 / 2
-            alive = (time >= t.begin[k]) & (time < t.end[k])
-            for source in range(w.num_groups):
-                base = path + t.symbol_delay[q, source][:, None] - (m - source) * w.group_spacing
-                passed = filter_gain(w, w.slope * base[:, w.num_samples // 2])
-                weight = (t.factor[k] * t.send[q, source] * passed)[:, None] * alive
-                if not weight.any():
-                    continue
-                antenna = t.antenna[q, source]
-                for rx in range(out.shape[1]):
-                    element = (
-                        t.tx_delay[k, antenna]
-                        + t.rx_delay[k, rx]
-                        + t.cross[t.cross_row[k], antenna, rx]
-                    )
-                    tau = base + element[:, None]
-                    out[m, rx] += weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
-    return out
-
-
-def sources(waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
-    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`,
-    offsets. Both (C,) int64."""
-    w, t = waveform, tones
-    half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
-    motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
-    longest = float(t.symbol_delay.max(initial=0.0))
-    margin = w.filter_transition / w.slope
-    paths, offsets = [], []
-    for offset in range(1 - w.num_groups, w.num_groups):
-        delay = t.delay - offset * w.group_spacing
-        passes = (delay + motion + longest >= -margin) & (delay - motion <= w.max_delay + margin)
-        paths.append(np.flatnonzero(passes))
-        offsets.append(np.full(paths[-1].size, offset))
-    return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
 
 
 def numbers(waveform: Waveform) -> np.ndarray:

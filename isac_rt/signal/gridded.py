@@ -27,6 +27,7 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
+from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import (
@@ -44,8 +45,11 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.direct import FAST, Tones, chirp_terms, filter_gain, numbers, passed, sources
+from isac_rt.signal.direct import FAST, chirp_terms, numbers, passed
+from isac_rt.signal.exact import filter_gain
+from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
+from isac_rt.signal.tones import Tones, sources
 
 
 @dataclass(frozen=True)
@@ -666,12 +670,10 @@ def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
 def range_cells(
     waveform: Waveform,
     tones: Tones,
-    delay_symbols: np.ndarray,
-    phases: np.ndarray,
+    payload: Payload,
     num_cells: int,
     setting: Setting = PROFILES,
-    power: float = 0.0,
-    key: np.ndarray | None = None,
+    noise: WhiteNoise | None = None,
 ) -> np.ndarray:
     """Range cells under Hann's window, made directly (`isac_rt.signal.profiles`): what a transform
     of the windowed samples gives.
@@ -681,10 +683,9 @@ def range_cells(
 
     Parameters
     ----------
-    delay_symbols : (M, P) int, D
-    phases : (M, P) complex, beta^(D), taken out with the symbols
+    payload : its delay symbols D and its phases beta^(D) are taken out
     num_cells : from cell 0, at most 3/4 of N: beyond the band a path's tail has no right phase
-    power, key : of white noise per IF sample [W], and its stream; no noise without a key
+    noise : of the IF samples
 
     Returns
     -------
@@ -697,13 +698,8 @@ def range_cells(
             "made directly; take samples"
         )
     length = w.window_length
-    band = make_band(
-        w.num_samples,
-        num_cells,
-        length,
-        0.0 if key is None else power,
-        np.zeros(2) if key is None else key,
-    )
+    delay_symbols, phases = payload.delay_symbols, payload.phases
+    band = make_band(w.num_samples, num_cells, length, noise or WhiteNoise(0.0, np.zeros(2)))
     start = np.ravel(w.data_shift(delay_symbols))
     size = len(band.window)
     pad = (size - num_cells) // 2 / w.num_samples

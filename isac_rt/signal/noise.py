@@ -13,8 +13,24 @@ doi:10.1145/2063384.2063405
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, uint32
+
+
+class WhiteNoise(NamedTuple):
+    """A draw of white noise.
+
+    Attributes
+    ----------
+    power : E|n|^2 per complex sample [W]
+    seed_words : (2,) uint32, the stream, ``seed_sequence(...).generate_state(2)``
+    """
+
+    power: float
+    seed_words: np.ndarray
+
 
 _PARITY = np.uint32(0x1BD11BDA)  # Threefish key-schedule constant, 32-bit variant
 _FAST = {

@@ -34,7 +34,7 @@ from isac_rt.frame.waveform import hann
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import LANES, aligned, load, splat, store, stream, transpose
 from isac_rt.signal.direct import FAST
-from isac_rt.signal.noise import add_stream
+from isac_rt.signal.noise import WhiteNoise, add_stream
 
 PAD = 32
 """Cells beyond either end of the band in which paths are kept."""
@@ -73,17 +73,9 @@ def band_size(num_samples: int, num_cells: int) -> int:
     return size if size < num_samples else num_samples
 
 
-def make_band(
-    num_samples: int, num_cells: int, window_length: float, power: float, key: np.ndarray
-) -> Band:
+def make_band(num_samples: int, num_cells: int, window_length: float, noise: WhiteNoise) -> Band:
     """The first `num_cells` cells under Hann's window of `window_length` samples, phases counted
-    from its start.
-
-    Parameters
-    ----------
-    power : of white noise per sample of the N [W]
-    key : (2,) uint32, the noise's stream
-    """
+    from its start; `noise` is that of the N samples."""
     size = band_size(num_samples, num_cells)
     x = (np.arange(size) - size // 2) * (num_samples / size)
     window = hann(x + window_length / 2, window_length) * (num_samples / size)
@@ -94,8 +86,8 @@ def make_band(
         window.astype(np.float32),
         *plan(size),
         turn,
-        power * size / num_samples,
-        np.asarray(key, np.uint32),
+        noise.power * size / num_samples,
+        np.asarray(noise.seed_words, np.uint32),
         *room,
     )
 

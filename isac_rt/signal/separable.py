@@ -18,7 +18,8 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.signal.direct import Tones, filter_gain
+from isac_rt.signal.exact import filter_gain
+from isac_rt.signal.tones import Tones
 
 
 def separable(waveform: Waveform, tones: Tones) -> np.ndarray:

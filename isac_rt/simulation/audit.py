@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
@@ -26,6 +26,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.store import CachedPropagation
 from isac_rt.randomness import generator
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Direct
 from isac_rt.simulation.plan import (
     Use,
     decibels,
@@ -265,7 +266,7 @@ def _link_items(
     depth = max(use.bounces for use in uses)
     at = stages or {}
     method = setup.plan.synthesis(int(num_kept))
-    error = decisions(setup.plan)["synthesis_error"] if method != "direct" else 1e-6
+    error = 1e-6 if isinstance(method, Direct) else setup.plan.synthesis_error
     return [
         Item(
             "paths",
@@ -294,7 +295,7 @@ def _link_items(
         Item(
             "synthesis",
             name,
-            method,
+            method.name,
             "rounding of the grid",
             error,
             "relative",
@@ -483,20 +484,10 @@ def _synthesis_error(
     sent: Transmission = setup.transmission(link[0], frame, poses[link[0]])
     start = setup.timetable.start_time(frame, link[0])
 
-    def cube(method: Any) -> np.ndarray:
-        return if_signal(
-            setup.waveform,
-            [(sent, some)],
-            poses[link[1]],
-            setup.antennas,
-            start_time=start,
-            method=method,
-            noise_power=level,
-            costs=setup.plan.costs,
-            max_error=setup.plan.synthesis_error,
-            decide_for=len(kept),
-        ).samples
-
-    exact, fast = cube("direct"), cube(setup.plan.synthesis(len(kept)))
+    receiver = ReceiveArray(poses[link[1]], setup.antennas)
+    exact, fast = (
+        if_signal(setup.waveform, [(sent, some)], receiver, Reference(start), method).samples
+        for method in (Direct(), setup.plan.synthesis(len(kept), level))
+    )
     scale = float(np.linalg.norm(exact))
     return float(np.linalg.norm(fast - exact)) / scale if scale else 0.0

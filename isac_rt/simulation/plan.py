@@ -41,7 +41,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
 from isac_rt.signal.choice import CostModel
 from isac_rt.signal.gridded import GRIDDED_ERROR
-from isac_rt.signal.if_signal import Method
+from isac_rt.signal.methods import Auto, Direct, Gridded, Method
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Swarm
 
@@ -50,7 +50,7 @@ FASTEST_UNTRACED_M = 4.0
 FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
-beyond, "auto"."""
+beyond, `Auto`."""
 
 
 REACH_MARGIN_M = 1.0
@@ -135,11 +135,19 @@ class Plan:
             self.preset, self.accuracy.max_untraced_m
         )
 
-    def synthesis(self, num_paths: int) -> Method:
-        """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths."""
+    def synthesis(self, num_paths: int, noise_power: float = 0.0) -> Method:
+        """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths, over noise of
+        this power [W]."""
         if self.preset == "fastest":
-            return "gridded"
-        return "direct" if self.preset == "everything" and num_paths <= MOST_DIRECT else "auto"
+            return Gridded()
+        if self.preset == "everything" and num_paths <= MOST_DIRECT:
+            return Direct()
+        return Auto(
+            noise_power=noise_power,
+            max_error=self.synthesis_error,
+            costs=self.costs,
+            decide_for=num_paths,
+        )
 
     @property
     def synthesis_error(self) -> float:
@@ -389,7 +397,7 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "traced_frames": len(plan.traced_frames) if plan.propagation.model == "ray_traced" else 0,
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
-        "synthesis": plan.synthesis(0),
+        "synthesis": plan.synthesis(0).name,
         "synthesis_error": plan.synthesis_error,
         "cost_model": plan.costs.record(),
     }

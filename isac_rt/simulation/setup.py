@@ -12,7 +12,7 @@ import numpy as np
 
 from isac_rt.access import Clock, Connections, Network, establish
 from isac_rt.frame.antennas import Antennas, antennas_of
-from isac_rt.frame.cube import IFCube, RangeProfiles, Transmission
+from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
     LinkBudget,
     link_budget,
@@ -34,6 +34,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
+from isac_rt.signal.noise import WhiteNoise
 from isac_rt.simulation.content import path_content
 from isac_rt.simulation.plan import Plan, Use
 from isac_rt.simulation.preflight import (
@@ -109,19 +110,10 @@ class Frame:
         on nothing but the frame and the link.
         """
         link, s = Link(*link), self._setup
-        arriving, level = self._arriving(link), self.noise_power(link)
-        cube = if_signal(
-            s.waveform,
-            arriving,
-            self.poses[link.rx],
-            s.antennas,
-            start_time=s.timetable.start_time(self.number, link.tx),
-            noise_power=level,
-            method=s.plan.synthesis(sum(len(p) for _, p in arriving)),
-            max_error=s.plan.synthesis_error,
-            costs=s.plan.costs,
-        )
-        return add_noise(cube, level, self._noise_words(link))
+        arriving, noise = self._arriving(link), self._noise(link)
+        method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
+        cube = if_signal(s.waveform, arriving, *self._listening(link), method)
+        return add_noise(cube, noise.power, noise.seed_words)
 
     def heard(self, link: tuple[str, str]) -> IFCube | RangeProfiles:
         """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at
@@ -132,12 +124,9 @@ class Frame:
         return range_profiles(
             s.waveform,
             self._arriving(link),
-            self.poses[link.rx],
-            s.antennas,
+            *self._listening(link),
             self.sent[link.tx].payload,
-            start_time=s.timetable.start_time(self.number, link.tx),
-            noise_power=self.noise_power(link),
-            seed_words=self._noise_words(link),
+            noise=self._noise(link),
         )
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
@@ -150,9 +139,16 @@ class Frame:
             out.append((sent, self.paths[Link(name, link.rx)]))
         return out
 
-    def _noise_words(self, link: Link) -> np.ndarray:
+    def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
+        """With what and when a link's receiver listens."""
+        s = self._setup
+        start = s.timetable.start_time(self.number, link.tx)
+        return ReceiveArray(self.poses[link.rx], s.antennas), Reference(start)
+
+    def _noise(self, link: Link) -> WhiteNoise:
         seed = self._setup.scenario.seed
-        return seed_sequence(seed, "noise", *link, self.number).generate_state(2)
+        words = seed_sequence(seed, "noise", *link, self.number).generate_state(2)
+        return WhiteNoise(self.noise_power(link), words)
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,16 @@ import pytest
 
 from isac_rt.access.dma import isolation, mix, raised_cosine
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive import Prediction, receive_passive
 from isac_rt.scenario.receivers import Receivers
-from isac_rt.signal.direct import filter_gain
+from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Direct, Exact
 from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
@@ -94,7 +95,7 @@ def test_mixed_chirps_equal_the_signal_model():
         (near, sight(w, 37.3, -7.7, 0.8 + 0.3j, start)),
         (far, sight(w, 61.9, 4.1, -0.2 + 1.1j, start)),
     ]
-    model = if_signal(w, links, STILL, one, start_time=start, method="exact").samples[0, 0]
+    model = if_signal(w, links, ReceiveArray(STILL, one), Reference(start), Exact()).samples[0, 0]
     middle = np.arange(6) * w.slot_duration - w.frame_duration / 2
     samples = np.zeros_like(model, np.complex128)
     for block, (t, p), speed, gain in zip(
@@ -198,7 +199,7 @@ def collided(first_block, modulated, rng, strength=1.0):
             "first_block": block,
         }
         links.append((Transmission(name="A", **fields), sight(w, length, speed, gain)))
-    cube = if_signal(w, links, STILL, antennas, start_time=0.0, method="direct")
+    cube = if_signal(w, links, ReceiveArray(STILL, antennas), Reference(0.0), Direct())
     noise = (
         np.float32(np.sqrt(0.05))
         * rng.standard_normal((*cube.samples.shape, 2), np.float32).view(np.complex64)[..., 0]

@@ -8,7 +8,7 @@ import pytest
 
 from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock, round_of
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -137,7 +137,7 @@ def received(w, antennas, forward, time, offset, held, seed, snr):
         clock_drift=s * DRIFT,
     )
     start = time - w.frame_duration / 2
-    cube = if_signal(w, [(sent, paths)], still, antennas, start_time=start)
+    cube = if_signal(w, [(sent, paths)], ReceiveArray(still, antennas), Reference(start))
     add_noise(cube, 1 / snr, seed_sequence(seed, "noise", forward).generate_state(2))
     return receive_passive(cube, antennas, Receivers(), 8, None, False)
 

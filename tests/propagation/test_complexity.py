@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pytest
 
+from isac_rt.signal.methods import Gridded
 from isac_rt.simulation.audit import tracer_of
 from isac_rt.simulation.setup import prepare
 from isac_rt.studies.bench import clutter, synthesis
@@ -19,7 +20,7 @@ def test_synthesis_grows_no_faster_than_its_paths():
     seconds = []
     for count in (1000, 4000):
         links = job.paths(count)
-        seconds.append(cpu_seconds(lambda links=links: job.samples(links, "gridded"), 5))
+        seconds.append(cpu_seconds(lambda links=links: job.samples(links, Gridded()), 5))
     assert seconds[1] < 8 * seconds[0]
 
 

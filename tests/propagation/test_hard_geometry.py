@@ -17,6 +17,7 @@ from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
 from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load, to_yaml
 from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.methods import Auto
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
 from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
 from isac_rt.studies.validation import stage
@@ -348,7 +349,7 @@ def test_no_path_at_all():
     sender = stage.sender(w, np.random.default_rng(1))
     paths = replace(paths, epoch=w.frame_duration / 2)
     samples = stage.synthesise(
-        w, [(sender, paths)], stage.pose((0, 0, 0)), "auto", 0.0, stage.arrays(w)
+        w, [(sender, paths)], stage.pose((0, 0, 0)), Auto(), 0.0, stage.arrays(w)
     )
     assert samples.shape[0] == 3 and not samples.any()
 

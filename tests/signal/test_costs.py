@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,11 @@ from isac_rt.signal.choice import (
     NAMES,
     SHIPPED,
     CostModel,
-    choose,
     read,
-    speed_of,
 )
 from isac_rt.signal.gridded import DEFAULT
-from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
+from isac_rt.signal.tones import tones_of
 from isac_rt.simulation.plan import decisions
 from isac_rt.simulation.setup import prepare
 from isac_rt.studies.bench.fit import fit
@@ -33,22 +33,12 @@ from isac_rt.studies.bench.synthesis import Job, relative
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SHAPE = (3, 15, 120, 1024)
-STILL = {"noise_power": np.inf, "max_error": 1e-4, "max_direct": 16}
 
 
-def decide(
-    count: int, *, model: CostModel | None = None, power: float = 1.0, speed: float = 7.0, **more
-):
-    """What is chosen for `count` equal paths."""
-    one = np.ones(count)
-    return choose(
-        model or read(SHIPPED),
-        SHAPE,
-        power * one,
-        speed * one,
-        np.zeros(count, bool),
-        **(STILL | more),
-    )
+def decide(count: int, **more):
+    """What is chosen for `count` equal paths of 7 m/s."""
+    one, auto = np.ones(count), Auto(**({"noise_power": np.inf, "max_error": 1e-4} | more))
+    return auto.choose(SHAPE, one, 7.0 * one, np.zeros(count, bool))
 
 
 @pytest.mark.parametrize("size", [2, 40, 400])
@@ -58,8 +48,8 @@ def test_what_is_predicted_twice_as_dear_is_dearer(size):
     job, model = Job(12), read(SHIPPED)
     links, shape = job.paths(size), (3, 15, 12, 1024)
     predicted = {name: model.seconds(name, shape, size) for name in NAMES}
-    works = {c.name: (lambda c=c: job.samples(links, "gridded", c.setting)) for c in CANDIDATES}
-    works[DIRECT] = lambda: job.samples(links, "direct")
+    works = {c.name: (lambda c=c: job.samples(links, Gridded(c.setting))) for c in CANDIDATES}
+    works[DIRECT] = lambda: job.samples(links, Direct())
     measured = {name: cpu_seconds(work, 3) for name, work in works.items()}
     clear = [(a, b) for a, b in itertools.permutations(NAMES, 2) if predicted[a] > 2 * predicted[b]]
     assert clear or size == 2
@@ -73,21 +63,12 @@ def test_the_choice_keeps_the_stated_error(speed):
     gridded (2e-4 where 1e-4 is stated)."""
     job = Job(3, speed=speed)
     links = job.paths(40)
-    truth = job.samples(links, "exact")
+    truth = job.samples(links, Exact())
     for stated in (1e-2, 3.5e-4, 1e-4, 1e-5, 1e-6):
-        found = if_signal(
-            job.waveform,
-            links,
-            job.pose,
-            job.antennas,
-            start_time=0.0,
-            noise_power=np.inf,
-            max_error=stated,
-            decide_for=20_000,
-        ).samples
+        found = job.samples(links, Auto(noise_power=np.inf, max_error=stated, decide_for=20_000))
         assert relative(found, truth) < stated
     for candidate in CANDIDATES:
-        error = relative(job.samples(links, "gridded", candidate.setting), truth)
+        error = relative(job.samples(links, Gridded(candidate.setting)), truth)
         assert error < candidate.error_at(np.array(speed)) < 10 * error
 
 
@@ -108,9 +89,7 @@ def test_sights_fast_and_strong_paths_go_direct():
     """One of each among 500. Planted bug: `strong` and `sight` joined by `and`."""
     power, speed, sight = np.full(500, 1e-12), np.full(500, 3.0), np.zeros(500, bool)
     power[[7, 8, 9]], speed[20], sight[30] = (1.0, 2.0, 3.0), 300.0, True
-    _, alone = choose(
-        read(SHIPPED), SHAPE, power, speed, sight, noise_power=1e-6, max_error=1e-4, max_direct=2
-    )
+    _, alone = Auto(noise_power=1e-6, max_direct=2).choose(SHAPE, power, speed, sight)
     assert np.flatnonzero(alone).tolist() == [8, 9, 20, 30]
 
 
@@ -119,22 +98,22 @@ def test_the_costs_decide():
     whatever is given."""
     shipped = read(SHIPPED)
     free = CostModel("made up", shipped.chirp_ns | {DIRECT: 0.1}, shipped.path_ns | {DIRECT: 1e-3})
-    assert decide(1000, model=free)[1].all()
-    assert decide(1000, num_paths=3)[1].all()
+    assert decide(1000, costs=free)[1].all()
+    assert decide(1000, decide_for=3)[1].all()
     job = Job(3)
-    links, options = (
-        job.paths(30),
-        {"start_time": 0.0, "noise_power": np.inf},
-    )
-    found = if_signal(job.waveform, links, job.pose, job.antennas, costs=free, **options).samples
-    np.testing.assert_array_equal(found, job.samples(links, "direct"))
+    links = job.paths(30)
+    found = job.samples(links, Auto(noise_power=np.inf, costs=free))
+    np.testing.assert_array_equal(found, job.samples(links, Direct()))
 
 
 def test_speed_is_the_largest_in_the_frame():
     """v = 11.3 m/s there and back, 40 m/s^2 over half of 7.2 ms. Planted bug: one way taken for
     two."""
+    job = Job(3)
+    tones = tones_of(job.waveform, job.paths(1), job.receiver, 0.0, 0)
     rate, accel = np.array([-2 * 11.3 / SPEED_OF_LIGHT]), np.array([2 * 40 / SPEED_OF_LIGHT])
-    assert speed_of(rate, accel, 7.2e-3)[0] == pytest.approx(11.3 + 40 * 3.6e-3, rel=1e-12)
+    found = replace(tones, rate=rate, accel=accel).speed(7.2e-3)
+    assert found[0] == pytest.approx(11.3 + 40 * 3.6e-3, rel=1e-12)
 
 
 def test_a_fit_is_a_model(tmp_path, capsys, monkeypatch):

@@ -10,14 +10,15 @@ import pytest
 from numba import njit
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.signal.direct import add_direct, exact
+from isac_rt.signal.direct import add_direct
+from isac_rt.signal.exact import exact
 from isac_rt.signal.gridded import (
     ACCURATE,
     ACCURATE_ERROR,
@@ -26,7 +27,7 @@ from isac_rt.signal.gridded import (
     add_gridded,
     add_plain,
 )
-from isac_rt.signal.if_signal import _tones
+from isac_rt.signal.tones import tones_of
 from isac_rt.world.swarm import Pose
 
 SETTINGS = [
@@ -145,7 +146,7 @@ def scene(count, rng, speed=15.0, view=60.0, **change):
         kind=PathKind.DIFFUSE,
         begin=born,
     )
-    return w, _tones(w, [(sender, paths)], pose, array, w.frame_duration / 2, 0)[0]
+    return w, tones_of(w, [(sender, paths)], ReceiveArray(pose, array), w.frame_duration / 2, 0)
 
 
 def gridded(w, tones, setting):

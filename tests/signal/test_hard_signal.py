@@ -15,13 +15,14 @@ from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.gridded import GRIDDED_ERROR
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.stage import FEW, SMALL
 
 C = SPEED_OF_LIGHT
 COMPLEX64 = 1e-6  # rounding of complex64 samples, in both of what is compared
 W = Waveform(num_samples=128)
-METHODS = ["exact", "direct", "gridded"]
+METHODS = [Exact(), Direct(), Gridded()]
 SETTINGS = Receivers()
 
 
@@ -45,7 +46,7 @@ def paths(w: Waveform, delay, gain=1.0, rate=0.0, radius=np.inf) -> PathSet:
 
 
 def samples(
-    w: Waveform, of: PathSet, method: str, data: bool = False, antennas: Antennas | None = None
+    w: Waveform, of: PathSet, method: Method, data: bool = False, antennas: Antennas | None = None
 ) -> np.ndarray:
     antennas = antennas or stage.arrays(w)
     sender = stage.sender(
@@ -95,7 +96,7 @@ def test_no_delay_at_all(method):
     found = stage.synthesise(
         w, [(sender, paths(w, 0.0, 0.3 - 0.7j))], stage.pose((0, 0, 0)), method, 0.0, one
     )
-    error = GRIDDED_ERROR if method == "gridded" else COMPLEX64
+    error = GRIDDED_ERROR if method == Gridded() else COMPLEX64
     assert (
         np.abs(found - (0.3 + 0.7j)).max() < 30 * error
     )  # RMS bound; a single sample may be off by more
@@ -134,15 +135,15 @@ def test_velocities_beyond_the_limit_are_aliases_of_a_known_span(speed):
     assert abs(found.range[best] - 14.3 - coupling) < 0.1 * W.range_cell(2)
 
 
-@pytest.mark.parametrize("method", ["direct", "gridded", "auto"])
+@pytest.mark.parametrize("method", [Direct(), Gridded(), Auto()])
 def test_a_target_at_half_a_metre(method):
     """Spherical waves over the whole array, against the exact model. Written against: plane
     waves."""
     found, truth = (
-        samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8, 0.5), m, True) for m in (method, "exact")
+        samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8, 0.5), m, True) for m in (method, Exact())
     )
-    plane = samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8), "exact", True)
-    assert stage.relative(found, truth) < (GRIDDED_ERROR if method == "gridded" else COMPLEX64)
+    plane = samples(SMALL, paths(SMALL, 1.0 / C, 0.7, 3e-8), Exact(), True)
+    assert stage.relative(found, truth) < (GRIDDED_ERROR if method == Gridded() else COMPLEX64)
     assert stage.relative(plane, truth) > 0.05
 
 
@@ -155,10 +156,10 @@ def test_one_path_80_db_above_another():
     gain[0] = 1e4 * abs(gain).max()
     strong = replace(every, gain=gain)
     without = strong.select(np.arange(14) > 0)
-    rest = samples(SMALL, strong, "auto") - samples(
-        SMALL, strong.select(np.arange(14) == 0), "exact"
+    rest = samples(SMALL, strong, Auto()) - samples(
+        SMALL, strong.select(np.arange(14) == 0), Exact()
     )
-    truth = samples(SMALL, without, "exact")
+    truth = samples(SMALL, without, Exact())
     assert (
         stage.relative(rest, truth) < 1e-2
     )  # complex64 of the strong one: 1e4 * 6e-8 * a few roundings
@@ -177,7 +178,7 @@ def test_a_million_paths(times):
     many = few.select(np.tile(np.arange(1000), times))
     many = replace(many, gain=many.gain / times)
     antennas = stage.arrays(w, tx_z=2, rx_x=2)
-    found, truth = (samples(w, p, "gridded", antennas=antennas) for p in (many, few))
+    found, truth = (samples(w, p, Gridded(), antennas=antennas) for p in (many, few))
     assert stage.relative(found, truth) < 5e-4
 
 
@@ -189,15 +190,15 @@ def test_ten_thousand_paths_at_one_delay():
     w = Waveform(num_samples=64, num_chirps=3, num_groups=1)
     antennas = stage.arrays(w, tx_z=2, rx_x=2)
     found = samples(
-        w, paths(w, np.full(10_000, 0.37 * w.max_delay), gain), "gridded", antennas=antennas
+        w, paths(w, np.full(10_000, 0.37 * w.max_delay), gain), Gridded(), antennas=antennas
     )
-    truth = samples(w, paths(w, 0.37 * w.max_delay, gain.sum()), "exact", antennas=antennas)
+    truth = samples(w, paths(w, 0.37 * w.max_delay, gain.sum()), Exact(), antennas=antennas)
     assert (
         stage.relative(found, truth) < GRIDDED_ERROR * 10
     )  # |sum| is a fortieth of the sum of the moduli
 
 
-@pytest.mark.parametrize("method", [*METHODS, "auto"])
+@pytest.mark.parametrize("method", [*METHODS, Auto()])
 def test_denormal_and_zero_gains(method):
     """They add nothing and make no NaN, alone and beside a path of size 1."""
     tiny = paths(SMALL, [0.1 * SMALL.max_delay, 0.3 * SMALL.max_delay], np.array([0.0, 5e-324]))
@@ -219,9 +220,9 @@ def test_sizes_that_are_no_powers_of_two(size, chirps, tx):
     decoded."""
     w = Waveform(num_samples=size, num_chirps=chirps, num_tx=tx, num_groups=min(tx, 3))
     every = stage.random_paths(w, np.random.default_rng(size), 30, w.frame_duration / 2)
-    truth = samples(w, every, "exact", True)
-    assert stage.relative(samples(w, every, "direct", True), truth) < COMPLEX64
-    assert stage.relative(samples(w, every, "gridded", True), truth) < GRIDDED_ERROR
+    truth = samples(w, every, Exact(), True)
+    assert stage.relative(samples(w, every, Direct(), True), truth) < COMPLEX64
+    assert stage.relative(samples(w, every, Gridded(), True), truth) < GRIDDED_ERROR
     _, schedule, payload = stage.frame(4, 3, w)
     antennas = Antennas(tx_x=2, tx_z=tx - 1, rx_x=2, rx_z=2, spacing=2e-3)
     length = 0.31 * size * w.range_cell(1)

@@ -10,14 +10,16 @@ import pytest
 from oracles import mixed_chirps
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.signal.direct import exact
+from isac_rt.signal.exact import exact
 from isac_rt.signal.gridded import GRIDDED_ERROR
-from isac_rt.signal.if_signal import _tones, if_signal
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
+from isac_rt.signal.tones import tones_of
 from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT
@@ -81,17 +83,9 @@ def paths(w, rng, count, *, reach=0.9, speed=30.0, **change):
     return make_paths(epoch=START + w.frame_duration / 2, tx="A", rx="B", **(fields | change))
 
 
-def synthesise(w, links, method, *, turned=(0.2, 1.0, 0.3), array=None, **options):
-    array = antennas(w) if array is None else array
-    return if_signal(
-        w,
-        links,
-        pose(*turned),
-        array,
-        start_time=START,
-        method=method,
-        **options,
-    ).samples
+def synthesise(w, links, method, *, array=None, schedule=None):
+    receiver = ReceiveArray(pose(0.2, 1.0, 0.3), array or antennas(w))
+    return if_signal(w, links, receiver, Reference(START, schedule=schedule), method).samples
 
 
 def relative(found, truth):
@@ -131,11 +125,10 @@ def test_exact_model_is_what_mixing_gives():
     transposed."""
     links = hard_links(SMALL, np.random.default_rng(11))
     truth = mixed_chirps(SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START)
-    tones, _, _ = _tones(
-        SMALL, links, pose(0.2, 1.0, 0.3), antennas(SMALL), START + SMALL.frame_duration / 2, 0
-    )
+    receiver = ReceiveArray(pose(0.2, 1.0, 0.3), antennas(SMALL))
+    tones = tones_of(SMALL, links, receiver, START + SMALL.frame_duration / 2, 0)
     assert relative(exact(SMALL, tones), truth) < FLOAT64
-    assert relative(synthesise(SMALL, links, "exact"), truth) < COMPLEX64
+    assert relative(synthesise(SMALL, links, Exact()), truth) < COMPLEX64
 
 
 @pytest.mark.parametrize("block", [0, 2, 4])
@@ -147,15 +140,8 @@ def test_resource_blocks_are_what_mixing_gives(block):
     links = [(replace(links[i][0], first_block=2 + i), links[i][1]) for i in (0, 1)]
     start = START + block * w.group_spacing
     truth = mixed_chirps(w, links, pose(0.2, 1.0, 0.3), antennas(w), start, block)
-    found = if_signal(
-        w,
-        links,
-        pose(0.2, 1.0, 0.3),
-        antennas(w),
-        start_time=start,
-        first_block=block,
-        method="exact",
-    )
+    receiver = ReceiveArray(pose(0.2, 1.0, 0.3), antennas(w))
+    found = if_signal(w, links, receiver, Reference(start, block), Exact())
     assert np.abs(truth).max() > 0.1
     assert relative(found.samples, truth) < COMPLEX64
 
@@ -171,7 +157,7 @@ def test_direct_is_exact(shape, data):
     links = [(sender(w, rng, data=data, antennas=array), paths(w, rng, 6, reach=2.5))]
     assert (
         relative(
-            synthesise(w, links, "direct", array=array), synthesise(w, links, "exact", array=array)
+            synthesise(w, links, Direct(), array=array), synthesise(w, links, Exact(), array=array)
         )
         < COMPLEX64
     )
@@ -186,8 +172,8 @@ def test_gridded_against_exact(samples, count, speed):
     rng = np.random.default_rng(samples + count)
     array = antennas(w, rx_x=8, rx_z=8)
     links = [(sender(w, rng, data=count != 40), paths(w, rng, count, speed=speed, reach=1.2))]
-    truth = synthesise(w, links, "direct", array=array)
-    assert relative(synthesise(w, links, "gridded", array=array), truth) < GRIDDED_ERROR
+    truth = synthesise(w, links, Direct(), array=array)
+    assert relative(synthesise(w, links, Gridded(), array=array), truth) < GRIDDED_ERROR
 
 
 def test_paths_at_the_ends_of_the_passband():
@@ -200,7 +186,7 @@ def test_paths_at_the_ends_of_the_passband():
             paths(w, np.random.default_rng(4), 6, delay=ends),
         )
     ]
-    assert relative(synthesise(w, links, "gridded"), synthesise(w, links, "exact")) < GRIDDED_ERROR
+    assert relative(synthesise(w, links, Gridded()), synthesise(w, links, Exact())) < GRIDDED_ERROR
 
 
 def test_births_and_deaths_of_fast_methods_are_whole_chirps():
@@ -217,12 +203,12 @@ def test_births_and_deaths_of_fast_methods_are_whole_chirps():
         reach=0.4,
     )
     links = [(sender(w, rng), one)]
-    truth = synthesise(w, links, "exact")
-    assert relative(synthesise(w, links, "direct"), truth) < COMPLEX64
-    assert relative(synthesise(w, links, "gridded"), truth) < GRIDDED_ERROR
+    truth = synthesise(w, links, Exact())
+    assert relative(synthesise(w, links, Direct()), truth) < COMPLEX64
+    assert relative(synthesise(w, links, Gridded()), truth) < GRIDDED_ERROR
 
 
-def tone(w, *, delay=0.3, method="exact", **change):
+def tone(w, *, delay=0.3, method, **change):
     """One unmodulated path of gain 1 through one sender without array offset."""
     rng = np.random.default_rng(2)
     fields = {
@@ -240,7 +226,7 @@ def tone(w, *, delay=0.3, method="exact", **change):
     )
 
 
-@pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
+@pytest.mark.parametrize("method", [Exact(), Direct(), Gridded()])
 def test_signs(method):
     """Farther: higher positive beat. Receding: positive slow-time frequency, f_v = +f_eff *
     rate."""
@@ -255,7 +241,7 @@ def test_signs(method):
     assert np.argmax(np.abs(np.fft.fft(slow))) == bins
 
 
-@pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
+@pytest.mark.parametrize("method", [Exact(), Direct(), Gridded()])
 def test_arrival_from_the_right_along_the_array(method):
     """A wave from +X: element phase exp(-j 2 pi f_eff x/c) at mid-window, less what was sent tau
     earlier."""
@@ -271,7 +257,7 @@ def test_arrival_from_the_right_along_the_array(method):
     )  # method error
 
 
-@pytest.mark.parametrize("method", ["exact", "direct", "gridded"])
+@pytest.mark.parametrize("method", [Exact(), Direct(), Gridded()])
 def test_filter(method):
     """Passband, half a skirt (amplitude 1/2), stop band, and the neighbour group whose beat is 2
     f_s lower."""
@@ -291,7 +277,7 @@ def test_filter(method):
     )  # group m - 1, two maximal delays late
 
 
-@pytest.mark.parametrize("method", ["direct", "exact"])
+@pytest.mark.parametrize("method", [Direct(), Exact()])
 def test_target_at_half_a_metre_is_seen_spherically(method):
     """Phase differences of the elements follow the distances to the point. Planted bug: plane
     waves."""
@@ -316,16 +302,16 @@ def test_linear_in_paths_and_gains():
     rng = np.random.default_rng(8)
     s, all_paths = sender(w, rng), paths(w, rng, 30)
     parts = [all_paths.select(np.arange(30) % 2 == i) for i in range(2)]
-    whole = synthesise(w, [(s, all_paths)], "gridded")
-    halves = sum(synthesise(w, [(s, part)], "gridded") for part in parts)
+    whole = synthesise(w, [(s, all_paths)], Gridded())
+    halves = sum(synthesise(w, [(s, part)], Gridded()) for part in parts)
     assert relative(halves, whole) < 1e-6  # rounding of the grid in float32
-    together = synthesise(w, [(s, parts[0]), (s, parts[1])], "gridded")
+    together = synthesise(w, [(s, parts[0]), (s, parts[1])], Gridded())
     assert relative(together, whole) < 1e-6
     turned = replace(all_paths, gain=all_paths.gain * 2j)
-    assert relative(synthesise(w, [(s, turned)], "gridded"), -2j * whole) < 1e-6
+    assert relative(synthesise(w, [(s, turned)], Gridded()), -2j * whole) < 1e-6
 
 
-@pytest.mark.parametrize("method", ["auto", "exact", "direct", "gridded"])
+@pytest.mark.parametrize("method", [Auto(), Exact(), Direct(), Gridded()])
 def test_nothing_gives_nothing(method):
     w, rng = SMALL, np.random.default_rng(9)
     s = sender(w, rng)
@@ -341,14 +327,14 @@ def test_auto_is_more_accurate_where_a_path_is_strong():
     gain = np.where(np.arange(40) == 17, 1.0, 1e-3) * np.exp(2j * np.pi * rng.uniform(size=40))
     kind = np.where(np.arange(40) == 5, int(PathKind.LINE_OF_SIGHT), int(PathKind.DIFFUSE))
     links = [(sender(w, rng), paths(w, rng, 40, gain=gain, kind=kind))]
-    truth = synthesise(w, links, "exact")
+    truth = synthesise(w, links, Exact())
     assert relative(
-        synthesise(w, links, "auto", noise_power=1e-6), truth
+        synthesise(w, links, Auto(noise_power=1e-6)), truth
     ) < 1e-2 * GRIDDED_ERROR * np.sqrt(40)
-    assert relative(synthesise(w, links, "gridded"), truth) > 1e-2 * GRIDDED_ERROR * np.sqrt(40)
+    assert relative(synthesise(w, links, Gridded()), truth) > 1e-2 * GRIDDED_ERROR * np.sqrt(40)
 
 
-@pytest.mark.parametrize("method", ["exact", "gridded"])
+@pytest.mark.parametrize("method", [Exact(), Gridded()])
 def test_the_epoch_is_only_where_the_polynomial_is_written(method):
     """Paths said for another instant, delays expanded about it by hand, and births counted from it,
     give the same samples. Accelerations of 1e6 m/s^2 so that their square shows: 0.3 mm.
@@ -380,4 +366,4 @@ def test_a_wrong_epoch_is_refused():
     w, rng = SMALL, np.random.default_rng(12)
     late = replace(paths(w, rng, 2), epoch=START)
     with pytest.raises(ValueError, match="middle of the frame"):
-        synthesise(w, [(sender(w, rng), late)], "auto")
+        synthesise(w, [(sender(w, rng), late)], Auto())

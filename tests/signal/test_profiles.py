@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS
 
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
@@ -21,11 +21,15 @@ from isac_rt.scenario.file import ScenarioError, load
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
+from isac_rt.signal.methods import Auto, Exact
+from isac_rt.signal.noise import WhiteNoise
 from isac_rt.simulation.simulate import run
 from isac_rt.world.swarm import Pose
 
 SCENES = Path(__file__).parents[2] / "scenes"
 POSE = Pose.at_rest(boresight=[0.1, 1.0, 0.05])
+
+HEARD = ReceiveArray(POSE, ANTENNAS), Reference(0.0)
 
 
 def sender(w: Waveform, name: str, seed: int, **more) -> Transmission:
@@ -74,9 +78,8 @@ def paths(w: Waveform, name: str, count: int, seed: int, speed: float = 15.0) ->
 def both(w: Waveform, links: list, cells: int, setting) -> tuple[np.ndarray, np.ndarray]:
     """Profiles made directly, and exact samples transformed."""
     own = links[0][0].payload
-    frame = {"start_time": 0.0}
-    found = range_profiles(w, links, POSE, ANTENNAS, own, num_cells=cells, setting=setting, **frame)
-    cube = if_signal(w, links, POSE, ANTENNAS, method="exact", **frame)
+    found = range_profiles(w, links, *HEARD, own, num_cells=cells, setting=setting)
+    cube = if_signal(w, links, *HEARD, Exact())
     return found.spectra, clean_spectrum(cube, own.delay_symbols, own.phases, cells)
 
 
@@ -147,15 +150,9 @@ def test_noise_is_that_of_windowed_white_samples():
     samples' power in the fewer samples of the band."""
     w, power = replace(Waveform(filter_transition=0.41e6), num_chirps=12), 1.7e-3
     silent = [(sender(w, "A", 1), paths(w, "A", 0, 2))]
-    words = np.array([5, 9], np.uint32)
-    options = {
-        "start_time": 0.0,
-        "noise_power": power,
-        "seed_words": words,
-    }
-    y = range_profiles(w, silent, POSE, ANTENNAS, silent[0][0].payload, **options).spectra.astype(
-        complex
-    )
+    noise = WhiteNoise(power, np.array([5, 9], np.uint32))
+    own = silent[0][0].payload
+    y = range_profiles(w, silent, *HEARD, own, noise=noise).spectra.astype(complex)
     square = hann(np.arange(w.num_samples), w.window_length) ** 2
     for lag in range(5):
         truth = (
@@ -182,15 +179,10 @@ def test_the_active_terminal_makes_the_same_of_both():
     )
     few = replace(few, delay=delay, gain=gain, begin=np.full(4, -np.inf))
     link = [(sender(w, "A", 1), few)]
-    frame, own = {"start_time": 0.0}, link[0][0].payload
-    noise, words = 1e-4, np.array([3, 4], np.uint32)
-    samples = add_noise(
-        if_signal(w, link, POSE, ANTENNAS, noise_power=noise, **frame), noise, words
-    )
+    own, noise = link[0][0].payload, WhiteNoise(1e-4, np.array([3, 4], np.uint32))
+    samples = add_noise(if_signal(w, link, *HEARD, Auto(noise.power)), *noise)
     settings = Receivers(velocity_method="latin_union")
-    profiles = range_profiles(
-        w, link, POSE, ANTENNAS, own, noise_power=noise, seed_words=words, **frame
-    )
+    profiles = range_profiles(w, link, *HEARD, own, noise=noise)
     a = receive_active(profiles, own, ANTENNAS, settings, maps=True)
     b = receive_active(samples, own, ANTENNAS, settings)
     assert len(b.detections) == 4

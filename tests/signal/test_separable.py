@@ -8,12 +8,13 @@ import pytest
 from receiver_cubes import Path, cube
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Separable
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0
@@ -45,7 +46,9 @@ def misfit(
         tx="A",
         rx="A",
     )
-    model = if_signal(w, [(sent, path)], still, ONE, start_time=0.0, method="paper").samples
+    model = if_signal(
+        w, [(sent, path)], ReceiveArray(still, ONE), Reference(0.0), Separable()
+    ).samples
     truth = cube(
         w, schedule, payload, [Path(passes * reach, passes * speed, 1.0, aside, aside)], ONE
     ).samples

@@ -16,7 +16,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
-from isac_rt.signal.direct import sources
+from isac_rt.signal.tones import sources
 from isac_rt.simulation.plan import (
     Plan,
     faintest,

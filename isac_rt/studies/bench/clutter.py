@@ -20,9 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Gridded
 from isac_rt.simulation.audit import tracer_of
 from isac_rt.simulation.plan import faintest
 from isac_rt.simulation.setup import Setup, prepare
@@ -135,10 +137,9 @@ def _of_samples(setup: Setup, floor: float, repeats: int) -> list[dict[str, obje
         return if_signal(
             setup.waveform,
             [(sent, some)],
-            poses["AT"],
-            setup.antennas,
-            start_time=setup.timetable.start_time(0, "AT"),
-            method="gridded",
+            ReceiveArray(poses["AT"], setup.antennas),
+            Reference(setup.timetable.start_time(0, "AT")),
+            Gridded(),
         ).samples
 
     truth, out = samples(paths), []

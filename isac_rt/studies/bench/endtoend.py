@@ -15,6 +15,7 @@ from statistics import median
 
 import numpy as np
 
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
@@ -89,10 +90,8 @@ def samples(setup: Setup) -> dict[Link, np.ndarray]:
         out[link] = if_signal(
             setup.waveform,
             [(frame.sent[link.tx], frame.paths[link])],
-            frame.poses[link.rx],
-            setup.antennas,
-            start_time=setup.timetable.start_time(number, link.tx),
-            noise_power=frame.noise_power(link),
-            method=setup.plan.synthesis(len(frame.paths[link])),
+            ReceiveArray(frame.poses[link.rx], setup.antennas),
+            Reference(setup.timetable.start_time(number, link.tx)),
+            setup.plan.synthesis(len(frame.paths[link]), frame.noise_power(link)),
         ).samples
     return out

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.signal.choice import CANDIDATES, DIRECT, FORMAT
+from isac_rt.signal.methods import Direct, Gridded
 from isac_rt.studies.bench.measure import cpu_seconds
 from isac_rt.studies.bench.synthesis import Job
 
@@ -42,10 +43,10 @@ def fit(
     for size in SIZES:
         links = job.paths(size)
         jobs |= {
-            (c.name, size): partial(job.samples, links, "gridded", c.setting) for c in CANDIDATES
+            (c.name, size): partial(job.samples, links, Gridded(c.setting)) for c in CANDIDATES
         }
     jobs |= {
-        (DIRECT, size): partial(job.samples, job.paths(size), "direct") for size in DIRECT_SIZES
+        (DIRECT, size): partial(job.samples, job.paths(size), Direct()) for size in DIRECT_SIZES
     }
     found: dict[tuple[str, int], list[float]] = {key: [] for key in jobs}
     for turn in range(repeats):

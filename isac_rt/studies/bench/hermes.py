@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from isac_rt.signal.methods import Exact, Gridded
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.synthesis import GRIDS, Job, relative
 
@@ -82,9 +83,9 @@ def errors() -> dict[str, float]:
     """Relative RMS error of our settings on 40 static paths."""
     job = job_of(3)
     links = job.paths(40)
-    truth = {True: job.samples(links, "exact"), False: job.narrowband(links)}
+    truth = {True: job.samples(links, Exact()), False: job.narrowband(links)}
     return {
-        name: relative(job.samples(links, "gridded", s), truth[s.wideband])
+        name: relative(job.samples(links, Gridded(s)), truth[s.wideband])
         for name, s in GRIDS
         if name in OURS
     }
@@ -141,7 +142,7 @@ def rows(quick: bool) -> list[dict[str, object]]:
         links = ours.paths(size)
         for method, setting in GRIDS:
             if method in OURS:
-                fast = cpu_seconds(partial(ours.samples, links, "gridded", setting))
+                fast = cpu_seconds(partial(ours.samples, links, Gridded(setting)))
                 add(
                     method,
                     size,

@@ -19,7 +19,7 @@ from scipy.fft import fft
 from threadpoolctl import threadpool_limits
 
 from isac_rt.frame.antennas import Antennas, unit_vector
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -29,6 +29,7 @@ from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.types import Detections, Prediction
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.signal.methods import Direct
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.world.swarm import Pose
 
@@ -64,14 +65,7 @@ def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
         rx_radius=np.inf,
         kind=PathKind.TARGET,
     )
-    cube = if_signal(
-        w,
-        [(sender, paths)],
-        pose,
-        antennas,
-        start_time=0.0,
-        method="direct",
-    )
+    cube = if_signal(w, [(sender, paths)], ReceiveArray(pose, antennas), Reference(0.0), Direct())
     cube = add_noise(cube, 0.05, np.array([3, count], np.uint32))
     one = np.ones(1)
     prediction = Prediction(

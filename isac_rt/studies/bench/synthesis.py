@@ -18,14 +18,15 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import ACCURATE, DEFAULT, PROFILES, Setting
-from isac_rt.signal.if_signal import Method, if_signal, range_profiles
+from isac_rt.signal.if_signal import if_signal, range_profiles
+from isac_rt.signal.methods import Direct, Exact, Gridded, Method
 from isac_rt.signal.noise import add_white_noise
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.world.swarm import Pose
@@ -65,6 +66,7 @@ class Job:
             tx_x=2, tx_z=w.num_tx - 1, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength
         )
         self.pose = Pose.at_rest()
+        self.receiver = ReceiveArray(self.pose, self.antennas)
         schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
         payload = random_payload(w, schedule, 8, rng)
         self.sender = Transmission(
@@ -102,38 +104,25 @@ class Job:
             )
         ]
 
-    def samples(self, links: list, method: Method, setting: Setting = DEFAULT) -> np.ndarray:
-        return if_signal(
-            self.waveform,
-            links,
-            self.pose,
-            self.antennas,
-            start_time=0.0,
-            method=method,
-            setting=setting,
-        ).samples
+    def cube(self, links: list, method: Method) -> IFCube:
+        return if_signal(self.waveform, links, self.receiver, Reference(0.0), method)
 
-    def transformed(self, links: list, method: Method, setting: Setting = DEFAULT) -> np.ndarray:
+    def samples(self, links: list, method: Method) -> np.ndarray:
+        return self.cube(links, method).samples
+
+    def transformed(self, links: list, method: Method) -> np.ndarray:
         """Range profiles of a receiver that knows the data, by way of the samples."""
-        samples = self.samples(links, method, setting)
-        cube = IFCube(
-            samples=samples, waveform=self.waveform, schedule=self.sender.schedule, start_time=0.0
-        )
-        return clean_spectrum(
-            cube,
-            self.sender.payload.delay_symbols,
-            self.sender.payload.phases,
-            self.waveform.num_delay_symbols,
-        )
+        sent = self.sender.payload
+        cells = self.waveform.num_delay_symbols
+        return clean_spectrum(self.cube(links, method), sent.delay_symbols, sent.phases, cells)
 
     def profiles(self, links: list, setting: Setting) -> np.ndarray:
         return range_profiles(
             self.waveform,
             links,
-            self.pose,
-            self.antennas,
+            self.receiver,
+            Reference(0.0),
             self.sender.payload,
-            start_time=0.0,
             setting=setting,
         ).spectra
 
@@ -141,17 +130,11 @@ class Job:
         """The exact model path by path with one element in the middle of the array, times the
         elements' phases at mid-window."""
         w, (sender, paths) = self.waveform, links[0]
-        middle = replace(self.antennas, rx_x=1, rx_z=1)
+        middle = ReceiveArray(self.pose, replace(self.antennas, rx_x=1, rx_z=1))
         total = np.zeros(())
         for k in range(len(paths)):
-            one = if_signal(
-                w,
-                [(sender, paths.select(np.array([k])))],
-                self.pose,
-                middle,
-                start_time=0.0,
-                method="exact",
-            ).samples
+            link = [(sender, paths.select(np.array([k])))]
+            one = if_signal(w, link, middle, Reference(0.0), Exact()).samples
             delay = (
                 -(self.pose.to_world(self.antennas.rx_positions) @ paths.arrival[k])
                 / SPEED_OF_LIGHT
@@ -171,14 +154,14 @@ def errors() -> dict[str, float]:
     """Error of every method on 40 paths and 3 chirps per group."""
     job = Job(3)
     links = job.paths(40)
-    full, narrow = job.samples(links, "exact"), job.narrowband(links)
-    found = {"direct": relative(job.samples(links, "direct"), full)}
+    full, narrow = job.samples(links, Exact()), job.narrowband(links)
+    found = {"direct": relative(job.samples(links, Direct()), full)}
     for name, setting in GRIDS:
         found[name] = relative(
-            job.samples(links, "gridded", setting), full if setting.wideband else narrow
+            job.samples(links, Gridded(setting)), full if setting.wideband else narrow
         )
-    whole = job.transformed(links, "exact")
-    found[BOTH] = relative(job.transformed(links, "gridded"), whole)
+    whole = job.transformed(links, Exact())
+    found[BOTH] = relative(job.transformed(links, Gridded()), whole)
     found |= {name: relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
     return found
 
@@ -227,7 +210,7 @@ def rows(quick: bool) -> list[dict[str, Any]]:
                 "direct",
                 size,
                 "paths",
-                cpu_seconds(partial(job.samples, links, "direct"), times),
+                cpu_seconds(partial(job.samples, links, Direct()), times),
                 error["direct"],
             )
         if size == SIZES[0]:
@@ -235,19 +218,19 @@ def rows(quick: bool) -> list[dict[str, Any]]:
                 "exact",
                 size,
                 "paths",
-                cpu_seconds(partial(job.samples, links, "exact"), 1, 0),
+                cpu_seconds(partial(job.samples, links, Exact()), 1, 0),
                 0.0,
                 oracle=True,
             )
         for name, setting in GRIDS:
-            seconds = cpu_seconds(partial(job.samples, links, "gridded", setting), times)
+            seconds = cpu_seconds(partial(job.samples, links, Gridded(setting)), times)
             add(name, size, "paths", seconds, error[name])
         if size in PROFILE_SIZES:
             add(
                 BOTH,
                 size,
                 "paths",
-                cpu_seconds(partial(job.transformed, links, "gridded"), times),
+                cpu_seconds(partial(job.transformed, links, Gridded()), times),
                 error[BOTH],
             )
             for name, setting in DIRECTLY:

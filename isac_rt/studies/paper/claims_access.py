@@ -14,6 +14,7 @@ from scipy import stats
 
 from isac_rt.access import Clock, Network, correct, establish, isolation, summarise
 from isac_rt.access.feedback import frames_to_repair
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
@@ -25,6 +26,7 @@ from isac_rt.receive import receive_passive
 from isac_rt.results.metrics import SymbolCount, count_symbols
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Direct
 from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
 from isac_rt.studies.waves import STILL, prediction, sender, waves
@@ -141,7 +143,7 @@ def crowd(
             sent = sender(arrays, schedule, random_payload(w, schedule, 8, rng))
             path = waves(epoch, length / C, rate / C, gain=10 ** (level / 20))
             links.append((replace(sent, name=f"AT{i}", first_block=block), path))
-        cube = if_signal(w, links, STILL, arrays, start_time=0.0, method="direct")
+        cube = if_signal(w, links, ReceiveArray(STILL, arrays), Reference(0.0), Direct())
         onepath.noisy(cube, snr_db, seed, "claims", "crowd", purpose, "noise", k)
         got = receive_passive(cube, arrays, Receivers(), 8, prediction(43.817, -5.3), True)
         total += count_symbols(links[0][0].payload, got)

@@ -20,7 +20,7 @@ import pandas as pd
 from scipy import ndimage
 
 from isac_rt.frame.antennas import unit_vector
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
@@ -37,6 +37,7 @@ from isac_rt.receive.types import Prediction
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.signal.methods import Auto
 from isac_rt.studies.paper import clutter_statistics as numbers
 from isac_rt.studies.paper.clutter_figure import draw
 from isac_rt.studies.paper.clutter_scenes import PLACES, SMALL_UAV_M2, SPEED, Scenes, scenario
@@ -191,7 +192,7 @@ def pt_errors(
             if clutter is None
             else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
         )
-        return if_signal(w, links, other, bench.antennas, start_time=0.0, noise_power=1e-3)
+        return if_signal(w, links, ReceiveArray(other, bench.antennas), Reference(0.0), Auto(1e-3))
 
     payload = random_payload(w, schedule, ORDER, rng)
     cube = received(payload, 0)
@@ -330,10 +331,9 @@ def _cube(bench: Bench, paths: PathSet, sent: Transmission) -> IFCube:
     return if_signal(
         bench.waveform,
         [(sent, paths)],
-        sent.pose,
-        bench.antennas,
-        start_time=0.0,
-        noise_power=1e-2,
+        ReceiveArray(sent.pose, bench.antennas),
+        Reference(0.0),
+        Auto(1e-2),
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import thermal_noise_power, transmit_amplitude
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
@@ -22,6 +22,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal
+from isac_rt.signal.methods import Auto
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.world.swarm import Pose, attitude
 
@@ -189,10 +190,9 @@ class Scenes:
         return if_signal(
             s.waveform,
             [(sent, paths)],
-            sent.pose,
-            s.antennas,
-            start_time=0.0,
-            noise_power=self.noise,
+            ReceiveArray(sent.pose, s.antennas),
+            Reference(0.0),
+            Auto(self.noise),
         )
 
     def noisy(self, parts: list[IFCube], *name: str | int) -> IFCube:

@@ -23,7 +23,7 @@ import scipy.fft
 from numba import njit
 
 from isac_rt.frame.antennas import Antennas, unit_vector
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -41,7 +41,8 @@ from isac_rt.receive.spectrum import clean_spectrum, tones
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Clutter
-from isac_rt.signal.if_signal import Method, if_signal
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.baselines import Echoes, LoRadar, fmcw_frame, loradar_frame, resolution
 from isac_rt.studies.baselines.fmcw import fmcw_spectra
 from isac_rt.studies.baselines.loradar import Compensation, loradar_delay, loradar_spectra
@@ -163,16 +164,8 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
     )
     pose = Pose.at_rest()
     sent = Transmission(name="AT", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
-    method: Method = "auto" if case.clutter else "direct"
-    return if_signal(
-        w,
-        [(sent, paths)],
-        pose,
-        antennas,
-        start_time=0.0,
-        method=method,
-        max_direct=1,
-    )
+    method = Auto(max_direct=1) if case.clutter else Direct()
+    return if_signal(w, [(sent, paths)], ReceiveArray(pose, antennas), Reference(0.0), method)
 
 
 def make_noise(case: Case, seed: int, index: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
@@ -44,7 +44,7 @@ def frame(
     """
     sent = replace(sender(arrays, schedule, payload), clock_offset=clock_offset)
     path = waves(waveform.frame_duration / 2, delay, rate, ends=ends)
-    return if_signal(waveform, [(sent, path)], STILL, arrays, start_time=0.0)
+    return if_signal(waveform, [(sent, path)], ReceiveArray(STILL, arrays), Reference(0.0))
 
 
 def noisy(cube: IFCube, snr_db: float, seed: int, *purpose: str | int) -> IFCube:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, running_phases
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -27,7 +27,8 @@ from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
 from isac_rt.scenario.tree import Clutter
-from isac_rt.signal.if_signal import Method, if_signal
+from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.paper.montecarlo import Counts, Curve, Precision, sample
 from isac_rt.studies.paper.outcome import Progress
 from isac_rt.world.swarm import Pose
@@ -134,16 +135,8 @@ def draw_frame(link: Link, seed: int, index: int) -> Frame:
     tx = Pose.at_rest()
     rx = Pose.at_rest(length * direction, (0, -1, 0))
     sent = Transmission(name="AT", pose=tx, antennas=antennas, schedule=schedule, payload=payload)
-    method: Method = "auto" if link.clutter else "direct"
-    cube = if_signal(
-        w,
-        [(sent, paths)],
-        rx,
-        antennas,
-        start_time=0.0,
-        method=method,
-        max_direct=1,
-    )
+    method = Auto(max_direct=1) if link.clutter else Direct()
+    cube = if_signal(w, [(sent, paths)], ReceiveArray(rx, antennas), Reference(0.0), method)
     errors = (
         (0.0, 0.0)
         if link.exact_prediction

@@ -15,6 +15,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation import PathKind, make_paths
 from isac_rt.receive.cfar import greatest_of_factor
 from isac_rt.results.metrics import gospa
+from isac_rt.signal.methods import Direct
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.world.city import load_city
@@ -164,7 +165,7 @@ def cube_against_mmwrt() -> float:
             rx="A",
         )
         centre = stage.synthesise(
-            w, [(sender, paths)], here, "direct", 0.0, stage.arrays(w, tx_x=1, tx_z=1, spacing=1e-9)
+            w, [(sender, paths)], here, Direct(), 0.0, stage.arrays(w, tx_x=1, tx_z=1, spacing=1e-9)
         )
         ours[i] = centre[0, 0, 0]
     ours = ours[:, late:]

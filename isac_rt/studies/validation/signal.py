@@ -15,6 +15,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation import PathKind, make_paths
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import GRIDDED_ERROR
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, flown, if_samples, wide
@@ -112,7 +113,7 @@ def differential_phases() -> float:
 # ---- the exact model
 
 
-def _one_path(moving: bool, method: str, data: bool = True) -> float:
+def _one_path(moving: bool, method: Method, data: bool = True) -> float:
     """Relative error of one line of sight between two arrays, each element its own distance,
     against mixed chirps."""
     w, rng = stage.SMALL, np.random.default_rng(7)
@@ -173,7 +174,7 @@ COMPLEX64 = "samples are complex64; two roundings"
 )
 def exact_model_at_rest() -> float:
     """IF samples of a line of sight between two arrays at rest, data on the chirps."""
-    return _one_path(False, "exact")
+    return _one_path(False, Exact())
 
 
 @case(
@@ -185,11 +186,11 @@ def exact_model_at_rest() -> float:
 def exact_model_in_motion() -> float:
     """IF samples of a line of sight between two arrays in flight at 12 m/s closing speed, data on
     the chirps."""
-    return _one_path(True, "exact")
+    return _one_path(True, Exact())
 
 
 def _against_exact(
-    method: str,
+    method: Method,
     counts: tuple[int, ...],
     w: Waveform = stage.SMALL,
     speeds: tuple[float, ...] = (0.0, 3.0, 30.0),
@@ -203,7 +204,7 @@ def _against_exact(
             paths = stage.random_paths(w, rng, count, START + w.frame_duration / 2, speed=speed)
             found, truth = (
                 stage.synthesise(w, [(sender, paths)], rx, m, START, antennas)
-                for m in (method, "exact")
+                for m in (method, Exact())
             )
             yield stage.relative(found, truth)
 
@@ -211,7 +212,7 @@ def _against_exact(
 @slow("the exact model, which has cases of its own", "2e-7 relative", COMPLEX64)
 def direct_method() -> Errors:
     """The direct method over K = 1, 4, 30 paths, 0 to 30 m/s, with and without data."""
-    return _against_exact("direct", (1, 4, 30))
+    return _against_exact(Direct(), (1, 4, 30))
 
 
 @slow(
@@ -222,7 +223,7 @@ def direct_method() -> Errors:
 def gridded_method() -> Errors:
     """The gridded method over K = 3, 40 and 200 paths anywhere in the passband, 0 to 30 m/s, with
     and without data."""
-    return _against_exact("gridded", (3, 40, 200))
+    return _against_exact(Gridded(), (3, 40, 200))
 
 
 @case(
@@ -232,7 +233,7 @@ def gridded_method() -> Errors:
 )
 def automatic_choice() -> Errors:
     """The method that runs use by default, over K = 2, 12 and 60 paths."""
-    return _against_exact("auto", (2, 12, 60))
+    return _against_exact(Auto(), (2, 12, 60))
 
 
 # ---- from mesh to IF
@@ -259,7 +260,7 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
     sender = stage.sender(w, rng, pose=flight["A"], antennas=point)
     symbols = np.minimum(sender.payload.delay_symbols, w.num_samples // 2 - 40)
     sender = replace(sender, payload=replace(sender.payload, delay_symbols=symbols))
-    found = stage.synthesise(w, [(sender, paths)], flight["P"], "auto", START, point)[:, :1]
+    found = stage.synthesise(w, [(sender, paths)], flight["P"], Auto(), START, point)[:, :1]
     body = {
         name: (pose.position, pose.velocity, pose.acceleration) for name, pose in flight.items()
     }
@@ -353,7 +354,7 @@ def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
         tx="A",
         rx="A",
     )
-    s = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), "direct", START, antennas)[
+    s = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), Direct(), START, antennas)[
         0, 0
     ]
     fast = np.angle((s[:, 1:] * s[:, :-1].conj()).sum()) / (2 * np.pi) * w.sampling_rate
@@ -414,7 +415,7 @@ def filter_skirts() -> Errors:
             tx="A",
             rx="A",
         )
-        for method in ("exact", "direct"):
+        for method in (Exact(), Direct()):
             found = stage.synthesise(
                 w, [(sender, paths)], stage.pose((0, 0, 0)), method, START, antennas
             )
@@ -451,7 +452,7 @@ def spherical_waves() -> float:
         tx="A",
         rx="A",
     )
-    s = stage.synthesise(w, [(sender, paths)], here, "direct", START, antennas)[0, :, 0, 32]
+    s = stage.synthesise(w, [(sender, paths)], here, Direct(), START, antennas)[0, :, 0, 32]
     elements = here.to_world(antennas.rx_positions)
     extra = np.linalg.norm(0.5 * u - elements, axis=1) - 0.5
     frequency = 77e9 + w.slope * (
@@ -487,7 +488,7 @@ def clock_errors() -> float:
     late = replace(sender, clock_offset=off, clock_drift=drift)
     longer = replace(paths, delay=paths.delay + off, delay_rate=paths.delay_rate + drift)
     found, truth = (
-        stage.synthesise(w, [link], rx, "direct", START, antennas)
+        stage.synthesise(w, [link], rx, Direct(), START, antennas)
         for link in ((late, paths), (sender, longer))
     )
     return stage.relative(found, truth)
@@ -503,13 +504,13 @@ def births_and_deaths() -> Errors:
     cut = (
         3 * slot - w.frame_duration / 2 - slot / 50
     )  # in the gap before the fourth chirp of the first group
-    for method in ("exact", "direct", "gridded"):
+    for method in (Exact(), Direct(), Gridded()):
         s = stage.synthesise(
             w, [(sender, replace(paths, end=np.array([cut])))], rx, method, START, stage.arrays(w)
         )
         energy = (np.abs(s[0]) ** 2).sum(axis=(0, 2))
         yield energy[3:].sum() / energy.sum()
-        yield abs(float(energy[:3].min() / energy[:3].max()) - 1) if method != "gridded" else 0.0
+        yield abs(float(energy[:3].min() / energy[:3].max()) - 1) if method != Gridded() else 0.0
 
 
 @case("the frame without data", "2e-6 of the peak", "complex64 samples and transform")
@@ -537,6 +538,6 @@ def resource_blocks() -> float:
     sender, rx, antennas = stage.sender(w, rng), stage.pose((0, 0, 0)), stage.arrays(w)
     paths = stage.random_paths(w, rng, 6, START + w.frame_duration / 2, reach=0.45, speed=0.0)
     paths = replace(paths, delay_accel=np.zeros(6))
-    same = stage.synthesise(w, [(sender, paths)], rx, "direct", START, antennas, first_block=0)
-    later = stage.synthesise(w, [(sender, paths)], rx, "direct", START, antennas, first_block=1)
+    same = stage.synthesise(w, [(sender, paths)], rx, Direct(), START, antennas, first_block=0)
+    later = stage.synthesise(w, [(sender, paths)], rx, Direct(), START, antennas, first_block=1)
     return stage.relative(later[:-1], same[1:])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -17,6 +17,7 @@ from isac_rt.propagation import PathKind, PathSet, Propagation, make_paths
 from isac_rt.randomness import seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import add_white_noise
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import City, Material
@@ -234,20 +235,14 @@ def synthesise(
     w: Waveform,
     links: list,
     rx: Pose,
-    method: Any,
+    method: Method,
     start: float,
     antennas: Antennas,
-    **options: Any,
+    first_block: int | None = None,
 ) -> np.ndarray:
-    return if_signal(
-        replace(w, filter_transition=SKIRT),
-        links,
-        rx,
-        antennas,
-        start_time=start,
-        method=method,
-        **options,
-    ).samples
+    """Samples through a filter whose skirts are `SKIRT` wide."""
+    w, receiver = replace(w, filter_transition=SKIRT), ReceiveArray(rx, antennas)
+    return if_signal(w, links, receiver, Reference(start, first_block), method).samples
 
 
 def relative(found: np.ndarray, truth: np.ndarray) -> float:

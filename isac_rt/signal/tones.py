@@ -1,0 +1,168 @@
+"""Paths as flat arrays of tones: what every method of synthesis starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.frame.cube import ReceiveArray, Transmission
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, PathSet
+
+Links = Sequence[tuple[Transmission, PathSet]]
+"""Transmissions, each with the paths from it to the receiver."""
+_CHUNK = 1024  # paths whose element delays stay in the second-level cache
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tones:
+    """K paths of Q links as plain arrays. Times are seconds since the middle of the frame.
+
+    Attributes
+    ----------
+    link : (K,) int64
+    sight : (K,) bool, whether it is a line of sight
+    power : (K,) received power [W]
+    factor : (K,) complex128, conj(path gain)
+    delay, rate, accel : (K,) float64, the clock of the transmitter included
+    begin, end : (K,) when the path lives
+    tx_delay, rx_delay : (K, L_tx), (K, L_rx) what an element adds to the delay [s]
+    cross_row : (K,) int64 row of `cross`
+    cross : (R, L_tx, L_rx) joint part of the element delays [s]; row 0 is zero
+    symbol_delay : (Q, M, P) delay of the data [s]
+    send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
+    antenna : (Q, M, P) int64 transmit element
+    """
+
+    link: np.ndarray
+    sight: np.ndarray
+    power: np.ndarray
+    factor: np.ndarray
+    delay: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    tx_delay: np.ndarray
+    rx_delay: np.ndarray
+    cross_row: np.ndarray
+    cross: np.ndarray
+    symbol_delay: np.ndarray
+    send: np.ndarray
+    antenna: np.ndarray
+
+    def __len__(self) -> int:
+        return self.delay.shape[0]
+
+    def select(self, which: np.ndarray) -> Tones:
+        """The paths that a mask or an index array chooses."""
+        shared = ("cross", "symbol_delay", "send", "antenna")
+        return Tones(**{k: v if k in shared else v[which] for k, v in vars(self).items()})
+
+    def speed(self, duration: float) -> np.ndarray:
+        """c/2 times the largest rate of each delay in a frame of this `duration` (K,) [m/s]."""
+        return (np.abs(self.rate) + np.abs(self.accel) * duration / 2) * (SPEED_OF_LIGHT / 2)
+
+
+def tones_of(
+    waveform: Waveform, links: Links, receiver: ReceiveArray, middle: float, first_block: int
+) -> Tones:
+    """All links' paths at a receiver whose frame has its middle at `middle` [s] and whose reference
+    chirps begin in block `first_block`."""
+    w = waveform
+    rx = receiver.pose.to_world(receiver.antennas.rx_positions)
+    num_tx = max((t.antennas.num_tx for t, _ in links), default=1)
+    none, grid = np.zeros(0), (w.num_groups, w.num_chirps)
+    parts = [
+        dict.fromkeys(Tones.__dataclass_fields__, none)
+        | {"link": none.astype(np.int64), "cross_row": none.astype(np.int64)}
+        | {"sight": none.astype(bool), "factor": none.astype(complex)}
+        | {"tx_delay": np.zeros((0, num_tx)), "rx_delay": np.zeros((0, len(rx)))}
+        | {"cross": np.zeros((1, num_tx, len(rx))), "symbol_delay": np.zeros((0, *grid))}
+        | {"send": np.zeros((0, *grid), complex), "antenna": np.zeros((0, *grid), np.int64)}
+    ]
+    rows = 1
+    for q, (t, s) in enumerate(links):
+        tx = np.zeros((num_tx, 3))
+        tx[: t.antennas.num_tx] = t.pose.to_world(t.antennas.tx_positions)
+        sight = s.kind == PathKind.LINE_OF_SIGHT
+        near = np.flatnonzero(sight & np.isfinite(s.rx_radius))
+        row = np.zeros(len(s), np.int64)
+        row[near] = rows + np.arange(near.size)
+        rows += near.size
+        tx_delay = _element_delay(tx, s.departure, s.tx_radius)
+        rx_delay = _element_delay(rx, s.arrival, s.rx_radius)
+        joint = _straight_delay(tx, rx, s.departure[near], s.rx_radius[near])
+        later = middle - s.epoch  # blocks start at different times of a slot, the epoch is one
+        moved = s.delay + (s.delay_rate + s.delay_accel * later / 2) * later
+        parts.append(
+            {
+                "link": np.full(len(s), q, np.int64),
+                "sight": sight,
+                "power": t.amplitude**2 * s.power,
+                "factor": s.gain.conj(),
+                "delay": moved + t.clock_offset + (t.first_block - first_block) * w.group_spacing,
+                "rate": s.delay_rate + s.delay_accel * later + t.clock_drift,
+                "accel": s.delay_accel,
+                "begin": s.begin - later,
+                "end": s.end - later,
+                "tx_delay": tx_delay,
+                "rx_delay": rx_delay,
+                "cross_row": row,
+                "cross": joint - tx_delay[near, :, None] - rx_delay[near, None, :],
+                "symbol_delay": t.payload.delay_symbols[None] * w.delay_step,
+                "send": t.amplitude
+                * t.payload.phases[None]
+                * (1.0 if t.active is None else t.active),
+                "antenna": np.array(t.schedule[None], np.int64),
+            }
+        )
+    return Tones(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+
+
+def sources(waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
+    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`,
+    offsets. Both (C,) int64."""
+    w, t = waveform, tones
+    half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
+    motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
+    longest = float(t.symbol_delay.max(initial=0.0))
+    margin = w.filter_transition / w.slope
+    paths, offsets = [], []
+    for offset in range(1 - w.num_groups, w.num_groups):
+        delay = t.delay - offset * w.group_spacing
+        passes = (delay + motion + longest >= -margin) & (delay - motion <= w.max_delay + margin)
+        paths.append(np.flatnonzero(passes))
+        offsets.append(np.full(paths[-1].size, offset))
+    return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
+
+
+def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """(|R u - r| - R)/c, and -r.u/c where R is infinite: (K, L) [s], free of cancellation."""
+    along = direction @ elements.T
+    out = along * (-1 / SPEED_OF_LIGHT)
+    square = (elements**2).sum(1)
+    near = np.flatnonzero(np.isfinite(radius))
+    for some in np.split(near, range(_CHUNK, near.size, _CHUNK)):
+        far = radius[some, None]
+        change = square - 2 * far * along[some]
+        distance = far**2 + change
+        np.sqrt(distance, out=distance)
+        distance += far
+        change /= distance
+        change /= SPEED_OF_LIGHT
+        out[some] = change
+    return out
+
+
+def _straight_delay(
+    tx: np.ndarray, rx: np.ndarray, direction: np.ndarray, length: np.ndarray
+) -> np.ndarray:
+    """(|L d + r_rx - r_tx| - L)/c of straight paths: (K, L_tx, L_rx) [s], free of cancellation."""
+    offset = rx[None, :] - tx[:, None]
+    along = np.einsum("trx,kx->ktr", offset, direction)
+    change = 2 * length[:, None, None] * along + (offset**2).sum(2)
+    distance = np.sqrt(length[:, None, None] ** 2 + change)
+    return change / (distance + length[:, None, None]) / SPEED_OF_LIGHT
