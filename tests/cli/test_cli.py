@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from matplotlib.image import imread
 import isac_rt.simulation
 from isac_rt.cli.cli import main
 from isac_rt.frame.level import LinkBudget
-from isac_rt.scenario.file import to_yaml
+from isac_rt.scenario.file import ScenarioWarning, to_yaml
 from isac_rt.simulation.setup import swarm_of
 
 ROOT = Path(__file__).parents[2]
@@ -177,6 +178,43 @@ def test_paths_writes_the_ledger(scenario_file, simulation, tmp_path, capsys):
 def test_view_draws_a_picture(scenario_file, simulation, tmp_path):
     assert main(["view", str(scenario_file), "--out", str(tmp_path / "v.png")]) == 0
     assert imread(tmp_path / "v.png")[..., :3].var() > 1e-3
+
+
+@pytest.mark.parametrize("columns", [None, 80, 140])
+def test_titles_keep_their_units_on_the_screen(
+    columns, scenario_file, simulation, tmp_path, capsys, monkeypatch
+):
+    """On terminals of 80 and 140 columns and without one. Planted bug: `Console()`, for which
+    "range [m]" is "range" in the style m."""
+    if columns is not None:
+        monkeypatch.setenv("TTY_COMPATIBLE", "1")
+        monkeypatch.setenv("NO_COLOR", "1")
+        monkeypatch.setenv("COLUMNS", str(columns))
+    assert main(["run", str(scenario_file), "--out", str(tmp_path / "o [m] :smile:")]) == 0
+    said = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    for unit in ("[m]", "[m/s]", "[deg]", "[kbit/s]", "[dBm]", "[dB]", "o [m] :smile:"):
+        assert unit in said, unit
+    words = set(said.split())
+    for word in ("Elevation", "Undecided", "processed", "received", "AT"):
+        assert word in words, word
+    if columns is not None:
+        tables = [t for t in said.splitlines() if not t.startswith(("paths:", "results in"))]
+        assert max(map(len, tables)) <= columns
+
+
+def test_warnings_are_said_as_they_stand(scenario_file, simulation, tmp_path, capsys):
+    """Planted bug: warnings printed as markup."""
+    changes = ["--set", "radio.carrier_hz=77", "--out", str(tmp_path / "o")]
+    assert main(["run", str(scenario_file), *changes]) == 0
+    assert "warning --set radio.carrier_hz=77: 77 is outside" in capsys.readouterr().err
+    isac_rt.cli.cli._say_warning("[bold]not[/] markup", ScenarioWarning)
+    assert "warning [bold]not[/] markup" in capsys.readouterr().err
+
+
+def test_help_of_every_command_says_its_options(capsys):
+    for name, option in (("run", "--set"), ("sweep", "--retry-failed"), ("bench", "--fit")):
+        assert main([name, "--help"]) == 0
+        assert option in capsys.readouterr().out
 
 
 def test_version_names_the_program_and_what_is_under_it(capsys):

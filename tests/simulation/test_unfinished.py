@@ -201,7 +201,7 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
 
     command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
     with monkeypatch.context() as once:
-        once.setattr("isac_rt.cli.cli._with_progress", stopped)
+        once.setattr("isac_rt.cli.simulation.with_progress", stopped)
         assert main(command) == 130
     said = capsys.readouterr().err
     assert (

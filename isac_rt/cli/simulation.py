@@ -1,0 +1,273 @@
+"""Commands on one scenario and on what a run of it wrote."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from isac_rt.cli.arguments import FrameNumber, InputProblem, Overrides, ScenarioFile, check_frame
+from isac_rt.cli.console import err, say, say_table, with_progress
+from isac_rt.cli.interruption import ending_soon_after_interrupt
+
+if TYPE_CHECKING:
+    from isac_rt.results.recorder import Results
+    from isac_rt.scenario.tree import Scenario
+
+
+def run(
+    scenario: ScenarioFile,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the results go; default runs/NAME.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help="Simulate so many frames.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Replace the scenario's seed.")] = None,
+    snapshots: Annotated[
+        int, typer.Option(min=1, help="Frames of which maps and path ledger are kept.")
+    ] = 3,
+    check_budget: Annotated[
+        bool,
+        typer.Option(
+            "--check-budget",
+            help="Afterwards measure what was left out on sampled frames; into summary.json.",
+        ),
+    ] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Simulate a scenario: results, summary, figures and a report."""
+    from isac_rt.scenario.file import load
+
+    loaded = load(scenario, overrides or (), frames, seed)
+    folder = out if out is not None else Path("runs") / loaded.name
+    with ending_soon_after_interrupt(folder):
+        _run(loaded, folder, snapshots, check_budget)
+    say(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/")
+
+
+def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> None:
+    from isac_rt.results.files import check_folder, save
+
+    check_folder(folder)
+    from isac_rt.simulation import simulate
+    from isac_rt.simulation.content import run_content
+    from isac_rt.simulation.resume import Unfinished
+    from isac_rt.simulation.setup import link_budgets, prepare
+
+    with err().status("setting up"):
+        setup = prepare(loaded)
+        budget = link_budgets(setup)
+    _say_budget(budget)
+    unfinished = Unfinished(folder, run_content(loaded, snapshots))
+    if unfinished.begun:
+        err().print(f"going on after the frames in {unfinished.file}", soft_wrap=True)
+    results = with_progress(
+        lambda report: simulate.run(
+            loaded, setup=setup, progress=report, snapshots=snapshots, unfinished=unfinished
+        ),
+        "frames",
+        loaded.frames,
+    )
+    if check_budget:
+        from isac_rt.simulation.audit import check
+
+        with err().status("measuring what was left out"):
+            results.summary["fidelity"]["checked"] = check(setup)
+    save(results, folder)
+    with err().status("figures and report"):
+        from isac_rt.views.figures import make_figures
+        from isac_rt.views.report import write_report
+
+        write_report(results, folder, make_figures(results, folder, setup.city))
+    unfinished.remove()
+    _say_summary(results)
+
+
+def _say_budget(rows: list[Any]) -> None:
+    """The link budget as `isac_rt.frame.level.LinkBudget` rows."""
+    titles = (
+        "link budget",
+        "reference",
+        "distance [m]",
+        "received [dBm]",
+        "noise [dBm]",
+        "SNR [dB]",
+        "gain [dB]",
+        "processed [dB]",
+    )
+    values = [
+        (
+            b.distance_m,
+            b.received_dbm,
+            b.noise_dbm,
+            b.snr_db,
+            b.processing_gain_db,
+            b.processed_snr_db,
+        )
+        for b in rows
+    ]
+    say_table(
+        titles,
+        [
+            (b.link.replace("->", " to "), b.reference, *(f"{v:.1f}" for v in row))
+            for b, row in zip(rows, values, strict=True)
+        ],
+    )
+
+
+def _say_summary(results: Results) -> None:
+    from isac_rt.views.report import number, per_terminal, rmse_table
+
+    left_out = ("Role", "Matched", "Matched, tracked")
+    for part in (per_terminal(results.summary), rmse_table(results.summary)):
+        kept = [i for i, title in enumerate(part.columns) if title not in left_out]
+        say_table([part.columns[i] for i in kept], [[row[i] for i in kept] for row in part.rows])
+    found = ", ".join(
+        f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n
+    )
+    say(f"paths: {found}; {number(results.summary['timing_s']['total'])} s")
+
+
+def plan(
+    scenario: ScenarioFile,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    receivers: Annotated[
+        bool, typer.Option("--receivers", help="Time the reception of one frame too.")
+    ] = False,
+    overrides: Overrides = None,
+) -> None:
+    """What a run will model, what it leaves out, and the estimated error and time of each; traces a
+    few frames only."""
+    from isac_rt.scenario.file import load
+
+    loaded = load(scenario, overrides or ())
+    with ending_soon_after_interrupt(Path()), err().status("tracing a few frames"):
+        from isac_rt.simulation.audit import make_plan
+        from isac_rt.simulation.setup import prepare
+
+        found = make_plan(prepare(loaded), receivers)
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+    else:
+        _say_plan(found, loaded.frames)
+
+
+def _say_plan(found: dict[str, Any], frames: int) -> None:
+    """The plan of `isac_rt.simulation.audit.make_plan`."""
+
+    def error(item: dict[str, Any]) -> str:
+        value = item["estimate"]
+        return "" if value is None else f"{value:.2g} {item['unit']}" if value else "none"
+
+    rows = [
+        (
+            item["what"],
+            item["link"].replace("->", " to "),
+            item["modelled"],
+            item["left_out"],
+            error(item),
+            "" if item["seconds"] is None else f"{item['seconds']:.3f}",
+        )
+        for item in found["items"]
+    ]
+    say_table(("", "link", "modelled", "left out", "error", "s/frame"), rows, numbers=False)
+    settled = {
+        "phase error at most [rad]": found["max_phase_error_rad"],
+        "weakest [dB under the noise of a cell]": found["weakest_path_db"],
+        "reach [m]": found["reach_m"],
+    }
+    said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
+    total = sum(found["seconds_per_frame"].values()) * frames
+    stages = ", ".join(found["seconds_per_frame"])
+    say(f"preset {found['preset']}; {said}; about {total:.0f} s for {frames} frames of {stages}")
+
+
+def paths(
+    scenario: ScenarioFile,
+    frame: FrameNumber,
+    out: Annotated[Path, typer.Option(metavar="FILE.nc", help="Where the ledger goes.")],
+    overrides: Overrides = None,
+) -> None:
+    """Write the path ledger of a frame, all links."""
+    from isac_rt.scenario.file import load
+
+    loaded = load(scenario, overrides or ())
+    check_frame(loaded, frame)
+    with ending_soon_after_interrupt(out.parent), err().status("tracing"):
+        from isac_rt.simulation.setup import trace
+        from isac_rt.views.interchange import write_ledger
+
+        found = trace(loaded, frame)
+        write_ledger(found, out, loaded)
+    kinds = next(iter(found.values())).counts() if found else ()
+    say_table(
+        ["link", *(kind.replace("_", " ") for kind in kinds)],
+        [(f"{tx} to {rx}", *map(str, p.counts().values())) for (tx, rx), p in found.items()],
+    )
+
+
+def view(
+    scenario: ScenarioFile,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="A .png, or an .html page with the scene to turn about."),
+    ],
+    frame: FrameNumber = 0,
+    overrides: Overrides = None,
+) -> None:
+    """Render the city, the swarm and the paths of a frame."""
+    if out.suffix not in (".png", ".html"):
+        raise InputProblem(f"--out {out}: a view is a .png picture or an .html page; name it so")
+    from isac_rt.scenario.file import load
+
+    loaded = load(scenario, overrides or ())
+    check_frame(loaded, frame)
+    with ending_soon_after_interrupt(out.parent), err().status("tracing and drawing"):
+        import numpy as np
+
+        from isac_rt.simulation.setup import prepare, trace
+        from isac_rt.views.render import view_scene, write_view
+
+        setup = prepare(loaded)
+        found = trace(loaded, frame, setup=setup)
+        times = np.linspace(setup.timetable.epoch(0), setup.timetable.epoch(loaded.frames - 1), 60)
+        scene = setup.city, setup.swarm, times, setup.timetable.epoch(frame), found
+        if out.suffix == ".html":
+            from isac_rt.views.interactive import scene_3d, write_page
+
+            write_page(scene_3d(*scene), out)
+        else:
+            write_view(view_scene(*scene), out)
+    say(out)
+
+
+def animate(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="What `isac-rt run --snapshots N` wrote.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A .gif or an .mp4; default DIR/run.gif.")
+    ] = None,
+    observer: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose map; default the first.")
+    ] = None,
+    rate: Annotated[float, typer.Option(min=0.1, max=60, help="Pictures per second.")] = 5.0,
+) -> None:
+    """Draw a run as a moving picture: the swarm with tracks, and a range-Doppler map, in step."""
+    from isac_rt.results.files import open_results
+
+    results = open_results(folder)
+    names = [str(name) for name in results.dataset.observer.values]
+    if observer is not None and observer not in names:
+        raise InputProblem(
+            f"--observer {observer}: no such observer in {folder}; choose from {', '.join(names)}"
+        )
+    from isac_rt.simulation.setup import city_of
+    from isac_rt.views.animate import write_animation
+
+    target = out if out is not None else folder / "run.gif"
+    number = names.index(observer) if observer else 0
+    with ending_soon_after_interrupt(folder), err().status("drawing"):
+        write_animation(results, target, number, city_of(results.scenario), rate)
+    say(target)

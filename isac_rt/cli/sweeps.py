@@ -1,0 +1,99 @@
+"""The command that runs sweeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from isac_rt.cli.arguments import InputProblem
+from isac_rt.cli.console import err, say, with_progress
+from isac_rt.cli.interruption import ending_soon_after_interrupt
+
+if TYPE_CHECKING:
+    from isac_rt.sweep.definition import Plan
+
+
+def sweep(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="SWEEP", help="The sweep, a YAML file.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the outcomes go; default runs/NAME.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes; default one per core, as memory allows."),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
+    ] = None,
+    max_points: Annotated[
+        int, typer.Option(min=1, help="Refuse a sweep with more points.")
+    ] = 100_000,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Run points again that failed.")
+    ] = False,
+    status: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Only say how far the sweep in DIR is.")
+    ] = None,
+) -> None:
+    """Run a sweep, or what is missing of it: the same command again goes on."""
+    if (file is None) == (status is None):
+        raise InputProblem(
+            "isac-rt sweep needs either a sweep file or --status DIR; give one of them"
+        )
+    if file is None:
+        _say_status(Path(str(status)))
+        return
+    from isac_rt.results.files import check_folder
+    from isac_rt.sweep import SchedulerLost, load_sweep, run_sweep
+
+    plan = load_sweep(file, max_points)
+    folder = out if out is not None else Path("runs") / plan.sweep.name
+    check_folder(folder)
+    with ending_soon_after_interrupt(folder):
+        try:
+            with_progress(
+                lambda report: run_sweep(
+                    plan,
+                    folder,
+                    workers=workers,
+                    scheduler=scheduler,
+                    retry_failed=retry_failed,
+                    progress=lambda done, failed, total: report(
+                        done + failed, total, f"{failed} failed"
+                    ),
+                ),
+                "points",
+            )
+        except SchedulerLost as lost:
+            typer.echo(lost, err=True)
+            raise typer.Exit(1) from None
+        _finish(plan, folder)
+
+
+def _finish(plan: Plan, folder: Path) -> None:
+    """The dataset and the figures of a sweep's outcomes, and where they are."""
+    from isac_rt.sweep import Outcomes, assemble, save_dataset
+    from isac_rt.views.figures import make_sweep_figures
+
+    with err().status("dataset and figures"):
+        dataset = assemble(plan, Outcomes(folder))
+        save_dataset(dataset, folder)
+        wanted = [(f.quantity, f.against, f.by) for f in plan.sweep.figures]
+        make_sweep_figures(dataset, wanted, folder)
+    _say_status(folder)
+    say(f"outcomes in {folder}: sweep.nc (isac_rt.open_sweep reads it, finished or not), figures/")
+
+
+def _say_status(folder: Path) -> None:
+    from isac_rt.sweep import status
+
+    found = status(folder)
+    left = found.total - found.done - found.failed
+    say(f"{found.done} of {found.total} points done, {found.failed} failed, {left} to do")
+    say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in found.errors))
+    if found.failed:
+        say("  --retry-failed runs them again")
