@@ -10,7 +10,6 @@ in a long one.
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -22,11 +21,11 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.simulation.simulate import summarise
+from isac_rt.studies import scene_file
 from isac_rt.studies.bench.measure import floor_seconds
 
 PRESETS = ("fastest", "budget", "everything")
 FRAMES = (4, 8, 16)
-SCENE = Path(__file__).parents[3] / "scenes" / "street_canyon.yaml"
 JOB = "street_canyon.yaml, clutter.rays 300, run without set-up"
 
 
@@ -65,7 +64,10 @@ def rows(quick: bool) -> list[dict[str, object]]:
 
 def scenario(preset: str, frames: int) -> Scenario:
     """The scene under a preset."""
-    return load(SCENE, [f"accuracy.preset={preset}", f"frames={frames}", "clutter.rays=300"])
+    return load(
+        scene_file("street_canyon.yaml"),
+        [f"accuracy.preset={preset}", f"frames={frames}", "clutter.rays=300"],
+    )
 
 
 def seconds_per_frame(of: Scenario, repeats: int) -> float:

@@ -7,8 +7,6 @@ face -y.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import xarray as xr
 
@@ -18,23 +16,17 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import swarm_of
+from isac_rt.studies import scene_file
 from isac_rt.studies.paper.outcome import Progress
 from isac_rt.world.swarm import Pose
 
-SCENES = Path(__file__).parents[3] / "scenes"
 VARIANTS = {"printed": "paper_swarm.yaml", "consistent": "paper_swarm_consistent.yaml"}
 UAVS = ("AT", "PT1", "PT2")
 
 
 def scenario(variant: str, seed: int | None = None, overrides: tuple[str, ...] = ()) -> Scenario:
-    """The scene of a variant in `VARIANTS`.
-
-    Raises
-    ------
-    isac_rt.scenario.file.ScenarioError  If the file is not there: the scenes lie beside the package
-    in its repository.
-    """
-    return load(SCENES / VARIANTS[variant], overrides, None, seed)
+    """The scene of a variant in `VARIANTS`."""
+    return load(scene_file(VARIANTS[variant]), overrides, None, seed)
 
 
 def views(scene: Scenario) -> dict[tuple[str, str], np.ndarray]:

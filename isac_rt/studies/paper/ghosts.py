@@ -26,7 +26,7 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
-from isac_rt.studies.paper.flight import SCENES
+from isac_rt.studies import scene_file
 from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, proportion
 from isac_rt.terminal.ghosts import Suspicion, Walls, suspicion
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
@@ -54,7 +54,7 @@ def scene(seed: int, index: int, frames: int) -> Scenario:
             f"swarm.{name}.position_m={np.round(place, 2).tolist()}",
             f"swarm.{name}.velocity_mps={np.round(speed, 2).tolist()}",
         ]
-    return load(SCENES / "street_canyon.yaml", tuple(changes), None, seed + index)
+    return load(scene_file("street_canyon.yaml"), tuple(changes), None, seed + index)
 
 
 class _Watched:
