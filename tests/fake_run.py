@@ -3,6 +3,8 @@ command line."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 
 from isac_rt.frame.antennas import antennas_of
@@ -11,7 +13,8 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
 from isac_rt.results.metrics import SensingScore, SymbolCount, Truth, resolutions
-from isac_rt.results.recorder import Recorder, Results
+from isac_rt.results.provenance import provenance
+from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
@@ -202,12 +205,8 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
 
 def fake_recorder(scenario: Scenario) -> Recorder:
     w = waveform_of(scenario)
-    return Recorder(
-        scenario,
-        w,
-        timetable_of(scenario, w, conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)),
-        STATES,
-    )
+    schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
+    return Recorder(timetable_of(scenario, w, schedule), STATES)
 
 
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
@@ -237,9 +236,10 @@ def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Result
                 [truth] if truth else [], o.reception.detections, kinds=o.detection_kind
             )
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
-    return recorder.finish(
-        scores=scores,
-        timing=TIMING,
-        fidelity={"model": "free_space", "if_model": "exact"},
-        link_budget=budget,
+    plan = {"model": "free_space", "if_model": "exact"}
+    summary = recorder.summary(Figures(scores, TIMING, plan))
+    attributes = {"fidelity": summary["fidelity"], "materials": {}, "link_budget": budget}
+    dataset = recorder.dataset().assign_attrs(
+        provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}
     )
+    return Results(dataset, {"scenario": scenario.name, "seed": scenario.seed} | summary, scenario)

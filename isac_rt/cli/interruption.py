@@ -13,8 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from isac_rt.simulation.resume import FILE
-
 _GRACE = 1.2
 """After Ctrl-C a run may tidy up for so long [s]; then the process ends."""
 
@@ -31,6 +29,9 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     Python runs its own handler only between byte codes; the wake-up pipe is written by the C
     handler at once, and a thread waits for it.
     """
+    from isac_rt.simulation.resume import FILE
+
+    kept = folder / FILE
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
@@ -41,9 +42,9 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
         if not heard:
             return
         time.sleep(_GRACE)
-        for unfinished in folder.rglob(f".*.{os.getpid()}.tmp"):
-            unfinished.unlink(missing_ok=True)
-        _say_kept(folder)
+        for partial in folder.rglob(f".*.{os.getpid()}.tmp"):
+            partial.unlink(missing_ok=True)
+        _say_kept(kept)
         say_interrupted()
         os._exit(128 + heard[0])
 
@@ -53,7 +54,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, Terminated):
-        _say_kept(folder)
+        _say_kept(kept)
         raise
     finally:
         signal.set_wakeup_fd(before)
@@ -71,8 +72,6 @@ def say_interrupted() -> None:
     sys.stderr.flush()
 
 
-def _say_kept(folder: Path) -> None:
-    if (folder / FILE).exists():
-        sys.stderr.write(
-            f"\n{folder / FILE} keeps the frames so far; the same command goes on after them\n"
-        )
+def _say_kept(file: Path) -> None:
+    if file.exists():
+        sys.stderr.write(f"\n{file} keeps the frames so far; the same command goes on after them\n")

@@ -52,19 +52,22 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
     check_folder(folder)
     from isac_rt.simulation import simulate
     from isac_rt.simulation.content import run_content
-    from isac_rt.simulation.resume import Unfinished
+    from isac_rt.simulation.resume import Resume
     from isac_rt.simulation.setup import link_budgets, prepare
 
     with err().status("setting up"):
         setup = prepare(loaded)
         budget = link_budgets(setup)
     _say_budget(budget)
-    unfinished = Unfinished(folder, run_content(loaded, snapshots))
-    if unfinished.begun:
-        err().print(f"going on after the frames in {unfinished.file}", soft_wrap=True)
+    resume = Resume(folder, run_content(loaded, snapshots))
+    if resume.begun:
+        err().print(f"going on after the frames in {resume.file}", soft_wrap=True)
+    elif resume.other:
+        said = f"{resume.other} is of another run or an earlier version: the run begins anew"
+        err().print(said, soft_wrap=True)
     results = with_progress(
         lambda report: simulate.run(
-            loaded, setup=setup, progress=report, snapshots=snapshots, unfinished=unfinished
+            loaded, setup=setup, progress=report, snapshots=snapshots, resume=resume
         ),
         "frames",
         loaded.frames,
@@ -80,7 +83,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
         from isac_rt.views.report import write_report
 
         write_report(results, folder, make_figures(results, folder, setup.city))
-    unfinished.remove()
+    resume.remove()
     _say_summary(results)
 
 

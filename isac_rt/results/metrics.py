@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -306,18 +306,26 @@ class SensingScore:
 
     def merge(self, other: SensingScore) -> None:
         """Pool another link's score into this one."""
-        for name in (
-            "frames",
-            "target_frames",
-            "hits",
-            "matched",
-            "matched_tracks",
-            "false",
-            "clutter",
-        ):
+        for name in COUNTS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.detection_errors.merge(other.detection_errors)
         self.track_errors.merge(other.track_errors)
+
+    def memory(self) -> dict[str, Any]:
+        """The score so far as plain numbers and arrays, for `restore`."""
+        errors = {name: vars(getattr(self, name)) for name in ERRORS}
+        return {name: getattr(self, name) for name in COUNTS} | errors
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        for name in COUNTS:
+            setattr(self, name, memory[name])
+        for name in ERRORS:
+            setattr(self, name, Errors(**memory[name]))
+
+
+COUNTS = ("frames", "target_frames", "hits", "matched", "matched_tracks", "false", "clutter")
+ERRORS = ("detection_errors", "track_errors")
 
 
 def pool(scores: Sequence[SensingScore]) -> SensingScore:
@@ -406,6 +414,11 @@ def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
         square, pairs = float(chosen[chosen < cutoff**2].sum()), int((chosen < cutoff**2).sum())
     missed, false = (len(x) - pairs) * cutoff**2 / 2, (len(y) - pairs) * cutoff**2 / 2
     return Gospa(float(np.sqrt(square + missed + false)), square, missed, false)
+
+
+def decibels(ratio: float) -> float | None:
+    """10 log10; None for nothing."""
+    return round(float(10 * np.log10(ratio)), 2) if ratio > 0 else None
 
 
 def binomial_interval(

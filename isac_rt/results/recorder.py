@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,11 +11,10 @@ import xarray as xr
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
-from isac_rt.frame.waveform import Waveform
-from isac_rt.results.dataset import _Builder
-from isac_rt.results.metrics import SensingScore, SymbolCount, pool, summary_block
-from isac_rt.results.provenance import provenance, versions
-from isac_rt.results.records import KINDS, FrameRecord, _slim, _SlimFrame, _sparse
+from isac_rt.results.dataset import Row, dataset_of, row_of
+from isac_rt.results.metrics import SensingScore, SymbolCount, decibels, pool, summary_block
+from isac_rt.results.provenance import versions
+from isac_rt.results.records import KINDS, FrameRecord
 from isac_rt.scenario.tree import Scenario
 
 TIMINGS = ("setup", "trace", "synthesis", "receive", "track", "total")
@@ -57,134 +55,150 @@ class Results:
         )
 
 
+@dataclass(frozen=True)
+class Figures:
+    """What a summary needs beside the frames.
+
+    Attributes
+    ----------
+    scores : every link's sensing
+    timing : seconds by stage, of `TIMINGS`
+    plan : what was modelled: the summary's `fidelity`, but for what was kept of the paths
+    access : what became of the stages before the data, None without them
+    """
+
+    scores: Mapping[Link, SensingScore]
+    timing: Mapping[str, float]
+    plan: Mapping[str, Any]
+    access: Mapping[str, Any] | None = None
+
+
 @dataclass
 class Recorder:
-    """Collects the frames of a run. An observer is a link's receiver; `states` are the names of the
-    terminals' state codes."""
+    """Collects the frames of a run as rows of plain arrays and numbers. An observer is a link's
+    receiver; `states` are the names of the terminals' state codes."""
 
-    scenario: Scenario
-    waveform: Waveform
     timetable: Timetable
     states: Sequence[str]
-    _frames: list[_SlimFrame] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
 
     def add(self, record: FrameRecord) -> None:
-        """Append the next frame. Of frames that are no snapshots the paths are counted and let
-        go."""
-        rows = {name: _slim(o, record.snapshot) for name, o in record.observers.items()}
-        self._frames.append(_SlimFrame(**{**vars(record), "observers": rows}))
+        """Append the next frame."""
+        self.rows.append(row_of(record))
 
-    @property
-    def count(self) -> int:
-        """Frames so far."""
-        return len(self._frames)
+    def restore(self, rows: Sequence[Row]) -> None:
+        """Append rows of an earlier call.
 
-    def since(self, first: int) -> list[Any]:
-        """The frames from number `first` on, for `restore`."""
-        return self._frames[first:]
+        Raises
+        ------
+        KeyError, ValueError, TypeError  If they are no rows of this run.
+        """
+        dataset_of(rows, self.timetable, self.states)
+        kept_of_paths([row["uses"] for row in rows])
+        _ = [SymbolCount(*o["symbols"]) for row in rows for o in row["observers"].values()]
+        self.rows += rows
 
-    def restore(self, frames: list[Any]) -> None:
-        """Append frames that `since` gave."""
-        self._frames += frames
+    def dataset(self) -> xr.Dataset:
+        """The labelled arrays of the frames so far."""
+        return dataset_of(self.rows, self.timetable, self.states)
 
-    def finish(
-        self,
-        *,
-        scores: Mapping[Link, SensingScore],
-        timing: Mapping[str, float],
-        fidelity: Mapping[str, Any],
-        access: Mapping[str, Any] | None = None,
-        materials: Mapping[str, Any] | None = None,
-        link_budget: Sequence[Mapping[str, Any]] = (),
-    ) -> Results:
-        """The results of the frames so far. `scores` holds every link's sensing; `timing` [s] goes
-        into the summary only, as does what became of the stages before the data (`access`);
-        `materials` and `link_budget` (rows of a table) are kept as JSON attributes of the
-        dataset."""
-        dataset = _Builder(
-            self.scenario, self.waveform, self.timetable, tuple(self.states), self._frames
-        ).dataset()
-        dataset.attrs |= {
-            **provenance(self.scenario),
-            "fidelity": json.dumps(dict(fidelity)),
-            "materials": json.dumps(dict(materials or {})),
-            "link_budget": json.dumps([dict(row) for row in link_budget]),
-        }
-        summary = self.summary(scores=scores, timing=timing, fidelity=fidelity, access=access)
-        return Results(dataset, summary, self.scenario)
-
-    def summary(
-        self,
-        *,
-        scores: Mapping[Link, SensingScore],
-        timing: Mapping[str, float],
-        fidelity: Mapping[str, Any],
-        access: Mapping[str, Any] | None = None,
-    ) -> dict[str, Any]:
-        """The fixed keys of `summary.json` alone; null stands for what does not apply."""
-        frames = self._frames
-        interval = self.scenario.frame_interval_s or self.waveform.frame_duration
+    def summary(self, figures: Figures) -> dict[str, Any]:
+        """The keys of `summary.json` but for the scenario's name and seed; null stands for what
+        does not apply."""
+        rows, timetable, scores = self.rows, self.timetable, figures.scores
         duration = (
-            (frames[-1].frame - frames[0].frame) * interval + self.waveform.frame_duration
-            if frames
+            (rows[-1]["frame"] - rows[0]["frame"]) * timetable.interval
+            + timetable.waveform.frame_duration
+            if rows
             else 0.0
         )
-        symbols = {link: self._symbols(link) for link in self.timetable.all_links}
-        links = {}
-        for (tx, rx), counted in symbols.items():
-            role = "active" if tx == rx else "passive"
-            links[f"{tx}->{rx}"] = summary_block(role, scores[tx, rx], counted, duration)
+        symbols = {link: self._symbols(link) for link in timetable.all_links}
         terminals = {}
-        for name in dict.fromkeys(rx for _, rx in self.timetable.all_links):
-            mine = [link for link in self.timetable.all_links if link[1] == name]
+        for name in dict.fromkeys(link.rx for link in timetable.all_links):
+            mine = [link for link in timetable.all_links if link.rx == name]
             received = [c for link in mine if (c := symbols[link]) is not None]
-            roles = self.timetable.roles_taken(name)
-            pooled = sum(received, SymbolCount()) if received else None
+            roles = timetable.roles_taken(name)
             terminals[name] = summary_block(
                 roles[0] if len(roles) == 1 else roles,
                 pool([scores[link] for link in mine]),
-                pooled,
+                sum(received, SymbolCount()) if received else None,
                 duration,
             )
+        links = {
+            str(link): summary_block(
+                "active" if link.own else "passive", scores[link], counted, duration
+            )
+            for link, counted in symbols.items()
+        }
         of_kind = sum(
-            (o.counts for f in frames for o in f.observers.values()), np.zeros(len(KINDS), int)
+            (o["path_count"] for row in rows for o in row["observers"].values()),
+            np.zeros(len(KINDS), int),
         )
         return {
-            "scenario": self.scenario.name,
-            "seed": self.scenario.seed,
-            "frames": len(frames),
+            "frames": len(rows),
             "terminals": terminals,
             "links": links,
             "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
-            "timing_s": {key: float(timing[key]) if key in timing else None for key in TIMINGS},
-            "fidelity": dict(fidelity),
-            "access": None if access is None else dict(access),
-            "sparsity": {
-                f"{tx}->{rx}": row for tx, rx in symbols if (row := self._sparsity((tx, rx)))
-            }
+            "timing_s": {key: figures.timing.get(key) for key in TIMINGS},
+            "fidelity": {
+                **figures.plan,
+                "links": kept_of_paths([row["uses"] for row in rows]),
+                "paths_contradicted": sum(row["dropped"] for row in rows),
+            },
+            "access": figures.access,
+            "sparsity": {str(link): judged for link in symbols if (judged := self._sparsity(link))}
             or None,
             "versions": versions(),
         }
 
+    def _of(self, link: Link) -> list[Row]:
+        """The rows of a link's receiver."""
+        label = self.timetable.labels[link]
+        return [row["observers"][label] for row in self.rows if label in row["observers"]]
+
     def _sparsity(self, link: Link) -> dict[str, int] | None:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent
         by the conventional schedule for that reason; None where no frame was judged."""
-        label = self.timetable.labels[link]
-        seen = [f.observers[label] for f in self._frames if label in f.observers]
-        judged = [found for s in seen if (found := _sparse(s)) >= 0]
-        fell_back = sum(s.record.fell_back for s in seen)
-        return (
-            {"judged": len(judged), "dense": judged.count(0), "fell_back": fell_back}
-            if judged
-            else None
-        )
+        rows = self._of(link)
+        judged = [row["sparse"] for row in rows if row["sparse"] >= 0]
+        if not judged:
+            return None
+        fell_back = sum(row["fell_back"] for row in rows)
+        return {"judged": len(judged), "dense": judged.count(0), "fell_back": fell_back}
 
     def _symbols(self, link: Link) -> SymbolCount | None:
         """What was sent over a link and became of it; None for a terminal's own echoes."""
-        if link[0] == link[1]:
+        if link.own:
             return None
-        label = self.timetable.labels[link]
-        return sum(
-            (f.observers[label].record.symbols for f in self._frames if label in f.observers),
-            SymbolCount(),
-        )
+        return sum((SymbolCount(*row["symbols"]) for row in self._of(link)), SymbolCount())
+
+
+def kept_of_paths(frames: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds
+    of all frames.
+
+    Parameters
+    ----------
+    frames : the values of `Use` by link, frame by frame
+    """
+    out = {}
+    for link in dict.fromkeys(link for frame in frames for link in frame):
+        rows = [frame[link] for frame in frames if link in frame]
+
+        def mean(values: Iterable[float]) -> float:
+            return round(float(np.mean(list(values))), 2)
+
+        counts = ("found", "unheard", "weak", "plane", "straight")
+        kinds = dict.fromkeys(kind for row in rows for kind in row["kept"])
+        out[link] = {
+            "frames": len(rows),
+            **{f"{name}_per_frame": mean(row[name] for row in rows) for name in counts},
+            "kept_per_frame": {
+                kind: mean(row["kept"].get(kind, 0) for row in rows) for kind in kinds
+            },
+            "bounces": max(row["bounces"] for row in rows),
+            "left_out_db": decibels(max(row["left_out"] for row in rows)),
+            "plane_error_rad": max(row["plane_error"] for row in rows),
+            "straight_error_rad": max(row["straight_error"] for row in rows),
+        }
+    return out

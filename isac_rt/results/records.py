@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.types import Reception
 from isac_rt.results.metrics import SymbolCount
@@ -93,11 +94,46 @@ class ObserverRecord:
     reference_snr: float = np.nan
 
 
+@dataclass(frozen=True)
+class Use:
+    """What was kept of the paths of one link in one frame, and the bounds of the rest.
+
+    Attributes
+    ----------
+    found, unheard, weak : number of paths found, stopped by the IF filter and left out as too weak
+    kept : by kind
+    bounces : most bounces of a kept path
+    left_out : largest power left out of one range cell over the noise of a cell (linear)
+    plane, straight : kept paths with a plane wavefront, without acceleration
+    plane_error, straight_error : bounds of their phase errors [rad]
+    """
+
+    found: int
+    unheard: int
+    weak: int
+    kept: dict[str, int]
+    bounces: int
+    left_out: float
+    plane: int
+    straight: int
+    plane_error: float
+    straight_error: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
-    """One frame: its index, the time of its middle [s], all poses then, and by its label every
-    observer that received in it. Of a `snapshot` frame the whole path ledger and the maps are
-    kept."""
+    """One frame.
+
+    Attributes
+    ----------
+    frame, time : its index and the time of its middle [s]
+    modulated : whether it carries data
+    poses : of all UAVs at its middle
+    observers : every observer that received in it, by its label
+    snapshot : whether the whole path ledger and the maps are kept
+    uses : what was kept of the paths of each link
+    dropped : traced paths that the float64 geometry contradicted
+    """
 
     frame: int
     time: float
@@ -105,42 +141,5 @@ class FrameRecord:
     poses: Mapping[str, Pose]
     observers: Mapping[str, ObserverRecord]
     snapshot: bool = False
-
-
-@dataclass(frozen=True)
-class _Slim:
-    """An `ObserverRecord` with its paths reduced to numbers and power by kind, and the ledger of a
-    snapshot."""
-
-    record: ObserverRecord
-    counts: np.ndarray
-    power: np.ndarray
-    ledger: PathSet | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SlimFrame:
-    """A `FrameRecord` of such observers."""
-
-    frame: int
-    time: float
-    modulated: bool
-    poses: Mapping[str, Pose]
-    observers: Mapping[str, _Slim]
-    snapshot: bool
-
-
-def _sparse(s: _Slim) -> int:
-    return -1 if s.record.reception.sparse is None else int(s.record.reception.sparse)
-
-
-def _slim(o: ObserverRecord, snapshot: bool) -> _Slim:
-    kind, power = o.paths.kind, o.paths.power
-    counts = np.bincount(kind, minlength=len(KINDS))
-    total = np.bincount(kind, weights=power, minlength=len(KINDS))
-    return _Slim(
-        ObserverRecord(**{**vars(o), "paths": o.paths.select(np.zeros(0, int))}),
-        counts,
-        total,
-        o.paths if snapshot else None,
-    )
+    uses: Mapping[Link, Use] = field(default_factory=dict)
+    dropped: int = 0

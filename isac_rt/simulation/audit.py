@@ -25,11 +25,11 @@ from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.store import CachedPropagation
 from isac_rt.randomness import generator
+from isac_rt.results.metrics import decibels
+from isac_rt.results.records import Use
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct
 from isac_rt.simulation.plan import (
-    Use,
-    decibels,
     decisions,
     extent,
     frame_reach,

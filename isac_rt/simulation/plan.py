@@ -24,7 +24,6 @@ motion during the flight of light.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -32,12 +31,12 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.model import Census
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.results.records import Use
 from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
 from isac_rt.signal.choice import CostModel
 from isac_rt.signal.gridded import GRIDDED_ERROR
@@ -55,32 +54,6 @@ beyond, `Auto`."""
 
 REACH_MARGIN_M = 1.0
 """Of the mesh, for accelerations within a frame."""
-
-
-@dataclass(frozen=True)
-class Use:
-    """What was kept of the paths of one link in one frame, and the bounds of the rest.
-
-    Attributes
-    ----------
-    found, unheard, weak : number of paths found, stopped by the IF filter and left out as too weak
-    kept : by kind
-    bounces : most bounces of a kept path
-    left_out : largest power left out of one range cell over the noise of a cell (linear)
-    plane, straight : kept paths with a plane wavefront, without acceleration
-    plane_error, straight_error : bounds of their phase errors [rad]
-    """
-
-    found: int
-    unheard: int
-    weak: int
-    kept: dict[str, int]
-    bounces: int
-    left_out: float
-    plane: int
-    straight: int
-    plane_error: float
-    straight_error: float
 
 
 @dataclass(frozen=True)
@@ -382,11 +355,6 @@ def missed_chains(found: float, born: float, died: float) -> float:
     return born * died / (6 * found) if found else 0.0
 
 
-def decibels(ratio: float) -> float | None:
-    """10 log10; None for nothing."""
-    return round(float(10 * np.log10(ratio)), 2) if ratio > 0 else None
-
-
 def decisions(plan: Plan) -> dict[str, Any]:
     """What is fixed before a run: the same in `isac-rt plan` and in summary.json."""
     everything = plan.preset == "everything"
@@ -438,31 +406,3 @@ def extent(city: City, census: Census, clutter: Clutter) -> dict[str, Any]:
         "city_faces_beyond_reach": city.num_beyond,
         **asdict(census),
     }
-
-
-def used(
-    uses: Mapping[tuple[int, Link], Use], names: Mapping[Link, str]
-) -> dict[str, dict[str, Any]]:
-    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds
-    of all frames."""
-    out = {}
-    for link in dict.fromkeys(link for _, link in uses):
-        rows = [asdict(use) for (_, of), use in uses.items() if of == link]
-        kinds = dict.fromkeys(kind for row in rows for kind in row["kept"])
-        per_frame = {
-            f"{name}_per_frame": round(float(np.mean([row[name] for row in rows])), 2)
-            for name in ("found", "unheard", "weak", "plane", "straight")
-        }
-        out[names.get(link, "->".join(link))] = {
-            "frames": len(rows),
-            **per_frame,
-            "kept_per_frame": {
-                kind: round(float(np.mean([row["kept"].get(kind, 0) for row in rows])), 2)
-                for kind in kinds
-            },
-            "bounces": max(row["bounces"] for row in rows),
-            "left_out_db": decibels(max(row["left_out"] for row in rows)),
-            "plane_error_rad": max(row["plane_error"] for row in rows),
-            "straight_error_rad": max(row["straight_error"] for row in rows),
-        }
-    return out

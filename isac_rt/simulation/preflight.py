@@ -20,8 +20,8 @@ from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.world.swarm import Pose, Swarm
 
 SAMPLE_BYTES = 8
-RECORD_BYTES = 40
-"""Of a recorded symbol: decisions and confidences of both alphabets."""
+RECORD_BYTES = 2e4
+"""What is kept of a link's frame, measured: 4 kB with few detections and tracks."""
 PROGRAM_BYTES = 4e8
 """Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of
 scenes/paper_swarm.yaml."""
@@ -35,14 +35,14 @@ def memory_needed(
     """Estimate of a run's memory [bytes], the city's mesh and its clutter left out.
 
     Each receiver at work holds its cube, a copy that it turns, the range spectra and the Doppler
-    maps; each frame of a link leaves its symbols behind.
+    maps; each frame of a link leaves its record behind.
     """
     w = waveform
     chirps = w.num_groups * w.num_chirps
     cube = chirps * antennas.num_rx * w.num_samples
     maps = antennas.num_tx * antennas.num_rx * w.num_chirps * w.num_samples / 2
-    kept = frames * links * (chirps * RECORD_BYTES + w.bits_per_frame(16))
-    return PROGRAM_BYTES + SAMPLE_BYTES * min(links, at_once) * (2.5 * cube + maps) + kept
+    at_work = SAMPLE_BYTES * min(links, at_once) * (2.5 * cube + maps)
+    return PROGRAM_BYTES + at_work + frames * links * RECORD_BYTES
 
 
 def check_memory(antennas: Antennas, timetable: Timetable) -> None:

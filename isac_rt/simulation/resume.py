@@ -1,46 +1,50 @@
 """The frames of a run that was stopped, in a file beside its results: the same run goes on after
 them, to the same bits.
 
-The file begins with a line that says which run it is of: a digest of the scenario, the city's file,
-the program and the versions under it. Entries follow, each with its length and a checksum; one that
-was torn when the process was killed is cut off. Entries are pickled, and reading them makes nothing
-but arrays and classes of this package: a file from elsewhere cannot run code.
+The file is an SQLite database, so that an entry is in it whole or not at all, whenever the process
+is killed. It says which run it is of: a digest of the scenario, the city's file, the program and
+the versions under it. An entry is data only: a tree of words, numbers, lists and mappings as JSON,
+and the bytes of its arrays.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import pickle
-import struct
+import json
+import math
+import sqlite3
 import time
-import zlib
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from isac_rt.runtime import UserError
 
-FILE = "unfinished.frames"
+FILE = "resume.sqlite"
+EARLIER = "unfinished.frames"
+"""What earlier versions wrote, which is not read."""
+TABLES = (
+    "BEGIN",
+    "CREATE TABLE IF NOT EXISTS run (digest TEXT PRIMARY KEY)",
+    "CREATE TABLE IF NOT EXISTS entry (id INTEGER PRIMARY KEY, tree TEXT, arrays BLOB)",
+)
 EVERY = 5.0
 """Least time between two entries: what a stop can cost, beside the frame at work. [s]"""
-_FRONT = struct.Struct("<QI")
-_ARRAYS = {
-    ("collections", "deque"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-}
+ENTRY_PROBLEMS = (sqlite3.Error, ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
+"""What reading an entry can raise that no run wrote."""
+ARRAY = "array"
+"""Key of a mapping that stands for an array: its type, shape and order (C, F), and where its
+bytes begin."""
 
 
-class UnfinishedError(UserError):
+class ResumeError(UserError):
     """The file holds what no run of this package wrote."""
 
 
-class Unfinished:
+class Resume:
     """The kept frames of one run.
 
     Parameters
@@ -52,38 +56,47 @@ class Unfinished:
 
     def __init__(self, folder: str | Path, content: str, every: float = EVERY) -> None:
         self.file = Path(folder) / FILE
-        self._head = f"isac_rt {hashlib.sha256(content.encode()).hexdigest()}\n".encode()
+        self._digest = hashlib.sha256(content.encode()).hexdigest()
         self._every, self._last, self._broken = every, time.monotonic(), False
 
     @property
     def begun(self) -> bool:
         """Whether there is a file of this very run."""
         try:
-            with self.file.open("rb") as file:
-                return file.readline(len(self._head)) == self._head
-        except OSError:
+            with self._open("rw") as database:
+                return database.execute("SELECT digest FROM run").fetchall() == [(self._digest,)]
+        except sqlite3.Error:
             return False
 
-    def entries(self) -> list[Any]:
-        """What an earlier call kept, in its order; none if there is nothing or if it belongs to
-        another run. A torn end is cut off.
+    @property
+    def other(self) -> Path | None:
+        """A file that is not of this run: of another one, or of an earlier version."""
+        files = (self.file, self.file.with_name(EARLIER))
+        return None if self.begun else next((file for file in files if file.exists()), None)
+
+    def entries(self) -> Iterator[Any]:
+        """What an earlier call kept, in its order; nothing if there is none or if it belongs to
+        another run.
 
         Raises
         ------
-        UnfinishedError  If an entry asks for more than arrays and classes of this package.
+        ResumeError  If an entry is not one of this package's.
         """
-        if not self.begun:
-            return []
-        with self.file.open("rb+") as file:
-            file.seek(len(self._head))
-            try:
-                found = list(_whole(file))
-            except pickle.UnpicklingError as problem:
-                raise UnfinishedError(
-                    f"{self.file} was not written by isac-rt: {problem}; delete it"
-                ) from problem
-            file.truncate()
-        return found
+        if self.begun:
+            with self.reading(), self._open("rw") as database:
+                for tree, arrays in database.execute("SELECT tree, arrays FROM entry ORDER BY id"):
+                    yield unpack(tree, arrays)
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Turn what goes wrong with an entry into one message."""
+        try:
+            yield
+        except ENTRY_PROBLEMS as problem:
+            raise ResumeError(
+                f"{self.file} was not written by isac-rt ({type(problem).__name__}: {problem}); "
+                "delete it"
+            ) from problem
 
     def due(self) -> bool:
         """Whether it is time for an entry."""
@@ -91,48 +104,72 @@ class Unfinished:
 
     def append(self, entry: Any) -> None:
         """Keep an entry. Where it cannot be written the run goes on and nothing is kept."""
-        text = pickle.dumps(entry, protocol=5)
         try:
-            ours = self.begun
-            with self.file.open("ab" if ours else "wb") as file:
-                file.write(
-                    (b"" if ours else self._head) + _FRONT.pack(len(text), zlib.crc32(text)) + text
-                )
-        except OSError:
+            if not self.begun:
+                self.remove()
+            with self._open("rwc") as database, database:
+                for command in TABLES:
+                    database.execute(command)
+                database.execute("INSERT OR IGNORE INTO run VALUES (?)", (self._digest,))
+                database.execute("INSERT INTO entry (tree, arrays) VALUES (?, ?)", pack(entry))
+        except sqlite3.Error:
             self._broken = True
             self.remove()
         self._last = time.monotonic()
 
     def remove(self) -> None:
         """Let go of what was kept."""
-        with suppress(OSError):
-            self.file.unlink(missing_ok=True)
+        for name in (FILE, f"{FILE}-journal", EARLIER):
+            with suppress(OSError):
+                self.file.with_name(name).unlink(missing_ok=True)
+
+    @contextmanager
+    def _open(self, mode: str) -> Iterator[sqlite3.Connection]:
+        address = f"{self.file.absolute().as_uri()}?mode={mode}"
+        with closing(sqlite3.connect(address, uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")
+            yield database
 
 
-def _whole(file: Any) -> Iterator[Any]:
-    """Entries up to the first that is not whole; leaves the file at the end of the last."""
-    while True:
-        here = file.tell()
-        front = file.read(_FRONT.size)
-        if len(front) == _FRONT.size:
-            length, checksum = _FRONT.unpack(front)
-            text = file.read(length)
-            if len(text) == length and zlib.crc32(text) == checksum:
-                yield _Reader(io.BytesIO(text)).load()
-                continue
-        file.seek(here)
-        return
+def pack(value: Any) -> tuple[str, bytes]:
+    """A tree of plain values and arrays as JSON and bytes.
+
+    Examples
+    --------
+    >>> tree, arrays = pack({"time": 0.25, "mean": np.arange(3.0)})
+    >>> unpack(tree, arrays)
+    {'time': 0.25, 'mean': array([0., 1., 2.])}
+    """
+    arrays: list[bytes] = []
+    position = 0
+
+    def plain(value: Any) -> Any:
+        nonlocal position
+        if isinstance(value, np.ndarray):
+            order: Literal["C", "F"] = "C" if value.flags.c_contiguous else "F"
+            arrays.append(value.tobytes(order))
+            here = position
+            position += value.nbytes
+            return {ARRAY: [value.dtype.str, list(value.shape), order, here]}
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, dict):
+            return {key: plain(entry) for key, entry in value.items()}
+        return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+    return json.dumps(plain(value)), b"".join(arrays)
 
 
-class _Reader(pickle.Unpickler):
-    """Makes arrays and this package's own classes."""
+def unpack(tree: str, arrays: bytes) -> Any:
+    """The value that `pack` took apart."""
 
-    def find_class(self, module: str, name: str) -> Any:
-        found = (
-            super().find_class(module, name)
-            if (module, name) in _ARRAYS or module.startswith("isac_rt.")
-            else None
-        )
-        if found is None or not (isinstance(found, type) or (module, name) in _ARRAYS):
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-        return found
+    def made(node: dict[str, Any]) -> Any:
+        if node.keys() != {ARRAY}:
+            return node
+        dtype, shape, order, begin = node[ARRAY]
+        if np.dtype(dtype).kind not in "biufc" or min(shape, default=0) < 0:
+            raise ValueError(f"an array of {dtype}, {shape}")
+        flat = np.frombuffer(arrays, dtype, math.prod(shape), begin)
+        return flat.reshape(shape, order=order).copy(order)
+
+    return json.loads(tree, object_hook=made)

@@ -29,6 +29,7 @@ from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_pr
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
+from isac_rt.results.records import Use
 from isac_rt.scenario.file import ScenarioError
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
@@ -36,7 +37,7 @@ from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.simulation.content import path_content
-from isac_rt.simulation.plan import Plan, Use
+from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
     check_flights,
     check_memory,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,12 +17,13 @@ from isac_rt.access import exchange
 from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
-from isac_rt.results.recorder import TIMINGS, Recorder, Results
+from isac_rt.results.provenance import provenance
+from isac_rt.results.recorder import TIMINGS, Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation.plan import Use, decisions, extent, mechanisms, used
-from isac_rt.simulation.resume import Unfinished
+from isac_rt.simulation.plan import decisions, extent, mechanisms
+from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 
@@ -34,12 +36,17 @@ class _Clock:
     """Seconds per stage, summed over the threads that work in it."""
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMINGS, 0.0))
+    begun: float = field(default_factory=time.perf_counter)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
         self.seconds[name] += time.perf_counter() - start
+
+    def so_far(self) -> dict[str, float]:
+        """The seconds with those of the whole run until now."""
+        return self.seconds | {"total": self.seconds["total"] + time.perf_counter() - self.begun}
 
 
 def standard_terminal(setup: Setup, link: Link) -> Terminal:
@@ -105,6 +112,17 @@ class _Observer:
             if answer.cells:
                 self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
 
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        score = self.scorer.score.memory()
+        return {"terminal": self.terminal.memory(), "score": score, "feedback": self.feedback}
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.terminal.restore(memory["terminal"])
+        self.scorer.score.restore(memory["score"])
+        self.feedback = memory["feedback"]
+
     def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
         """The frame held against the truth."""
         paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
@@ -119,7 +137,7 @@ def run(
     threads: int | None = None,
     snapshots: int = 3,
     terminal: Callable[[Setup, Link], Terminal] = standard_terminal,
-    unfinished: Unfinished | None = None,
+    resume: Resume | None = None,
 ) -> Results:
     """Simulate every frame of a scenario.
 
@@ -131,25 +149,30 @@ def run(
     threads : receivers at work at once; None: as many as the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path
         ledger are kept
-    terminal : makes the receiver of a link; one of one's own is a subclass of `ActiveTerminal` or
+    terminal : makes the receiver of a link; a custom one is a subclass of `ActiveTerminal` or
         `PassiveTerminal` with another `receive`
-    unfinished : where the frames are kept meanwhile and from where a run that was stopped goes on;
-        with the terminals of this package
+    resume : where the frames are kept meanwhile and from where a run that was stopped goes on
 
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
     """
     run = _Run.begin(scenario, setup, snapshots, terminal)
-    run.fly(progress, threads, unfinished)
-    return run.recorder.finish(
-        **run.figures(),
-        materials={
-            m.name: {k: v for k, v in vars(m).items() if k != "name"}
-            for m in run.setup.city.materials
+    run.fly(progress, threads, resume)
+    summary = run.summary()
+    materials = {m.name: vars(m) for m in run.setup.city.materials}
+    attributes = {
+        "fidelity": summary["fidelity"],
+        "materials": {
+            name: {key: value for key, value in entry.items() if key != "name"}
+            for name, entry in materials.items()
         },
-        link_budget=[vars(row) for row in link_budgets(run.setup)],
+        "link_budget": [vars(row) for row in link_budgets(run.setup)],
+    }
+    dataset = run.recorder.dataset().assign_attrs(
+        provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}
     )
+    return Results(dataset, summary, scenario)
 
 
 def summarise(
@@ -158,7 +181,7 @@ def summarise(
     """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
     run = _Run.begin(scenario, setup, 0, standard_terminal)
     run.fly(None, threads, None)
-    return run.recorder.summary(**run.figures())
+    return run.summary()
 
 
 def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[str, float]]:
@@ -189,11 +212,8 @@ class _Run:
     schedules: Schedules
     snapshots: set[int]
     clock: _Clock
-    uses: dict[tuple[int, Link], Use] = field(default_factory=dict)
-    contradicted: dict[int, int] = field(default_factory=dict)
-    """Traced paths of each frame that the float64 geometry contradicted."""
-    _safe: int = 0
-    """Frames already in the file of the unfinished run."""
+    kept: int = 0
+    """Frames that a later call could go on after."""
 
     @classmethod
     def begin(
@@ -204,58 +224,45 @@ class _Run:
         terminal: Callable[[Setup, Link], Terminal],
     ) -> _Run:
         """Before the first frame."""
-        s = setup or prepare(scenario)
-        clock = _Clock()
+        s, clock = setup or prepare(scenario), _Clock()
         clock.seconds["setup"] = clock.seconds["total"] = s.seconds
         return cls(
             s,
-            Recorder(
-                scenario, s.waveform, s.timetable, [state.name.lower() for state in TerminalState]
-            ),
+            Recorder(s.timetable, [state.name.lower() for state in TerminalState]),
             {link: _Observer(s, link, terminal(s, link)) for link in s.timetable.all_links},
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),
             clock,
         )
 
-    def fly(
-        self, progress: Progress | None, threads: int | None, unfinished: Unfinished | None
-    ) -> None:
+    def fly(self, progress: Progress | None, threads: int | None, resume: Resume | None) -> None:
         """Frame after frame; while the receivers work on one the next is traced."""
-        setup, frames = self.setup, self.setup.timetable.frames
+        setup, clock, frames = self.setup, self.clock, self.setup.timetable.frames
         at_work: tuple[Frame, dict[Link, Future[Heard]]] | None = None
         with (
             threadpool_limits(limits=1),
             ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
         ):
-            for number in range(self.go_on(unfinished), frames):
-                with self.clock.stage("total"):
-                    with self.clock.stage("trace"):
-                        frame = setup.frame(number)
-                    if at_work is not None:
-                        self.collect(*at_work)
-                        if unfinished and unfinished.due():
-                            unfinished.append(self.kept())
-                    if progress and number:
-                        progress(number, frames)
-                    frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
-                    at_work = (
-                        frame,
-                        {
-                            link: pool.submit(
-                                self.observers[link].hear,
-                                frame,
-                                self.clock,
-                                number in self.snapshots,
-                            )
-                            for link in setup.timetable.links(number)
-                        },
-                    )
-            with self.clock.stage("total"):
+            for number in range(self.restore(resume) if resume else 0, frames):
+                with clock.stage("trace"):
+                    frame = setup.frame(number)
                 if at_work is not None:
                     self.collect(*at_work)
-        if progress:
-            progress(frames, frames)
+                    if resume and resume.due():
+                        resume.append(self.memory())
+                if progress and number:
+                    progress(number, frames)
+                frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
+                maps = number in self.snapshots
+                jobs = {
+                    link: pool.submit(self.observers[link].hear, frame, clock, maps)
+                    for link in setup.timetable.links(number)
+                }
+                at_work = frame, jobs
+            if at_work is not None:
+                self.collect(*at_work)
+            if progress:
+                progress(frames, frames)
 
     def collect(self, frame: Frame, jobs: dict[Link, Future[Heard]]) -> None:
         """Wait for a frame's receivers, score and record it, take their advice."""
@@ -280,67 +287,61 @@ class _Run:
                         for link, h in heard.items()
                     },
                     snapshot=frame.number in self.snapshots,
+                    uses=frame.uses,
+                    dropped=frame.dropped,
                 )
             )
-            self.uses.update({(frame.number, link): use for link, use in frame.uses.items()})
-            self.contradicted[frame.number] = frame.dropped
             self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
-    def kept(self) -> dict[str, Any]:
-        """What an unfinished run needs to go on after the frames so far: those since the last call,
-        and all that receivers carry over.
+    def memory(self) -> dict[str, Any]:
+        """What a later call needs to go on after the frames so far: those since the last call, and
+        all that receivers carry over.
 
         Only while no receiver is at work. Paths and samples are functions of the frame alone and
         are made anew.
         """
-        first, self._safe = self._safe, self.recorder.count
+        first, self.kept = self.kept, len(self.recorder.rows)
         return {
             "first": first,
-            "frames": self.recorder.since(first),
-            "observers": {
-                link: (o.terminal, o.scorer.score, o.feedback) for link, o in self.observers.items()
-            },
-            "advice": self.schedules.advice,
-            "uses": {key: use for key, use in self.uses.items() if first <= key[0] < self._safe},
-            "contradicted": {frame: self.contradicted[frame] for frame in range(first, self._safe)},
-            "seconds": self.clock.seconds,
+            "rows": self.recorder.rows[first:],
+            "observers": {str(link): o.memory() for link, o in self.observers.items()},
+            "advice": self.schedules.memory(),
+            "seconds": self.clock.so_far(),
         }
 
-    def go_on(self, unfinished: Unfinished | None) -> int:
+    def restore(self, resume: Resume) -> int:
         """Take up what an earlier call of the same run kept; the number of the next frame."""
-        for entry in unfinished.entries() if unfinished else []:
-            if entry["first"] != self.recorder.count:
-                break  # two calls wrote into one folder
-            self.recorder.restore(entry["frames"])
-            self.uses.update(entry["uses"])
-            self.contradicted.update(entry["contradicted"])
-            last = entry
-        if self.recorder.count:
-            for link, (terminal, score, feedback) in last["observers"].items():
-                o = self.observers[link]
-                o.terminal, o.scorer.score, o.feedback = terminal, score, feedback
-            self.schedules.advice.update(last["advice"])
-            for stage, seconds in last["seconds"].items():
-                self.clock.seconds[stage] += seconds
-        self._safe = self.recorder.count
-        return self._safe
+        last = None
+        for entry in resume.entries():
+            with resume.reading():
+                if entry["first"] == len(self.recorder.rows):  # not another call's at the same time
+                    self.recorder.restore(entry["rows"])
+                    last = entry
+        if last is not None:
+            with resume.reading():
+                for link, observer in self.observers.items():
+                    observer.restore(last["observers"][str(link)])
+                self.schedules.restore(last["advice"])
+                for stage in TIMINGS:
+                    self.clock.seconds[stage] += last["seconds"][stage]
+        self.kept = len(self.recorder.rows)
+        return self.kept
 
-    def figures(self) -> dict[str, Any]:
-        """What a summary needs beside the frames."""
+    def summary(self) -> dict[str, Any]:
+        """Of the frames so far."""
         s = self.setup
-        names = {link: str(link) for link in s.timetable.all_links}
-        return {
-            "scores": {link: o.scorer.score for link, o in self.observers.items()},
-            "timing": self.clock.seconds,
-            "fidelity": {
+        figures = Figures(
+            scores={link: o.scorer.score for link, o in self.observers.items()},
+            timing=self.clock.so_far(),
+            plan={
                 **mechanisms(s.scenario.propagation, s.scenario.clutter),
                 **decisions(s.plan),
-                "links": used(self.uses, names),
-                "paths_contradicted": sum(self.contradicted.values()),
                 **extent(s.city, s.propagation.census(), s.scenario.clutter),
             },
-            "access": self._access(),
-        }
+            access=self._access(),
+        )
+        named = {"scenario": s.scenario.name, "seed": s.scenario.seed}
+        return named | self.recorder.summary(figures)
 
     def _access(self) -> dict[str, Any] | None:
         stages = self.setup.connections.summary(self.setup.timetable.epoch(0))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -109,6 +110,14 @@ class ActiveTerminal:
             cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps
         )
 
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        return self.tracker.memory()
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.tracker.restore(memory)
+
 
 class PassiveTerminal:
     """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of
@@ -182,6 +191,27 @@ class PassiveTerminal:
         if self.reference is not None and reception.line_of_sight:
             self.tracker.update(reception.detections, own_pose, self.reference.state)
         return reception, self.tracker.snapshot(own_pose, self.reference)
+
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        return {
+            "tracker": self.tracker.memory(),
+            "time": self._time,
+            "state": int(self.state),
+            "reference": None if self.reference is None else self.reference.memory(),
+            "slips_repaired": self.slips_repaired,
+            "ends": list(self._ends),
+            "profile": self._profile,
+        }
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.tracker.restore(memory["tracker"])
+        reference = memory["reference"]
+        self.reference = None if reference is None else Track.of_memory(reference)
+        self._time, self.state = memory["time"], TerminalState(memory["state"])
+        self.slips_repaired, self._profile = memory["slips_repaired"], memory["profile"]
+        self._ends = deque(memory["ends"], maxlen=EVIDENCE_FRAMES)
 
     def shorten(self, cells: int, own_pose: Pose) -> None:
         """Take whole cells off the reference's range, as the active terminal's answer to feedback

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -68,6 +69,16 @@ class Track:
     recent: list[bool] = field(default_factory=lambda: [True])
     missed: int = 0
     confirmed: bool = False
+
+    def memory(self) -> dict[str, Any]:
+        """The track as plain numbers and arrays, for `of_memory`."""
+        return {**vars(self), "state": list(self.state)}
+
+    @classmethod
+    def of_memory(cls, memory: dict[str, Any]) -> Track:
+        """The track that gave a `memory`."""
+        mean, covariance = memory["state"]
+        return cls(**{**memory, "state": Gaussian(mean, covariance)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +172,16 @@ class Tracker:
     def clear(self) -> None:
         """Forget all tracks (their numbers stay used)."""
         self.tracks = []
+
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        tracks = [track.memory() for track in self.tracks]
+        return {"time": self.time, "next_id": self._next_id, "tracks": tracks}
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.time, self._next_id = memory["time"], memory["next_id"]
+        self.tracks = [Track.of_memory(track) for track in memory["tracks"]]
 
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""

@@ -21,7 +21,7 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.results.dataset import DIMENSIONLESS, PATH_COLUMNS, path_columns
+from isac_rt.results.dataset import DIMENSIONLESS, PATHS
 from isac_rt.results.files import ResultsError, write_bytes, write_dataset
 from isac_rt.results.provenance import provenance
 from isac_rt.results.records import KINDS
@@ -90,15 +90,8 @@ def write_ledger(
         DIMENSIONLESS,
         "receiving terminal",
     )
-    for name, (dtype, units, text) in PATH_COLUMNS.items():
-        put(
-            name,
-            ["path"],
-            [np.asarray(path_columns(p)[name], dtype) for p in paths.values()],
-            np.zeros(0, dtype),
-            units,
-            text,
-        )
+    for name, c in PATHS.items():
+        column(name, c.read, c.dtype, c.units, c.meaning)
     carrier = scenario.radio.carrier_hz
     column(
         "doppler",

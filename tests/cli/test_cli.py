@@ -48,7 +48,7 @@ def simulation(monkeypatch):
             timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
         )
 
-    def run(scenario, *, setup, progress, snapshots, unfinished):
+    def run(scenario, *, setup, progress, snapshots, resume):
         for k in range(scenario.frames):
             progress(k + 1, scenario.frames)
         return fake_run(scenario)
@@ -255,7 +255,7 @@ def test_help_loads_nothing_heavy():
 
 @pytest.mark.parametrize("stuck", ["time.sleep(60)", "native()"])
 def test_interrupt_ends_within_two_seconds(stuck, scenario_file, tmp_path):
-    """Also inside a native call that Python cannot interrupt, with an unfinished file on disk. Seen
+    """Also inside a native call that Python cannot interrupt, with a partial file on disk. Seen
     to fail without the thread."""
     program = f"""
 import ctypes, sys, time, types, os, pathlib
