@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,12 +11,11 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.propagation.elements import element_amplitude
-from isac_rt.propagation.legs.geometry import straight
+from isac_rt.propagation.legs.geometry import Legs, straight
 from isac_rt.propagation.model import Census, Traced
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.rcs import CrossSection
+from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.swarm import Uav
 from isac_rt.world.swarm import Pose
 
@@ -59,102 +59,64 @@ class FreeSpace:
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link; those that no element sends or hears are left out."""
-        return Traced({Link(*link): self._link(poses, epoch, *link) for link in links})
+        states = [
+            LinkState(Link(tx, rx), epoch, poses[tx], poses[rx], self.names) for tx, rx in links
+        ]
+        return Traced({state.link: self._link(state, poses) for state in states})
 
     def census(self) -> Census:
         """No clutter at all."""
         return Census()
 
-    def _link(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
-        parts = [self.echoes(poses, epoch, tx, rx)]
-        if tx != rx:
-            parts.insert(0, self.line_of_sight(poses, epoch, tx, rx))
-        every = merge(parts)
+    def _link(self, state: LinkState, poses: dict[str, Pose]) -> PathSet:
+        parts = [] if state.link.own else [self._line_of_sight(state)]
+        every = merge([*parts, self._echoes(state, poses)])
         return every.select(every.gain != 0)
 
-    def line_of_sight(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
+    def _line_of_sight(self, state: LinkState) -> PathSet:
         """The straight path of a link, by Friis."""
-        leg = straight(
-            poses[tx], poses[rx].position[None], poses[rx].velocity, poses[rx].acceleration
-        )
-        elements = element_amplitude(
-            self.antennas, poses[tx], poses[rx], leg.departure, leg.arrival
-        )
-        return make_paths(
-            gain=friis_amplitude(self.wavelength, leg.length) * elements,
-            delay=leg.length / SPEED_OF_LIGHT,
-            delay_rate=leg.rate / SPEED_OF_LIGHT,
-            delay_accel=leg.accel / SPEED_OF_LIGHT,
-            departure=leg.departure,
-            arrival=leg.arrival,
-            tx_radius=leg.length,
-            rx_radius=leg.length,
-            kind=PathKind.LINE_OF_SIGHT,
-            epoch=epoch,
-            tx=tx,
-            rx=rx,
-            target_names=self.names,
-        )
+        end = state.end
+        ways = Ways.along(straight(state.start, end.position[None], end.velocity, end.acceleration))
+        gain = friis_amplitude(self.wavelength, ways.length) * state.elements(self.antennas, ways)
+        return state.paths(ways, gain, PathKind.LINE_OF_SIGHT)
 
-    def echoes(self, poses: dict[str, Pose], epoch: float, tx: str, rx: str) -> PathSet:
+    def _echoes(self, state: LinkState, poses: dict[str, Pose]) -> PathSet:
         """Echoes of every UAV that is neither end, straight there and straight on."""
-        others = [name for name in self.names if name not in (tx, rx)]
-        there, on = ([self._leg(poses, end, name) for name in others] for end in (tx, rx))
-
-        def stack(legs: list, name: str) -> np.ndarray:
-            return (
-                np.concatenate([getattr(leg, name) for leg in legs]) if legs else np.zeros((0, 3))
-            )
-
-        dep, arr = stack(there, "departure"), stack(on, "departure")
-        d1, d2 = (np.array([leg.length[0] for leg in legs]) for legs in (there, on))
-        amplitude = np.array(
-            [
-                self.echo_amplitude(poses, tx, rx, name, a, b)
-                for name, a, b in zip(others, there, on, strict=True)
-            ]
-        )
-        elements = element_amplitude(self.antennas, poses[tx], poses[rx], dep, arr)
+        others = [name for name in self.names if name not in state.link]
+        there, back = (self._legs(end, others, poses) for end in (state.start, state.end))
+        ways = Ways.over(there, back)
+        amplitude = np.empty(len(others))
+        for k, name in enumerate(others):
+            rcs, row = self.uavs[name].rcs, slice(k, k + 1)
+            if rcs.model == "relative":
+                amplitude[k] = self.reference_amplitude(poses, *state.link)
+                amplitude[k] *= 10 ** (rcs.level_db / 20)
+            else:
+                amplitude[k] = self._echo(name, poses, there.select(row), back.select(row))
+        elements = state.elements(self.antennas, ways)
         relative = np.array([self.uavs[name].rcs.model == "relative" for name in others], bool)
-        return make_paths(
-            gain=np.where(relative, amplitude * (elements > 0), amplitude * elements),
-            delay=(d1 + d2) / SPEED_OF_LIGHT,
-            delay_rate=np.array([a.rate[0] + b.rate[0] for a, b in zip(there, on, strict=True)])
-            / SPEED_OF_LIGHT,
-            delay_accel=np.array([a.accel[0] + b.accel[0] for a, b in zip(there, on, strict=True)])
-            / SPEED_OF_LIGHT,
-            departure=dep,
-            arrival=arr,
-            tx_radius=d1,
-            rx_radius=d2,
-            kind=PathKind.TARGET,
+        return state.paths(
+            ways,
+            np.where(relative, amplitude * (elements > 0), amplitude * elements),
+            PathKind.TARGET,
             target=np.array([self.names.index(name) for name in others], int),
-            epoch=epoch,
-            tx=tx,
-            rx=rx,
-            target_names=self.names,
             points=np.array([poses[name].position for name in others]).reshape(-1, 1, 3),
             faces=np.full((len(others), 1), -1),
         )
 
-    def _leg(self, poses: dict[str, Pose], end: str, name: str):
-        return straight(
-            poses[end], poses[name].position[None], poses[name].velocity, poses[name].acceleration
-        )
+    def _legs(self, end: Pose, names: Sequence[str], poses: dict[str, Pose]) -> Legs:
+        """Straight legs from an end to UAVs."""
+        bodies = [poses[name] for name in names]
+        motion = [[b.position, b.velocity, b.acceleration] for b in bodies]
+        return straight(end, *np.array(motion).reshape(-1, 3, 3).swapaxes(0, 1))
 
-    def echo_amplitude(
-        self, poses: dict[str, Pose], tx: str, rx: str, name: str, there, on
-    ) -> float:
-        """Amplitude of one UAV's echo: by the radar equation without the elements, or, with a
-        relative cross-section, a fixed level under the link's reference path, elements included."""
-        rcs = self.uavs[name].rcs
-        if rcs.model == "relative":
-            return self.reference_amplitude(poses, tx, rx) * 10 ** (rcs.level_db / 20)
+    def _echo(self, name: str, poses: dict[str, Pose], there: Legs, back: Legs) -> float:
+        """Amplitude of one UAV's echo by the radar equation, without the elements."""
         body = poses[name]
         section = self.sections[name].square_metres(
-            body.to_body(there.arrival), body.to_body(on.arrival)
+            body.to_body(there.arrival), body.to_body(back.arrival)
         )
-        return float(radar_amplitude(self.wavelength, section, there.length, on.length)[0])
+        return float(radar_amplitude(self.wavelength, section, there.length, back.length)[0])
 
     def reference_amplitude(self, poses: dict[str, Pose], tx: str, rx: str) -> float:
         """Amplitude of a link's reference path as if unshadowed and on boresight at both ends.
@@ -189,6 +151,6 @@ class FreeSpace:
         out = {}
         for name, uav in self.uavs.items():
             if name != tx and uav.rcs.model != "relative":
-                leg = self._leg(poses, tx, name)
-                out[name] = self.echo_amplitude(poses, tx, tx, name, leg, leg)
+                leg = self._legs(poses[tx], [name], poses)
+                out[name] = self._echo(name, poses, leg, leg)
         return out

@@ -3,11 +3,12 @@ ledger."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Required, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from isac_rt.frame.link import Link
 
@@ -73,23 +74,12 @@ class PathSet:
 
     def __post_init__(self) -> None:
         count = self.delay.shape[0]
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                if value.shape[0] != count:
-                    raise ValueError(
-                        f"PathSet.{field.name} has {value.shape[0]} rows, delay has {count}"
-                    )
-                value.setflags(write=False)
-        finite = (
-            np.isfinite(self.delay).all()
-            and np.isfinite(self.gain).all()
-            and np.isfinite(self.delay_rate).all()
-        )
-        if not finite:
-            raise ValueError(
-                f"paths {self.tx}->{self.rx}: a delay, delay rate or gain is not finite"
-            )
+        for name, array in self.arrays().items():
+            if array.shape[0] != count:
+                raise ValueError(f"PathSet.{name} has {array.shape[0]} rows, delay has {count}")
+            array.setflags(write=False)
+        if not all(np.isfinite(a).all() for a in (self.delay, self.gain, self.delay_rate)):
+            raise ValueError(f"paths {self.link}: a delay, delay rate or gain is not finite")
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -125,68 +115,78 @@ class PathSet:
 
     def select(self, which: np.ndarray) -> PathSet:
         """The paths that a mask or an index array chooses."""
-        return replace(
-            self,
-            **{
-                f.name: getattr(self, f.name)[which]
-                for f in fields(self)
-                if isinstance(getattr(self, f.name), np.ndarray)
-            },
-        )
+        return replace(self, **{name: a[which] for name, a in self.arrays().items()})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The columns by name."""
+        return {name: a for name, a in vars(self).items() if isinstance(a, np.ndarray)}
 
     def counts(self) -> dict[str, int]:
         """Number of paths of each kind, by the kind's name in lower case."""
         return {k.name.lower(): int((self.kind == k).sum()) for k in PathKind}
 
 
+class Columns(TypedDict, total=False):
+    """The arrays of a `PathSet`, or one value for all paths."""
+
+    gain: Required[ArrayLike]
+    delay: Required[ArrayLike]
+    departure: Required[ArrayLike]
+    arrival: Required[ArrayLike]
+    kind: Required[ArrayLike]
+    delay_rate: ArrayLike
+    delay_accel: ArrayLike
+    tx_radius: ArrayLike
+    rx_radius: ArrayLike
+    target: ArrayLike
+    bounces: ArrayLike
+    begin: ArrayLike
+    end: ArrayLike
+    points: ArrayLike | None
+    faces: ArrayLike | None
+
+
+_NEUTRAL: dict[str, tuple[type, float]] = {
+    "gain": (np.complex128, np.nan),
+    "delay": (np.float64, np.nan),
+    "delay_rate": (np.float64, 0.0),
+    "delay_accel": (np.float64, 0.0),
+    "tx_radius": (np.float64, np.inf),
+    "rx_radius": (np.float64, np.inf),
+    "kind": (np.int8, -1),
+    "target": (np.int16, -1),
+    "bounces": (np.int16, 0),
+    "begin": (np.float64, -np.inf),
+    "end": (np.float64, np.inf),
+}
+"""Type and neutral value of each column of numbers."""
+
+
 def make_paths(
     *,
-    gain: np.ndarray,
-    delay: np.ndarray,
-    departure: np.ndarray,
-    arrival: np.ndarray,
-    kind: np.ndarray | int,
-    epoch: float,
     tx: str,
     rx: str,
-    delay_rate: np.ndarray | float = 0.0,
-    delay_accel: np.ndarray | float = 0.0,
-    tx_radius: np.ndarray | float = np.inf,
-    rx_radius: np.ndarray | float = np.inf,
-    target: np.ndarray | int = -1,
-    bounces: np.ndarray | int = 0,
-    begin: np.ndarray | float = -np.inf,
-    end: np.ndarray | float = np.inf,
+    epoch: float,
     target_names: tuple[str, ...] = (),
-    points: np.ndarray | None = None,
-    faces: np.ndarray | None = None,
+    **columns: Unpack[Columns],
 ) -> PathSet:
     """A PathSet from what is known; the rest gets its neutral value. Arrays are copied."""
-    count = np.asarray(delay).shape[0]
-
-    def full(value: np.ndarray | float, dtype: type) -> np.ndarray:
-        return np.array(np.broadcast_to(value, (count,)), dtype=dtype)
-
+    given: dict[str, Any] = {name: v for name, v in columns.items() if v is not None}
+    count = np.asarray(given["delay"]).shape[0]
+    flat = {
+        name: np.array(np.broadcast_to(given.get(name, neutral), (count,)), dtype=dtype)
+        for name, (dtype, neutral) in _NEUTRAL.items()
+    }
     return PathSet(
-        gain=full(gain, np.complex128),
-        delay=full(delay, np.float64),
-        delay_rate=full(delay_rate, np.float64),
-        delay_accel=full(delay_accel, np.float64),
-        departure=np.array(departure, np.float64).reshape(count, 3),
-        arrival=np.array(arrival, np.float64).reshape(count, 3),
-        tx_radius=full(tx_radius, np.float64),
-        rx_radius=full(rx_radius, np.float64),
-        kind=full(kind, np.int8),
-        target=full(target, np.int16),
-        bounces=full(bounces, np.int16),
-        begin=full(begin, np.float64),
-        end=full(end, np.float64),
+        **flat,
+        departure=np.array(given["departure"], np.float64).reshape(count, 3),
+        arrival=np.array(given["arrival"], np.float64).reshape(count, 3),
+        points=np.array(given.get("points", np.zeros((count, 0, 3))), np.float64),
+        faces=np.array(given.get("faces", np.zeros((count, 0))), np.int32),
         epoch=float(epoch),
         tx=tx,
         rx=rx,
         target_names=target_names,
-        points=np.full((count, 0, 3), np.nan) if points is None else np.array(points, np.float64),
-        faces=np.full((count, 0), -1, np.int32) if faces is None else np.array(faces, np.int32),
     )
 
 
@@ -194,25 +194,16 @@ def merge(parts: list[PathSet]) -> PathSet:
     """All paths of one link in one set, in the order given; interaction lists are padded to the
     longest."""
     first = parts[0]
-    if any(
-        (p.tx, p.rx, p.epoch, p.target_names)
-        != (first.tx, first.rx, first.epoch, first.target_names)
-        for p in parts
-    ):
+    if len({(p.link, p.epoch, p.target_names) for p in parts}) > 1:
         raise ValueError("merge needs path sets of one link, epoch and list of targets")
     depth = max(p.faces.shape[1] for p in parts)
 
-    def padded(a: np.ndarray, fill: float) -> np.ndarray:
+    def padded(name: str, a: np.ndarray) -> np.ndarray:
+        if name not in ("points", "faces"):
+            return a
         width = [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2)
-        return np.pad(a, width, constant_values=fill)
+        return np.pad(a, width, constant_values=np.nan if name == "points" else -1)
 
-    stacked: dict[str, Any] = {}
-    for f in fields(first):
-        values = [getattr(p, f.name) for p in parts]
-        if f.name == "points":
-            values = [padded(v, np.nan) for v in values]
-        elif f.name == "faces":
-            values = [padded(v, -1) for v in values]
-        if isinstance(values[0], np.ndarray):
-            stacked[f.name] = np.concatenate(values)
-    return replace(first, **stacked)
+    columns = [p.arrays() for p in parts]
+    joined = {n: np.concatenate([padded(n, c[n]) for c in columns]) for n in columns[0]}
+    return replace(first, **joined)

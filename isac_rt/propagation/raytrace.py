@@ -29,21 +29,18 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
 
 from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
-from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.between import Between, LegSet, TracedLegs, leg_set, pick
+from isac_rt.propagation.legs.between import Between, LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.clearance import Clearance
 from isac_rt.propagation.legs.direct import past_edges_and_bodies
@@ -57,6 +54,7 @@ from isac_rt.propagation.legs.geometry import (
 )
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter, Propagation
 from isac_rt.world.city.mesh import City
 from isac_rt.world.city.scene import shared_scene
@@ -151,7 +149,10 @@ class RayTracer:
         bodies = Bodies.of(self._swarm.uavs, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._free.wavelength)
         hits = self._diffuse_hits(local, links) if self._clutter.model == "diffuse" else {}
-        paths = {link: self._link(local, epoch, *link, legs, hits, bodies) for link in links}
+        paths = {}
+        for link in links:
+            state = LinkState(link, epoch, local[link.tx], local[link.rx], self._free.names)
+            paths[link] = self._link(state, local, legs, hits, bodies)
         return Traced(paths, dropped)
 
     def _local(self, poses: dict[str, Pose]) -> dict[str, Pose]:
@@ -298,110 +299,88 @@ class RayTracer:
             keep = one_of_each_chain(planes, chain, good)
             duplicates += int(good.sum()) - keep.size
             keep = keep[np.argsort(legs.length[keep], kind="stable")]
-            parts.append((amplitude[which][keep], pick(legs, keep), chain[keep], planes[keep]))
+            parts.append((amplitude[which][keep], legs.select(keep), chain[keep], planes[keep]))
         return leg_set(parts, faces.shape[1]), dropped, duplicates
 
     def _link(
-        self, local: dict, epoch: float, tx: str, rx: str, legs: dict, hits: dict, bodies: Bodies
+        self,
+        state: LinkState,
+        local: dict[str, Pose],
+        legs: dict[Link, LegSet],
+        hits: dict,
+        bodies: Bodies,
     ) -> PathSet:
-        common: dict[str, Any] = {
-            "epoch": epoch,
-            "tx": tx,
-            "rx": rx,
-            "target_names": self._free.names,
-        }
-        parts = [self._between(local[tx], local[rx], legs[tx, rx], common)]
-        for number, name in enumerate(self._free.names):
-            if name not in (tx, rx):
-                parts.append(self._by_way_of(local, tx, rx, name, number, legs, common))
-        if (tx, rx) in hits:
-            amplitude, face, point = hits[tx, rx]
-            parts.append(self._scattered(local[tx], local[rx], amplitude, face, point, common))
+        link, antennas = state.link, self._free.antennas
+        parts = [self._by_the_city(state, legs[link])]
+        for name in self._free.names:
+            if name not in link:
+                there, back = legs[Link(link.tx, name)], legs[Link(link.rx, name)]
+                parts.append(self._by_way_of(state, name, local[name], there, back))
+        if link in hits:
+            parts.append(self._scattered(state, *hits[link]))
         if self.field is not None:
-            parts.append(
-                self.field.paths(tx, rx, local[tx], local[rx], self._free.antennas, common, bodies)
-            )
+            parts.append(self.field.paths(state, antennas, bodies))
         if self.two_bounces is not None:
-            parts.extend(
-                self.two_bounces.paths(
-                    tx, rx, local[tx], local[rx], self._free.antennas, common, bodies
-                )
-            )
-        leakage = self._propagation.leakage
-        if tx == rx and leakage.enabled:
-            ahead = local[tx].rotation[:, 1][None]
-            gain = np.array([10 ** (-leakage.isolation_db / 20)])
-            delay = np.array([leakage.delay_s])
-            parts.append(
-                make_paths(
-                    gain=gain,
-                    delay=delay,
-                    departure=ahead,
-                    arrival=ahead,
-                    kind=PathKind.LEAKAGE,
-                    **common,
-                )
-            )
+            parts.extend(self.two_bounces.paths(state, antennas, bodies))
+        if link.own and self._propagation.leakage.enabled:
+            parts.append(self._leakage(state))
         every = merge(parts)
         every = replace(every, points=every.points + self._city.origin)
         return every.select(every.gain != 0)
 
-    def _between(self, start: Pose, end: Pose, found: LegSet, common: dict) -> PathSet:
-        """Line of sight and mirror reflections of the city."""
-        legs = found.legs
+    def _leakage(self, state: LinkState) -> PathSet:
+        """A terminal's transmitter into its own receiver."""
+        leakage, ahead = self._propagation.leakage, state.start.rotation[:, 1][None]
         return make_paths(
-            gain=found.amplitude
-            * element_amplitude(self._free.antennas, start, end, legs.departure, legs.arrival),
-            delay=legs.length / SPEED_OF_LIGHT,
-            delay_rate=legs.rate / SPEED_OF_LIGHT,
-            delay_accel=legs.accel / SPEED_OF_LIGHT,
-            departure=legs.departure,
-            arrival=legs.arrival,
-            tx_radius=legs.length,
-            rx_radius=legs.length,
-            kind=np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
+            gain=[10 ** (-leakage.isolation_db / 20)],
+            delay=[leakage.delay_s],
+            departure=ahead,
+            arrival=ahead,
+            kind=PathKind.LEAKAGE,
+            tx=state.link.tx,
+            rx=state.link.rx,
+            epoch=state.epoch,
+            target_names=state.target_names,
+        )
+
+    def _by_the_city(self, state: LinkState, found: LegSet) -> PathSet:
+        """Line of sight and mirror reflections of the city."""
+        ways = Ways.along(found.legs)
+        return state.paths(
+            ways,
+            found.amplitude * state.elements(self._free.antennas, ways),
+            np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
             bounces=found.bounces,
-            points=legs.points,
+            points=found.legs.points,
             faces=found.faces,
-            **common,
         )
 
     def _by_way_of(
-        self, local: dict, tx: str, rx: str, name: str, number: int, legs: dict, common: dict
+        self, state: LinkState, name: str, body: Pose, there: LegSet, back: LegSet
     ) -> PathSet:
         """Echo and ghosts of one UAV: every leg to it with every leg from it, up to the bounces
         allowed."""
-        there, back = legs[tx, name], legs[rx, name]
         i, j = (a.ravel() for a in np.indices((there.amplitude.size, back.amplitude.size)))
         bounces = there.bounces[i] + back.bounces[j]
         allowed = bounces <= (self._propagation.max_bounces if self._propagation.ghosts else 0)
-        i, j, bounces = i[allowed], j[allowed], bounces[allowed]
-        a, b, body = there.legs, back.legs, local[name]
+        there, back, bounces = there.select(i[allowed]), back.select(j[allowed]), bounces[allowed]
+        a, b, count = there.legs, back.legs, bounces.size
         section = self._free.sections[name].square_metres(
-            body.to_body(a.arrival[i]), body.to_body(b.arrival[j])
+            body.to_body(a.arrival), body.to_body(b.arrival)
         )
         scatter = np.sqrt(4 * np.pi * section) / self._free.wavelength
-        elements = element_amplitude(
-            self._free.antennas, local[tx], local[rx], a.departure[i], b.departure[j]
-        )
-        middle = np.broadcast_to(body.position, (i.size, 1, 3))
-        return make_paths(
-            gain=there.amplitude[i] * back.amplitude[j] * scatter * elements,
-            delay=(a.length[i] + b.length[j]) / SPEED_OF_LIGHT,
-            delay_rate=(a.rate[i] + b.rate[j]) / SPEED_OF_LIGHT,
-            delay_accel=(a.accel[i] + b.accel[j]) / SPEED_OF_LIGHT,
-            departure=a.departure[i],
-            arrival=b.departure[j],
-            tx_radius=a.length[i],
-            rx_radius=b.length[j],
-            kind=np.where(bounces > 0, PathKind.GHOST, PathKind.TARGET),
-            target=number,
+        ways = Ways.over(a, b)
+        elements = state.elements(self._free.antennas, ways)
+        middle = np.broadcast_to(body.position, (count, 1, 3))
+        chain = [there.faces, np.full((count, 1), -1), back.faces[:, ::-1]]
+        return state.paths(
+            ways,
+            there.amplitude * back.amplitude * scatter * elements,
+            np.where(bounces > 0, PathKind.GHOST, PathKind.TARGET),
+            target=self._free.names.index(name),
             bounces=bounces,
-            points=np.concatenate([a.points[i], middle, b.points[j][:, ::-1]], axis=1),
-            faces=np.concatenate(
-                [there.faces[i], np.full((i.size, 1), -1), back.faces[j][:, ::-1]], axis=1
-            ),
-            **common,
+            points=np.concatenate([a.points, middle, b.points[:, ::-1]], axis=1),
+            faces=np.concatenate(chain, axis=1),
         )
 
     def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict:
@@ -427,17 +406,11 @@ class RayTracer:
             which = np.flatnonzero(valid[i, j] & (faces[i, j, :, 0] >= 0))
             face, point = faces[i, j, which, 0], points[i, j, which, 0]
             order = np.lexsort(point.T)
-            out[tx, rx] = np.abs(amplitude[i, j, which])[order], face[order], point[order]
+            out[Link(tx, rx)] = np.abs(amplitude[i, j, which])[order], face[order], point[order]
         return out
 
     def _scattered(
-        self,
-        start: Pose,
-        end: Pose,
-        amplitude: np.ndarray,
-        face: np.ndarray,
-        point: np.ndarray,
-        common: dict,
+        self, state: LinkState, amplitude: np.ndarray, face: np.ndarray, point: np.ndarray
     ) -> PathSet:
         """Scatterers at rest on the mesh, each with a phase of its own that belongs to its
         place."""
@@ -445,22 +418,13 @@ class RayTracer:
         on_plane = (
             point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
         )
-        there, back = straight(start, on_plane), straight(end, on_plane)
-        phase = scatterer_phase(point, self._free.seed)
-        return make_paths(
-            gain=amplitude
-            * np.exp(1j * phase)
-            * element_amplitude(self._free.antennas, start, end, there.departure, back.departure),
-            delay=(there.length + back.length) / SPEED_OF_LIGHT,
-            delay_rate=(there.rate + back.rate) / SPEED_OF_LIGHT,
-            delay_accel=(there.accel + back.accel) / SPEED_OF_LIGHT,
-            departure=there.departure,
-            arrival=back.departure,
-            tx_radius=there.length,
-            rx_radius=back.length,
-            kind=PathKind.DIFFUSE,
+        ways = Ways.over(straight(state.start, on_plane), straight(state.end, on_plane))
+        turn = np.exp(1j * scatterer_phase(point, self._free.seed))
+        return state.paths(
+            ways,
+            amplitude * turn * state.elements(self._free.antennas, ways),
+            PathKind.DIFFUSE,
             bounces=1,
             points=on_plane[:, None],
             faces=face[:, None],
-            **common,
         )

@@ -137,11 +137,7 @@ def _pack(traced: Traced, census: Census) -> dict[str, Any]:
     about = []
     for i, p in enumerate(traced.paths.values()):
         about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
-        out |= {
-            f"{i}/{f.name}": value
-            for f in fields(p)
-            if isinstance(value := getattr(p, f.name), np.ndarray)
-        }
+        out |= {f"{i}/{name}": array for name, array in p.arrays().items()}
     text = json.dumps({"links": about, "dropped": traced.dropped, "census": asdict(census)})
     return out | {"about": np.array(text)}
 

@@ -13,10 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.field import ClutterField, Seen
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
-from isac_rt.propagation.elements import element_amplitude
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.environment import Clutter
@@ -89,20 +90,17 @@ class MeshExpectation:
         error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(
             self._city.num_faces
         )
-        once = self._field.seen(name, name, local, local, time)
-        parts = [self._expected(once, once.departure, once.arrival, error, amplitude, local)]
-        by_mirrors = (
-            []
-            if self._two_bounces is None
-            else self._two_bounces.seen(name, name, local, local, time)
-        )
+        state = LinkState(Link(name, name), time, local, local)
+        once = self._field.seen(state)
+        parts = [self._expected(once, once.departure, once.arrival, error, amplitude, state)]
+        by_mirrors = [] if self._two_bounces is None else self._two_bounces.seen(state)
         for part in by_mirrors:
             n, s = part.mirror.normal, part.seen
             met = s.departure if part.before else s.arrival
             turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
             moved = 2 * error[part.mirror.faces[0]] * (met @ n)
-            parts.append(self._expected(s, there, back, error, amplitude, local, moved))
+            parts.append(self._expected(s, there, back, error, amplitude, state, moved))
         return ExpectedClutter.joined(parts)
 
     def _expected(
@@ -112,13 +110,13 @@ class MeshExpectation:
         back: np.ndarray,
         error: np.ndarray,
         amplitude: float,
-        local: Pose,
+        state: LinkState,
         moved: np.ndarray | float = 0.0,
     ) -> ExpectedClutter:
         """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the
         scatterers, on faces that are each in error, and ways made longer by `moved` as a mirror is
         in error [m]."""
-        elements = element_amplitude(self._antennas, local, local, seen.departure, seen.arrival)
+        elements = state.elements(self._antennas, seen)
         face = self._field.cells.face[seen.index]
         length = (
             seen.length
@@ -131,8 +129,8 @@ class MeshExpectation:
             length[some] / SPEED_OF_LIGHT,
             seen.rate[some] / SPEED_OF_LIGHT,
             power[some],
-            local.to_body(seen.departure)[some],
-            local.to_body(seen.arrival)[some],
+            state.start.to_body(seen.departure)[some],
+            state.start.to_body(seen.arrival)[some],
         )
 
 

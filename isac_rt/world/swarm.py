@@ -37,6 +37,10 @@ class Pose:
         """A body that hovers at a place [m], turned towards `boresight` with its roll level."""
         return cls(np.array(position, float), np.zeros(3), np.zeros(3), attitude(boresight))
 
+    def motion(self) -> np.ndarray:
+        """(3, 3) position, velocity and acceleration, one a row."""
+        return np.stack([self.position, self.velocity, self.acceleration])
+
     def to_body(self, direction: np.ndarray) -> np.ndarray:
         """World vectors (..., 3) in body axes."""
         return direction @ self.rotation

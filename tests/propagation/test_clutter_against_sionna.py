@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
+from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.cells import area_for
+from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation.clutter import sionna_power
 from isac_rt.world.city import load_city
@@ -101,7 +103,7 @@ def compare(
                     city, poses[tx].position, poses[rx].position, edges, rays
                 )
             theirs = POWERS[name, number, rx]
-            seen = model.field.seen(tx, rx, poses[tx], poses[rx], time)
+            seen = model.field.seen(LinkState(Link(tx, rx), time, poses[tx], poses[rx]))
             ours = np.histogram(seen.length, edges, weights=seen.magnitude**2)[0]
             filled = theirs > 1e-3 * theirs.sum()
             with np.errstate(divide="ignore"):

@@ -12,7 +12,9 @@ import trimesh
 from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
+from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
+from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import City, load_city
 
@@ -123,7 +125,7 @@ def test_field_is_coherent_with_a_separate_sum(name):
             when = time + step / speed
             pose = flight.pose(when)
             local = replace(pose, position=pose.position - city.origin)
-            seen = model.field.seen("A", "A", local, local, when)
+            seen = model.field.seen(LinkState(Link("A", "A"), when, local, local))
             p = profile(seen.length, cells.amplitude[seen.index] * seen.magnitude)
             worst = min(worst, correlation(p, separate.at(local.position)))
             exact = np.sqrt(
@@ -188,7 +190,7 @@ def test_sight_alone_changes_no_range_cell_at_once():
         pose = flight.pose(time)
         local = replace(pose, position=pose.position - city.origin)
         seen, share = (
-            model.field.seen("A", "A", local, local, time),
+            model.field.seen(LinkState(Link("A", "A"), time, local, local)),
             model.field.sight.share("A", local, time),
         )
         gain, mean = np.zeros(len(cells), complex), np.zeros(len(cells))

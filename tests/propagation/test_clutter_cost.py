@@ -11,7 +11,9 @@ import pytest
 
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
+from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import load_city
 
@@ -57,7 +59,6 @@ def test_advancing_is_far_cheaper_than_tracing_anew():
     setup = process_time() - begin
     again, _, _ = tracer(city, model="diffuse", rays=160_000)
     scatterers = len(model.field.cells)
-    common = {"tx": "A", "rx": "A", "target_names": ()}
     advance, whole, trace, found = [], [], [], []
     for block in range(4):
         seconds = np.zeros(2)
@@ -68,10 +69,10 @@ def test_advancing_is_far_cheaper_than_tracing_anew():
             pose = swarm.poses(time)["A"]
             local = replace(pose, position=pose.position - city.origin)
             begin = process_time()
-            seen = model.field.seen("A", "A", local, local, time)
+            seen = model.field.seen(LinkState(Link("A", "A"), time, local, local))
             gain = model.field.cells.amplitude[seen.index] * seen.magnitude
             middle = process_time()
-            paths = model.field.paths("A", "A", local, local, antennas, common | {"epoch": time})
+            paths = model.field.paths(LinkState(Link("A", "A"), time, local, local), antennas)
             seconds += middle - begin, process_time() - middle
         advance.append(seconds[0] / (FRAMES // 4) / scatterers * PATHS)
         whole.append(seconds[1] / (FRAMES // 4) / scatterers * PATHS)

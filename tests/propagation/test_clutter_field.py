@@ -17,10 +17,12 @@ from scipy.integrate import dblquad
 
 from isac_rt import randomness, scenario
 from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import seed_sequence
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import City, Material, load_city
@@ -100,7 +102,8 @@ def test_cells_do_not_know_the_order_of_faces(seed):
 def test_cells_are_the_same_in_every_process():
     """Planted bug: Python's own hash(), which is salted, in the seed."""
     program = (
-        "import sys; sys.path[:0] = ['tests', 'tests/propagation']; import test_clutter_field as t; "
+        "import sys; sys.path[:0] = ['tests', 'tests/propagation']; "
+        "import test_clutter_field as t; "
         "print(t.digest(t.all_cells(t.canyon())))"
     )
     root = Path(__file__).parents[2]
@@ -228,7 +231,7 @@ def flown(
 
 
 def mean_power(model, tx: str, rx: str, poses: dict[str, Pose]) -> float:
-    seen = model.field.seen(tx, rx, poses[tx], poses[rx], 0.0)
+    seen = model.field.seen(LinkState(Link(tx, rx), 0.0, poses[tx], poses[rx]))
     return float((seen.magnitude**2).sum())
 
 
@@ -342,7 +345,7 @@ def test_each_scatterer_against_an_oracle(name):
 
     for tx, rx in (("A", "P"), ("A", "A")):
         start, end = bodies[tx], bodies[rx]
-        seen = model.field.seen(tx, rx, start, end, 0.0)
+        seen = model.field.seen(LinkState(Link(tx, rx), 0.0, start, end))
         assert len(seen.index) > 20
         for i in range(0, len(seen.index), 7):
             cell = seen.index[i]

@@ -11,6 +11,8 @@ from scipy import stats
 from test_clutter_coherence import F_C, LAMBDA, C, crossing
 
 from isac_rt import scenario
+from isac_rt.frame.link import Link
+from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 
 pytestmark = pytest.mark.sionna
@@ -41,7 +43,7 @@ def at(model, flight, time: float):
     in local coordinates."""
     pose = flight.pose(time)
     local = replace(pose, position=pose.position - crossing().origin)
-    seen = model.field.seen("A", "A", local, local, time)
+    seen = model.field.seen(LinkState(Link("A", "A"), time, local, local))
     wave = (
         model.field.cells.amplitude[seen.index]
         * seen.magnitude

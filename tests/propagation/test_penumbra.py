@@ -12,7 +12,7 @@ from test_clutter_against_sionna import flown as street_of
 from test_clutter_coherence import ROUND_A_CORNER, crossing
 from test_clutter_coherence import flown as flown_round
 from test_clutter_field import LAMBDA, METAL, flown, rectangle, slab
-from test_clutter_twice import joined
+from test_two_bounces import joined
 
 from isac_rt.propagation.legs.diffraction import edge_factor
 from isac_rt.propagation.legs.edges import ShadowEdges

@@ -13,9 +13,11 @@ from test_clutter_field import METAL, flown, rectangle
 from test_diffraction import chopped
 
 from isac_rt import scenario
+from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
+from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import City
 from isac_rt.world.city.mesh import empty_city
@@ -228,12 +230,12 @@ def test_clutter_behind_a_body_is_in_its_shadow():
         smallest_cell_m2=0.05,
     )
     a, body = pose((0.3, -1.1, 0.9)), np.array([0.9, 7.1, 1.3])
-    bare = model.field.seen("A", "A", a, a, 0.0)
+    bare = model.field.seen(LinkState(Link("A", "A"), 0.0, a, a))
     for names in (("U",), ("A", "U")):
         bodies = Bodies(names, np.array([body, body])[: len(names)], np.full(len(names), 0.23))
         if "A" in names:
             bodies = Bodies(names, np.array([a.position, body]), bodies.radii)
-        seen = model.field.seen("A", "A", a, a, 0.0, bodies)
+        seen = model.field.seen(LinkState(Link("A", "A"), 0.0, a, a), bodies)
         ratio, checked = seen.magnitude / bare.magnitude, 0
         for i, point in enumerate(model.field.cells.points[bare.index]):
             r = np.linalg.norm(point - a.position)

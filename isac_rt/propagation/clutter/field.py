@@ -33,22 +33,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
+from typing import NamedTuple
 
 import mitsuba as mi
 import numba
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.cells import Cells, Density, cut
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Shadows, Sight
-from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.legs.bodies import Bodies
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.legs.reflection import slab_coefficients
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter
-from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
+from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import City
-from isac_rt.world.swarm import Pose, Swarm
+from isac_rt.world.swarm import Swarm
 
 TABLE = 4097
 """Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines
@@ -58,8 +59,7 @@ KEPT_SPACING = 1.0
 these places is left out."""
 
 
-@dataclass(frozen=True)
-class Surfaces:
+class Surfaces(NamedTuple):
     """What the kernel needs of a city's faces and materials.
 
     Attributes
@@ -82,7 +82,7 @@ class Surfaces:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Seen(Ways):
     """What K scatterers of the field do between two terminals at one instant, isotropic antennas.
 
     Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link
@@ -93,13 +93,20 @@ class Seen:
     index : (K,) int32 into the field's cells
     magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own
         amplitude not
-    length, rate, accel : (K,) of the way over the scatterer [m, m/s, m/s^2]
-    tx_radius, rx_radius : (K,) distances from either end [m]
-    departure, arrival : (K, 3) unit vectors from either end to the scatterer
     """
 
     index: np.ndarray
     magnitude: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """Of the arrays, each counted once."""
+        return sum({id(a): a.nbytes for a in vars(self).values()}.values())
+
+
+class Rows(NamedTuple):
+    """The arrays of `Seen`, as the kernels take them."""
+
     length: np.ndarray
     rate: np.ndarray
     accel: np.ndarray
@@ -107,11 +114,8 @@ class Seen:
     rx_radius: np.ndarray
     departure: np.ndarray
     arrival: np.ndarray
-
-    @property
-    def nbytes(self) -> int:
-        """Of the arrays, each counted once."""
-        return sum({id(a): a.nbytes for a in vars(self).values()}.values())
+    index: np.ndarray
+    magnitude: np.ndarray
 
 
 class ClutterField:
@@ -167,59 +171,36 @@ class ClutterField:
         """Of the scatterers and of what is remembered of their sight."""
         return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
 
-    def seen(
-        self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None
-    ) -> Seen:
+    def seen(self, state: LinkState, bodies: Bodies | None = None) -> Seen:
         """What is in sight of both ends of a link, poses in local coordinates; in the shadows of
         `bodies`, if given."""
-        share = self.sight.share(tx, start, time)
-        if tx != rx:
-            share = share * self.sight.share(rx, end, time)
+        (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
+        share = self.sight.share(tx, start, state.epoch)
+        if not own:
+            share = share * self.sight.share(rx, end, state.epoch)
         index = np.flatnonzero(share).astype(np.int32)
-        count, own = index.size, tx == rx
+        count = index.size
         radius, departure = np.empty(count), np.empty((count, 3))
-        out: list[np.ndarray] = [
-            np.empty(count, np.float32),
-            np.empty(count),
-            np.empty(count),
-            np.empty(count, np.float32),
-            radius,
-        ]
-        out += (
-            [radius, departure, departure]
-            if own
-            else [np.empty(count), departure, np.empty((count, 3))]
+        found = Seen(
+            length=np.empty(count),
+            rate=np.empty(count),
+            accel=np.empty(count, np.float32),
+            tx_radius=radius,
+            rx_radius=radius if own else np.empty(count),
+            departure=departure,
+            arrival=departure if own else np.empty((count, 3)),
+            index=index,
+            magnitude=np.empty(count, np.float32),
         )
-        s, c = self.surfaces, self.cells
-        motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
-        _advance(
-            index,
-            share,
-            c.points,
-            c.face,
-            c.area,
-            s.normals,
-            s.material,
-            s.table,
-            s.coefficient,
-            s.lobe,
-            s.exponent,
-            self._scale,
-            *motion,
-            own,
-            *out,
-        )  # type: ignore[call-arg]
-        found = Seen(index, *out)
+        c, rows, motion = self.cells, Rows(**vars(found)), (start.motion(), end.motion())
+        _advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
         if bodies is not None:
-            there = bodies.sight(
-                start.position, c.points[index], found.tx_radius, self._wavelength, (tx,)
-            )
+            points = self.cells.points[index]
+            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, (tx,))
             back = (
                 there
                 if own
-                else bodies.sight(
-                    end.position, c.points[index], found.rx_radius, self._wavelength, (rx,)
-                )
+                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, (rx,))
             )
             found.magnitude[:] *= there * back
         lit = found.magnitude > 0
@@ -228,38 +209,16 @@ class ClutterField:
         parts = {id(a): a[lit] for a in vars(found).values()}
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
-    def paths(
-        self,
-        tx: str,
-        rx: str,
-        start: Pose,
-        end: Pose,
-        antennas: Antennas,
-        common: dict,
-        bodies: Bodies | None = None,
-    ) -> PathSet:
-        """The link's paths at ``common["epoch"]``; poses, points and bodies in local
-        coordinates."""
-        seen = self.seen(tx, rx, start, end, common["epoch"], bodies)
-        elements = (
-            antennas.element_gain(start.to_body(seen.departure))
-            if tx == rx
-            else element_amplitude(antennas, start, end, seen.departure, seen.arrival)
-        )
-        return make_paths(
-            gain=self.cells.amplitude[seen.index] * (seen.magnitude * elements),
-            delay=seen.length / SPEED_OF_LIGHT,
-            delay_rate=seen.rate / SPEED_OF_LIGHT,
-            delay_accel=seen.accel / SPEED_OF_LIGHT,
-            departure=seen.departure,
-            arrival=seen.arrival,
-            tx_radius=seen.tx_radius,
-            rx_radius=seen.rx_radius,
-            kind=PathKind.DIFFUSE,
+    def paths(self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None) -> PathSet:
+        """The link's paths; poses, points and bodies in local coordinates."""
+        seen = self.seen(state, bodies)
+        return state.paths(
+            seen,
+            self.cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
+            PathKind.DIFFUSE,
             bounces=1,
             points=self.cells.points[seen.index][:, None],
             faces=self.cells.face[seen.index][:, None],
-            **common,
         )
 
 
@@ -279,10 +238,10 @@ def _ever_seen(
 def surfaces(city: City, wavelength: float) -> Surfaces:
     """Tables of a city's materials."""
     cosine = np.linspace(0.0, 1.0, TABLE)
-    table = [
-        np.stack([*slab_reflectivity(m, cosine, wavelength), 1 / lobe_norm(m, cosine)], axis=1)
-        for m in city.materials
-    ]
+    table = []
+    for m in city.materials:
+        te, tm = (np.abs(r) ** 2 for r in slab_coefficients(m, cosine, wavelength, whole=True))
+        table.append(np.stack([te, tm, 1 / lobe_norm(m, cosine)], axis=1))
     lobes = {"lambertian": -1.0, "directive": 1.0, "backscattering": 0.5}
     return Surfaces(
         city.normals,
@@ -292,22 +251,6 @@ def surfaces(city: City, wavelength: float) -> Surfaces:
         np.array([lobes[m.scattering_pattern] for m in city.materials]),
         np.array([m.pattern_exponent for m in city.materials], np.int64),
     )
-
-
-def slab_reflectivity(
-    material: Material, cosine: np.ndarray, wavelength: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Power reflectivity of a slab for TE and TM waves over the cosine of incidence (ITU-R
-    P.2040-3, eqs. 37, 43 and 44)."""
-    omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
-    eta = material.relative_permittivity - 1j * material.conductivity / (
-        omega * VACUUM_PERMITTIVITY
-    )
-    root = np.sqrt(eta - (1 - cosine**2))
-    turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
-    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
-    first, second = (np.abs(r * (1 - turn) / (1 - r**2 * turn)) ** 2 for r in (te, tm))
-    return first, second
 
 
 def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
@@ -330,43 +273,21 @@ def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _advance(
-    index,
-    share,
-    points,
-    face,
-    area,
-    normals,
-    material,
-    table,
-    coefficient,
-    lobe,
-    exponent,
-    scale,
-    start,
-    end,
-    own,
-    magnitude,
-    length,
-    rate,
-    accel,
-    tx_radius,
-    rx_radius,
-    departure,
-    arrival,
-):
-    """Fill the last eight arrays, one row per `index`; rows are independent. `start`, `end`:
-    position, velocity, acceleration; `own`: both are one body, and `arrival` is `departure`."""
-    last = table.shape[1] - 2
+def _advance(surfaces, points, face, area, share, scale, start, end, own, rows):
+    """Fill all `rows` but `index`; they are independent. `start`, `end`: position, velocity,
+    acceleration; `own`: both are one body, and `arrival` is `departure`."""
+    index, length, rate, accel = rows.index, rows.length, rows.rate, rows.accel
+    tx_radius, rx_radius, magnitude = rows.tx_radius, rows.rx_radius, rows.magnitude
+    departure, arrival = rows.departure, rows.arrival
     for row in range(index.size):
         i = index[row]
         f = face[i]
-        nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
-        r1, v1, a1, x1, y1, z1 = _leg(points[i, 0], points[i, 1], points[i, 2], start)
+        nx, ny, nz = surfaces.normals[f, 0], surfaces.normals[f, 1], surfaces.normals[f, 2]
+        r1, v1, a1, x1, y1, z1 = leg_to(points[i, 0], points[i, 1], points[i, 2], start)
         r2, v2, a2, x2, y2, z2 = r1, v1, a1, x1, y1, z1
         departure[row, 0], departure[row, 1], departure[row, 2] = x1, y1, z1
         if not own:
-            r2, v2, a2, x2, y2, z2 = _leg(points[i, 0], points[i, 1], points[i, 2], end)
+            r2, v2, a2, x2, y2, z2 = leg_to(points[i, 0], points[i, 1], points[i, 2], end)
             arrival[row, 0], arrival[row, 1], arrival[row, 2] = x2, y2, z2
         tx_radius[row], rx_radius[row] = r1, r2
         length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2
@@ -375,32 +296,46 @@ def _advance(
         if into * back <= 0:
             magnitude[row] = 0.0
             continue
-        m = material[f]
         cos_i = min(abs(into), 1.0)
-        at = cos_i * (last + 1)
-        k = min(int(at), last)
-        at -= k
-        te = table[m, k, 0] + at * (table[m, k + 1, 0] - table[m, k, 0])
-        tm = table[m, k, 1] + at * (table[m, k + 1, 1] - table[m, k, 1])
         # the vertical field is across the horizontal u x z: its TE part is the part of n along u x
         # z, of all of n across u
         whole = (x1 * x1 + y1 * y1) * (1 - cos_i * cos_i)
         part = min((ny * x1 - nx * y1) ** 2 / whole, 1.0) if whole > 1e-12 else 0.5
-        power = coefficient[m] * (part * te + (1 - part) * tm) * cos_i * area[i]
-        if lobe[m] < 0:
-            power *= abs(back) / np.pi
-        else:
-            norm = table[m, k, 2] + at * (table[m, k + 1, 2] - table[m, k, 2])
-            with_way_in = x1 * x2 + y1 * y2 + z1 * z2
-            with_mirror = 2 * into * back - with_way_in
-            mirror = max(0.5 * (1 + with_mirror), 0.0) ** exponent[m]
-            way_in = max(0.5 * (1 + with_way_in), 0.0) ** exponent[m]
-            power *= (lobe[m] * mirror + (1 - lobe[m]) * way_in) * norm
+        between = x1 * x2 + y1 * y2 + z1 * z2
+        power = scattered_power(surfaces, f, area[i], into, back, between, part)
         magnitude[row] = scale * share[i] * np.sqrt(power) / (r1 * r2)
 
 
 @numba.njit(inline="always", error_model="numpy")
-def _leg(px, py, pz, body):
+def scattered_power(surfaces, face, area, into, back, between, part):
+    """Of the power density at a cell, what it scatters into a direction, per steradian: the
+    effective-roughness integrand without its distances.
+
+    `into` and `back` are the facet's normal along the ways in and out, `between` is the cosine of
+    the angle between them, `part` the share of the field that is TE.
+    """
+    table, m = surfaces.table, surfaces.material[face]
+    last = table.shape[1] - 2
+    cos_i = min(abs(into), 1.0)
+    at = cos_i * (last + 1)
+    k = min(int(at), last)
+    at -= k
+    te = table[m, k, 0] + at * (table[m, k + 1, 0] - table[m, k, 0])
+    tm = table[m, k, 1] + at * (table[m, k + 1, 1] - table[m, k, 1])
+    power = surfaces.coefficient[m] * (part * te + (1 - part) * tm) * cos_i * area
+    lobe, exponent = surfaces.lobe[m], surfaces.exponent[m]
+    if lobe < 0:
+        power *= abs(back) / np.pi
+    else:
+        norm = table[m, k, 2] + at * (table[m, k + 1, 2] - table[m, k, 2])
+        mirror = max(0.5 * (1 + (2 * into * back - between)), 0.0) ** exponent
+        way_in = max(0.5 * (1 + between), 0.0) ** exponent
+        power *= (lobe * mirror + (1 - lobe) * way_in) * norm
+    return power
+
+
+@numba.njit(inline="always", error_model="numpy")
+def leg_to(px, py, pz, body):
     """Distance from a moving body to a point, its rate and acceleration, and the unit vector
     towards the point."""
     x, y, z = px - body[0, 0], py - body[0, 1], pz - body[0, 2]

@@ -62,7 +62,7 @@ class Mirror:
     def image(self, pose: Pose) -> np.ndarray:
         """(3, 3) position, velocity and acceleration of a pose's image."""
         n = self.normal
-        motion = np.stack([pose.position, pose.velocity, pose.acceleration])
+        motion = pose.motion()
         motion = motion - 2 * (motion @ n)[:, None] * n
         motion[0] += 2 * self.offset * n
         return motion

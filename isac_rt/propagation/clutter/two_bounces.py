@@ -29,13 +29,12 @@ import numba
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.propagation.clutter.field import ClutterField, Seen, _leg
+from isac_rt.propagation.clutter.field import ClutterField, Rows, Seen, leg_to, scattered_power
 from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
-from isac_rt.propagation.elements import element_amplitude
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.reflection import slab_coefficients
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.ways import LinkState
 from isac_rt.world.city.mesh import City
 from isac_rt.world.swarm import Pose
 
@@ -100,73 +99,50 @@ class TwoBounces:
             for name, kept in self.mirrors.items()
         }
 
-    def seen(
-        self, tx: str, rx: str, start: Pose, end: Pose, time: float, bodies: Bodies | None = None
-    ) -> list[SeenByMirror]:
+    def seen(self, state: LinkState, bodies: Bodies | None = None) -> list[SeenByMirror]:
         """What is in sight of both ends, once for each mirror and order; poses in local
         coordinates."""
-        out = []
+        (tx, rx), out = state.link, []
         for before, name, pose, other, far in (
-            (True, tx, start, rx, end),
-            (False, rx, end, tx, start),
+            (True, tx, state.start, rx, state.end),
+            (False, rx, state.end, tx, state.start),
         ):
             if not self.mirrors[name]:
                 continue
-            straight = self._field.sight.share(other, far, time)
-            for mirror, (index, share) in zip(
-                self.mirrors[name], self._share(name, pose, time), strict=True
-            ):
+            straight = self._field.sight.share(other, far, state.epoch)
+            shown_in = self._share(name, pose, state.epoch)
+            for mirror, (index, share) in zip(self.mirrors[name], shown_in, strict=True):
                 share = share * straight[index]
                 lit = share > 0
                 if lit.any():
-                    found = self._by_way_of(mirror, index[lit], share[lit], start, end, before)
-                    out.append(
-                        found if bodies is None else self._shaded(found, tx, rx, start, end, bodies)
-                    )
+                    found = self._by_way_of(mirror, index[lit], share[lit], state, before)
+                    if bodies is not None:
+                        self._shade(found, state, bodies)
+                    out.append(found)
         return out
 
     def paths(
-        self,
-        tx: str,
-        rx: str,
-        start: Pose,
-        end: Pose,
-        antennas: Antennas,
-        common: dict,
-        bodies: Bodies | None = None,
+        self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None
     ) -> list[PathSet]:
-        """The link's paths at ``common["epoch"]``, one set for each mirror and order; poses, points
-        and bodies in local coordinates."""
+        """The link's paths, one set for each mirror and order; poses, points and bodies in local
+        coordinates."""
         cells, out = self._field.cells, []
-        for part in self.seen(tx, rx, start, end, common["epoch"], bodies):
+        for part in self.seen(state, bodies):
             s = part.seen
-            points, faces = self._chain(part, start, end)
-            elements = element_amplitude(antennas, start, end, s.departure, s.arrival)
+            points, faces = self._chain(part, state)
+            gain = cells.amplitude[s.index] * part.turn
+            gain = gain * (s.magnitude * state.elements(antennas, s))
             out.append(
-                make_paths(
-                    gain=cells.amplitude[s.index] * part.turn * (s.magnitude * elements),
-                    delay=s.length / SPEED_OF_LIGHT,
-                    delay_rate=s.rate / SPEED_OF_LIGHT,
-                    delay_accel=s.accel / SPEED_OF_LIGHT,
-                    departure=s.departure,
-                    arrival=s.arrival,
-                    tx_radius=s.tx_radius,
-                    rx_radius=s.rx_radius,
-                    kind=PathKind.DIFFUSE,
-                    bounces=2,
-                    points=points,
-                    faces=faces,
-                    **common,
-                )
+                state.paths(s, gain, PathKind.DIFFUSE, bounces=2, points=points, faces=faces)
             )
         return out
 
-    def _chain(self, part: SeenByMirror, start: Pose, end: Pose) -> tuple[np.ndarray, np.ndarray]:
+    def _chain(self, part: SeenByMirror, state: LinkState) -> tuple[np.ndarray, np.ndarray]:
         """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of
         a mirror go by its largest."""
         place = self._field.cells.points[part.seen.index]
         own = self._field.cells.face[part.seen.index]
-        m, body = part.mirror, (start if part.before else end).position
+        m, body = part.mirror, (state.start if part.before else state.end).position
         above, up = m.normal @ body - m.offset, place @ m.normal - m.offset
         image = place - 2 * up[:, None] * m.normal
         at = body + (above / (above + up))[:, None] * (image - body)
@@ -212,109 +188,63 @@ class TwoBounces:
         )
 
     def _by_way_of(
-        self,
-        mirror: Mirror,
-        index: np.ndarray,
-        share: np.ndarray,
-        start: Pose,
-        end: Pose,
-        before: bool,
+        self, mirror: Mirror, index: np.ndarray, share: np.ndarray, state: LinkState, before: bool
     ) -> SeenByMirror:
-        motion = [np.stack([p.position, p.velocity, p.acceleration]) for p in (start, end)]
-        motion[0 if before else 1] = mirror.image(start if before else end)
-        count = index.size
-        out = [
-            np.empty(count),
-            np.empty(count),
+        start, end = state.start.motion(), state.end.motion()
+        if before:
+            start = mirror.image(state.start)
+        else:
+            end = mirror.image(state.end)
+        count, c = index.size, self._field.cells
+        rows = Rows(
+            *(np.empty(count, dtype) for dtype in (float, float, np.float32, float, float)),
+            *np.empty((2, count, 3)),
+            index,
             np.empty(count, np.float32),
-            np.empty(count),
-            np.empty(count),
-        ]
-        out += [np.empty((count, 3)), np.empty((count, 3))]
-        c, s = self._field.cells, self._field.surfaces
-        _lay_out(index, c.points, mirror.normal, *motion, before, *out)  # type: ignore[call-arg]
-        tx_radius, rx_radius, departure, arrival = out[3:]
-        met = departure if before else arrival
-        te, tm = slab_coefficients(
+        )
+        _lay_out(c.points, mirror.normal, start, end, before, rows)
+        met = rows.departure if before else rows.arrival
+        slab = slab_coefficients(
             mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength
         )
-        gain = np.empty(count, complex)
-        _weigh(
-            index,
-            share,
-            c.face,
-            c.area,
-            s.normals,
-            s.material,
-            s.table,
-            s.coefficient,
-            s.lobe,
-            s.exponent,
-            self._wavelength / (4 * np.pi),
-            mirror.normal,
-            te,
-            tm,
-            before,
-            tx_radius,
-            rx_radius,
-            departure,
-            arrival,
-            gain,
-        )
-        size = np.abs(gain)
+        gain, scale = np.empty(count, complex), self._wavelength / (4 * np.pi)
+        surfaces = self._field.surfaces
+        _weigh(surfaces, c.face, c.area, share, scale, mirror.normal, slab, before, rows, gain)
+        rows.magnitude[:] = size = np.abs(gain)
         some = np.flatnonzero(size > 0)
         turn = (gain[some] / size[some]).astype(np.complex64)
-        kept = [np.asarray(a)[some] for a in (index, size.astype(np.float32), *out)]
-        return SeenByMirror(Seen(*kept), turn, mirror, before)
+        return SeenByMirror(Seen(*(a[some] for a in rows)), turn, mirror, before)
 
-    def _shaded(
-        self, part: SeenByMirror, tx: str, rx: str, start: Pose, end: Pose, bodies: Bodies
-    ) -> SeenByMirror:
-        """The same past the swarm's bodies, on both ways."""
-        s = part.seen
-        points, _ = self._chain(part, start, end)
+    def _shade(self, part: SeenByMirror, state: LinkState, bodies: Bodies) -> None:
+        """Put it into the shadows of the swarm's bodies, on both ways."""
+        points, _ = self._chain(part, state)
         split = 2 if part.before else 1
-        ends = [np.broadcast_to(p.position, (len(points), 1, 3)) for p in (start, end)]
+        ends = [np.broadcast_to(p.position, (len(points), 1, 3)) for p in (state.start, state.end)]
         there = np.concatenate([ends[0], points[:, :split]], axis=1)
         back = np.concatenate([points[:, split - 1 :], ends[1]], axis=1)
-        factor = np.abs(
-            bodies.factor(there, self._wavelength, (tx,))
-            * bodies.factor(back, self._wavelength, (rx,))
+        part.seen.magnitude[:] *= np.abs(
+            bodies.factor(there, self._wavelength, (state.link.tx,))
+            * bodies.factor(back, self._wavelength, (state.link.rx,))
         )
-        s.magnitude[:] *= factor
-        return part
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lay_out(
-    index,
-    points,
-    normal,
-    start,
-    end,
-    before,
-    length,
-    rate,
-    accel,
-    tx_radius,
-    rx_radius,
-    departure,
-    arrival,
-):
+def _lay_out(points, normal, start, end, before, rows):
     """Geometry of ways over scatterers from `start` to `end` (position, velocity, acceleration),
     one of them an image behind the mirror; directions are those at the terminals themselves."""
-    for row in range(index.size):
-        i = index[row]
-        r1, v1, a1, x1, y1, z1 = _leg(points[i, 0], points[i, 1], points[i, 2], start)
-        r2, v2, a2, x2, y2, z2 = _leg(points[i, 0], points[i, 1], points[i, 2], end)
+    departure, arrival = rows.departure, rows.arrival
+    for row in range(rows.index.size):
+        i = rows.index[row]
+        r1, v1, a1, x1, y1, z1 = leg_to(points[i, 0], points[i, 1], points[i, 2], start)
+        r2, v2, a2, x2, y2, z2 = leg_to(points[i, 0], points[i, 1], points[i, 2], end)
         if before:
             k = 2 * (x1 * normal[0] + y1 * normal[1] + z1 * normal[2])
             x1, y1, z1 = x1 - k * normal[0], y1 - k * normal[1], z1 - k * normal[2]
         else:
             k = 2 * (x2 * normal[0] + y2 * normal[1] + z2 * normal[2])
             x2, y2, z2 = x2 - k * normal[0], y2 - k * normal[1], z2 - k * normal[2]
-        length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2
-        tx_radius[row], rx_radius[row] = r1, r2
+        rows.length[row], rows.rate[row], rows.accel[row] = r1 + r2, v1 + v2, a1 + a2
+        rows.tx_radius[row], rows.rx_radius[row] = r1, r2
         departure[row, 0], departure[row, 1], departure[row, 2] = x1, y1, z1
         arrival[row, 0], arrival[row, 1], arrival[row, 2] = x2, y2, z2
 
@@ -365,66 +295,32 @@ def _mirrored(u, out, n, te, tm):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(
-    index,
-    share,
-    face,
-    area,
-    normals,
-    material,
-    table,
-    coefficient,
-    lobe,
-    exponent,
-    scale,
-    normal,
-    te,
-    tm,
-    before,
-    tx_radius,
-    rx_radius,
-    departure,
-    arrival,
-    gain,
-):
+def _weigh(surfaces, face, area, share, scale, normal, slab, before, rows, gain):
     """Complex gains of ways over scatterers; the scatterers' own amplitudes left out."""
-    last = table.shape[1] - 2
+    normals, departure, arrival = surfaces.normals, rows.departure, rows.arrival
     mirror = normal[0], normal[1], normal[2]
-    for row in range(index.size):
-        f = face[index[row]]
+    for row in range(rows.index.size):
+        i = rows.index[row]
+        f, te, tm = face[i], slab[0][row], slab[1][row]
         n = normals[f, 0], normals[f, 1], normals[f, 2]
         away = departure[row, 0], departure[row, 1], departure[row, 2]
         home = -arrival[row, 0], -arrival[row, 1], -arrival[row, 2]
         if before:  # the field that reaches the scatterer has been through the mirror
             u, w = _turned(away, mirror), home
-            x, y, z = _mirrored(away, u, mirror, te[row], tm[row])
+            x, y, z = _mirrored(away, u, mirror, te, tm)
             passed = _dot((x, y, z), _upright(u))
         else:
             u, w = away, _turned(home, mirror)
             up = _upright(u)
             x, y, z = complex(up[0]), complex(up[1]), complex(up[2])
-            passed = _dot(_mirrored(w, home, mirror, te[row], tm[row]), _upright(home))
+            passed = _dot(_mirrored(w, home, mirror, te, tm), _upright(home))
         into, back = _dot(u, n), -_dot(w, n)
         if into * back <= 0:
             gain[row] = 0.0
             continue
-        m = material[f]
-        cos_i = min(abs(into), 1.0)
-        at = cos_i * (last + 1)
-        k = min(int(at), last)
-        at -= k
-        slab_te = table[m, k, 0] + at * (table[m, k + 1, 0] - table[m, k, 0])
-        slab_tm = table[m, k, 1] + at * (table[m, k + 1, 1] - table[m, k, 1])
         across = _cross(u, n)
         whole = (abs(x) ** 2 + abs(y) ** 2 + abs(z) ** 2) * _dot(across, across)
         part = min(abs(_dot((x, y, z), across)) ** 2 / whole, 1.0) if whole > 1e-24 else 0.5
-        power = coefficient[m] * (part * slab_te + (1 - part) * slab_tm) * cos_i * area[index[row]]
-        if lobe[m] < 0:
-            power *= abs(back) / np.pi
-        else:
-            norm = table[m, k, 2] + at * (table[m, k + 1, 2] - table[m, k, 2])
-            straight_on = _dot(u, w)
-            forward = max(0.5 * (1 + straight_on + 2 * into * back), 0.0) ** exponent[m]
-            way_in = max(0.5 * (1 - straight_on), 0.0) ** exponent[m]
-            power *= (lobe[m] * forward + (1 - lobe[m]) * way_in) * norm
-        gain[row] = scale * share[row] * passed * np.sqrt(power) / (tx_radius[row] * rx_radius[row])
+        power = scattered_power(surfaces, f, area[i], into, back, -_dot(u, w), part)
+        radii = rows.tx_radius[row] * rows.rx_radius[row]
+        gain[row] = scale * share[row] * passed * np.sqrt(power) / radii

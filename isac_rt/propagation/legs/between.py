@@ -12,7 +12,7 @@ Local coordinates. Import only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -51,7 +51,13 @@ class LegSet:
 
     @property
     def bounces(self) -> np.ndarray:
+        """(K,) of each chain."""
         return (self.faces >= 0).sum(axis=1)
+
+    def select(self, which: np.ndarray) -> LegSet:
+        """The legs that an index array chooses."""
+        legs = self.legs.select(which)
+        return LegSet(self.amplitude[which], legs, self.faces[which], self.planes[which])
 
 
 class TracedLegs(NamedTuple):
@@ -63,52 +69,31 @@ class TracedLegs(NamedTuple):
     duplicates: int = 0
 
 
-def pick(legs: Legs, which: np.ndarray) -> Legs:
-    """The legs that an index array chooses."""
-    return Legs(
-        *(
-            getattr(legs, name)[which]
-            for name in ("length", "rate", "accel", "departure", "arrival", "points")
-        )
-    )
-
-
 def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth: int) -> LegSet:
     """One set of (amplitude, legs, faces, planes) of chains of one length each, padded to
     `depth`."""
-    if not parts:
-        nothing = Legs(
-            np.zeros(0),
-            np.zeros(0),
-            np.zeros(0),
-            np.zeros((0, 3)),
-            np.zeros((0, 3)),
-            np.zeros((0, depth, 3)),
-        )
-        return LegSet(
-            np.zeros(0, complex),
-            nothing,
-            np.zeros((0, depth), np.int64),
-            np.zeros((0, depth), np.int64),
-        )
+    scalars, vectors = [np.zeros(0)] * 3, [np.zeros((0, 3))] * 2
+    nothing = Legs(*scalars, *vectors, np.zeros((0, depth, 3)))
+    chain = np.zeros((0, depth), np.int64)
+    parts = [(np.zeros(0, complex), nothing, chain, chain), *parts]
 
-    def padded(chain: np.ndarray) -> np.ndarray:
-        return np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1)
+    def joined(arrays: Iterable[np.ndarray], fill: float) -> np.ndarray:
+        """Padded along the second axis to `depth`."""
+        return np.concatenate(
+            [
+                np.pad(
+                    a,
+                    [(0, 0), (0, depth - a.shape[1]), *[(0, 0)] * (a.ndim - 2)],
+                    constant_values=fill,
+                )
+                for a in arrays
+            ]
+        )
 
     amplitudes, legs, faces, planes = zip(*parts, strict=True)
-    points = [
-        np.pad(p.points, ((0, 0), (0, depth - p.points.shape[1]), (0, 0)), constant_values=np.nan)
-        for p in legs
-    ]
-    length, rate, accel = (
-        np.concatenate([getattr(p, name) for p in legs]) for name in ("length", "rate", "accel")
-    )
-    departure, arrival = (
-        np.concatenate([getattr(p, name) for p in legs]) for name in ("departure", "arrival")
-    )
-    joined = Legs(length, rate, accel, departure, arrival, np.concatenate(points))
-    chains = [np.concatenate([padded(chain) for chain in part]) for part in (faces, planes)]
-    return LegSet(np.concatenate(amplitudes), joined, chains[0], chains[1])
+    *columns, points = zip(*(vars(part).values() for part in legs), strict=True)
+    every = Legs(*map(np.concatenate, columns), joined(points, np.nan))
+    return LegSet(np.concatenate(amplitudes), every, joined(faces, -1), joined(planes, -1))
 
 
 class Between:
@@ -238,7 +223,7 @@ class Between:
         parts, owners = [], []
         for part in found:
             keep = np.flatnonzero(part.alive)
-            legs, faces = pick(part.legs, keep), part.chains.faces[keep]
+            legs, faces = part.legs.select(keep), part.chains.faces[keep]
             amplitude = mirror_amplitude(
                 self._city, part.normals[keep], faces, legs, self._wavelength
             )
@@ -248,15 +233,7 @@ class Between:
         order = np.lexsort([every.legs.length, every.bounces, owner])
         edges = np.searchsorted(owner[order], np.arange(len(pairs) + 1))
         rows = [order[a:b] for a, b in itertools.pairwise(edges)]
-        return {
-            pair: LegSet(
-                every.amplitude[which],
-                pick(every.legs, which),
-                every.faces[which],
-                every.planes[which],
-            )
-            for pair, which in zip(pairs, rows, strict=True)
-        }
+        return {pair: every.select(which) for pair, which in zip(pairs, rows, strict=True)}
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,12 @@ amplitude, and the same at the edge.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation.legs.between import LegSet, leg_set, pick
+from isac_rt.propagation.legs.between import LegSet, leg_set
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.diffraction import edge_factor
 from isac_rt.propagation.legs.edges import ShadowEdges
@@ -37,7 +39,7 @@ def past_edges_and_bodies(
         parts = [(*direct[pair], empty, empty)] if pair in direct else []
         for count in range(1, depth + 1):
             which = np.flatnonzero(found.bounces == count)
-            legs_here = pick(found.legs, which)
+            legs_here = found.legs.select(which)
             ends = [np.broadcast_to(poses[name].position, (which.size, 1, 3)) for name in pair]
             chain = np.concatenate([ends[0], legs_here.points[:, :count], ends[1]], axis=1)
             amplitude = found.amplitude[which] * bodies.factor(chain, wavelength, pair)
@@ -62,7 +64,7 @@ def direct_legs(
     apart = [
         pair
         for pair in pairs
-        if np.linalg.norm(poses[pair.rx].position - poses[pair.tx].position) > 1e-9
+        if np.linalg.norm(poses[pair[1]].position - poses[pair[0]].position) > 1e-9
     ]
     starts, ends = (
         np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1)
@@ -82,14 +84,7 @@ def direct_legs(
                 2j * np.pi * (leg.length - direct.length) / wavelength
             )  # the detour's phase is in its delay
         else:
-            leg = Legs(
-                direct.length,
-                direct.rate,
-                direct.accel,
-                direct.departure,
-                direct.arrival,
-                np.full((1, 1, 3), np.nan),
-            )
+            leg = replace(direct, points=np.full((1, 1, 3), np.nan))
             chain = np.stack([start.position, end.position])[None]
         friis = wavelength / (4 * np.pi * direct.length)
         out[pair] = friis * factor * bodies.factor(chain, wavelength, pair), leg

@@ -34,6 +34,10 @@ class Legs:
     arrival: np.ndarray
     points: np.ndarray
 
+    def select(self, which: np.ndarray | slice) -> Legs:
+        """The legs that an index array or a slice chooses."""
+        return Legs(*(array[which] for array in vars(self).values()))
+
 
 def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> Legs:
     """Legs from `start` to `end` over chains of B mirrors at rest.

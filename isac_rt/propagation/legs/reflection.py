@@ -12,17 +12,17 @@ from isac_rt.world.city.mesh import City
 
 
 def slab_coefficients(
-    material: Material, cosine: np.ndarray, wavelength: float
+    material: Material, cosine: np.ndarray, wavelength: float, *, whole: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Complex reflection coefficients of a slab for TE and TM waves over the cosine of incidence
-    (ITU-R P.2040-3, eqs. 37, 43, 44), less what the material scatters."""
+    (ITU-R P.2040-3, eqs. 37, 43, 44), less what the material scatters unless `whole`."""
     omega = 2 * np.pi * SPEED_OF_LIGHT / wavelength
     eta = material.relative_permittivity - 1j * material.conductivity / (
         omega * VACUUM_PERMITTIVITY
     )
     root = np.sqrt(eta - (1 - cosine**2))
     turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
-    mirrored = np.sqrt(1 - material.scattering_coefficient**2)
+    mirrored = 1.0 if whole else np.sqrt(1 - material.scattering_coefficient**2)
     te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
     first, second = (mirrored * r * (1 - turn) / (1 - r**2 * turn) for r in (te, tm))
     return first, second

@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 
 from isac_rt.frame.cube import ReceiveArray, Reference
+from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.ways import LinkState
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Gridded
@@ -70,7 +72,7 @@ def advance(setup: Setup, frames: range) -> tuple[float, float, int]:
     for frame in frames:
         when = setup.timetable.epoch(frame)
         pose = _local(setup, when)
-        found = field.seen(*LINK, pose, pose, when)
+        found = field.seen(LinkState(Link(*LINK), when, pose, pose))
         gain = field.cells.amplitude[found.index] * found.magnitude
         power += float((found.magnitude.astype(float) ** 2).sum())
         seen = len(gain)

@@ -21,11 +21,13 @@ from scipy import ndimage
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
@@ -141,8 +143,9 @@ class Bench:
         start = replace(own, position=own.position - origin)
         end = start if passes == 2 else replace(other, position=other.position - origin)
         names = kind.clutter, kind.clutter if passes == 2 else f"{kind.clutter}-pt"
-        common = {"epoch": self.scenes.epoch, "tx": names[0], "rx": names[1], "target_names": ()}
-        paths = self.scenes.field.paths(*names, start, end, self.antennas, common)
+        paths = self.scenes.field.paths(
+            LinkState(Link(*names), self.scenes.epoch, start, end), self.antennas
+        )
         other_draw = own_rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
         paths = weeded(
             replace(paths, gain=_mean_amplitude(self.scenes, paths, names, start, end) * other_draw)
@@ -165,7 +168,7 @@ def _mean_amplitude(
     scenes: Scenes, paths: PathSet, names: tuple[str, str], start: Pose, end: Pose
 ) -> np.ndarray:
     """Root of the mean power of a field's paths, without the field's own amplitudes."""
-    seen = scenes.field.seen(*names, start, end, paths.epoch)
+    seen = scenes.field.seen(LinkState(Link(*names), paths.epoch, start, end))
     return np.abs(paths.gain / scenes.field.cells.amplitude[seen.index])
 
 

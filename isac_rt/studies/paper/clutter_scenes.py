@@ -15,10 +15,12 @@ import numpy as np
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import thermal_noise_power, transmit_amplitude
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal
@@ -154,9 +156,10 @@ class Scenes:
         """
         pose = self.pose(place, speed)
         local = replace(pose, position=pose.position - self.setup.city.origin)
-        seen = self.field.seen(place, place, local, local, self.epoch)
-        common = {"epoch": self.epoch, "tx": place, "rx": place, "target_names": ()}
-        paths = self.field.paths(place, place, local, local, self.setup.antennas, common)
+        seen = self.field.seen(LinkState(Link(place, place), self.epoch, local, local))
+        paths = self.field.paths(
+            LinkState(Link(place, place), self.epoch, local, local), self.setup.antennas
+        )
         rng = generator(self.setup.scenario.seed, "amplitudes", place, draw)
         drawn = rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
         mean = paths.gain / self.field.cells.amplitude[seen.index]

@@ -10,9 +10,11 @@ from scipy.integrate import dblquad, quad
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.level import noise_rise, thermal_noise_power
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation import FreeSpace, PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
+from isac_rt.propagation.ways import LinkState
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.swarm import Rcs
 from isac_rt.scenario.tree import Clutter
@@ -236,7 +238,9 @@ def _field_tracer(poses: dict, city: City, **clutter: Any) -> Any:
 
 def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
     field = _field_tracer(poses, city).field
-    return float((field.seen(tx, rx, poses[tx], poses[rx], 0.0).magnitude ** 2).sum())
+    return float(
+        (field.seen(LinkState(Link(tx, rx), 0.0, poses[tx], poses[rx])).magnitude ** 2).sum()
+    )
 
 
 @slow_traced(
@@ -291,7 +295,7 @@ def lambertian_wall_by_way_of_the_ground() -> float:
         "P": stage.pose((-13.1, 25.3, -6.6), boresight=(0, 1, 0)),
     }
     ways = _field_tracer(poses, city, mirrors=2).two_bounces.seen(
-        "A", "P", poses["A"], poses["P"], 0.0
+        LinkState(Link("A", "P"), 0.0, poses["A"], poses["P"])
     )
     worst, count = 0.0, 0
     for part in ways:
@@ -320,15 +324,16 @@ def lambertian_wall_by_way_of_the_ground() -> float:
 def reflectivity_of_scatterers() -> Errors:
     """Power reflectivity of a slab for both polarisations, from grazing to upright incidence, as
     the clutter field uses it."""
-    from isac_rt.propagation.clutter.field import slab_reflectivity
+    from isac_rt.propagation.legs.reflection import slab_coefficients
 
     cosines = np.array([0.03, 0.21, 0.5, 0.83, 1.0])
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (6.31, 1.21, 0.012)):
-        found = slab_reflectivity(stage.material(eps, sigma, 0.3, thickness), cosines, WAVELENGTH)
+        slab = stage.material(eps, sigma, 0.3, thickness)
+        found = np.abs(slab_coefficients(slab, cosines, WAVELENGTH, whole=True)) ** 2
         truth = np.array(
             [[abs(r) ** 2 for r in slab_reflection(eps, sigma, thickness, c)] for c in cosines]
         ).T
-        yield np.abs(np.array(found) - truth).max()
+        yield np.abs(found - truth).max()
 
 
 @traced(

@@ -12,6 +12,8 @@ import numpy as np
 import trimesh
 from scipy import ndimage, stats
 
+from isac_rt.frame.link import Link
+from isac_rt.propagation.ways import LinkState
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation import truths
@@ -81,7 +83,7 @@ class Flight:
     def seen(self, time: float) -> Any:
         """What the terminal sees."""
         pose = self.pose(time)
-        return self.field.seen("A", "A", pose, pose, time)
+        return self.field.seen(LinkState(Link("A", "A"), time, pose, pose))
 
     def waves(self, seen: Any) -> np.ndarray:
         """(K,) complex amplitude of each scatterer, carrier phase included."""
@@ -341,7 +343,7 @@ def mean_power_of_a_street() -> float:
         for rx, step in (("A", 8.0), ("P", 4.0)):
             edges = np.arange(0, 4000, step)
             truth = sionna_power(city, poses["A"].position, poses[rx].position, edges)
-            seen = field.seen("A", rx, poses["A"], poses[rx], time)
+            seen = field.seen(LinkState(Link("A", rx), time, poses["A"], poses[rx]))
             found = np.histogram(seen.length, edges, weights=seen.magnitude**2)[0]
             filled = truth > 1e-3 * truth.sum()
             cells.append(10 * np.log10(np.maximum(found[filled], 1e-30) / truth[filled]))

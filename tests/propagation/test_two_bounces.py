@@ -28,7 +28,9 @@ from test_clutter_field import (
 
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation.clutter import sionna_power
@@ -177,9 +179,12 @@ def test_each_way_against_an_oracle(pattern):
     checked = {True: 0, False: 0}
     for tx, rx in (("A", "P"), ("A", "A")):
         start, end = bodies[tx], bodies[rx]
-        common = {"epoch": 0.0, "tx": tx, "rx": rx, "target_names": ()}
-        sets = model.two_bounces.paths(tx, rx, start, end, model._free.antennas, common)
-        for part, paths in zip(model.two_bounces.seen(tx, rx, start, end, 0.0), sets, strict=True):
+        sets = model.two_bounces.paths(
+            LinkState(Link(tx, rx), 0.0, start, end), model._free.antennas
+        )
+        for part, paths in zip(
+            model.two_bounces.seen(LinkState(Link(tx, rx), 0.0, start, end)), sets, strict=True
+        ):
             if part.mirror.faces[0] < 2:  # the ground in the wall
                 continue
             for i in range(0, len(part.seen.index), 7):
@@ -258,7 +263,7 @@ def test_power_of_a_wall_by_way_of_the_ground_is_its_integral():
     for tx, rx, start, end in (("A", "A", a, a), ("A", "P", a, p)):
         by_ground = [
             s
-            for s in model.two_bounces.seen(tx, rx, poses[tx], poses[rx], 0.0)
+            for s in model.two_bounces.seen(LinkState(Link(tx, rx), 0.0, poses[tx], poses[rx]))
             if (s.mirror.normal[2] ** 2 > 0.5)
         ]
         assert [s.before for s in by_ground] == [True, False]
@@ -356,7 +361,7 @@ def test_mean_power_by_way_of_mirrors_is_sionnas(material, rays):
             city, poses[source].position, poses[sink].position, edges, rays, by_mirror=True
         )
         ours = np.zeros(edges.size - 1)
-        for part in model.two_bounces.seen(tx, rx, poses[tx], poses[rx], 0.13):
+        for part in model.two_bounces.seen(LinkState(Link(tx, rx), 0.13, poses[tx], poses[rx])):
             if part.before == before:
                 ours += np.histogram(
                     part.seen.length, edges, weights=part.seen.magnitude.astype(float) ** 2
@@ -500,10 +505,12 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
             ):
                 shares[id(m)][index] = share
             straight = model.field.sight.share("A", local, when)
-            for part in model.two_bounces.seen("A", "A", local, local, when):
+            for part in model.two_bounces.seen(LinkState(Link("A", "A"), when, local, local)):
                 if part.before:
                     q, n = part.seen, city.normals[cells.face[part.seen.index]]
-                    points, _ = model.two_bounces._chain(part, local, local)
+                    points, _ = model.two_bounces._chain(
+                        part, LinkState(Link("A", "A"), when, local, local)
+                    )
                     into = points[:, 0] - points[:, 1]
                     cosines = (
                         np.abs((into * n).sum(1))
@@ -544,12 +551,14 @@ def test_what_a_terminal_expects_of_mirrors():
     swarm = swarm_of(s)
     copy = make_expectation("map", s.clutter, swarm, city, w, antennas, s.seed)
     pose = swarm.poses(0.0)["A"]
-    parts = copy._two_bounces.seen("A", "A", pose, pose, 0.0)
-    once = len(copy._field.seen("A", "A", pose, pose, 0.0).index)
+    parts = copy._two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
+    once = len(copy._field.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)
     right, wrong = (
         copy.clutter("A", pose, 0.0, 1.0, Mistakes(mesh_std=std, seed=5)) for std in (0.0, 1e-4)
     )
-    ours = sum(power(part) for part in model.two_bounces.seen("A", "A", pose, pose, 0.0))
+    ours = sum(
+        power(part) for part in model.two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
+    )
     assert abs(10 * np.log10(right.power[once:].sum() / ours)) < 0.2
     error = 1e-4 * generator(5, "mesh error").standard_normal(city.num_faces)
     begin = once

@@ -1,0 +1,105 @@
+"""Ways from a transmitter to a receiver, and the paths that run along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.legs.geometry import Legs
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.world.swarm import Pose
+
+
+@dataclass(frozen=True)
+class Ways:
+    """K ways of waves between the ends of a link.
+
+    Attributes
+    ----------
+    length, rate, accel : (K,) [m, m/s, m/s^2]
+    tx_radius, rx_radius : (K,) of the wavefront's curvature at either end [m]
+    departure, arrival : (K, 3) unit vectors at either end, away from it
+    """
+
+    length: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+    tx_radius: np.ndarray
+    rx_radius: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+    @classmethod
+    def along(cls, leg: Legs) -> Ways:
+        """From end to end in one leg."""
+        ends = leg.length, leg.length, leg.departure, leg.arrival
+        return cls(leg.length, leg.rate, leg.accel, *ends)
+
+    @classmethod
+    def over(cls, there: Legs, back: Legs) -> Ways:
+        """By way of what scatters; `there` starts at the transmitter, `back` at the receiver."""
+        motion = there.length + back.length, there.rate + back.rate, there.accel + back.accel
+        return cls(*motion, there.length, back.length, there.departure, back.departure)
+
+
+@dataclass(frozen=True)
+class LinkState:
+    """One link at one instant.
+
+    Attributes
+    ----------
+    link : Link
+    epoch : [s]
+    start, end : poses of the transmitter and of the receiver
+    target_names : what the paths' `target` may name
+    """
+
+    link: Link
+    epoch: float
+    start: Pose
+    end: Pose
+    target_names: tuple[str, ...] = ()
+
+    def elements(self, antennas: Antennas, ways: Ways) -> np.ndarray:
+        """(K,) sqrt(G_tx G_rx) of the elements at both ends: the one place where antennas touch a
+        gain."""
+        sent = antennas.element_gain(self.start.to_body(ways.departure))
+        if self.link.own and ways.arrival is ways.departure:
+            return sent
+        return np.sqrt(sent * antennas.element_gain(self.end.to_body(ways.arrival)))
+
+    def paths(
+        self,
+        ways: Ways,
+        gain: np.ndarray,
+        kind: np.ndarray | PathKind,
+        *,
+        bounces: np.ndarray | int = 0,
+        target: np.ndarray | int = -1,
+        points: np.ndarray | None = None,
+        faces: np.ndarray | None = None,
+    ) -> PathSet:
+        """Paths along ways, with the interactions in the order in which the wave meets them."""
+        return make_paths(
+            gain=gain,
+            delay=ways.length / SPEED_OF_LIGHT,
+            delay_rate=ways.rate / SPEED_OF_LIGHT,
+            delay_accel=ways.accel / SPEED_OF_LIGHT,
+            departure=ways.departure,
+            arrival=ways.arrival,
+            tx_radius=ways.tx_radius,
+            rx_radius=ways.rx_radius,
+            kind=kind,
+            target=target,
+            bounces=bounces,
+            points=points,
+            faces=faces,
+            tx=self.link.tx,
+            rx=self.link.rx,
+            epoch=self.epoch,
+            target_names=self.target_names,
+        )
