@@ -10,7 +10,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.scenario import environment
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def make_propagation(
     clutter: environment.Clutter,
     swarm: Swarm,
     free: FreeSpace,
-    city: City,
+    city: CityMesh,
     waveform: Waveform,
     instants: Sequence[float] = (),
 ) -> Propagation:

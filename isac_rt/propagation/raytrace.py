@@ -56,7 +56,7 @@ from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter, Propagation
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scene
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -82,7 +82,7 @@ class RayTracer:
         clutter: Clutter,
         swarm: Swarm,
         free: FreeSpace,
-        city: City,
+        city: CityMesh,
         carrier: float,
         instants: Sequence[float] = (),
     ) -> None:

@@ -39,7 +39,7 @@ from isac_rt.simulation.plan import (
 )
 from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.simulate import stage_seconds
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 if TYPE_CHECKING:
@@ -438,7 +438,7 @@ def _flight_error(setup: Setup, frame: int, link: Link, kept: PathSet) -> float:
     return float(2 * np.pi * setup.waveform.effective_carrier * error.max())
 
 
-def delays(paths: PathSet, poses: dict[str, Pose], city: City) -> np.ndarray:
+def delays(paths: PathSet, poses: dict[str, Pose], city: CityMesh) -> np.ndarray:
     """(K,) delays of the same chains and scatterers with the bodies elsewhere [s]."""
     local = {
         name: replace(pose, position=pose.position - city.origin) for name, pose in poses.items()
@@ -459,7 +459,7 @@ def delays(paths: PathSet, poses: dict[str, Pose], city: City) -> np.ndarray:
     return out / SPEED_OF_LIGHT
 
 
-def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: City) -> np.ndarray:
+def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.ndarray:
     """(K,) lengths of unfolded chains (K, B), -1 where a chain is shorter [m]."""
     out = np.zeros(len(faces))
     normals, offsets = (

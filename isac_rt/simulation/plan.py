@@ -41,7 +41,7 @@ from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
 from isac_rt.signal.choice import CostModel
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Gridded, Method
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 FASTEST_UNTRACED_M = 4.0
@@ -386,7 +386,7 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
     }
 
 
-def extent(city: City, census: Census, clutter: Clutter) -> dict[str, Any]:
+def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
     """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in
     summary.json.
 

@@ -46,7 +46,7 @@ from isac_rt.simulation.preflight import (
 )
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
 from isac_rt.world.area import city_about
-from isac_rt.world.city import City
+from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 
@@ -170,7 +170,7 @@ class Setup:
     waveform: Waveform
     antennas: Antennas
     swarm: Swarm
-    city: City
+    city: CityMesh
     propagation: Propagation
     reference: FreeSpace
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
@@ -447,14 +447,16 @@ def swarm_of(scenario: Scenario) -> Swarm:
     return Swarm(scenario.swarm, scenario.flight_duration_s, successors)
 
 
-def city_of(scenario: Scenario, radius: float = np.inf) -> City:
+def city_of(scenario: Scenario, radius: float = np.inf) -> CityMesh:
     """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object
     again for equal scenarios."""
     centre, carrier = swarm_of(scenario).middle, scenario.radio.carrier_hz
     return city_about(centre, scenario.city, scenario.folder, carrier, radius)
 
 
-def propagation_in(city: City, scenario: Scenario, instants: Sequence[float] = ()) -> Propagation:
+def propagation_in(
+    city: CityMesh, scenario: Scenario, instants: Sequence[float] = ()
+) -> Propagation:
     """The scenario's propagation model in a city, which need not be the scenario's own."""
     waveform, swarm = waveform_of(scenario), swarm_of(scenario)
     antennas = antennas_of(scenario, waveform)

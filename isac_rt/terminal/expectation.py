@@ -21,7 +21,7 @@ from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.environment import Clutter
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 
@@ -51,7 +51,7 @@ class MeshExpectation:
         self,
         clutter: Clutter,
         swarm: Swarm,
-        city: City,
+        city: CityMesh,
         scene: mi.Scene,
         antennas: Antennas,
         wavelength: float,
@@ -151,7 +151,7 @@ def make_expectation(
     detector: str,
     clutter: Clutter,
     swarm: Swarm,
-    city: City,
+    city: CityMesh,
     waveform: Waveform,
     antennas: Antennas,
     seed: int,

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from isac_rt.terminal.tracker import TrackSet
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 SMALLEST_WALL = 20.0
@@ -38,7 +38,7 @@ estimates."""
 class Walls:
     """A mesh as a terminal uses it, in world coordinates."""
 
-    city: City
+    city: CityMesh
 
     @cached_property
     def mirrors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

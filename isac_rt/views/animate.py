@@ -15,7 +15,7 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.results.files import ResultsError, write_bytes
 from isac_rt.results.recorder import Results
 from isac_rt.views.figures import STYLE, range_doppler, scene_map, uav_colour
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
 _STYLE = STYLE | {"figure.constrained_layout.use": False}
@@ -49,7 +49,7 @@ def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndar
 
 
 def animate(
-    results: Results, observer: int = 0, city: City | None = None
+    results: Results, observer: int = 0, city: CityMesh | None = None
 ) -> tuple[Figure, FuncAnimation]:
     """A picture per frame whose maps were kept (`run(snapshots=)`): left the swarm so far with the
     terminal's tracks, right its map.
@@ -124,7 +124,7 @@ def write_animation(
     results: Results,
     file: str | Path,
     observer: int = 0,
-    city: City | None = None,
+    city: CityMesh | None = None,
     rate: float = 5.0,
 ) -> None:
     """Write the moving picture as GIF or, where there is ffmpeg, MP4; it appears whole or not at

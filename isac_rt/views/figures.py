@@ -20,7 +20,7 @@ from isac_rt.results.dataset import MEASURES, errors_of
 from isac_rt.results.files import write_bytes
 from isac_rt.results.recorder import Results
 from isac_rt.results.records import KINDS
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 KIND_COLOURS = {
     "line_of_sight": "#000000",
@@ -88,7 +88,7 @@ def uav_colour(dataset: xr.Dataset, index: int) -> str:
     return UAV_COLOURS[index % len(UAV_COLOURS)]
 
 
-def scene_map(ax: Axes, dataset: xr.Dataset, city: City | None = None) -> Axes:
+def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Axes:
     """The swarm from above: tracks, final positions by role, over the city's upward faces shaded by
     height."""
     position = dataset.uav_position.values
@@ -139,7 +139,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: City | None = None) -> Axes:
     return ax
 
 
-def _footprints(ax: Axes, city: City) -> None:
+def _footprints(ax: Axes, city: CityMesh) -> None:
     corners = city.corners + city.origin
     up = np.abs(city.normals[:, 2]) > 0.2
     triangles = corners[up]
@@ -503,7 +503,7 @@ def _figure(
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
+def _all(results: Results, city: CityMesh | None) -> Iterable[tuple[str, Figure]]:
     d = results.dataset
     observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
     shots = sorted({0, kept // 2, kept - 1}) if kept else []
@@ -559,7 +559,7 @@ def _all(results: Results, city: City | None) -> Iterable[tuple[str, Figure]]:
     yield "link", figure
 
 
-def make_figures(results: Results, folder: str | Path, city: City | None = None) -> list[Path]:
+def make_figures(results: Results, folder: str | Path, city: CityMesh | None = None) -> list[Path]:
     """Write all figures of a run as ``figures/*.png`` under `folder`; the scene shows the `city` if
     it is given.
 

@@ -16,7 +16,7 @@ from isac_rt.propagation import PathKind, PathSet
 from isac_rt.results.files import write_text
 from isac_rt.views.figures import KIND_COLOURS, UAV_COLOURS, words
 from isac_rt.views.render import polyline
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 
 
 def scene_3d(
-    city: City,
+    city: CityMesh,
     swarm: Swarm,
     times: np.ndarray,
     time: float,
@@ -119,7 +119,7 @@ def scene_3d(
     return figure
 
 
-def _mesh(city: City, tracks: np.ndarray, reach: float) -> dict[str, object]:
+def _mesh(city: CityMesh, tracks: np.ndarray, reach: float) -> dict[str, object]:
     """The faces near the swarm, lighter the higher."""
     corners = city.corners + city.origin
     low, high = tracks[..., :2].min((0, 1)) - reach, tracks[..., :2].max((0, 1)) + reach

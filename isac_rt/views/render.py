@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_bytes
 from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, UAV_COLOURS, words
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 ELEVATION = np.deg2rad(38.0)
@@ -135,7 +135,7 @@ def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 
     return p[..., 2] > depth[row, column] + slack
 
 
-def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Picture (height, width, 3) of the city in [0, 1] and its depth buffer; row 0 is the
     bottom."""
     corners = city.corners + city.origin
@@ -178,7 +178,7 @@ def shade(city: City, view: View, width: int, height: int) -> tuple[np.ndarray, 
     return picture, depth
 
 
-def best_view(city: City, tracks: np.ndarray, aspect: float) -> View:
+def best_view(city: CityMesh, tracks: np.ndarray, aspect: float) -> View:
     """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3)
     [m]."""
     low, high = tracks.reshape(-1, 3).min(axis=0), tracks.reshape(-1, 3).max(axis=0)
@@ -338,7 +338,7 @@ def _draw_swarm(
 
 
 def view_scene(
-    city: City,
+    city: CityMesh,
     swarm: Swarm,
     times: np.ndarray,
     time: float,

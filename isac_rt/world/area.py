@@ -12,7 +12,7 @@ import numpy as np
 
 from isac_rt.scenario import environment
 from isac_rt.scenario.file import plain_tree
-from isac_rt.world.city import City, load_city
+from isac_rt.world.city import CityMesh, load_city
 
 
 def city_about(
@@ -21,7 +21,7 @@ def city_about(
     folder: Path,
     carrier: float,
     radius: float = np.inf,
-) -> City:
+) -> CityMesh:
     """A scenario's city about a place (3,), as far as `radius` [m]; the same object again for equal
     arguments.
 
@@ -36,14 +36,14 @@ def city_about(
 
 
 @lru_cache(maxsize=2)
-def _near_city(radius: float, *of: Any) -> City:
+def _near_city(radius: float, *of: Any) -> CityMesh:
     return _loaded_city(*of).within(radius)
 
 
 @lru_cache(maxsize=2)
 def _loaded_city(
     text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]
-) -> City:
+) -> CityMesh:
     tree = environment.City.model_validate(json.loads(text)) if text else None
     return load_city(tree, folder, carrier, centre)
 

@@ -9,7 +9,7 @@ import pytest
 from isac_rt import scenario
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city import CityMesh, Material, load_city
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -43,7 +43,7 @@ def swarm_over(a, p, u, **changes) -> scenario.Scenario:
     return scenario.Scenario.model_validate(tree)
 
 
-def tracer(s: scenario.Scenario, city: City, instants=()):
+def tracer(s: scenario.Scenario, city: CityMesh, instants=()):
 
     return propagation_in(city, s, instants)
 
@@ -153,7 +153,7 @@ def test_a_path_dies_where_its_wall_ends():
     passes 3 m. Planted bug: the test behind the wall left out (it lives on)."""
     corners = np.array([[7.0, -40, -20], [7, 3, -20], [7, 3, 40], [7, -40, 40]])
     material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
-    city = City(
+    city = CityMesh(
         "wall",
         corners,
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -182,7 +182,7 @@ def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
     Planted bug: no ray tested at all."""
     corners = np.array([[2.0, 0, -20], [60, 0, -20], [60, 0, 40], [2, 0, 40]])
     material = Material("slab", 5.31, 1.9, 0.0, "lambertian", 1, 0.1, "test")
-    city = City(
+    city = CityMesh(
         "screen",
         corners,
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),

@@ -16,7 +16,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.world.city import City, load_city
+from isac_rt.world.city import CityMesh, load_city
 
 pytestmark = pytest.mark.sionna
 C, F_C = 299_792_458.0, 77e9
@@ -38,7 +38,7 @@ SHARE = 0.4
 
 
 @cache
-def crossing() -> City:
+def crossing() -> CityMesh:
     return load_city(CROSSING, ".", F_C, (0.4, -0.3, 0.2))
 
 
@@ -74,7 +74,7 @@ class Separate:
     ray caster."""
 
     def __init__(
-        self, city: City, points: np.ndarray, strength: np.ndarray, normals: np.ndarray
+        self, city: CityMesh, points: np.ndarray, strength: np.ndarray, normals: np.ndarray
     ) -> None:
         self.points, self.strength, self.normals = points, strength, normals
         self.caster = trimesh.ray.ray_triangle.RayMeshIntersector(

@@ -25,7 +25,7 @@ from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import seed_sequence
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
@@ -37,15 +37,15 @@ PLACES = np.array([[0.7, -5.1, 8.3], [1.9, 6.2, 8.9]])
 DENSITY = Density(0.05, 0.07)
 
 
-def canyon(centre=(0.31, -0.17, 0.9)) -> City:
+def canyon(centre=(0.31, -0.17, 0.9)) -> CityMesh:
     return load_city(CANYON, ".", F_C, centre)
 
 
-def all_cells(city: City, seed: int = 3, places=PLACES):
+def all_cells(city: CityMesh, seed: int = 3, places=PLACES):
     return cut(city, np.ones(city.num_faces, bool), places - city.origin, DENSITY, seed)
 
 
-def permuted(city: City, seed: int) -> City:
+def permuted(city: CityMesh, seed: int) -> CityMesh:
     """The same triangles in another order, each begun at another corner and some turned over."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(city.num_faces)
@@ -181,10 +181,10 @@ def slab(**changes) -> Material:
 METAL = slab(conductivity=1e7)
 
 
-def rectangle(corner, along, across, material: Material) -> City:
+def rectangle(corner, along, across, material: Material) -> CityMesh:
     p, a, b = (np.array(v, float) for v in (corner, along, across))
     vertices = np.array([p, p + a, p + a + b, p + b])
-    return City(
+    return CityMesh(
         "wall",
         vertices,
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -195,7 +195,7 @@ def rectangle(corner, along, across, material: Material) -> City:
 
 
 def flown(
-    city: City,
+    city: CityMesh,
     a=(0.0, 0.0, 0.0),
     p=(1.0, 0.0, 0.0),
     speed_a=(0.0, 0.0, 0.0),
@@ -395,7 +395,7 @@ def test_each_scatterer_against_an_oracle(name):
 # ---- what a terminal expects of it
 
 
-def expectation(city: City, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
+def expectation(city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     """A terminal's own copy of the mesh and its pose; isotropic elements of 0 dBi."""
     from isac_rt.terminal.expectation import make_expectation
 

@@ -22,7 +22,7 @@ from isac_rt.simulation.preflight import check_flights, warn_of_aliases
 from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.truths import WAVELENGTH, chain_length
-from isac_rt.world.city import City, load_city
+from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, clean
 
@@ -33,12 +33,12 @@ CONCRETE = stage.material()
 
 
 def found(
-    mesh: City, a, p, u=FAR, bounces: int = 1, link=("A", "P"), moving: bool = False
+    mesh: CityMesh, a, p, u=FAR, bounces: int = 1, link=("A", "P"), moving: bool = False
 ) -> PathSet:
     return stage.tracer(mesh, bounces).trace(stage.swarm(a, p, u, moving), 0.0, [link]).paths[link]
 
 
-def wall(material=CONCRETE) -> City:
+def wall(material=CONCRETE) -> CityMesh:
     """A wall at x = 11.3, 40 m wide, from the ground to 30 m."""
     return stage.rectangle((11.3, -20, 0), (0, 40, 0), (0, 0, 30), material)
 
@@ -128,7 +128,7 @@ def test_coincident_walls_reflect_once_or_twice_but_never_more(apart):
         [[11.3, -20, 0], [11.3, 20, 0], [11.3, 20, 30], [11.3, -20, 30], [11.3, 1, 14]]
     ) + np.array([apart, 0, 0])
     faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], np.int32)
-    mesh = City(
+    mesh = CityMesh(
         "twice",
         np.concatenate([one.vertices, other]),
         np.concatenate([one.faces, faces + 4]).astype(np.int32),
@@ -162,7 +162,7 @@ def test_sheets_that_share_an_edge():
         float,
     )
     faces = np.array([[0, 1, 2], [1, 3, 2], [0, 4, 1], [1, 4, 5], [0, 6, 1], [1, 6, 7]], np.int32)
-    mesh = City("fan", points, faces, np.zeros(6, np.int16), (CONCRETE,), np.zeros(3))
+    mesh = CityMesh("fan", points, faces, np.zeros(6, np.int16), (CONCRETE,), np.zeros(3))
     a, p = (-4.4, 2.1, 9.7), (-3.3, 7.9, 8.8)
     paths = specular(found(mesh, a, p))
     assert C * paths.delay == pytest.approx(

@@ -10,7 +10,7 @@ import pytest
 
 from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.propagation.legs.reflection import mirror_amplitude, slab_coefficients, vertical
-from isac_rt.world.city import City, Material
+from isac_rt.world.city import CityMesh, Material
 from isac_rt.world.swarm import Pose
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
@@ -53,7 +53,7 @@ def test_slab_is_the_sum_of_its_echoes():
             assert np.abs(found).max() > 0.1
 
 
-def facets(normals, offsets, materials) -> City:
+def facets(normals, offsets, materials) -> CityMesh:
     """One large triangle in each plane."""
     corners = []
     for n, d in zip(np.asarray(normals, float), offsets, strict=True):
@@ -61,7 +61,7 @@ def facets(normals, offsets, materials) -> City:
         a /= np.linalg.norm(a)
         corners.append(d * n + 100 * np.array([a, np.cross(n, a), -a - np.cross(n, a)]))
     faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-    return City(
+    return CityMesh(
         "facets",
         np.concatenate(corners),
         faces,

@@ -17,7 +17,7 @@ from isac_rt.propagation.legs.geometry import (
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario.swarm import Rcs, Uav
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, attitude
 
 C = 299_792_458.0
@@ -221,14 +221,14 @@ def test_all_triangles_of_a_wall_are_one_mirror():
         [(0, 0, 0), (9.1, 0, 0), (9.1, 5.3, 0), (0, 7.7, 5e-7), (0, 0, 3.0), (9.1, 0, 3.0)], float
     )
     faces = np.array([(0, 1, 2), (0, 2, 3), (0, 1, 5), (0, 5, 4)], np.int32)
-    city = City("tilted", vertices, faces, np.zeros(4, np.int16), (), np.zeros(3))
+    city = CityMesh("tilted", vertices, faces, np.zeros(4, np.int16), (), np.zeros(3))
     assert city.areas[1] > city.areas[0]
     normals, offsets = plane_of_each_face(city)
     assert np.array_equal(normals[0], city.normals[1])
     assert np.array_equal(normals[1], city.normals[1])
     assert offsets[0] == offsets[1] == city.plane_offsets[1]
     assert np.abs(normals[2:, 2]).max() < 1e-12
-    empty = City(
+    empty = CityMesh(
         "none", np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int16), (), np.zeros(3)
     )
     assert [a.shape for a in plane_of_each_face(empty)] == [(0, 3), (0,)]

@@ -15,7 +15,7 @@ from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import FreeSpace, PathKind, PathSet
 from isac_rt.simulation.setup import propagation_in
-from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.city.mesh import empty_city
 from isac_rt.world.swarm import Pose, attitude
 
@@ -47,7 +47,7 @@ def swarm_of(a, p, u) -> dict[str, Pose]:
     }
 
 
-def tracer(mesh: City, bounces: int = 2, **changes):
+def tracer(mesh: CityMesh, bounces: int = 2, **changes):
     """A ray tracer in a mesh (whatever city the scenario names), with isotropic elements of 0 dBi,
     and its scenario."""
     rcs = {"model": "constant", "value_dbsm": -11.7}
@@ -69,7 +69,7 @@ def tracer(mesh: City, bounces: int = 2, **changes):
     return propagation_in(mesh, s), s
 
 
-def builtin(name: str, centre=(0.31, -0.17, 0.9)) -> City:
+def builtin(name: str, centre=(0.31, -0.17, 0.9)) -> CityMesh:
     return load_city(scenario.City(source="builtin", name=name), ".", F_C, centre)
 
 
@@ -79,12 +79,12 @@ def slab(permittivity=5.31, conductivity=1.9, scattering=0.0, thickness=0.1) -> 
     )
 
 
-def rectangle(corner, along, across, material: Material, origin=(0.0, 0.0, 0.0)) -> City:
+def rectangle(corner, along, across, material: Material, origin=(0.0, 0.0, 0.0)) -> CityMesh:
     """One flat wall of two triangles; world coordinates."""
     p, a, b = (np.array(v, float) for v in (corner, along, across))
     vertices = np.array([p, p + a, p + a + b, p + b]) - np.array(origin)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return City(
+    return CityMesh(
         "wall", vertices, faces, np.zeros(2, np.int16), (material,), np.array(origin, float)
     )
 
@@ -109,7 +109,7 @@ class Images:
 
     MARGIN = 2e-3  # [m] nearer than this to the edge of a face, or of a shadow, a path is not sure
 
-    def __init__(self, city: City) -> None:
+    def __init__(self, city: CityMesh) -> None:
         self.corners = city.corners + city.origin
         a, b, c = np.moveaxis(self.corners, 1, 0)
         n = np.cross(b - a, c - a)
@@ -478,7 +478,7 @@ def test_a_corner_returns_one_image_to_its_radar(walls):
         vertices[:, 2] = np.maximum(vertices[:, 2], 0)
         vertices = np.concatenate([vertices, 40 * np.array([(1.0, 1.0, 0.0)])])
         faces += [(0, 2, 6), (0, 6, 4)]
-    mesh = City(
+    mesh = CityMesh(
         "corner",
         vertices @ turn.T + corner,
         np.array(faces, np.int32),

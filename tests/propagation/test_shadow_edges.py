@@ -19,7 +19,7 @@ from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in
-from isac_rt.world.city import City
+from isac_rt.world.city import CityMesh
 from isac_rt.world.city.mesh import empty_city
 from isac_rt.world.swarm import Pose
 
@@ -28,7 +28,7 @@ C, F_C = 299_792_458.0, 77e9
 LAMBDA = C / F_C
 
 
-def tracer(city: City, **radii):
+def tracer(city: CityMesh, **radii):
     """A tracer for A (active), P (passive) and the target U, isotropic elements of 0 dBi, no mirror
     reflections."""
     uavs = {

@@ -35,20 +35,20 @@ from isac_rt.randomness import generator
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation.clutter import sionna_power
 from isac_rt.terminal.expectation import Mistakes, make_expectation
-from isac_rt.world.city import City, Material, load_city
+from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 
 pytestmark = pytest.mark.sionna
 
 
-def joined(*parts: City) -> City:
+def joined(*parts: CityMesh) -> CityMesh:
     """Several meshes in one, each with its own material."""
     shift = np.cumsum([0] + [len(p.vertices) for p in parts])
     faces = np.concatenate([p.faces + s for p, s in zip(parts, shift, strict=False)]).astype(
         np.int32
     )
     material = np.repeat(np.arange(len(parts)), [p.num_faces for p in parts]).astype(np.int16)
-    return City(
+    return CityMesh(
         "several",
         np.concatenate([p.vertices for p in parts]),
         faces,
@@ -385,7 +385,7 @@ class Separate:
     Lambert on metal, images of the scatterers (not of the terminal) in the planes of faces, shadows
     and mirrors by trimesh's ray caster."""
 
-    def __init__(self, city: City, points, strength, normals, planes) -> None:
+    def __init__(self, city: CityMesh, points, strength, normals, planes) -> None:
         self.points, self.strength, self.normals, self.planes, self.city = (
             points,
             strength,

@@ -15,7 +15,7 @@ from isac_rt.simulation import simulate
 from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.plan import extent, mechanisms
 from isac_rt.simulation.setup import city_of, prepare, propagation_in
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 SHORT = {"groups": 1, "samples_per_chirp": 256, "chirps_per_frame": 12}
 """A waveform that hears no farther than 66 m."""
@@ -56,7 +56,7 @@ def district(seed: int, **changes: Any) -> Scenario:
     return Scenario.model_validate(tree)
 
 
-def places(paths: PathSet, city: City, kind: PathKind) -> set[tuple[int, ...]]:
+def places(paths: PathSet, city: CityMesh, kind: PathKind) -> set[tuple[int, ...]]:
     """Of each path of one kind its delay and its points, in whole micrometres of way and
     millimetres of place."""
     some = paths.select(paths.kind == kind)

@@ -14,7 +14,7 @@ from isac_rt.studies.paper.ghosts import explained_tracks, run, verdicts, whole_
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.ghosts import Walls, echoes, reflections, suspicion
 from isac_rt.terminal.tracker import Track, track_set
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 ORIGIN = np.array([310.7, -120.3, 41.9])
@@ -27,11 +27,11 @@ BODY = np.array([4.6, 24.7, 6.9, -1.3, -2.2, 0.4])
 """Local position and velocity of a body before the wall."""
 
 
-def wall() -> City:
+def wall() -> CityMesh:
     corners = np.array(
         [[WALL_X, 2.0, -6.0], [WALL_X, 40.0, -6.0], [WALL_X, 40.0, 13.0], [WALL_X, 2.0, 13.0]]
     )
-    return City(
+    return CityMesh(
         "wall",
         corners,
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),

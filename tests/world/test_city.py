@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
-from isac_rt.world.city import City, CityError, load_city
+from isac_rt.world.city import CityError, CityMesh, load_city
 from isac_rt.world.city.extrude import building
 from isac_rt.world.city.footprints import is_lonlat
 from isac_rt.world.city.materials import (
@@ -53,7 +53,7 @@ def write(folder: Path, *features, name: str = "town.geojson") -> Path:
     return folder
 
 
-def solid(city: City, chosen: np.ndarray) -> trimesh.Trimesh:
+def solid(city: CityMesh, chosen: np.ndarray) -> trimesh.Trimesh:
     return trimesh.Trimesh(city.vertices, city.faces[chosen], process=True)
 
 
@@ -272,7 +272,7 @@ def test_faces_of_one_wall_share_a_plane_whichever_way_they_face():
         np.concatenate(triangles), np.arange(15).reshape(5, 3), MaterialUse("concrete")
     )
     vertices, faces, _, _, tolerance = clean([surface], "walls", np.zeros(3), None)
-    city = City("walls", vertices, faces, np.zeros(5, np.int16), (), np.zeros(3), (), tolerance)
+    city = CityMesh("walls", vertices, faces, np.zeros(5, np.int16), (), np.zeros(3), (), tolerance)
     planes = city.plane_of_face
     assert planes[0] == planes[1] == planes[2]
     assert len({planes[0], planes[3], planes[4]}) == 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.world.city import City, load_city
+from isac_rt.world.city import CityMesh, load_city
 
 pytestmark = pytest.mark.sionna
 F_C = 77e9
@@ -46,7 +46,7 @@ def trace(handle, tx, rx, depth=2, **flags):
     return handle.face_index(objects, primitives), points, hits.reshape(shape)[:, kept], gain
 
 
-def assert_points_lie_in_their_faces(city: City, faces: np.ndarray, points: np.ndarray) -> None:
+def assert_points_lie_in_their_faces(city: CityMesh, faces: np.ndarray, points: np.ndarray) -> None:
     a, b, c = np.moveaxis(city.corners[faces], -2, 0)
     off = np.einsum("...i,...i->...", city.normals[faces], points - a)
     assert np.abs(off).max() < FLOAT32

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from isac_rt.randomness import seed_sequence, splitmix64
 from isac_rt.scenario.environment import Clutter
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 UNIT = 1e-6 * np.sqrt(2)
 """World coordinates are hashed in whole multiples of this [m]. Irrational, so that no coordinate of
@@ -97,13 +97,13 @@ class Cells:
 
 
 def cut(
-    city: City, scattering: np.ndarray, places: np.ndarray, density: Density, seed: int
+    city: CityMesh, scattering: np.ndarray, places: np.ndarray, density: Density, seed: int
 ) -> Cells:
     """All scatterers of a city.
 
     Parameters
     ----------
-    city : City
+    city : CityMesh
     scattering : (F,) bool, faces that scatter at all
     places : (K, 3) points along the flights of the whole run, local coordinates [m]
     density : Density

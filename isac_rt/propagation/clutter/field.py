@@ -48,7 +48,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.materials import Material
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 TABLE = 4097
@@ -123,7 +123,7 @@ class ClutterField:
     it."""
 
     def __init__(
-        self, city: City, cells: Cells, sight: Sight, wavelength: float, num_candidates: int
+        self, city: CityMesh, cells: Cells, sight: Sight, wavelength: float, num_candidates: int
     ) -> None:
         self._city, self.sight = city, sight
         self.cells = cells
@@ -137,7 +137,7 @@ class ClutterField:
         cls,
         clutter: Clutter,
         swarm: Swarm,
-        city: City,
+        city: CityMesh,
         scene: mi.Scene,
         wavelength: float,
         seed: int,
@@ -235,7 +235,7 @@ def _ever_seen(
     return kept
 
 
-def surfaces(city: City, wavelength: float) -> Surfaces:
+def surfaces(city: CityMesh, wavelength: float) -> Surfaces:
     """Tables of a city's materials."""
     cosine = np.linspace(0.0, 1.0, TABLE)
     table = []

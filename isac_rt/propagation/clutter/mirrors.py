@@ -26,7 +26,7 @@ from isac_rt.propagation.clutter.sight import LIFT, Flight, Shadows
 from isac_rt.propagation.legs.geometry import plane_of_each_face
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 PLACES = 16
@@ -69,7 +69,7 @@ class Mirror:
 
 
 def strongest(
-    city: City, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int
+    city: CityMesh, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int
 ) -> tuple[list[Mirror], float]:
     """The mirrors that send on the most of what a terminal radiates on its flight, strongest first,
     at most `most`; and the share that all others send on."""

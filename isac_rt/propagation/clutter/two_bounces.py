@@ -35,7 +35,7 @@ from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 KNOTS_KEPT = 16
@@ -66,7 +66,7 @@ class TwoBounces:
     def __init__(
         self,
         field: ClutterField,
-        city: City,
+        city: CityMesh,
         mirrors: dict[str, tuple[list[Mirror], float]],
         wavelength: float,
     ) -> None:
@@ -79,7 +79,7 @@ class TwoBounces:
 
     @classmethod
     def plan(
-        cls, field: ClutterField, city: City, wavelength: float, seed: int, most: int
+        cls, field: ClutterField, city: CityMesh, wavelength: float, seed: int, most: int
     ) -> TwoBounces:
         """Choose each terminal's mirrors, at most `most`, for the whole of its flight."""
         mirrors = {

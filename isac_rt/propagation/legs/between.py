@@ -23,7 +23,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.sight import LIFT, _rows
 from isac_rt.propagation.legs.geometry import EDGE, Legs, unfold
 from isac_rt.propagation.legs.reflection import mirror_amplitude
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 PROPER = 1e-9
@@ -103,7 +103,7 @@ class Between:
     ----------
     instants : (I,) traced instants in rising order [s]
     trace : traces an instant
-    city : City
+    city : CityMesh
     mirrors : normals (F, 3) and offsets (F,) of the plane that each face lies in
     scene : for rays
     wavelength : [m]
@@ -113,7 +113,7 @@ class Between:
         self,
         instants: np.ndarray,
         trace: Callable[[float], TracedLegs],
-        city: City,
+        city: CityMesh,
         mirrors: tuple[np.ndarray, np.ndarray],
         scene: mi.Scene,
         wavelength: float,

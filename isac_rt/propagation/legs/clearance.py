@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from isac_rt.world.city.mesh import City, distance_to_triangles
+from isac_rt.world.city.mesh import CityMesh, distance_to_triangles
 
 CLEARANCE = 0.01
 """Sionna's rays start a little off where they should: a transmitter within a millimetre of a wall
@@ -21,7 +21,7 @@ class ClearanceWarning(UserWarning):
 class Clearance:
     """Watches the bodies of a run and warns once of each that comes too near to the city."""
 
-    def __init__(self, city: City) -> None:
+    def __init__(self, city: CityMesh) -> None:
         self._city = city
         self._warned: set[str] = set()
 

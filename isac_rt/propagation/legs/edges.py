@@ -18,7 +18,7 @@ import numpy as np
 
 from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 BESIDE = 0.01
 """How far beside an edge rays are sent that find out which side of it is free [m]; float32 rays are
@@ -44,7 +44,7 @@ class Edges:
     wings: np.ndarray
 
     @classmethod
-    def of(cls, city: City) -> Edges:
+    def of(cls, city: CityMesh) -> Edges:
         """All edges of a city, flat ones left out; one between more than two faces stands there for
         each pair of neighbours in the list."""
         faces = city.faces.astype(np.int64)
@@ -86,7 +86,7 @@ class Bends:
 class ShadowEdges:
     """Finds the edges of one city that shade or brush straight paths."""
 
-    def __init__(self, city: City, shadows: Shadows, wavelength: float) -> None:
+    def __init__(self, city: CityMesh, shadows: Shadows, wavelength: float) -> None:
         self._edges, self._shadows, self._wavelength = Edges.of(city), shadows, wavelength
 
     def bends(self, starts: np.ndarray, ends: np.ndarray) -> Bends:

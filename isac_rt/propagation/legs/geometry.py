@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 
@@ -100,7 +100,7 @@ def straight(
     return Legs(length, rate, accel, e, -e, np.zeros((points.shape[0], 0, 3)))
 
 
-def plane_of_each_face(city: City) -> tuple[np.ndarray, np.ndarray]:
+def plane_of_each_face(city: CityMesh) -> tuple[np.ndarray, np.ndarray]:
     """Normals (F, 3) and offsets (F,) of the planes that faces lie in: those of the plane's largest
     face.
 

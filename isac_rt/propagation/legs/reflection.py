@@ -8,7 +8,7 @@ import numpy as np
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.legs.geometry import Legs
 from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 
 def slab_coefficients(
@@ -41,7 +41,7 @@ def vertical(direction: np.ndarray) -> np.ndarray:
 
 
 def mirror_amplitude(
-    city: City, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float
+    city: CityMesh, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float
 ) -> np.ndarray:
     """(K,) complex amplitudes of unfolded chains between isotropic vertical elements, without the
     carrier phase.

@@ -22,7 +22,7 @@ from isac_rt.simulation.setup import propagation_in
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, slab_reflection
-from isac_rt.world.city import City
+from isac_rt.world.city import CityMesh
 from isac_rt.world.city.materials import Material, resolve_materials, water_permittivity
 from isac_rt.world.city.materials import MaterialUse as Use
 
@@ -71,7 +71,7 @@ def radar_equation() -> Errors:
         yield abs(10 * np.log10(power) - truth)
 
 
-def _ground(conductivity: float, permittivity: float = 5.31) -> City:
+def _ground(conductivity: float, permittivity: float = 5.31) -> CityMesh:
     return stage.rectangle(
         (-900, -900, 0), (1800, 0, 0), (0, 1800, 0), stage.material(permittivity, conductivity)
     )
@@ -142,7 +142,7 @@ def conducting_corner() -> float:
         + corner
     )
     faces = np.array([(0, 2, 3), (0, 3, 1), (0, 1, 5), (0, 5, 4)], np.int32)
-    mesh = City(
+    mesh = CityMesh(
         "corner",
         points,
         faces,
@@ -225,7 +225,7 @@ def ghosts_over_a_conducting_wall() -> float:
     return float(np.abs(found / expected - 1).max()) if found.size == 4 else np.inf
 
 
-def _field_tracer(poses: dict, city: City, **clutter: Any) -> Any:
+def _field_tracer(poses: dict, city: CityMesh, **clutter: Any) -> Any:
     where = {
         n: {"role": r, "position_m": poses[n].position.tolist()}
         for n, r in (("A", "active"), ("P", "passive"))
@@ -236,7 +236,7 @@ def _field_tracer(poses: dict, city: City, **clutter: Any) -> Any:
     return propagation_in(city, s)
 
 
-def _field_power(tx: str, rx: str, poses: dict, city: City) -> float:
+def _field_power(tx: str, rx: str, poses: dict, city: CityMesh) -> float:
     field = _field_tracer(poses, city).field
     return float(
         (field.seen(LinkState(Link(tx, rx), 0.0, poses[tx], poses[rx])).magnitude ** 2).sum()
@@ -282,7 +282,7 @@ def lambertian_wall_by_way_of_the_ground() -> float:
     wall = stage.rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), metal)
     ground = stage.rectangle((-80.0, -30.0, -30.0), (160.0, 0, 0), (0, 110.0, 0), metal)
     faces = np.concatenate([wall.faces, ground.faces + len(wall.vertices)]).astype(np.int32)
-    city = City(
+    city = CityMesh(
         "wall and ground",
         np.concatenate([wall.vertices, ground.vertices]),
         faces,

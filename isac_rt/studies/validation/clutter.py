@@ -19,7 +19,7 @@ from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.studies.validation import truths
 from isac_rt.studies.validation.case import Errors, slow_traced, traced
 from isac_rt.studies.validation.truths import WAVELENGTH
-from isac_rt.world.city import City, load_city
+from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.swarm import Pose
 
 CELL = 0.25
@@ -95,7 +95,7 @@ class Flight:
 
 
 @cache
-def _crossing() -> City:
+def _crossing() -> CityMesh:
     s = Scenario.model_validate(
         {
             "swarm": {"A": {"role": "active", "position_m": [0, 0, 5]}},
@@ -359,7 +359,7 @@ def mean_power_of_a_street() -> float:
 
 
 def sionna_power(
-    city: City,
+    city: CityMesh,
     start: np.ndarray,
     end: np.ndarray,
     edges: np.ndarray,

@@ -20,7 +20,7 @@ from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import add_white_noise
 from isac_rt.simulation.setup import propagation_in
-from isac_rt.world.city import City, Material
+from isac_rt.world.city import CityMesh, Material
 from isac_rt.world.swarm import Pose, attitude
 
 Triple = Sequence[float] | np.ndarray
@@ -70,7 +70,7 @@ def scenario(traced: bool = True, **changes: Any) -> Scenario:
     return Scenario.model_validate(tree)
 
 
-def tracer(mesh: City, bounces: int = 2, **changes: Any) -> Propagation:
+def tracer(mesh: CityMesh, bounces: int = 2, **changes: Any) -> Propagation:
     """A ray tracer in a mesh, whatever city the scenario names."""
     s = scenario(**({"propagation": {"max_bounces": bounces}} | changes))
     return propagation_in(mesh, s)
@@ -94,11 +94,11 @@ amplitude."""
 
 def rectangle(
     corner: Triple, along: Triple, across: Triple, of: Material, origin: Triple = (0.0, 0.0, 0.0)
-) -> City:
+) -> CityMesh:
     """One flat wall of two triangles; world coordinates."""
     p, a, b = (np.array(v, float) for v in (corner, along, across))
     vertices = np.array([p, p + a, p + a + b, p + b]) - np.array(origin)
-    return City(
+    return CityMesh(
         "wall",
         vertices,
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),

@@ -2,8 +2,7 @@
 (`isac_rt.world.city.scene`, which needs Sionna)."""
 
 from isac_rt.world.city.materials import CityError, Material
-from isac_rt.world.city.mesh import City
-from isac_rt.world.city.mesh import City as Mesh
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.sources import load_city
 
-__all__ = ["City", "CityError", "Material", "Mesh", "load_city"]
+__all__ = ["CityError", "CityMesh", "Material", "load_city"]

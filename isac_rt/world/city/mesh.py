@@ -35,7 +35,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class City:
+class CityMesh:
     """A city as one float64 triangle mesh.
 
     Parameters
@@ -76,7 +76,7 @@ class City:
     def __repr__(self) -> str:
         size = np.ptp(self.vertices, axis=0) if self.num_faces else np.zeros(3)
         return (
-            f"<City {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x "
+            f"<CityMesh {self.name}: {self.num_faces} faces, {size[0]:.0f} x {size[1]:.0f} x "
             f"{size[2]:.0f} m, {len(self.materials)} materials>"
         )
 
@@ -131,7 +131,7 @@ class City:
         )
         return _read_only(planes)
 
-    def within(self, radius: float) -> City:
+    def within(self, radius: float) -> CityMesh:
         """The faces that come as near to the origin as `radius` [m], whole; this very city if all
         do."""
         near = (
@@ -206,9 +206,9 @@ def _group_planes(
     return plane
 
 
-def empty_city(name: str, origin: NDArray[np.float64]) -> City:
+def empty_city(name: str, origin: NDArray[np.float64]) -> CityMesh:
     """Free space: a city without faces."""
-    return City(
+    return CityMesh(
         name,
         np.zeros((0, 3)),
         np.zeros((0, 3), np.int32),

@@ -15,7 +15,7 @@ import sionna.rt as rt
 from numpy.typing import NDArray
 
 from isac_rt.world.city.materials import Material
-from isac_rt.world.city.mesh import City
+from isac_rt.world.city.mesh import CityMesh
 
 NO_FACE = -1
 
@@ -48,10 +48,10 @@ class SceneHandle:
         return out
 
 
-_latest: tuple[weakref.ref[City], float, SceneHandle] | None = None
+_latest: tuple[weakref.ref[CityMesh], float, SceneHandle] | None = None
 
 
-def shared_scene(city: City, carrier_frequency: float) -> SceneHandle:
+def shared_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
     """As `build_scene`, but the one built last is handed out again for the same city object, to
     tracers that place and clear away their own terminals: compilation is paid once in a worker that
     runs many points of a sweep."""
@@ -61,7 +61,7 @@ def shared_scene(city: City, carrier_frequency: float) -> SceneHandle:
     return _latest[2]
 
 
-def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
+def build_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
     """Sionna scene of a city, new.
 
     Materials carry their constants at the carrier, so that none can be undefined there; they are
@@ -88,7 +88,7 @@ def build_scene(city: City, carrier_frequency: float) -> SceneHandle:
     return SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
 
 
-def _shape(city: City, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
+def _shape(city: CityMesh, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
     used, faces = np.unique(city.faces[chosen], return_inverse=True)
     mesh = mi.Mesh(name, used.size, chosen.size)
     parameters = mi.traverse(mesh)

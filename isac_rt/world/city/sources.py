@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from isac_rt import scenario
 from isac_rt.world.city.footprints import footprints
 from isac_rt.world.city.materials import CityError, resolve_materials
-from isac_rt.world.city.mesh import City, Surface, clean, empty_city
+from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file
 from isac_rt.world.city.parametric import blocks, canyon
@@ -49,7 +49,7 @@ def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], li
 
 def load_city(
     city: scenario.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike
-) -> City:
+) -> CityMesh:
     """The city of a scenario as one float64 mesh about `centre`.
 
     Parameters
@@ -87,7 +87,7 @@ def load_city(
     counted = [
         text if n == 1 else f"{text} ({n} times)" for text, n in Counter(notes + cleaning).items()
     ]
-    return City(
+    return CityMesh(
         name,
         vertices,
         faces,
