@@ -50,8 +50,8 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
     from isac_rt.results.files import check_folder, save
 
     check_folder(folder)
+    from isac_rt.results.provenance import run_content
     from isac_rt.simulation import simulate
-    from isac_rt.simulation.content import run_content
     from isac_rt.simulation.resume import Resume
     from isac_rt.simulation.setup import link_budgets, prepare
 

@@ -7,11 +7,14 @@ import importlib.metadata
 import json
 import platform
 import subprocess
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from isac_rt.scenario.file import to_yaml
 from isac_rt.scenario.tree import Scenario
+from isac_rt.world.area import city_digest, file_digest
 
 PACKAGES = (
     "isac_rt",
@@ -87,6 +90,36 @@ def commit() -> str:
         )
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
+"""Parts of a scenario on which its paths do not depend: runs that differ in nothing else share
+them. What they say of the links and of the city's reach is in the key of stored paths besides."""
+
+
+def path_content(tree: Mapping[str, Any], city: str) -> str:
+    """All that paths depend on, but the instant, as text.
+
+    Parameters
+    ----------
+    tree : the scenario as plain values
+    city : digest of the city's file
+    """
+    seen = {key: value for key, value in tree.items() if key not in UNSEEN_BY_PATHS}
+    return json.dumps([seen, city, program_fingerprint()], sort_keys=True)
+
+
+def run_content(scenario: Scenario, snapshots: int) -> str:
+    """All that the results of a run depend on, as text."""
+    costs = scenario.cost_model_path()
+    files = [
+        city_digest(scenario.city, scenario.folder),
+        "" if costs is None else file_digest(costs),
+    ]
+    return json.dumps(
+        [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],
+        sort_keys=True,
+    )
 
 
 def provenance(scenario: Scenario) -> dict[str, str | int]:

@@ -29,6 +29,7 @@ from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_pr
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
+from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.file import ScenarioError
 from isac_rt.scenario.tree import Scenario
@@ -36,7 +37,6 @@ from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.simulation.content import path_content
 from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
     check_flights,
@@ -45,7 +45,7 @@ from isac_rt.simulation.preflight import (
     warn_of_aliases,
 )
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
-from isac_rt.world.area import city_about
+from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -335,8 +335,9 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     if store is None or scenario.propagation.model == "free_space":
         propagation = make()
     else:
-        content = json.dumps([path_content(scenario), city.num_faces])
-        propagation = CachedPropagation(make, store, content)
+        digest = city_digest(scenario.city, scenario.folder)
+        content = path_content(scenario.model_dump(mode="json"), digest)
+        propagation = CachedPropagation(make, store, json.dumps([content, city.num_faces]))
     setup = Setup(
         scenario,
         waveform,

@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
-from isac_rt.results.provenance import program_fingerprint
+from isac_rt.results.provenance import path_content, program_fingerprint
 from isac_rt.scenario.file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
@@ -217,7 +217,7 @@ class Plan:
                 for key, value in axis.entry(i).items():
                     put(here, key, value)
             here["seed"] = self.seed(index[-1])
-            yield Point(index, here, self.key_of(here), self._paths_key(here))
+            yield Point(index, here, self.key_of(here), self.paths_key(here))
 
     def seed(self, repetition: int) -> int:
         """The scenario's seed in a repetition."""
@@ -231,16 +231,11 @@ class Plan:
         )
         return _digest([tree, *files, program_fingerprint()])
 
-    def _paths_key(self, tree: dict[str, Any]) -> str | None:
+    def paths_key(self, tree: dict[str, Any]) -> str | None:
+        """Under which a point's paths are kept; None where they are not traced."""
         if (tree.get("propagation") or {}).get("model") != "ray_traced":
             return None
-        unseen = ("modulation", "noise", "receivers", "tracking")
-        return _digest(
-            [
-                {k: v for k, v in tree.items() if k not in unseen},
-                self._named_file(tree, "city", "file"),
-            ]
-        )
+        return _digest(path_content(tree, self._named_file(tree, "city", "file")))
 
     def _named_file(self, tree: dict[str, Any], part: str, key: str) -> str:
         """Digest of the file that a key names, "" without one."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import fake_run as fake
 import numpy as np
@@ -17,7 +18,9 @@ from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import ResultsError, check_folder, open_results, save
 from isac_rt.results.records import KINDS
 from isac_rt.scenario.file import to_yaml
+from isac_rt.simulation import simulate
 from isac_rt.views.interchange import write_ledger
+from isac_rt.views.report import write_report
 
 TERMINAL_KEYS = {
     "counts",
@@ -257,3 +260,45 @@ def test_commit_is_of_the_package_not_of_the_current_folder(tmp_path, monkeypatc
     here = provenance.commit()
     monkeypatch.chdir(tmp_path)
     assert provenance.commit() == here
+
+
+EARLIER = Path(__file__).parent / "earlier"
+"""A run of an earlier version: its summary, its scenario and the layout of its dataset."""
+
+
+def test_runs_of_earlier_versions_are_opened(tmp_path):
+    """What they held is still there under the same name, over the same dimensions, in the same
+    unit; and they are opened, drawn and reported. Planted bug: `state` called `status`."""
+    layout = json.loads((EARLIER / "layout.json").read_text())
+    fill = {"object": "A", "bool": False}
+    variables = {
+        name: (
+            dims,
+            np.full([layout["sizes"][d] for d in dims], fill.get(dtype, 0), dtype),
+            {"units": units},
+        )
+        for name, (dims, dtype, units) in layout["variables"].items()
+    }
+    (tmp_path / "run").mkdir()
+    xr.Dataset(variables, attrs=layout["attributes"]).to_netcdf(
+        tmp_path / "run" / "results.nc", engine="h5netcdf"
+    )
+    for name in ("summary.json", "scenario.yaml"):
+        (tmp_path / "run" / name).write_text((EARLIER / name).read_text())
+    old = open_results(tmp_path / "run")
+    assert write_report(old, tmp_path, []).is_file()
+    new = simulate.run(old.scenario, snapshots=1)
+    for name, (dims, dtype, units) in layout["variables"].items():
+        variable = new.dataset[name]
+        assert list(variable.dims) == dims, name
+        assert (str(variable.dtype), variable.attrs["units"]) == (dtype, units), name
+    assert set(layout["attributes"]) <= set(new.dataset.attrs)
+    assert missing(old.summary, new.summary) == []
+
+
+def missing(old, new, at="summary"):
+    """Keys of a summary that another one lacks."""
+    if not isinstance(old, dict):
+        return []
+    lost = [f"{at}.{key}" for key in old if key not in new]
+    return lost + [m for k in old.keys() & new.keys() for m in missing(old[k], new[k], f"{at}.{k}")]

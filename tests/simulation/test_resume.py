@@ -17,9 +17,9 @@ from test_fall_back import scenario as dense_scenario
 
 from isac_rt.cli.cli import main
 from isac_rt.results.files import open_results
+from isac_rt.results.provenance import run_content
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.simulation import simulate
-from isac_rt.simulation.content import run_content
 from isac_rt.simulation.resume import ARRAY, EARLIER, FILE, Resume, ResumeError, pack, unpack
 
 ROOT = Path(__file__).parents[2]

@@ -23,7 +23,9 @@ from isac_rt.cli.cli import main
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.scenario.file import ScenarioError, load
+from isac_rt.results.provenance import UNSEEN_BY_PATHS
+from isac_rt.scenario.file import ScenarioError, load, plain_tree
+from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import summarise
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, status
@@ -589,6 +591,55 @@ def test_cached_paths_are_the_same_and_made_once(folder, tmp_path):
     ):
         CachedPropagation(lambda: model, store, content).trace(where, time_, links)
     assert model.calls == 4
+
+
+CHANGES = {
+    "name": "other",
+    "seed": 9,
+    "frames": 5,
+    "frame_interval_s": 0.05,
+    "radio": {"carrier_hz": 78e9},
+    "array": {"element_gain_dbi": 2},
+    "modulation": {"dpsk_order": 4},
+    "swarm": {"P1": {"position_m": [-1.9, 5.4, 50.7]}},
+    "role_changes": [{"frame": 2, "from_uav": "A", "to_uav": "P1"}],
+    "access": {"feedback": True},
+    "city": {"block_size_m": 21},
+    "propagation": {"max_bounces": 1},
+    "accuracy": {"max_untraced_m": 0.3},
+    "clutter": {"model": "field"},
+    "noise": {"snr_db": 5},
+    "receivers": {"clutter_filter": "runs"},
+    "tracking": {"confirm_hits": 2},
+}
+"""One change of each part of a scenario."""
+
+
+def merged(tree, change):
+    if not isinstance(tree, dict) or not isinstance(change, dict):
+        return change
+    return tree | {key: merged(tree.get(key), value) for key, value in change.items()}
+
+
+def test_paths_are_shared_by_what_differs_in_nothing_that_they_depend_on(folder):
+    """Every part of a scenario changed once: the key of its paths changes with all but those of one
+    list, and paths of scenarios that differ in these are the same. Planted bug: the swarm in the
+    list."""
+    text = BASE.replace("{leakage", "{model: ray_traced, leakage") + "city: {source: blocks}\n"
+    (folder / "base.yaml").write_text(text)
+    plan = plan_of(folder)
+    base = plain_tree(plan.base)
+    assert set(CHANGES) == set(Scenario.model_fields)
+    keys = {part: plan.paths_key(merged(base, {part: CHANGES[part]})) for part in CHANGES}
+    shared = {part for part, key in keys.items() if key == plan.paths_key(base)}
+    assert shared == set(UNSEEN_BY_PATHS)
+    free = base | {"city": None, "propagation": {"leakage": {"enabled": False}}}
+    expected = prepare(Scenario.model_validate(free))
+    for part in shared:
+        found = prepare(Scenario.model_validate(merged(free, {part: CHANGES[part]})))
+        for link in expected.timetable.links(0):
+            one, two = (s.find(1)[1][link] for s in (expected, found))
+            assert np.array_equal(one.delay, two.delay) and np.array_equal(one.gain, two.gain)
 
 
 def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp_path):
