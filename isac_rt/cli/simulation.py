@@ -198,11 +198,12 @@ def paths(
     loaded = load(scenario, overrides or ())
     check_frame(loaded, frame)
     with ending_soon_after_interrupt(out.parent), err().status("tracing"):
+        from isac_rt.results.provenance import provenance
         from isac_rt.simulation.setup import trace
         from isac_rt.views.interchange import write_ledger
 
         found = trace(loaded, frame)
-        write_ledger(found, out, loaded)
+        write_ledger(found, out, loaded.radio.carrier_hz, provenance(loaded))
     kinds = next(iter(found.values())).counts() if found else ()
     say_table(
         ["link", *(kind.replace("_", " ") for kind in kinds)],

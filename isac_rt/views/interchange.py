@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 import importlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,11 +21,9 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.results.dataset import DIMENSIONLESS, PATHS
+from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column
 from isac_rt.results.files import ResultsError, write_bytes, write_dataset
-from isac_rt.results.provenance import provenance
 from isac_rt.results.records import KINDS
-from isac_rt.scenario.tree import Scenario
 
 if TYPE_CHECKING:
     import sionna.rt as rt
@@ -36,118 +34,80 @@ _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
 
 
 def write_ledger(
-    paths: Mapping[tuple[str, str], PathSet], file: str | Path, scenario: Scenario
+    paths: Mapping[tuple[str, str], PathSet],
+    file: str | Path,
+    carrier_frequency: float,
+    attributes: Mapping[str, str | int],
 ) -> None:
     """Write the path ledger of one frame, all links, as NetCDF.
 
-    Rows over the dimension ``path`` with the columns of `PATH_COLUMNS`, ``doppler`` [Hz], wavefront
-    radii, the transmitter and receiver of each, interaction points (path, bounce, axis) [m] and
-    faces of the city mesh (path, bounce).
+    Rows over the dimension ``path`` with the columns of `PATHS`, ``doppler`` [Hz], wavefront radii,
+    the transmitter and receiver of each, interaction points (path, bounce, axis) [m] and faces of
+    the city mesh (path, bounce).
+
+    Parameters
+    ----------
+    carrier_frequency : of the Doppler shifts [Hz]
+    attributes : of the file, such as `isac_rt.results.provenance.provenance` gives
 
     Raises
     ------
     ResultsError  If the file cannot be written.
     """
     depth = max((p.faces.shape[1] for p in paths.values()), default=0)
-    names = next((p.target_names for p in paths.values() if p.target_names), ())
+    shapes = {"points": (0, depth, 3), "faces": (0, depth)}
+
+    def padded(a: np.ndarray, fill: float) -> np.ndarray:
+        missing = [(0, 0), (0, depth - a.shape[1]), (0, 0)][: a.ndim]
+        return np.pad(a, missing, constant_values=fill)
+
+    curvature = "radius of curvature of the wavefront at the"
+    columns = {
+        "transmitter": _names("transmitting terminal", "tx"),
+        "receiver": _names("receiving terminal", "rx"),
+        **PATHS,
+        "doppler": Column(
+            float,
+            "Hz",
+            "Doppler shift at the carrier, positive closing",
+            lambda p: -carrier_frequency * p.delay_rate,
+        ),
+        "tx_radius": Column(float, "m", f"{curvature} transmitter", "tx_radius"),
+        "rx_radius": Column(float, "m", f"{curvature} receiver", "rx_radius"),
+        "points": Column(
+            float,
+            "m",
+            "interaction points in world axes, NaN where there is none",
+            lambda p: padded(p.points, np.nan),
+        ),
+        "faces": Column(
+            np.int32,
+            DIMENSIONLESS,
+            "face of the city mesh at each point, -1 where there is none",
+            lambda p: padded(p.faces, -1),
+        ),
+    }
     out: dict[str, xr.Variable] = {}
-
-    def put(
-        name: str,
-        dims: Sequence[str],
-        parts: list[np.ndarray],
-        empty: np.ndarray,
-        units: str,
-        text: str,
-    ) -> None:
-        out[name] = xr.Variable(
-            dims, np.concatenate([empty, *parts]), {"units": units, "long_name": text}
-        )
-
-    def column(
-        name: str, get: Callable[[PathSet], np.ndarray], dtype: type, units: str, text: str
-    ) -> None:
-        put(
-            name,
-            ["path"],
-            [np.asarray(get(p), dtype) for p in paths.values()],
-            np.zeros(0, dtype),
-            units,
-            text,
-        )
-
-    column(
-        "transmitter",
-        lambda p: np.full(len(p), p.tx, object),
-        object,
-        DIMENSIONLESS,
-        "transmitting terminal",
-    )
-    column(
-        "receiver",
-        lambda p: np.full(len(p), p.rx, object),
-        object,
-        DIMENSIONLESS,
-        "receiving terminal",
-    )
-    for name, c in PATHS.items():
-        column(name, c.read, c.dtype, c.units, c.meaning)
-    carrier = scenario.radio.carrier_hz
-    column(
-        "doppler",
-        lambda p: -carrier * p.delay_rate,
-        float,
-        "Hz",
-        "Doppler shift at the carrier, positive closing",
-    )
-    column(
-        "tx_radius",
-        lambda p: p.tx_radius,
-        float,
-        "m",
-        "radius of curvature of the wavefront at the transmitter",
-    )
-    column(
-        "rx_radius",
-        lambda p: p.rx_radius,
-        float,
-        "m",
-        "radius of curvature of the wavefront at the receiver",
-    )
-
-    def pad(a: np.ndarray, fill: float) -> np.ndarray:
-        return np.pad(
-            a, [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2), constant_values=fill
-        )
-
-    put(
-        "points",
-        ["path", "bounce", "axis"],
-        [pad(p.points, np.nan) for p in paths.values()],
-        np.zeros((0, depth, 3)),
-        "m",
-        "interaction points in world axes, NaN where there is none",
-    )
-    put(
-        "faces",
-        ["path", "bounce"],
-        [pad(p.faces, -1) for p in paths.values()],
-        np.zeros((0, depth), np.int32),
-        DIMENSIONLESS,
-        "face of the city mesh at each point, -1 where there is none",
-    )
-    out["kind_name"] = xr.Variable(
-        ["kind"],
-        np.array(KINDS, object),
-        {"units": DIMENSIONLESS, "long_name": "name of each kind of path"},
-    )
-    out["target_name"] = xr.Variable(
-        ["uav"],
-        np.array(names, object),
-        {"units": DIMENSIONLESS, "long_name": "name that target indexes"},
-    )
+    for name, column in columns.items():
+        parts = [np.asarray(column.read(p), column.dtype) for p in paths.values()]
+        values = np.concatenate([np.zeros(shapes.get(name, 0), column.dtype), *parts])
+        about = {"units": column.units, "long_name": column.meaning}
+        out[name] = xr.Variable(("path", "bounce", "axis")[: values.ndim], values, about)
+    uavs = next((p.target_names for p in paths.values() if p.target_names), ())
+    for name, dim, names, meaning in (
+        ("kind_name", "kind", KINDS, "name of each kind of path"),
+        ("target_name", "uav", uavs, "name that target indexes"),
+    ):
+        about = {"units": DIMENSIONLESS, "long_name": meaning}
+        out[name] = xr.Variable([dim], np.array(names, object), about)
     epoch = next((p.epoch for p in paths.values()), np.nan)
-    write_dataset(xr.Dataset(out, attrs={**provenance(scenario), "epoch_s": epoch}), Path(file))
+    write_dataset(xr.Dataset(out, attrs={**attributes, "epoch_s": epoch}), Path(file))
+
+
+def _names(meaning: str, end: str) -> Column:
+    return Column(
+        object, DIMENSIONLESS, meaning, lambda p: np.full(len(p), getattr(p, end), object)
+    )
 
 
 def cube_dataset(cube: IFCube) -> xr.Dataset:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
 
 from isac_rt.results.files import write_text
 from isac_rt.results.recorder import Results
@@ -87,44 +85,40 @@ def number(value: Any, digits: int = 3) -> str:
 
 def per_terminal(summary: Mapping[str, Any]) -> Table:
     """Decoding and detection, one row for each link (and so for each terminal)."""
-    columns = (
-        "Link",
-        "Role",
-        "SER delay",
-        "SER DPSK",
-        "BER",
-        "Undecided",
-        "Bits",
-        "Bit rate [kbit/s]",
-        "Hit rate",
-        "Matched",
-        "Matched, tracked",
-        "False per frame",
-    )
-    rows = []
-    for name, s in summary["links"].items():
-        rate = None if s["bit_rate_bps"] is None else s["bit_rate_bps"] / 1e3
-        values = (
-            s["ser_delay"],
-            s["ser_dpsk"],
-            s["ber"],
-            s["erased"],
-            s["bits"],
-            rate,
-            s["hit_rate"],
-            s["matched"],
-            s["matched_tracked"],
-            s["false_per_frame"],
-        )
-        rows.append((name.replace("->", " to "), s["role"], *map(number, values)))
-    return Table(columns, rows)
+    keys = {
+        "SER delay": "ser_delay",
+        "SER DPSK": "ser_dpsk",
+        "BER": "ber",
+        "Undecided": "erased",
+        "Bits": "bits",
+        "Bit rate [kbit/s]": "bit_rate_bps",
+        "Hit rate": "hit_rate",
+        "Matched": "matched",
+        "Matched, tracked": "matched_tracked",
+        "False per frame": "false_per_frame",
+    }
+
+    def shown(link: Mapping[str, Any], key: str) -> str:
+        value = link[key]
+        return number(value / 1e3 if key == "bit_rate_bps" and value is not None else value)
+
+    rows = [
+        (_link(name), s["role"], *(shown(s, key) for key in keys.values()))
+        for name, s in summary["links"].items()
+    ]
+    return Table(("Link", "Role", *keys), rows)
+
+
+def _link(name: str) -> str:
+    """AT to PT1, of AT->PT1."""
+    return name.replace("->", " to ")
 
 
 def rmse_table(summary: Mapping[str, Any]) -> Table:
     """RMSE of detections and of tracks."""
     columns = ("RMSE", "Range [m]", "Velocity [m/s]", "Azimuth [deg]", "Elevation [deg]")
     rows = [
-        (f"{name.replace('->', ' to ')}, {word}", *(number(v) for v in s[key].values()))
+        (f"{_link(name)}, {word}", *(number(v) for v in s[key].values()))
         for name, s in summary["links"].items()
         for key, word in (("rmse", "detections"), ("rmse_tracked", "tracks"))
     ]
@@ -139,14 +133,8 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         if isinstance(value, Mapping):
             out += flat(value, f"{name}: ")
         else:
-            out.append(
-                (
-                    name,
-                    ", ".join(map(number, value))
-                    if isinstance(value, list | tuple)
-                    else number(value),
-                )
-            )
+            values = value if isinstance(value, list | tuple) else [value]
+            out.append((name, ", ".join(map(number, values))))
     return out
 
 
@@ -164,17 +152,6 @@ def _title(key: str) -> str:
     """A key as a column title, its unit in brackets."""
     ending = next((e for e in sorted(_UNITS, key=len, reverse=True) if key.endswith(e)), "")
     return key.removesuffix(ending).replace("_", " ").replace("snr", "SNR") + _UNITS.get(ending, "")
-
-
-def _html(table: Table) -> Markup:
-    head = "".join(f"<th>{html.escape(c)}</th>" for c in table.columns)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in table.rows
-    )
-    return Markup(
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )  # escaped above
 
 
 def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
@@ -216,7 +193,6 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         roles=", ".join(f"{roles.count(r)} {r}" for r in dict.fromkeys(roles)),
         carrier=f"{radio.carrier_hz / 1e9:g} GHz",
         bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
-        table=_html,
         terminals=per_terminal(s),
         rmse=rmse_table(s),
         budget=row_table(json.loads(d.attrs["link_budget"])),
@@ -226,10 +202,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         figures=_embedded(pictures),
         access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),
         sparsity=row_table(
-            [
-                {"link": name.replace("->", " to "), **row}
-                for name, row in (s.get("sparsity") or {}).items()
-            ]
+            [{"link": _link(name), **row} for name, row in (s.get("sparsity") or {}).items()]
         ),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
