@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.results.files import ResultsError, write_bytes
 from isac_rt.results.recorder import Results
-from isac_rt.views.figures import STYLE, range_doppler, scene_map, uav_colour
+from isac_rt.views.figures import STYLE, colour_of, range_doppler, scene_map
 from isac_rt.world.city.mesh import CityMesh
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
@@ -95,9 +95,9 @@ class _Moving:
     def __init__(self, ax: Axes, dataset: xr.Dataset, observer: int) -> None:
         self._d, self._ax, self._observer = dataset, ax, observer
         count = dataset.sizes["uav"]
-        self._paths = [ax.plot([], [], color=uav_colour(dataset, u))[0] for u in range(count)]
+        self._paths = [ax.plot([], [], color=colour_of(u))[0] for u in range(count)]
         self._here = [
-            ax.plot([], [], "o", color=uav_colour(dataset, u), mec="white")[0] for u in range(count)
+            ax.plot([], [], "o", color=colour_of(u), mec="white")[0] for u in range(count)
         ]
         (self._tracks,) = ax.plot(
             [],

@@ -3,7 +3,7 @@ all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -78,14 +78,32 @@ _UNITS = {
 }
 
 
-def words(kind: str) -> str:
-    """A path kind as people read it."""
-    return kind.replace("_", " ")
+def words(name: str) -> str:
+    """A name as people read it."""
+    return name.replace("_", " ")
 
 
-def uav_colour(dataset: xr.Dataset, index: int) -> str:
-    """The colour of a UAV in every figure."""
+def colour_of(index: int) -> str:
+    """The colour of a UAV, an observer or a curve by its number."""
     return UAV_COLOURS[index % len(UAV_COLOURS)]
+
+
+def _link(dataset: xr.Dataset, observer: int) -> str:
+    return f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}"
+
+
+def _moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
+    """Index of a snapshot's frame, and the frame's number."""
+    frame = int(dataset.snapshot_frame.values[snapshot])
+    return frame, int(dataset.frame.values[frame])
+
+
+def _labelled(ax: Axes, x: str, y: str, **legend: Any) -> Axes:
+    """Labels, and a legend if there is something to name."""
+    ax.set(xlabel=x, ylabel=y)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(**legend)
+    return ax
 
 
 def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Axes:
@@ -98,7 +116,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
         _footprints(ax, city)
     for u, name in enumerate(dataset.uav.values):
         x, y = position[:, u, 0], position[:, u, 1]
-        role, colour = str(dataset.role.values[u]), uav_colour(dataset, u)
+        role, colour = str(dataset.role.values[u]), colour_of(u)
         ax.plot(x, y, color=colour)
         ax.plot(
             x[-1],
@@ -186,7 +204,7 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
             ha="center",
             transform=ax.transAxes,
         )
-    frame = int(dataset.snapshot_frame.values[snapshot])
+    frame, number = _moment(dataset, snapshot)
     mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
     kind = dataset.det_kind.values
     for k, name in [*enumerate(KINDS), (-1, "unexplained")]:
@@ -209,30 +227,22 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     )
     far = np.concatenate([dataset.det_range.values[mine], y[np.isfinite(y)], [20.0]])
     ax.set(xlim=(v[columns].min(), v[columns].max()), ylim=(0, min(1.4 * far.max(), r[rows].max())))
+    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
     ax.set(
         xlabel="radial velocity [m/s] (receding is positive)",
-        ylabel=_range_label(dataset, observer),
+        ylabel="range [m]" if own else "path length [m]",
     )
-    ax.set_title(f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}")
-    if ax.get_legend_handles_labels()[0]:
-        legend = ax.legend(
-            loc="upper right",
-            frameon=True,
-            facecolor="#303030",
-            edgecolor="none",
-            labelcolor="white",
-            fontsize=7,
-        )
-        legend.set_zorder(9)
+    ax.set_title(f"{dataset.observer.values[observer]}, frame {number}")
+    legend = ax.legend(
+        loc="upper right",
+        frameon=True,
+        facecolor="#303030",
+        edgecolor="none",
+        labelcolor="white",
+        fontsize=7,
+    )
+    legend.set_zorder(9)
     return ax
-
-
-def _range_label(dataset: xr.Dataset, observer: int) -> str:
-    return (
-        "range [m]"
-        if dataset.transmitter.values[observer] == dataset.receiver.values[observer]
-        else "path length [m]"
-    )
 
 
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
@@ -255,6 +265,8 @@ def _map(
     shown: tuple[float, float],
     label: str,
 ) -> None:
+    """A picture of levels whose cells have their middles at `x` and `y`."""
+    dx, dy = ((a[-1] - a[0]) / max(len(a) - 1, 1) / 2 for a in (x, y))
     image = ax.imshow(
         level_db,
         origin="lower",
@@ -263,15 +275,10 @@ def _map(
         vmin=shown[0],
         vmax=shown[1],
         interpolation="nearest",
-        extent=_extent(x, y),
+        extent=(x[0] - dx, x[-1] + dx, y[0] - dy, y[-1] + dy),
     )
     ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.05)
     ax.grid(False)
-
-
-def _extent(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float, float]:
-    dx, dy = ((a[-1] - a[0]) / max(len(a) - 1, 1) / 2 for a in (x, y))
-    return x[0] - dx, x[-1] + dx, y[0] - dy, y[-1] + dy
 
 
 def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
@@ -291,13 +298,11 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
     )
     cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])
     ax.plot(chirps, cells, "o", ms=2.5, mfc="none", mec="white", mew=0.4)
-    frame = int(dataset.snapshot_frame.values[snapshot])
-    ax.set(xlabel="chirp", ylabel="range cell (circles: one-dimensional CFAR)")
     ax.set_title(
-        f"{dataset.observer.values[observer]}, frame {int(dataset.frame.values[frame])}, "
+        f"{dataset.observer.values[observer]}, frame {_moment(dataset, snapshot)[1]}, "
         "equivalent range before data removal"
     )
-    return ax
+    return _labelled(ax, "chirp", "range cell (circles: one-dimensional CFAR)")
 
 
 def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
@@ -309,7 +314,7 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     for u, uav in enumerate(dataset.uav.values):
         if uav == dataset.receiver.values[observer] or not here.in_view.values[:, u].any():
             continue
-        colour, seen = uav_colour(dataset, u), here.in_view.values[:, u]
+        colour, seen = colour_of(u), here.in_view.values[:, u]
         ax.plot(
             t,
             np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan),
@@ -322,10 +327,7 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         )
         ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
-    ax.set(xlabel="time [s]", ylabel=f"{name} [{unit}]")
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(ncols=4, loc="best")
-    return ax
+    return _labelled(ax, "time [s]", f"{name} [{unit}]", ncols=4, loc="best")
 
 
 def _processed(dataset: xr.Dataset, observer: int) -> xr.Dataset:
@@ -354,18 +356,11 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
                     np.maximum(e, 1e-9),
                     np.arange(1, e.size + 1) / e.size,
                     dash,
-                    color=UAV_COLOURS[o % len(UAV_COLOURS)],
+                    color=colour_of(o),
                     label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})",
                 )
-    ax.set(
-        xscale="log",
-        ylim=(0, 1.02),
-        xlabel=f"|{name} error| [{unit}]",
-        ylabel="share of errors below",
-    )
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="best")
-    return ax
+    ax.set(xscale="log", ylim=(0, 1.02))
+    return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", loc="best")
 
 
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
@@ -392,17 +387,13 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
                 mew=0,
                 label=f"{words(name)} ({at.sum()})",
             )
-    ax.set(
-        xlabel="path length [m]"
-        if against == "delay"
-        else "Doppler shift [kHz] (closing is positive)",
-        ylabel="path gain [dB]",
-    )
-    ax.set_title(f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}")
-    if ax.get_legend_handles_labels()[0]:
-        for handle in ax.legend(loc="best", ncols=2).legend_handles:
-            assert handle is not None
-            handle.set(markersize=5, alpha=1)
+    delay, doppler = "path length [m]", "Doppler shift [kHz] (closing is positive)"
+    ax.set_title(_link(dataset, observer))
+    _labelled(ax, delay if against == "delay" else doppler, "path gain [dB]", loc="best", ncols=2)
+    legend = ax.get_legend()
+    for handle in legend.legend_handles if legend else ():
+        assert handle is not None
+        handle.set(markersize=5, alpha=1)
     return ax
 
 
@@ -439,13 +430,9 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     )
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
     _shade(ax, t, d.shadowed.values[:, sender], "#303030")
-    ax.set(ylim=(-0.04, 1.14), xlabel="time [s]", ylabel="symbol error rate")
-    ax.set_title(
-        f"{dataset.observer.values[observer]} (shaded: the city hides "
-        f"{dataset.transmitter.values[observer]})"
-    )
-    ax.legend(loc="center right")
-    return ax
+    ax.set_ylim(-0.04, 1.14)
+    ax.set_title(f"{d.observer.values} (shaded: the city hides {d.transmitter.values})")
+    return _labelled(ax, "time [s]", "symbol error rate", loc="center right")
 
 
 def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
@@ -460,12 +447,10 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
             ".-",
             ms=3,
             lw=1,
-            color=UAV_COLOURS[o % len(UAV_COLOURS)],
+            color=colour_of(o),
             label=name,
         )
-    ax.set(xlabel="time [s]", ylabel="SNR of the reference path [dB]")
-    ax.legend(loc="best")
-    return ax
+    return _labelled(ax, "time [s]", "SNR of the reference path [dB]", loc="best")
 
 
 def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
@@ -485,78 +470,69 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
                 color=KIND_COLOURS[name],
                 label=f"{words(name)} ({count[:, k].sum()})",
             )
-    ax.set(xlabel="time [s]", ylabel="path gain of the kind [dB]")
-    ax.set_title(
-        f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]} (paths "
-        "over all frames)"
-    )
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(ncols=3)
-    return ax
+    ax.set_title(f"{_link(dataset, observer)} (paths over all frames)")
+    return _labelled(ax, "time [s]", "path gain of the kind [dB]", ncols=3)
 
 
 def _figure(
-    rows: int, columns: int, height: float, width: float = 8.4
-) -> tuple[Figure, np.ndarray]:
-    """A figure of its own, outside pyplot, so that none stays open."""
+    draw: Sequence[Callable[[Axes], Any]], height: float, columns: int = 1, width: float = 8.4
+) -> Figure:
+    """A figure of one axis for each of `draw`, row by row; outside pyplot, so that none stays
+    open."""
     figure = Figure(figsize=(width, height))
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(len(draw) // columns, columns, squeeze=False)
+    for ax, drawn in zip(axes.flat, draw, strict=True):
+        drawn(ax)
+    return figure
 
 
-def _all(results: Results, city: CityMesh | None) -> Iterable[tuple[str, Figure]]:
-    d = results.dataset
+def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[tuple[str, Figure]]:
+    """Names and figures of a run, one after the other."""
     observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
-    shots = sorted({0, kept // 2, kept - 1}) if kept else []
-    figure, axes = _figure(1, 1, 6.4)
-    scene_map(axes[0, 0], d, city)
-    yield "scene", figure
-    for s in shots:
-        with_map = [o for o in observers if np.isfinite(d.map_power.values[s, o]).any()]
-        figure, axes = _figure(len(with_map), 1, 4.1 * len(with_map))
-        for ax, o in zip(axes[:, 0], with_map, strict=True):
-            range_doppler(ax, d, s, o)
-        yield f"range_doppler_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}", figure
-        before = [
-            o for o in with_map if np.isfinite(d.map_equivalent_range.values[s, o]).any()
-        ]  # none where profiles were made directly
-        if before:
-            figure, axes = _figure(len(before), 1, 3.2 * len(before))
-            for ax, o in zip(axes[:, 0], before, strict=True):
-                equivalent_range(ax, d, s, o)
-            yield (
-                f"equivalent_range_{int(d.frame.values[int(d.snapshot_frame.values[s])]):04d}",
-                figure,
-            )
+    yield "scene", _figure([partial(scene_map, dataset=d, city=city)], 6.4)
+    for s in sorted({0, kept // 2, kept - 1}) if kept else ():
+        for name, function, values, height in (
+            ("range_doppler", range_doppler, d.map_power, 4.1),
+            ("equivalent_range", equivalent_range, d.map_equivalent_range, 3.2),
+        ):  # the latter is missing where profiles were made directly
+            shown = [o for o in observers if np.isfinite(values.values[s, o]).any()]
+            if shown:
+                draw = [partial(function, dataset=d, snapshot=s, observer=o) for o in shown]
+                yield f"{name}_{_moment(d, s)[1]:04d}", _figure(draw, height * len(shown))
     for o in observers:
-        figure, axes = _figure(3, 1, 7.6)
-        for ax, name in zip(axes[:, 0], ("range", "velocity", "azimuth"), strict=True):
-            over_time(ax, d, o, name)
-        axes[0, 0].set_title(
-            f"{d.observer.values[o]}: truth (line), detections (dots), tracks (broad); shaded "
-            "where hidden"
+        of = ("range", "velocity", "azimuth")
+        figure = _figure([partial(over_time, dataset=d, observer=o, name=m) for m in of], 7.6)
+        label = str(d.observer.values[o])
+        figure.axes[0].set_title(
+            f"{label}: truth (line), detections (dots), tracks (broad); shaded where hidden"
         )
-        yield f"tracks_{str(d.observer.values[o]).replace('->', '_to_')}", figure
-    figure, axes = _figure(2, 2, 6.0)
-    for ax, name in zip(axes.flat, MEASURES, strict=True):
-        error_cdf(ax, d, name)
-    yield "errors", figure
+        yield f"tracks_{label.replace('->', '_to_')}", figure
+    yield "errors", _figure([partial(error_cdf, dataset=d, name=m) for m in MEASURES], 6.0, 2)
     if d.sizes["path"]:
-        figure, axes = _figure(len(observers), 2, 3.3 * len(observers), 10.0)
-        for o in observers:
-            path_power(axes[o, 0], d, o, "delay")
-            path_power(axes[o, 1], d, o, "doppler")
-        yield "paths", figure
+        draw = [
+            partial(path_power, dataset=d, observer=o, against=against)
+            for o in observers
+            for against in ("delay", "doppler")
+        ]
+        yield "paths", _figure(draw, 3.3 * len(observers), 2, 10.0)
     decoders = [o for o in observers if (d.symbol_total.values[:, o] > 0).any()]
     if decoders:
-        figure, axes = _figure(len(decoders), 1, 2.8 * len(decoders))
-        for ax, o in zip(axes[:, 0], decoders, strict=True):
-            decoding(ax, d, o)
-        yield "decoding", figure
-    figure, axes = _figure(1 + len(observers), 1, 2.7 * (1 + len(observers)))
-    reference_snr(axes[0, 0], d)
-    for o in observers:
-        path_counts(axes[1 + o, 0], d, o)
-    yield "link", figure
+        draw = [partial(decoding, dataset=d, observer=o) for o in decoders]
+        yield "decoding", _figure(draw, 2.8 * len(decoders))
+    counts = [partial(path_counts, dataset=d, observer=o) for o in observers]
+    draw = [partial(reference_snr, dataset=d), *counts]
+    yield "link", _figure(draw, 2.7 * len(draw))
+
+
+def _written(figures: Iterable[tuple[str, Figure]], folder: str | Path) -> list[Path]:
+    """The figures as ``figures/*.png``; each is made when the one before is written."""
+    written = []
+    with matplotlib.rc_context(STYLE):
+        for name, figure in figures:
+            file = Path(folder) / "figures" / f"{name}.png"
+            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
+            written.append(file)
+    return written
 
 
 def make_figures(results: Results, folder: str | Path, city: CityMesh | None = None) -> list[Path]:
@@ -567,13 +543,7 @@ def make_figures(results: Results, folder: str | Path, city: CityMesh | None = N
     ------
     isac_rt.results.files.ResultsError  If the folder cannot be written.
     """
-    written = []
-    with matplotlib.rc_context(STYLE):
-        for name, figure in _all(results, city):
-            file = Path(folder) / "figures" / f"{name}.png"
-            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
-            written.append(file)
-    return written
+    return _written(_all(results.dataset, city), folder)
 
 
 def sweep_curves(
@@ -603,7 +573,7 @@ def sweep_curves(
             if not np.isfinite(y).any():
                 continue
             colour, label = (
-                UAV_COLOURS[curve % len(UAV_COLOURS)],
+                colour_of(curve),
                 f"{link}" + (f", {by} {entry}" if by else ""),
             )
             ax.plot(x, np.maximum(y, 1e-9) if rate else y, "o-", ms=3.5, color=colour, label=label)
@@ -620,25 +590,19 @@ def sweep_curves(
     if values[against].dtype == object:
         ax.set_xticks(x, [str(v) for v in values[against].values])
     kept = ", ".join(f"{d} {values[d].values}" for d in rest)
-    ax.set(
-        xlabel=f"{against} ({dataset.attrs[f'axis_{against}']})", ylabel=quantity.replace("_", " ")
-    )
-    ax.set_title(f"{quantity.replace('_', ' ')} against {against}" + (f" ({kept})" if kept else ""))
-    if curve:
-        ax.legend(loc="best")
-    return ax
+    ax.set_title(f"{words(quantity)} against {against}" + (f" ({kept})" if kept else ""))
+    about = dataset.attrs[f"axis_{against}"]
+    return _labelled(ax, f"{against} ({about})", words(quantity), loc="best")
 
 
 def make_sweep_figures(
     dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path
 ) -> list[Path]:
     """Write (quantity, against, by) figures of a sweep as ``figures/*.png`` under `folder`."""
-    written = []
-    with matplotlib.rc_context(STYLE):
+
+    def made() -> Iterator[tuple[str, Figure]]:
         for quantity, against, by in figures:
-            figure, axes = _figure(1, 1, 4.4)
-            sweep_curves(axes[0, 0], dataset, quantity, against, by)
-            file = Path(folder) / "figures" / f"{quantity}_{against}{f'_{by}' if by else ''}.png"
-            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
-            written.append(file)
-    return written
+            draw = partial(sweep_curves, dataset=dataset, quantity=quantity, against=against, by=by)
+            yield "_".join(filter(None, (quantity, against, by))), _figure([draw], 4.4)
+
+    return _written(made(), folder)

@@ -14,7 +14,7 @@ import numpy as np
 
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.results.files import write_text
-from isac_rt.views.figures import KIND_COLOURS, UAV_COLOURS, words
+from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.views.render import polyline
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
@@ -75,7 +75,7 @@ def scene_3d(
                 )
             )
     for u, (name, uav) in enumerate(swarm.uavs.items()):
-        colour = UAV_COLOURS[u % len(UAV_COLOURS)]
+        colour = colour_of(u)
         x, y, z = tracks[:, u].T
         figure.add_trace(
             go.Scatter3d(

@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_bytes
-from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, UAV_COLOURS, words
+from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -291,7 +291,7 @@ def _draw_swarm(
     """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`."""
     poses, legend = swarm.poses(time), []
     for u, (name, uav) in enumerate(swarm.uavs.items()):
-        colour, here = UAV_COLOURS[u % len(UAV_COLOURS)], poses[name].position
+        colour, here = colour_of(u), poses[name].position
         _line(
             ax,
             np.array([swarm.trajectories[name].pose(t).position for t in times]),
