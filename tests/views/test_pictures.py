@@ -136,7 +136,7 @@ def test_objects_print_themselves_in_short(results):
     paths = setup.frame(2).paths["A", "P"]
     assert repr(paths).startswith("<PathSet A -> P at 0.0030 s: 1 line of sight")
     assert "hit rate" in repr(results)
-    assert repr(setup.city) == "<City free space: 0 faces, 0 x 0 x 0 m, 0 materials>"
+    assert repr(setup.city) == "<CityMesh free space: 0 faces, 0 x 0 x 0 m, 0 materials>"
     w = Waveform(num_samples=16, num_chirps=6)
     cube = IFCube(
         samples=np.full((3, 2, 6, 16), 3 + 4j, np.complex64),
