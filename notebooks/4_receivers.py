@@ -19,6 +19,7 @@ import numpy as np
 import isac_rt as irt
 from isac_rt.receive import cfar, spectrum
 from isac_rt.receive import maps as doppler
+from isac_rt.receive.known import Known
 from isac_rt.receive.symbols import powers as demodulate
 
 scenario = irt.load(
@@ -51,10 +52,10 @@ ax.set(xlabel="chirp", ylabel="cell", title="group 0, antenna 0, with data")
 # to one uniform slow time.
 
 # %%
-spectra = spectrum.clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-power = doppler.accumulate(doppler.channel_maps(spectra, w, cube.schedule, payload.delay_symbols))
-looks, r = setup.antennas.num_tx * setup.antennas.num_rx, scenario.receivers
-above, level = cfar.CfarRule.of(r, looks).detect(power)
+r, sent_by_me = scenario.receivers, Known.of(cube, payload, setup.antennas, passes=2)
+spectra = spectrum.clean_spectrum(cube, sent_by_me)
+power = doppler.power_map(spectra, sent_by_me)
+above, level = cfar.CfarRule.of(r, sent_by_me.channels).detect(power)
 velocity = doppler.doppler_bins(w) * w.velocity_cell(2)
 figure, ax = plt.subplots(figsize=(8, 3.6))
 far = 120
@@ -94,7 +95,7 @@ known = irt.Prediction(
     velocity_std=np.array([0.1]),
     weight=np.ones(1),
 )
-symbols = demodulate.demodulate(heard, known, scenario.modulation.dpsk_order, None)
+symbols = demodulate.demodulate(heard, known, scenario.modulation.dpsk_order)
 print(
     "wrong delay symbols:",
     int((symbols.delay != payload.delay_symbols).sum()),

@@ -82,10 +82,12 @@ TESTS_OF = {
     "receive/passive.py": "test_receive_data",
     "receive/spectrum.py": "test_receive_data test_receive_detection",
     "receive/transform.py": "test_receive_transform",
-    "receive/clutter/sense.py": "test_clutter_detectors",
+    "receive/known.py": "test_receive_detection test_receive_joint",
+    "receive/arms.py": "test_receive_detection test_clutter_detectors",
+    "receive/chain.py": "test_receive_detection test_receive_schemes",
     "receive/joint/fit.py": "test_receive_joint",
     "receive/symbols/phases.py": "test_receive_joint",
-    "receive/joint/separate.py": "test_receive_joint",
+    "receive/joint/neighbours.py": "test_receive_joint",
     "receive/symbols/beams.py": "test_receive_beams",
     "receive/pursuit.py": "test_receive_pursuit",
     "receive/symbols/profile.py": "test_profile_decision",
@@ -93,6 +95,9 @@ TESTS_OF = {
     "receive/clutter/correction.py": "test_clutter_fit",
     "receive/clutter/power.py": "test_clutter_detectors",
     "receive/clutter/detectors.py": "test_clutter_detectors",
+    "receive/clutter/threshold_map.py": "test_clutter_detectors test_clutter_fit",
+    "receive/clutter/angle_doppler.py": "test_clutter_detectors",
+    "receive/clutter/sample_matrix.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
 COMPILED_FROM = {
@@ -140,7 +145,7 @@ EXCUSED = [
     ("signal/separable.py", "* fast) % 2)", "whole turns, one or two"),
     ("propagation/clutter/penumbra.py", "lift / side", "a quotient by a sign"),
     ("propagation/legs/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
-    ("receive/maps.py", "support] = -2", "less than any modulus, as -1 is"),
+    ("receive/omp.py", "support] = -2", "less than any modulus, as -1 is"),
     (
         "signal/profiles.py",
         "*plan(2), np.zeros((0",

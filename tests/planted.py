@@ -390,8 +390,8 @@ OF_CASES = {
     ),
     "scatter of directions": Bug(
         "receive/estimate.py",
-        "apart = 1j * scale * place[: len(values)]",
-        "apart = 1.02j * scale * place[: len(values)]",
+        "apart = 1j * known.wavenumber * line.places[: len(values), axis]",
+        "apart = 1.02j * known.wavenumber * line.places[: len(values), axis]",
     ),
     "processing gain": Bug("frame/level.py", "- 2 * 10 * np.log10(1.5)", "- 10 * np.log10(1.5)"),
     "standing clutter is removed": Bug(

@@ -12,6 +12,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.known import Known
 
 C = 299_792_458.0
 ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * C / 77e9, pattern="sector")
@@ -34,6 +35,13 @@ def frame(order: int = 8, seed: int = 3, waveform: Waveform | None = None):
     w, rng = waveform or Waveform(), np.random.default_rng(seed)
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     return w, schedule, random_payload(w, schedule, order, rng)
+
+
+def known(
+    w: Waveform, schedule, payload: Payload, antennas: Antennas = ANTENNAS, passes: int = 2
+) -> Known:
+    """What a receiver to which the payload is known knows of a frame."""
+    return Known(w, schedule, payload.delay_symbols, payload.phases, antennas, passes)
 
 
 def cube(

@@ -2,17 +2,57 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
-from isac_rt.receive.clutter.filter import remove_standing
-from isac_rt.receive.clutter.sense import sense_in_clutter
-from isac_rt.receive.joint.fit import Frame
-from isac_rt.receive.joint.separate import separate
-from isac_rt.receive.sense import make_maps, sense
+from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
+from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.known import Known
+from isac_rt.receive.sense import Detector, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter, Reception
 from isac_rt.scenario.receivers import Receivers
+
+
+@dataclass(frozen=True)
+class ActiveReceiver:
+    """The active terminal's chain: data out, clutter filter, detector and estimator, refiner."""
+
+    antennas: Antennas
+    settings: Receivers
+    clutter_filter: ClutterFilter | None
+    detector: Detector
+    refiner: Refiner | None
+
+    @classmethod
+    def of(cls, antennas: Antennas, settings: Receivers) -> ActiveReceiver:
+        """The chain that the settings name."""
+        chain = filter_of(settings), detector_of(settings), refiner_of(settings)
+        return cls(antennas, settings, *chain)
+
+    def receive(
+        self,
+        cube: IFCube | RangeProfiles,
+        payload: Payload,
+        clutter: ExpectedClutter | None = None,
+        *,
+        maps: bool = False,
+    ) -> Reception:
+        """See `receive_active`."""
+        known = Known.of(cube, payload, self.antennas, 2)
+        ready = isinstance(cube, RangeProfiles)
+        spectra = cube.spectra if ready else clean_spectrum(cube, known)
+        if self.clutter_filter is not None:
+            spectra = spectra.copy() if ready else spectra
+            self.clutter_filter.clean(spectra, cube.schedule)
+        found = self.detector.sense(spectra, known, clutter)
+        detections = found.detections
+        if self.refiner is not None and not ready:
+            detections = self.refiner(cube.samples, known, detections)[0]
+        picture = make_maps(found.power, cube, self.settings, 2) if maps else None
+        return Reception.undecoded(cube.waveform, detections, picture, found.sparse)
 
 
 def receive_active(
@@ -30,6 +70,9 @@ def receive_active(
     ----------
     cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which
         there is no `joint` refinement
+    payload : what the terminal has sent
+    antennas : of both ends
+    settings : Receivers
     clutter : what the city is expected to return, for the detectors that need it
         (`isac_rt.receive.clutter.detectors`)
     maps : also return pictures
@@ -38,30 +81,31 @@ def receive_active(
     -------
     Reception with detections only: range one way, velocity receding positive, direction cosines
     from the virtual L
+
+    Examples
+    --------
+    An echo 5 m away that recedes at 4 m/s, straight ahead:
+
+    >>> import numpy as np
+    >>> from isac_rt.frame.payload import unmodulated
+    >>> from isac_rt.frame.schedule import conventional_schedule
+    >>> from isac_rt.frame.waveform import Waveform
+    >>> w = Waveform(num_samples=64, num_chirps=24)
+    >>> antennas = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5 * w.wavelength)
+    >>> t = w.chirp_time[:, :, None] + w.fast_time - w.frame_duration / 2
+    >>> tau = (2 * 5 + 2 * 4 * t) / 299792458
+    >>> samples = np.exp(2j * np.pi * w.phase(tau, w.fast_time))[:, None].repeat(3, axis=1)
+    >>> cube = IFCube(
+    ...     samples=samples.astype(np.complex64),
+    ...     waveform=w,
+    ...     schedule=conventional_schedule(3, 24, 3),
+    ...     start_time=0.0,
+    ... )
+    >>> found = receive_active(cube, unmodulated(w), antennas, Receivers())
+    >>> found
+    <Reception 1 detections, no data decoded>
+    >>> found.detections.range.round(2), found.detections.velocity.round(1)
+    (array([5.]), array([4.]))
     """
-    w = cube.waveform
-    if isinstance(cube, RangeProfiles):
-        spectra = cube.spectra.copy() if settings.clutter_filter != "none" else cube.spectra
-    else:
-        spectra = clean_spectrum(cube, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-    if settings.clutter_filter != "none":
-        remove_standing(
-            spectra,
-            cube.schedule,
-            settings.clutter_run_cells if settings.clutter_filter == "runs" else None,
-        )
-    if settings.clutter_detector == "cfar":
-        found = sense(
-            spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, passes=2
-        )
-    else:
-        found = sense_in_clutter(
-            spectra, w, cube.schedule, payload.delay_symbols, antennas, settings, clutter
-        )
-    detections = found.detections
-    if settings.refinement == "joint" and isinstance(cube, IFCube):
-        detections = separate(
-            Frame(cube, payload.delay_symbols, payload.phases, antennas, 2), detections
-        )[0]
-    picture = make_maps(found.power, cube, settings, 2) if maps else None
-    return Reception.undecoded(w, detections, picture, found.sparse)
+    chain = ActiveReceiver.of(antennas, settings)
+    return chain.receive(cube, payload, clutter, maps=maps)

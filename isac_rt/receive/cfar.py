@@ -89,6 +89,11 @@ class CfarRule:
         level = np.maximum(self.background(power, ~strong_lobes(power)), ROUNDING * power.max())
         return power > self.factors(len(power))[:, None] * level, level
 
+    def ratio(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Power over the threshold of `detect`, and the background."""
+        level = self.detect(power)[1]
+        return power / (self.factors(len(power))[:, None] * level), level
+
     def detect_chirps(self, power: np.ndarray) -> np.ndarray:
         """One-dimensional CFAR along the range cells of every chirp (the paper's first stage).
 

@@ -15,14 +15,14 @@ of it is linearised in the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numba import njit
 
-from isac_rt.frame.antennas import Antennas, unit_vector
-from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.arms import arm
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
 
 # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
@@ -62,16 +62,14 @@ class LocalSpectra:
     def __init__(
         self,
         spectra: np.ndarray,
-        waveform: Waveform,
-        schedule: Schedule,
-        delay_symbols: np.ndarray,
+        known: Known,
         row: int,
         *,
         separate: bool = False,
     ) -> None:
         """`separate`: the groups are not added coherently, as where the velocity is known up to
         aliases only."""
-        w, low = waveform, max(row - HALF_WIDTH, 0)
+        w, low = known.waveform, max(row - HALF_WIDTH, 0)
         self._sets = w.num_groups if separate else 1
         self.waveform, self._first = w, low
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
@@ -81,12 +79,12 @@ class LocalSpectra:
             2j * np.pi * (low + np.arange(rows.shape[2])) * (w.window_length / 2 / w.num_samples)
         )
         self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(
-            schedule.size, rows.shape[2], -1
+            known.schedule.size, rows.shape[2], -1
         )
         self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
-        self._tx = np.ascontiguousarray((schedule + own).ravel())
-        self._time = (w.middle_time + delay_symbols * w.delay_step).ravel()
+        self._tx = np.ascontiguousarray((known.schedule + own).ravel())
+        self._time = known.times.ravel()
         self._numbers = np.array(
             [
                 w.carrier_frequency,
@@ -137,7 +135,8 @@ class LocalSpectra:
 def _match(
     data, weight, tx, time, first, numbers, delay, delay_rate, out, energy
 ):  # pragma: no cover - compiled
-    """out[tx, rx] = sum of conj(template) * data over the XX
+    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the
+    template: beat, phase and `hann_response` in one loop, which a test holds against them.
 
     `data` alternates real and imaginary parts, and is turned so that the template's rows differ by
     real factors.
@@ -245,55 +244,47 @@ def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int
     return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
 
 
-@lru_cache(maxsize=32)
-def arm(antennas: Antennas, axis: int, virtual: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Channels (tx index, rx index) along X (axis 0) or Z (axis 2) of the L and their places along
-    it [m].
+@dataclass(frozen=True)
+class Estimator:
+    """How a peak of the map becomes an estimate: off the grid, or `on_grid` as the centre of its
+    cell and the nearest of the directions, eight to a beam."""
 
-    `virtual`: transmit and receive elements of the axis together (an echo); else the receive arm
-    with every transmit antenna.
-    """
-    rx = np.arange(antennas.rx_x) if axis == 0 else np.arange(antennas.rx_x - 1, antennas.num_rx)
-    along = np.arange(antennas.tx_x) if axis == 0 else np.arange(antennas.tx_x - 1, antennas.num_tx)
-    tx = along if virtual else np.arange(antennas.num_tx)
-    t, r = (a.ravel() for a in np.meshgrid(tx, rx, indexing="ij"))
-    place = antennas.rx_positions[r, axis] + (antennas.tx_positions[t, axis] if virtual else 0.0)
-    for a in (t, r, place):
-        a.setflags(write=False)
-    return t, r, place
+    on_grid: bool = False
+
+    def at(self, local: LocalSpectra, power: np.ndarray, row: int, column: int) -> Estimate:
+        """The estimate of a peak of the centred map `power`."""
+        if not self.on_grid:
+            return refine(local, *start_point(power, row, column, local.waveform))
+        w = local.waveform
+        delay, rate = to_delay(row, column - w.num_chirps // 2, w)
+        return Estimate(delay, rate, local.respond(delay, rate))
+
+
+OFF_GRID = Estimator()
 
 
 def direction_cosine(
-    channels: np.ndarray,
-    antennas: Antennas,
-    waveform: Waveform,
-    axis: int,
-    virtual: bool,
-    *,
-    on_grid: bool = False,
+    channels: np.ndarray, known: Known, axis: int, *, on_grid: bool = False
 ) -> float:
     """Direction cosine along one axis of the L from the channel responses, by maximising the
     beamformed power.
 
     An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle.
-    Echoes (`virtual`) are combined coherently over both arrays; one-way paths coherently over the
+    Echoes are combined coherently over both arrays; one-way paths coherently over the
     receivers and in power over the transmitters, whose direction of departure is another and
     ambiguous.
     """
-    tx, rx, place = arm(antennas, axis, virtual)
-    scale = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
-    limit = min(1.0, np.pi / (scale * antennas.spacing))
-    values = channels[tx, rx].reshape(1 if virtual else antennas.num_tx, -1).T
-    apart = 1j * scale * place[: len(values)]  # the receivers stand alike for every transmitter
+    a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
+    limit = min(1.0, np.pi / (known.wavenumber * a.spacing))
+    values = channels[line.tx, line.rx].reshape(1 if echo else a.num_tx, -1).T
+    # the receivers stand alike for every transmitter
+    apart = 1j * known.wavenumber * line.places[: len(values), axis]
 
     def beam(u: np.ndarray) -> np.ndarray:
         return (np.abs(np.exp(np.outer(u, apart)) @ values) ** 2).sum(axis=1)
 
-    u = np.linspace(
-        -limit,
-        limit,
-        8 * (antennas.rx_x if axis == 0 else antennas.rx_z) * (2 if virtual else 1) + 1,
-    )
+    count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
+    u = np.linspace(-limit, limit, count)
     best = u[np.argmax(beam(u))]
     for step in () if on_grid else ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
         low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))
@@ -306,53 +297,41 @@ def direction_cosine(
     return float(best) if abs(best) <= 1 else float("nan")
 
 
-def direction_cosines(
-    estimate: Estimate,
-    antennas: Antennas,
-    waveform: Waveform,
-    passes: int,
-    *,
-    on_grid: bool = False,
-) -> list[float]:
+def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False) -> list[float]:
     """u_x and u_z of a detection.
 
     A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an
     element at r and a source at R, which would turn the estimate by 0.02 degrees at 11 m. R is the
     estimated range; behind a reflector on the way to a PT the true radius is shorter.
     """
-    virtual, channels = passes == 2, estimate.channels
-    u = [
-        direction_cosine(channels, antennas, waveform, axis, virtual, on_grid=on_grid)
-        for axis in (0, 2)
-    ]
-    radius = estimate.delay * SPEED_OF_LIGHT / passes
+    channels = estimate.channels
+    u = [direction_cosine(channels, known, axis, on_grid=on_grid) for axis in (0, 2)]
+    radius = estimate.delay * SPEED_OF_LIGHT / known.passes
     if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
         return u
     towards = unit_vector(u)
-    scale = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
+    scale = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
     tx, rx = (
         scale * ((r**2).sum(1) - (r @ towards) ** 2)
-        for r in (antennas.tx_positions, antennas.rx_positions)
+        for r in (known.antennas.tx_positions, known.antennas.rx_positions)
     )
     flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
-    return [
-        direction_cosine(flat, antennas, waveform, axis, virtual, on_grid=on_grid)
-        for axis in (0, 2)
-    ]
+    return [direction_cosine(flat, known, axis, on_grid=on_grid) for axis in (0, 2)]
 
 
-def standard_deviations(
-    snr: float, antennas: Antennas, waveform: Waveform, passes: int
-) -> np.ndarray:
+def standard_deviations(snr: float, known: Known) -> np.ndarray:
     """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao
     of a tone, with Hann's loss of 2 on the two windowed axes), and never below the floors at which
     other paths' sidelobes usually end the gain."""
-    w, tone = waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
-    spread = [max(tone, 2e-3) * w.range_cell(passes), max(tone, 4e-3) * w.velocity_cell(passes)]
+    w, tone = known.waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
+    spread = [
+        max(tone, 2e-3) * known.range_cell,
+        max(tone, 4e-3) * w.velocity_cell(known.passes),
+    ]
     angles = []
     for axis in (0, 2):
-        place = arm(antennas, axis, passes == 2)[2]
+        place = arm(known.antennas, axis, known.passes).places[:, axis]
         slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
-        share = place.size / (antennas.num_tx * antennas.num_rx)
+        share = place.size / known.channels
         angles.append(max(1 / (slope * np.sqrt(2 * max(snr, 1.0) * share)), 2e-4))
     return np.array(spread + angles)

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 import numpy as np
 from numba import njit
 
-from isac_rt.frame.schedule import Schedule, is_latin
 from isac_rt.frame.waveform import Waveform, hann
+from isac_rt.receive.known import Known
 
 UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler
@@ -33,22 +33,13 @@ def doppler_bins(waveform: Waveform) -> np.ndarray:
     return np.fft.fftshift(np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps))
 
 
-def slow_times(waveform: Waveform, delay_symbols: np.ndarray) -> np.ndarray:
-    """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a
-    chirp with data lies tau_D later."""
-    w = waveform
-    return (w.chirp_time + delay_symbols * w.delay_step) / w.slot_duration
-
-
-def channel_maps(
-    spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
-) -> np.ndarray:
+def channel_maps(spectra: np.ndarray, known: Known) -> np.ndarray:
     """Doppler spectrum of every virtual channel over all its chirps, groups united.
 
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) complex64 from `clean_spectrum`
-    delay_symbols : (M, P) int, those that were removed
+    known : Known, whose data were taken out
 
     Returns
     -------
@@ -57,34 +48,25 @@ def channel_maps(
         them.
     """
     num_rx, num_rows, num_chirps = spectra.shape[1:]
-    out = np.empty((waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
-    for tx, (places, operator) in enumerate(
-        _operators(spectra.shape, waveform, schedule, delay_symbols)
-    ):
+    out = np.empty((known.waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
+    for tx, (places, operator) in enumerate(_operators(spectra.shape, known)):
         united = np.empty((num_rx * num_rows, places.size), np.complex64)
         _unite(spectra.reshape(-1), places, num_chirps, united)
         np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
     return out
 
 
-def _operators(
-    shape: tuple[int, ...], waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _operators(shape: tuple[int, ...], known: Known) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Of each transmit antenna where its chirps lie in the flat spectra of a `shape`, in the first
     row, and the operator on them."""
-    num_groups, num_rx, num_rows, num_chirps = shape
-    full = num_groups == waveform.num_tx and is_latin(schedule, waveform.num_tx)
-    times = slow_times(waveform, delay_symbols)
-    for tx in range(waveform.num_tx):
-        sent = schedule == tx
+    w, (_, num_rx, num_rows, num_chirps) = known.waveform, shape
+    for sent in known.sent_by:
         groups, chirps = np.nonzero(sent)
-        operator = (union_operator if full else correlation_operator)(waveform, times[sent])
+        operator = (union_operator if known.full else correlation_operator)(w, known.slots[sent])
         yield (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), operator
 
 
-def power_map(
-    spectra: np.ndarray, waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray
-) -> np.ndarray:
+def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
     """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, Doppler centred.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
@@ -94,7 +76,7 @@ def power_map(
     num_rx, num_rows, num_chirps = spectra.shape[1:]
     half = num_chirps // 2 + 1
     power = np.zeros((num_rows, num_chirps), np.float32)
-    for places, operator in _operators(spectra.shape, waveform, schedule, delay_symbols):
+    for places, operator in _operators(spectra.shape, known):
         rows = operator[:half].copy()
         if num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
             rows[-1] = rows[-1].conj()
@@ -110,7 +92,49 @@ def power_map(
             )
             np.matmul(united.reshape(2 * num_rows, -1), parts, out=made)
             _add_both_bins(made.reshape(2, num_rows, 2, half), power)
-    return np.fft.fftshift(power, axes=-1) / (waveform.num_tx * num_rx)
+    return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * num_rx)
+
+
+class LatinUnion:
+    """All groups as one uniform sampling of slow time; the map of a receiver by this way.
+
+    Attributes
+    ----------
+    separate : groups are added in power and not in phase: velocities are known up to the
+        unambiguous velocity divided by L_tx
+    advises : says whether the scene is sparse enough for sparse sampling
+    """
+
+    separate = False
+    advises = False
+
+    def power(self, spectra: np.ndarray, known: Known) -> np.ndarray:
+        """(rows, P) power, Doppler centred."""
+        return power_map(spectra, known)
+
+    def keep(
+        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+    ) -> np.ndarray:
+        """Which of the cells `above` the threshold may be peaks."""
+        return above
+
+
+LATIN_UNION = LatinUnion()
+
+
+class Conventional(LatinUnion):
+    """The DFT over each antenna's own chirps in each group."""
+
+    separate = True
+    advises = True
+
+    def power(self, spectra: np.ndarray, known: Known) -> np.ndarray:
+        return conventional_power(spectra, known)
+
+    def keep(
+        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+    ) -> np.ndarray:
+        return above & own_bins(known.waveform)
 
 
 @njit(nogil=True, cache=True)
@@ -187,7 +211,7 @@ def accumulate(maps: np.ndarray) -> np.ndarray:
     return np.fft.fftshift(power, axes=-1) / (maps.shape[0] * maps.shape[1])
 
 
-def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedule) -> np.ndarray:
+def conventional_power(spectra: np.ndarray, known: Known) -> np.ndarray:
     """Mean power of the DFT over each antenna's own chirps in each group: the conventional TDM-MIMO
     receiver, schemes (a) and (c).
 
@@ -200,19 +224,17 @@ def conventional_power(spectra: np.ndarray, waveform: Waveform, schedule: Schedu
     power : (rows, P) float32, Doppler centred, periodic
     """
     num_groups, num_rx, num_rows, num_chirps = spectra.shape
-    size = num_chirps // waveform.num_tx
+    num_tx = known.waveform.num_tx
+    size = num_chirps // num_tx
     window = hann(np.arange(size) + 0.5, size)
-    analyse = (
-        np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size) * window
-    ).astype(np.complex64)
+    turns = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
+    analyse = (turns * window).astype(np.complex64)
     power = np.zeros((num_rows, size), np.float32)
     for m in range(num_groups):
-        for tx in range(waveform.num_tx):
-            own = spectra[m][..., schedule[m] == tx].reshape(-1, size) @ analyse.T
+        for sent in known.sent_by:
+            own = spectra[m][..., sent[m]].reshape(-1, size) @ analyse.T
             power += (own.real**2 + own.imag**2).reshape(num_rx, num_rows, size).sum(axis=0)
-    return np.fft.fftshift(
-        np.tile(power / (num_groups * waveform.num_tx * num_rx), waveform.num_tx), axes=-1
-    )
+    return np.fft.fftshift(np.tile(power / (num_groups * num_tx * num_rx), num_tx), axes=-1)
 
 
 def own_bins(waveform: Waveform) -> np.ndarray:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import LatinUnion
 
+SPARSITY = 4
+"""Atoms per range row."""
 MOST_UNEXPLAINED = 1 / 3
 """Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably
 may leave."""
@@ -24,40 +28,34 @@ def recovery_limit(num_samples: int, num_chirps: int) -> int:
     return max(int(num_samples / (2 * np.log(num_chirps))), 1)
 
 
-def unexplained(
-    spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule
-) -> np.ndarray:
+def unexplained(spectra: np.ndarray, rows: np.ndarray, known: Known) -> np.ndarray:
     """(len(rows),) share of each row's power that as many OMP atoms as the sampling's
     `recovery_limit` do not explain."""
+    num_chirps = known.waveform.num_chirps
     total, left = np.zeros(len(rows)), np.zeros(len(rows))
-    for m in range(len(schedule)):
-        for tx in range(waveform.num_tx):
-            chosen = np.flatnonzero(schedule[m] == tx)
-            part = spectra[m][:, rows][:, :, chosen]
-            found = omp(
-                part.reshape(-1, chosen.size),
-                chosen,
-                waveform.num_chirps,
-                recovery_limit(chosen.size, waveform.num_chirps),
-            )
-            atoms = (
-                np.exp(
-                    2j
-                    * np.pi
-                    * np.outer(np.arange(waveform.num_chirps), chosen)
-                    / waveform.num_chirps
-                )
-                / chosen.size
-            )
-            rest = part - (found @ atoms).reshape(part.shape)
-            total += (np.abs(part) ** 2).sum(axis=(0, 2))
-            left += (np.abs(rest) ** 2).sum(axis=(0, 2))
+    for part, chosen in _sparse_samples(spectra, rows, known):
+        limit = recovery_limit(chosen.size, num_chirps)
+        found = omp(part.reshape(-1, chosen.size), chosen, num_chirps, limit)
+        turns = np.outer(np.arange(num_chirps), chosen)
+        atoms = np.exp(2j * np.pi * turns / num_chirps) / chosen.size
+        rest = part - (found @ atoms).reshape(part.shape)
+        total += (np.abs(part) ** 2).sum(axis=(0, 2))
+        left += (np.abs(rest) ** 2).sum(axis=(0, 2))
     return left / np.maximum(total, 1e-300)
 
 
-def sparse_enough(
-    spectra: np.ndarray, rows: np.ndarray, noise: float, waveform: Waveform, schedule: Schedule
-) -> bool:
+def _sparse_samples(
+    spectra: np.ndarray, rows: np.ndarray, known: Known
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Of each group and transmit antenna its samples of some rows (L_rx, rows, S) and their slots
+    (S,)."""
+    for m in range(len(spectra)):
+        for sent in known.sent_by:
+            chosen = np.flatnonzero(sent[m])
+            yield spectra[m][:, rows][:, :, chosen], chosen
+
+
+def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, known: Known) -> bool:
     """Whether the occupied range rows are sparse enough in Doppler for random sampling (scheme
     (d)).
 
@@ -76,11 +74,11 @@ def sparse_enough(
         return True
     power = np.mean(np.abs(spectra[:, :, rows]) ** 2, axis=(0, 1, 3))
     above = np.maximum(power - noise, 1e-3 * noise)
-    size = waveform.num_chirps // waveform.num_tx
-    kept = (
-        1 - recovery_limit(size, waveform.num_chirps) / size
-    )  # of the noise: each atom takes one dimension
-    share = (unexplained(spectra, rows, waveform, schedule) * power - kept * noise) / above
+    w = known.waveform
+    size = w.num_chirps // w.num_tx
+    # of the noise: each atom takes one dimension
+    kept = 1 - recovery_limit(size, w.num_chirps) / size
+    share = (unexplained(spectra, rows, known) * power - kept * noise) / above
     return bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
 
 
@@ -107,11 +105,8 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     count, size = vectors.shape
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
     gram = atoms.conj().T @ atoms
-    ridge = (
-        1e-9 * size
-        # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient
-        # then
-    )
+    # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient then
+    ridge = 1e-9 * size
     first = vectors @ atoms.conj()
     correlation, support = first.copy(), np.zeros((count, 0), np.int64)
     solution = np.zeros((count, 0), np.complex128)
@@ -128,9 +123,7 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     return out
 
 
-def omp_power(
-    spectra: np.ndarray, rows: np.ndarray, waveform: Waveform, schedule: Schedule, sparsity: int
-) -> np.ndarray:
+def omp_power(spectra: np.ndarray, rows: np.ndarray, known: Known, sparsity: int) -> np.ndarray:
     """Accumulated OMP power on some range rows (the paper's map): mean over groups, antennas and
     receivers.
 
@@ -141,13 +134,31 @@ def omp_power(
     """
     num_groups, num_rx, _, num_chirps = spectra.shape
     power = np.zeros((len(rows), num_chirps), np.float64)
-    for m in range(num_groups):
-        for tx in range(waveform.num_tx):
-            chosen = np.flatnonzero(schedule[m] == tx)
-            vectors = spectra[m][:, rows][:, :, chosen].reshape(-1, chosen.size)
-            found = omp(vectors, chosen, num_chirps, sparsity).reshape(
-                num_rx, len(rows), num_chirps
-            )
-            power += (np.abs(found) ** 2).sum(axis=0)
-    power /= num_groups * waveform.num_tx * num_rx
+    for part, chosen in _sparse_samples(spectra, rows, known):
+        found = omp(part.reshape(-1, chosen.size), chosen, num_chirps, sparsity)
+        power += (np.abs(found.reshape(num_rx, len(rows), num_chirps)) ** 2).sum(axis=0)
+    power /= num_groups * known.waveform.num_tx * num_rx
     return np.fft.fftshift(power, axes=-1).astype(np.float32)
+
+
+class Omp(LatinUnion):
+    """Each group's sparse sampling: the correlations, where OMP's support keeps them.
+
+    A cell stays if OMP's accumulated power there, compared with the correlation's, is above the
+    background: the sparse sampling's sidelobes fall away. A path some 20 dB below another one of
+    its row is lost: off the grid the stronger one takes several of the few atoms.
+    """
+
+    advises = True
+
+    def keep(
+        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+    ) -> np.ndarray:
+        rows, out = np.flatnonzero(above.any(axis=1)), np.zeros_like(above)
+        if rows.size:
+            found = omp_power(spectra, rows, known, SPARSITY)
+            # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2,
+            # OMP one group's
+            gain = (len(known.schedule) / 2) ** 2
+            out[rows] = found * gain > level[rows]
+        return above & out

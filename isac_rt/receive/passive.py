@@ -3,47 +3,188 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.payload import unmodulated
-from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.estimate import Estimate, LocalSpectra
-from isac_rt.receive.joint.fit import Frame, JointPath
-from isac_rt.receive.joint.separate import separate
-from isac_rt.receive.sense import (
-    Sensed,
-    describe,
-    estimate_at,
-    make_maps,
-    num_looks,
-    sense,
-    velocity_method,
-)
+from isac_rt.receive.chain import Refiner, cfar_of, reader_of, refiner_of
+from isac_rt.receive.estimate import Estimate
+from isac_rt.receive.joint.fit import JointPath
+from isac_rt.receive.known import Known
+from isac_rt.receive.sense import Cfar, Sensed, describe, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.beams import demodulate_beams, usable_paths
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.symbols.powers import (
-    EXTRA_CELLS,
+    ByPowers,
     Symbols,
     confidence_threshold,
-    demodulate,
     moves_as_predicted,
+    symbol_cells,
 )
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario.receivers import Receivers
 
-# the line of sight arrives first; what precedes the strongest path by more is a sidelobe or noise
 REFERENCE_SPAN_DB = 20.0
-# range rows searched on each side of the predicted one: the fraction is known, the whole cell is
-# the prediction's
-GATE_CELLS = 1
-GATE_BINS = 4
+"""The line of sight arrives first; what precedes the strongest path by more is a sidelobe or
+noise."""
+GATE_CELLS, GATE_BINS = 1, 4
+"""Range rows and Doppler bins searched on each side of the predicted cell: the fraction of a row is
+known, the whole row is the prediction's."""
+
+
+@dataclass(frozen=True)
+class PassiveReceiver:
+    """A passive terminal's chain: symbol reader, data out, CFAR with its estimator, refiner.
+
+    Attributes
+    ----------
+    groups : that carry data for this terminal, None for all (see `receive_passive`)
+    """
+
+    antennas: Antennas
+    settings: Receivers
+    reader: ByPowers
+    detector: Cfar
+    refiner: Refiner | None
+    groups: Sequence[int] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        antennas: Antennas,
+        settings: Receivers,
+        dpsk_order: int,
+        groups: Sequence[int] | None = None,
+    ) -> PassiveReceiver:
+        """The chain that the settings name."""
+        chain = reader_of(settings, dpsk_order), cfar_of(settings), refiner_of(settings)
+        return cls(antennas, settings, *chain, groups)
+
+    def receive(
+        self,
+        cube: IFCube,
+        prediction: Prediction | None,
+        modulated: bool,
+        profile: np.ndarray | None = None,
+        *,
+        maps: bool = False,
+    ) -> Reception:
+        """See `receive_passive`; `profile` is what the reader learned last."""
+        if self.groups is not None and modulated:
+            part, every = cube.of_groups(self.groups), replace(self, groups=None)
+            mine = every.receive(part, prediction, True, profile, maps=maps)
+            return _among_all(mine, self.groups, cube.waveform)
+        w = cube.waveform
+        if not modulated:
+            known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
+            found = self.detector.sense(clean_spectrum(cube, known), known)
+            detections, reference = self._earliest(found, known)
+            return self._reception(cube, known, found, detections, reference, maps=maps)
+        symbols = None
+        if prediction is not None:
+            symbols = self.reader.read(cube, prediction, self.antennas, profile)
+        if prediction is None or symbols is None or not self._believed(symbols, w):
+            power = np.zeros((w.num_delay_symbols, w.num_chirps))
+            picture = make_maps(power, cube, self.settings, 1) if maps else None
+            return Reception.undecoded(w, no_detections(), picture)
+        known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        found, detections, reference = self._sense_data(cube, known, prediction)
+        if (
+            self.refiner is not None
+            and reference is not None
+            and np.isfinite(detections.direction[0]).all()
+        ):
+            first = detections  # row 0 is the reference
+            delay, rate = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT
+            path = JointPath(delay, rate, first.direction[0], np.ones(1), np.zeros(4))
+            phases = decide_phases(cube.samples, known, path, self.reader.order)
+            if not np.allclose(phases, known.phases):
+                known = replace(known, phases=phases)
+                found, detections, reference = self._sense_data(cube, known, prediction)
+        reception = self._reception(cube, known, found, detections, reference, maps=maps)
+        return reception if reference is None else _decoded(reception, symbols)
+
+    def _believed(self, symbols: Symbols, waveform: Waveform) -> bool:
+        """Whether the decisions look neither like noise nor like a path that moves otherwise."""
+        least = confidence_threshold(symbols.looks, symbol_cells(waveform).size, symbols.raw.size)
+        confident = np.median(symbols.delay_confidence) >= least
+        return bool(confident) and moves_as_predicted(symbols, self.reader.order)
+
+    def _sense_data(
+        self, cube: IFCube, known: Known, prediction: Prediction
+    ) -> tuple[Sensed, Detections, Estimate | None]:
+        """What a frame shows once its symbols are taken out, with the reference put first."""
+        spectra = clean_spectrum(cube, known)
+        found = self.detector.sense(spectra, known)
+        return found, *self._at_prediction(spectra, known, found, prediction)
+
+    def _earliest(self, found: Sensed, known: Known) -> tuple[Detections, Estimate | None]:
+        """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the
+        false-alarm rate is asked of the whole map here and not of one cell, or an empty pilot would
+        now and then be acquired."""
+        d, rule = found.detections, self.detector.rule(known)
+        sure = d.snr > replace(rule, rate=rule.rate / found.power.size).threshold
+        if not sure.any():
+            return d, None
+        power = np.array([_power(e) for e in found.estimates])
+        sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
+        first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
+        return replace(d, is_reference=np.arange(len(d)) == first), found.estimates[first]
+
+    def _at_prediction(
+        self, spectra: np.ndarray, known: Known, found: Sensed, prediction: Prediction
+    ) -> tuple[Detections, Estimate | None]:
+        """The reference within the gate, put first with its own estimate, and the other detections
+        beside it."""
+        w, power = known.waveform, found.power
+        row, column = predicted_cell(prediction, w)
+        if not 0 <= row < len(power):
+            return no_detections(), None
+        rows = np.arange(max(row - GATE_CELLS, 0), min(row + GATE_CELLS + 1, len(power)))
+        columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
+        gate = power[np.ix_(rows, columns)]
+        i, j = np.unravel_index(gate.argmax(), gate.shape)
+        row, column = int(rows[i]), int(columns[j])
+        snr = power[row, column] / found.level[row, column]
+        if not snr > self.detector.rule(known).factors(len(power))[row]:
+            return no_detections(), None
+        estimate = self.detector.estimate(spectra, known, power, row, column)
+        on_grid = self.detector.estimator.on_grid
+        reference = describe([estimate], np.array([snr]), known, on_grid=on_grid)
+        d = found.detections
+        apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
+        apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
+        first = replace(reference, is_reference=np.ones(1, bool))
+        return Detections.joined([first, d.select(apart)]), estimate
+
+    def _reception(
+        self,
+        cube: IFCube,
+        known: Known,
+        found: Sensed,
+        detections: Detections,
+        reference: Estimate | None,
+        *,
+        maps: bool,
+    ) -> Reception:
+        """What was found, refined, without the symbols."""
+        picture = make_maps(found.power, cube, self.settings, 1) if maps else None
+        out = Reception.undecoded(cube.waveform, detections, picture, found.sparse)
+        if reference is not None:
+            out = replace(out, line_of_sight=True, reference_power=_power(reference))
+        if self.refiner is None:
+            return out
+        detections, power = self.refiner(cube.samples, known, detections)
+        mine = power[detections.is_reference]
+        fitted = mine.size and np.isfinite(mine[0])
+        return replace(
+            out,
+            detections=detections,
+            reference_power=float(mine[0]) if fitted else out.reference_power,
+        )
 
 
 def receive_passive(
@@ -55,7 +196,6 @@ def receive_passive(
     modulated: bool,
     *,
     groups: Sequence[int] | None = None,
-    profile: np.ndarray | None = None,
     maps: bool = False,
 ) -> Reception:
     """Data symbols, bits and detections of one frame.
@@ -63,13 +203,14 @@ def receive_passive(
     Parameters
     ----------
     cube : IFCube
+    antennas : of both ends
+    settings : Receivers
+    dpsk_order : D
     prediction : row 0 is the line of sight; None when nothing is tracked. Unmodulated frames need
         none
     modulated : whether the frame carries data (public)
     groups : that carry data for this terminal, None for all. It decodes these, and senses with
         these alone while there are data: what the others carry it does not know
-    profile : range profile with which the delay symbols are decided
-        (`isac_rt.receive.symbols.profile`), None: by the strongest cell
     maps : also return pictures
 
     Returns
@@ -77,83 +218,45 @@ def receive_passive(
     Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the
     strongest. Without a prediction a modulated frame cannot be read: nothing is detected. When the
     decisions look like noise or like a path that moves otherwise, or nothing is found where the
-    reference is expected, `line_of_sight` is False and all symbols are erased.
+    reference is expected, `line_of_sight` is False and all symbols are erased. With
+    ``symbol_decision: profile`` the delay symbols are decided as by powers: what a terminal learned
+    from an unmodulated frame is `PassiveReceiver.receive`'s to know.
+
+    Examples
+    --------
+    An unmodulated frame with a line of sight of 10 m; its data frames are read with a prediction:
+
+    >>> from isac_rt.frame.schedule import conventional_schedule
+    >>> w = Waveform(num_samples=64, num_chirps=24)
+    >>> antennas = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5 * w.wavelength)
+    >>> t = w.chirp_time[:, :, None] + w.fast_time - w.frame_duration / 2
+    >>> samples = np.exp(2j * np.pi * w.phase(0 * t + 10 / 299792458, w.fast_time))[:, None]
+    >>> cube = IFCube(
+    ...     samples=samples.repeat(3, axis=1).astype(np.complex64),
+    ...     waveform=w,
+    ...     schedule=conventional_schedule(3, 24, 3),
+    ...     start_time=0.0,
+    ... )
+    >>> receive_passive(cube, antennas, Receivers(), 8, None, modulated=False)
+    <Reception 1 detections, line of sight, no data decoded>
     """
-    if groups is not None and modulated:
-        part = cube.of_groups(groups)
-        mine = receive_passive(
-            part, antennas, settings, dpsk_order, prediction, modulated, profile=profile, maps=maps
-        )
-        return _among_all(mine, groups, cube.waveform)
-    w = cube.waveform
-    if not modulated:
-        pilot = unmodulated(w)
-        spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
-        found = sense(spectra, w, cube.schedule, pilot.delay_symbols, antennas, settings, passes=1)
-        reception = _reception(
-            cube, settings, *_earliest(found, cube.schedule, antennas, settings), found, None, maps
-        )
-        return _jointly(
-            reception, Frame(cube, pilot.delay_symbols, pilot.phases, antennas, 1), settings
-        )
-    if prediction is None:
-        return _reception(cube, settings, no_detections(), None, None, None, maps)
-    run_cells = settings.clutter_run_cells if settings.clutter_filter == "runs" else None
-    if settings.symbol_decision == "beams" and usable_paths(prediction).size:
-        symbols = demodulate_beams(cube, prediction, antennas, dpsk_order, run_cells)
-    else:
-        symbols = demodulate(cube, prediction, dpsk_order, run_cells, profile)
-    cells = w.num_delay_symbols + 2 * EXTRA_CELLS
-    confident = np.median(symbols.delay_confidence) >= confidence_threshold(
-        symbols.looks, cells, symbols.raw.size
-    )
-    if not confident or not moves_as_predicted(symbols, dpsk_order):
-        return _reception(cube, settings, no_detections(), None, None, None, maps)
-    frame = Frame(cube, symbols.raw, symbols.phases, antennas, 1)
-    found, detections, reference = _sense_data(frame, prediction, settings)
-    if (
-        settings.refinement == "joint"
-        and reference is not None
-        and np.isfinite(detections.direction[0]).all()
-    ):
-        first = detections  # row 0 is the reference
-        start = (
-            first.range[0] / SPEED_OF_LIGHT,
-            first.velocity[0] / SPEED_OF_LIGHT,
-            first.direction[0],
-        )
-        phases = decide_phases(frame, JointPath(*start, np.ones(1), np.zeros(4)), dpsk_order)
-        if not np.allclose(phases, frame.phases):
-            frame = replace(frame, phases=phases)
-            found, detections, reference = _sense_data(frame, prediction, settings)
-    reception = _reception(
-        cube, settings, detections, reference, found, symbols if reference else None, maps
-    )
-    return _jointly(reception, frame, settings)
+    chain = PassiveReceiver.of(antennas, settings, dpsk_order, groups)
+    return chain.receive(cube, prediction, modulated, maps=maps)
 
 
-def _sense_data(
-    frame: Frame, prediction: Prediction, settings: Receivers
-) -> tuple[Sensed, Detections, Estimate | None]:
-    """What a frame shows once its symbols are taken out, with the reference put first."""
-    cube, raw = frame.cube, frame.delay_symbols
-    spectra = clean_spectrum(cube, raw, frame.phases, frame.waveform.num_delay_symbols)
-    found = sense(spectra, frame.waveform, cube.schedule, raw, frame.antennas, settings, passes=1)
-    return found, *_at_prediction(spectra, raw, found, prediction, cube, frame.antennas, settings)
-
-
-def _jointly(reception: Reception, frame: Frame, settings: Receivers) -> Reception:
-    """With `joint` refinement all detections fitted at once, and the reference's power with
-    them."""
-    if settings.refinement != "joint":
-        return reception
-    detections, power = separate(frame, reception.detections)
-    mine = power[detections.is_reference]
-    known = mine.size and np.isfinite(mine[0])
+def _decoded(reception: Reception, symbols: Symbols) -> Reception:
+    """A reception with the symbols that were read."""
     return replace(
         reception,
-        detections=detections,
-        reference_power=float(mine[0]) if known else reception.reference_power,
+        decoded=True,
+        delay_symbols=symbols.delay,
+        transitions=symbols.transitions,
+        bits=symbols.bits,
+        delay_confidence=symbols.delay_confidence,
+        transition_confidence=symbols.transition_confidence,
+        raw_delay_symbols=symbols.raw,
+        soft_bits=symbols.soft_bits,
+        confidence_looks=symbols.looks,
     )
 
 
@@ -174,63 +277,9 @@ def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Re
     )
 
 
-def _earliest(
-    found: Sensed, schedule: Schedule, antennas: Antennas, settings: Receivers
-) -> tuple[Detections, Estimate | None]:
-    """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the
-    false-alarm rate is asked of the whole map here and not of one cell, or an empty pilot would now
-    and then be acquired."""
-    d = found.detections
-    rule = CfarRule.of(settings, num_looks(settings, schedule, antennas))
-    sure = d.snr > replace(rule, rate=rule.rate / found.power.size).threshold
-    if not sure.any():
-        return d, None
-    power = np.array([_power(e) for e in found.estimates])
-    sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
-    first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
-    return replace(d, is_reference=np.arange(len(d)) == first), found.estimates[first]
-
-
 def _power(estimate: Estimate) -> float:
     """Mean power of a path per sample and receive antenna [W]."""
     return float((np.abs(estimate.channels) ** 2).mean())
-
-
-def _at_prediction(
-    spectra: np.ndarray,
-    delay_symbols: np.ndarray,
-    found: Sensed,
-    prediction: Prediction,
-    cube: IFCube,
-    antennas: Antennas,
-    settings: Receivers,
-) -> tuple[Detections, Estimate | None]:
-    """The reference within the gate, put first with its own estimate, and the other detections
-    beside it."""
-    w = cube.waveform
-    row, column = predicted_cell(prediction, w)
-    if not 0 <= row < found.power.shape[0]:
-        return no_detections(), None
-    rows = np.arange(max(row - GATE_CELLS, 0), min(row + GATE_CELLS + 1, found.power.shape[0]))
-    columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
-    gate = found.power[np.ix_(rows, columns)]
-    i, j = np.unravel_index(gate.argmax(), gate.shape)
-    rule = CfarRule.of(settings, num_looks(settings, cube.schedule, antennas))
-    factors = rule.factors(len(found.power))
-    snr = found.power[rows[i], columns[j]] / found.level[rows[i], columns[j]]
-    if not snr > factors[rows[i]]:
-        return no_detections(), None
-    separate = velocity_method(settings, cube.schedule, w.num_tx) == "conventional"
-    local = LocalSpectra(spectra, w, cube.schedule, delay_symbols, int(rows[i]), separate=separate)
-    estimate = estimate_at(local, found.power, int(rows[i]), int(columns[j]), settings)
-    reference = describe(
-        [estimate], np.array([snr]), antennas, w, 1, on_grid=settings.refinement == "grid"
-    )
-    d = found.detections
-    apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
-    apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
-    first = replace(reference, is_reference=np.ones(1, bool))
-    return Detections.joined([first, d.select(apart)]), estimate
 
 
 def predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int]:
@@ -239,36 +288,3 @@ def predicted_cell(prediction: Prediction, waveform: Waveform) -> tuple[int, int
     doppler = prediction.velocity[0] / w.velocity_cell(1)
     beat = prediction.range[0] / w.range_cell(1) + doppler * (w.sampled_duration / w.frame_duration)
     return round(beat), (round(doppler) + w.num_chirps // 2) % w.num_chirps
-
-
-def _reception(
-    cube: IFCube,
-    settings: Receivers,
-    detections: Detections,
-    reference: Estimate | None,
-    found: Sensed | None,
-    symbols: Symbols | None,
-    maps: bool,
-) -> Reception:
-    w = cube.waveform
-    picture = None
-    if maps:
-        power = found.power if found else np.zeros((w.num_delay_symbols, w.num_chirps))
-        picture = make_maps(power, cube, settings, 1)
-    out = Reception.undecoded(w, detections, picture, found.sparse if found else None)
-    if reference is not None:
-        out = replace(out, line_of_sight=True, reference_power=_power(reference))
-    if symbols is None:
-        return out
-    return replace(
-        out,
-        decoded=True,
-        delay_symbols=symbols.delay,
-        transitions=symbols.transitions,
-        bits=symbols.bits,
-        delay_confidence=symbols.delay_confidence,
-        transition_confidence=symbols.transition_confidence,
-        raw_delay_symbols=symbols.raw,
-        soft_bits=symbols.soft_bits,
-        confidence_looks=symbols.looks,
-    )

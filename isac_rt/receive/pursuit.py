@@ -9,11 +9,10 @@ sparse sampling go with it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.cfar import CfarRule, first_row
 from isac_rt.receive.estimate import (
     Estimate,
@@ -24,7 +23,10 @@ from isac_rt.receive.estimate import (
     start_point,
 )
 from isac_rt.receive.joint.fit import element_delays
-from isac_rt.receive.maps import power_map
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import LATIN_UNION, LatinUnion, power_map
+from isac_rt.receive.sense import Cfar, Sensed, describe
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
 REACH = 24
@@ -37,14 +39,22 @@ removal left."""
 NEAR = (3, 4)
 
 
+@dataclass(frozen=True)
+class Pursuit(Cfar):
+    """The CFAR on what the paths found before leave."""
+
+    doppler: LatinUnion | None = LATIN_UNION
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        paths, snr, power = pursue(spectra, known, self.settings)
+        level = self.rule(known).detect(power)[1]
+        return Sensed(paths, describe(paths, snr, known), power, level)
+
+
 def pursue(
-    spectra: np.ndarray,
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    antennas: Antennas,
-    settings: Receivers,
-    passes: int,
+    spectra: np.ndarray, known: Known, settings: Receivers
 ) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
     """Paths of a frame from cleaned spectra, in the order in which they were found, their SNR on
     the map that was left, and the map (rows, P) before anything was taken out.
@@ -52,13 +62,10 @@ def pursue(
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) from `clean_spectrum`; not changed
-    delay_symbols : (M, P), those that were removed
-    passes : 2 for echoes, 1 at a PT
     """
-    w, left = waveform, spectra.copy()
-    rule = CfarRule.of(settings, antennas.num_tx * antennas.num_rx)
-    first = first_row(settings, w.range_cell(passes))
-    power = power_map(left, w, schedule, delay_symbols)
+    w, left = known.waveform, spectra.copy()
+    rule, first = CfarRule.of(settings, known.channels), first_row(settings, known.range_cell)
+    power = power_map(left, known)
     whole = power.copy()
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder
     found: list[Estimate] = []
@@ -70,7 +77,7 @@ def pursue(
         if not above.any():
             break
         row, column = divmod(int(np.where(above, power, 0).argmax()), power.shape[1])
-        local = LocalSpectra(left, w, schedule, delay_symbols, row)
+        local = LocalSpectra(left, known, row)
         estimate = refine(local, *start_point(power, row, column, w))
         found.append(estimate)
         snr.append(float(power[row, column] / level[row, column]))
@@ -78,70 +85,49 @@ def pursue(
         columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % w.num_chirps
         block = np.ix_(rows, columns)
         taken[block] = np.maximum(taken[block], power[row, column] * 10 ** (-LEFT_OVER_DB / 10))
-        changed = _take_out(left, estimate, w, schedule, delay_symbols, antennas, passes)
-        _fit_again(left, found, w, schedule, delay_symbols, antennas, passes)
-        power[changed] = power_map(left[:, :, changed], w, schedule, delay_symbols)
+        changed = _take_out(left, estimate, known)
+        _fit_again(left, found, known)
+        power[changed] = power_map(left[:, :, changed], known)
     return found, np.array(snr), whole
 
 
-def _fit_again(
-    spectra: np.ndarray,
-    found: list[Estimate],
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    antennas: Antennas,
-    passes: int,
-) -> None:
+def _fit_again(spectra: np.ndarray, found: list[Estimate], known: Known) -> None:
     """Estimate the last path and those within its rows once more, each with the others taken out:
     the orthogonal step. In place."""
-    w, place = waveform, [float(waveform.beat_cells(e.delay, e.delay_rate).mean()) for e in found]
+    w = known.waveform
+    place = [float(w.beat_cells(e.delay, e.delay_rate).mean()) for e in found]
     near = [k for k in range(len(found)) if abs(place[k] - place[-1]) < 2 * NEAR[0]]
     for _ in range(CYCLES if len(near) > 1 else 0):
         for k in near:
-            _take_out(spectra, found[k], w, schedule, delay_symbols, antennas, passes, back=True)
-            local = LocalSpectra(
-                spectra,
-                w,
-                schedule,
-                delay_symbols,
-                min(max(round(place[k]), 0), spectra.shape[2] - 1),
-            )
+            _take_out(spectra, found[k], known, back=True)
+            row = min(max(round(place[k]), 0), spectra.shape[2] - 1)
+            local = LocalSpectra(spectra, known, row)
             found[k] = refine(local, found[k].delay, found[k].delay_rate)
-            _take_out(spectra, found[k], w, schedule, delay_symbols, antennas, passes)
+            _take_out(spectra, found[k], known)
 
 
 def _take_out(
-    spectra: np.ndarray,
-    estimate: Estimate,
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    antennas: Antennas,
-    passes: int,
-    *,
-    back: bool = False,
+    spectra: np.ndarray, estimate: Estimate, known: Known, *, back: bool = False
 ) -> slice:
     """Subtract a path in place from the rows that it reaches, or put it `back`; returns the rows.
     The template is that of `LocalSpectra` with each element's own delay."""
-    w = waveform
-    time = w.middle_time + delay_symbols * w.delay_step
-    beat = w.beat_cells(estimate.delay, estimate.delay_rate, time)
-    cycles = w.phase(estimate.delay + estimate.delay_rate * time, w.window_middle)
-    middle = round(float(w.beat_cells(estimate.delay, estimate.delay_rate).mean()))
+    w, e, schedule = known.waveform, estimate, known.schedule
+    beat = w.beat_cells(e.delay, e.delay_rate, known.times)
+    cycles = w.phase(e.delay + e.delay_rate * known.times, w.window_middle)
+    middle = round(float(w.beat_cells(e.delay, e.delay_rate).mean()))
     rows = np.arange(max(middle - REACH, 0), min(middle + REACH + 1, spectra.shape[2]))
-    direction = np.nan_to_num(direction_cosines(estimate, antennas, w, passes))
-    radius = max(estimate.delay * SPEED_OF_LIGHT / passes, w.range_cell(passes))
-    heard = element_delays(antennas.rx_positions, direction, radius)[0] / w.delay_step
-    sent = (
-        element_delays(antennas.tx_positions, direction, radius)[0] / w.delay_step * (passes == 2)
+    direction = np.nan_to_num(direction_cosines(e, known))
+    heard, sent = (
+        element_delays(positions, direction, known.radius(e.delay))[0] / w.delay_step
+        for positions in (known.antennas.rx_positions, known.antennas.tx_positions)
     )
+    sent = sent * (known.passes == 2)
     for m in range(len(spectra)):
         turn = np.exp(
             2j * np.pi * (cycles[m] - rows[:, None] * (w.window_length / 2 / w.num_samples))
         )
         for rx in range(spectra.shape[1]):
             shape = hann_response(w, beat[m] + sent[schedule[m]] + heard[rx] - rows[:, None])
-            path = (estimate.channels[schedule[m], rx] * shape * turn).astype(np.complex64)
+            path = (e.channels[schedule[m], rx] * shape * turn).astype(np.complex64)
             spectra[m, rx, rows] += path if back else -path
     return slice(int(rows[0]), int(rows[-1]) + 1)

@@ -1,41 +1,28 @@
-"""From cleaned spectra to detections: what the active and the passive terminal do alike."""
+"""From cleaned spectra to detections: the CFAR on range-Doppler maps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Protocol
 
 import numpy as np
 import scipy.fft
 
-from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
-from isac_rt.frame.schedule import Schedule, is_latin
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.cfar import CfarRule, first_row, strongest_peaks
 from isac_rt.receive.estimate import (
+    OFF_GRID,
     Estimate,
+    Estimator,
     LocalSpectra,
     direction_cosines,
-    refine,
     standard_deviations,
-    start_point,
-    to_delay,
 )
-from isac_rt.receive.maps import (
-    UNION_FLOOR,
-    conventional_power,
-    doppler_bins,
-    own_bins,
-    power_map,
-    slow_window,
-)
-from isac_rt.receive.omp import omp_power, sparse_enough
-from isac_rt.receive.pursuit import pursue
-from isac_rt.receive.types import Detections, Maps
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import UNION_FLOOR, Conventional, LatinUnion, doppler_bins, slow_window
+from isac_rt.receive.omp import Omp, sparse_enough
+from isac_rt.receive.types import Detections, ExpectedClutter, Maps
 from isac_rt.scenario.receivers import Receivers
-
-OMP_SPARSITY = 4
 
 
 @dataclass(frozen=True)
@@ -50,138 +37,103 @@ class Sensed:
     sparse: bool | None = None
 
 
-def velocity_method(
-    settings: Receivers, schedule: Schedule, num_tx: int
-) -> Literal["omp", "pursuit", "latin_union", "conventional"]:
-    """`auto`: the union where it samples every antenna in every slot; else each antenna's own DFT
-    where its chirps are equally spaced, as in a conventional schedule; OMP elsewhere."""
-    if settings.velocity_method != "auto":
-        return settings.velocity_method
-    if is_latin(schedule, num_tx) and len(schedule) == num_tx:
-        return "latin_union"
-    return "conventional" if (schedule[:, num_tx:] == schedule[:, :-num_tx]).all() else "omp"
+class Detector(Protocol):
+    """What finds paths in cleaned spectra (M, L_rx, rows, P)."""
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        """What a frame shows; `clutter` is what the terminal expects of its mesh there."""
+        ...
 
 
-def num_looks(settings: Receivers, schedule: Schedule, antennas: Antennas) -> int:
-    """Channels whose powers are added in the map."""
-    groups = (
-        len(schedule)
-        if velocity_method(settings, schedule, antennas.num_tx) == "conventional"
-        else 1
-    )
-    return groups * antennas.num_tx * antennas.num_rx
+@dataclass(frozen=True)
+class Cfar:
+    """Peaks of the range-Doppler map that stand out of their surroundings.
+
+    Attributes
+    ----------
+    settings : Receivers
+    estimator : of the peaks
+    doppler : how the map is made; None: as the schedule asks for (`doppler_of`)
+    """
+
+    settings: Receivers
+    estimator: Estimator = OFF_GRID
+    doppler: LatinUnion | None = None
+
+    def way(self, known: Known) -> LatinUnion:
+        """How the map of a frame is made."""
+        return self.doppler or doppler_of(known)
+
+    def rule(self, known: Known) -> CfarRule:
+        """The rule for the map of a frame."""
+        groups = len(known.schedule) if self.way(known).separate else 1
+        return CfarRule.of(self.settings, groups * known.channels)
+
+    def estimate(
+        self, spectra: np.ndarray, known: Known, power: np.ndarray, row: int, column: int
+    ) -> Estimate:
+        """The path at a peak of the map."""
+        local = LocalSpectra(spectra, known, row, separate=self.way(known).separate)
+        return self.estimator.at(local, power, row, column)
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        """Range-Doppler map, CFAR, peaks, and an estimate of each."""
+        way = self.way(known)
+        power = way.power(spectra, known)
+        above, level = self.rule(known).detect(power)
+        above[: first_row(self.settings, known.range_cell)] = False
+        sparse = None
+        if way.advises:
+            added = len(known.schedule) if way.separate else 1
+            noise = float(np.median(power)) * added / window_gain(known)
+            sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, known)
+        above = way.keep(above, level, spectra, known)
+        rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
+        estimates = [
+            self.estimate(spectra, known, power, row, column)
+            for row, column in zip(rows.tolist(), bins.tolist(), strict=True)
+        ]
+        snr = power[rows, bins] / level[rows, bins]
+        found = describe(estimates, snr, known, on_grid=self.estimator.on_grid)
+        return Sensed(estimates, found, power, level, sparse)
 
 
-def sense(
-    spectra: np.ndarray,
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    antennas: Antennas,
-    settings: Receivers,
-    passes: int,
-) -> Sensed:
-    """Range-Doppler map, CFAR, peaks, and an off-grid estimate of each, from spectra whose
-    `delay_symbols` were removed."""
-    w, method = waveform, velocity_method(settings, schedule, waveform.num_tx)
-    rule = CfarRule.of(settings, num_looks(settings, schedule, antennas))
-    if method == "pursuit":
-        paths, ratio, power = pursue(
-            spectra, w, schedule, delay_symbols, antennas, settings, passes
-        )
-        return Sensed(
-            paths, describe(paths, ratio, antennas, w, passes), power, rule.detect(power)[1]
-        )
-    conventional = method == "conventional"
-    if conventional:
-        power = conventional_power(spectra, w, schedule)
-    else:
-        power = power_map(spectra, w, schedule, delay_symbols)
-    above, level = rule.detect(power)
-    above[: first_row(settings, w.range_cell(passes))] = False
-    sparse = None
-    if method in ("omp", "conventional"):
-        added = len(schedule) if conventional else 1  # groups in power, there
-        noise = float(np.median(power)) * added / window_gain(w, schedule)
-        sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, w, schedule)
-    if conventional:
-        above[:, ~own_bins(w)] = False
-    elif method == "omp":
-        above &= _confirmed_by_omp(spectra, above, level, w, schedule)
-    rows, bins = strongest_peaks(power, above, settings, UNION_FLOOR)
-    estimates = []
-    for row, column in zip(rows, bins, strict=True):
-        local = LocalSpectra(spectra, w, schedule, delay_symbols, int(row), separate=conventional)
-        estimates.append(estimate_at(local, power, int(row), int(column), settings))
-    snr = power[rows, bins] / level[rows, bins]
-    found = describe(estimates, snr, antennas, w, passes, on_grid=settings.refinement == "grid")
-    return Sensed(estimates, found, power, level, sparse)
+def doppler_of(known: Known) -> LatinUnion:
+    """The union where it samples every antenna in every slot; else each antenna's own DFT where its
+    chirps are equally spaced, as in a conventional schedule; OMP elsewhere."""
+    if known.full:
+        return LatinUnion()
+    schedule, num_tx = known.schedule, known.waveform.num_tx
+    equally = (schedule[:, num_tx:] == schedule[:, :-num_tx]).all()
+    return Conventional() if equally else Omp()
 
 
-def window_gain(waveform: Waveform, schedule: Schedule) -> float:
+def window_gain(known: Known) -> float:
     """Noise power of a map's cell over that of a sample of the spectra: the squared window over an
     antenna's chirps."""
-    return float((slow_window(waveform) ** 2).sum()) * len(schedule) / waveform.num_tx
-
-
-def _confirmed_by_omp(
-    spectra: np.ndarray,
-    above: np.ndarray,
-    level: np.ndarray,
-    waveform: Waveform,
-    schedule: Schedule,
-) -> np.ndarray:
-    """Cells of rows with a detection that OMP's support keeps: the sparse sampling's sidelobes fall
-    away.
-
-    A cell stays if OMP's accumulated power there, compared with the correlation's, is above the
-    background. A path some 20 dB below another one of its row is lost: off the grid the stronger
-    one takes several of the few atoms.
-    """
-    rows = np.flatnonzero(above.any(axis=1))
-    out = np.zeros_like(above)
-    if rows.size:
-        found = omp_power(spectra, rows, waveform, schedule, OMP_SPARSITY)
-        # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2, OMP
-        # one group's
-        gain = (len(schedule) / 2) ** 2
-        out[rows] = found * gain > level[rows]
-    return out
-
-
-def estimate_at(
-    local: LocalSpectra, power: np.ndarray, row: int, column: int, settings: Receivers
-) -> Estimate:
-    """The estimate of a peak of the map: off the grid, or with `refinement: grid` the centre of its
-    cell."""
-    w = local.waveform
-    if settings.refinement == "grid":
-        delay, rate = to_delay(row, column - w.num_chirps // 2, w)
-        return Estimate(delay, rate, local.respond(delay, rate))
-    return refine(local, *start_point(power, row, column, w))
+    w = known.waveform
+    return float((slow_window(w) ** 2).sum()) * len(known.schedule) / w.num_tx
 
 
 def describe(
-    estimates: list[Estimate],
-    snr: np.ndarray,
-    antennas: Antennas,
-    waveform: Waveform,
-    passes: int,
-    *,
-    on_grid: bool = False,
+    estimates: list[Estimate], snr: np.ndarray, known: Known, *, on_grid: bool = False
 ) -> Detections:
     """Detections in ranges, velocities and direction cosines; what lies outside the field of view
     has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam."""
     count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
-    limit = antennas.view_limit
+    limit = known.antennas.view_limit
     for i, e in enumerate(estimates):
-        u = direction_cosines(e, antennas, waveform, passes, on_grid=on_grid)
+        u = direction_cosines(e, known, on_grid=on_grid)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]
-        std[i] = standard_deviations(snr[i] * e.channels.size, antennas, waveform, passes)
+        std[i] = standard_deviations(snr[i] * e.channels.size, known)
     return Detections(
-        range=np.array([e.delay for e in estimates]) * (SPEED_OF_LIGHT / passes),
-        velocity=np.array([e.delay_rate for e in estimates]) * (SPEED_OF_LIGHT / passes),
+        range=np.array([e.delay for e in estimates]) * known.metres,
+        velocity=np.array([e.delay_rate for e in estimates]) * known.metres,
         direction=direction,
         snr=np.asarray(snr, float),
         std=std,

@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from isac_rt.frame.cube import IFCube
+from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
 
 
@@ -74,30 +75,28 @@ def _fill_tones(start, step, out):  # pragma: no cover - compiled
             out[p, n] = start[p, n // 32] * step[p, n % 32]
 
 
-def clean_spectrum(
-    cube: IFCube, delay_symbols: np.ndarray, phases: np.ndarray, num_rows: int
-) -> np.ndarray:
+def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> np.ndarray:
     """Hann-windowed range spectra without the data.
 
     Parameters
     ----------
     cube : IFCube
-    delay_symbols : (M, P) int, as sent or as decided
-    phases : (M, P) complex, beta^(D)
-    num_rows : range cells wanted, from cell 0
+    known : Known, whose data are taken out
+    num_rows : range cells wanted, from cell 0; None: the N/2 that hold every chirp
 
     Returns
     -------
     spectra : (M, L_rx, num_rows, P) complex64; a path of unit amplitude at cell f gives
         sum_n w(n) exp(j 2 pi (f - k) n/N) times its phase at sample 0
     """
-    w, samples = cube.waveform, cube.samples
+    w, samples, symbols = known.waveform, cube.samples, known.delay_symbols
     num_groups, num_rx, num_chirps, num_samples = samples.shape
-    shift = w.data_shift(delay_symbols)
+    num_rows = w.num_delay_symbols if num_rows is None else num_rows
+    shift = w.data_shift(symbols)
     out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
     for m in range(num_groups):
-        factor = _factors(num_samples, delay_symbols[m], shift[m], w.window_length)
-        phase = phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(delay_symbols[m]))
+        factor = _factors(num_samples, symbols[m], shift[m], w.window_length)
+        phase = known.phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(symbols[m]))
         turn = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
         transform(samples[m], factor, np.arange(num_rows), out[m], turn=turn)
     return out

@@ -19,9 +19,10 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, Reception, receive_active, receive_passive
+from isac_rt.receive import Prediction, Reception
+from isac_rt.receive.active import ActiveReceiver
+from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.receive.symbols.profile import learn_profile, reference_of
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import (
@@ -78,7 +79,7 @@ class ActiveTerminal:
     def __init__(
         self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking
     ) -> None:
-        self._antennas, self._receivers = antennas, receivers
+        self._receiver = ActiveReceiver.of(antennas, receivers)
         self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
 
     def step(
@@ -105,10 +106,8 @@ class ActiveTerminal:
         clutter: ExpectedClutter | None,
         maps: bool,
     ) -> Reception:
-        """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
-        return receive_active(
-            cube, payload, self._antennas, self._receivers, clutter=clutter, maps=maps
-        )
+        """What the terminal makes of one frame's samples; a custom receiver replaces this."""
+        return self._receiver.receive(cube, payload, clutter, maps=maps)
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
@@ -143,13 +142,8 @@ class PassiveTerminal:
         transmit_amplitude: float,
         groups: Sequence[int] | None = None,
     ) -> None:
-        self._groups = groups
-        self._waveform, self._antennas, self._receivers, self._order = (
-            waveform,
-            antennas,
-            receivers,
-            dpsk_order,
-        )
+        self._receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)
+        self._groups, self._waveform = groups, waveform
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
@@ -180,13 +174,8 @@ class PassiveTerminal:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
             reception = reception.without_reference()
-        if (
-            self._receivers.symbol_decision == "profile"
-            and not modulated
-            and reception.line_of_sight
-        ):
-            found = learn_profile(cube, reference_of(reception.detections))
-            self._profile = found if found.any() else None
+        if not modulated and reception.line_of_sight:
+            self._profile = self._receiver.reader.learn(cube, reception.detections)
         self._follow(reception, own_pose, modulated)
         if self.reference is not None and reception.line_of_sight:
             self.tracker.update(reception.detections, own_pose, self.reference.state)
@@ -223,18 +212,8 @@ class PassiveTerminal:
     def receive(
         self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
     ) -> Reception:
-        """What the terminal makes of one frame's samples; a receiver of one's own replaces this."""
-        return receive_passive(
-            cube,
-            self._antennas,
-            self._receivers,
-            self._order,
-            prediction,
-            modulated,
-            groups=self._groups,
-            profile=self._profile,
-            maps=maps,
-        )
+        """What the terminal makes of one frame's samples; a custom receiver replaces this."""
+        return self._receiver.receive(cube, prediction, modulated, self._profile, maps=maps)
 
     def _expect(self, own: Pose) -> Prediction | None:
         """Prediction for a data frame; None when the range is no longer known well enough to read a

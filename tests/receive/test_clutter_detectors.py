@@ -7,32 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube, frame
+from receiver_cubes import ANTENNAS, Path, cube, frame, known
 from scipy import stats
 
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
+from isac_rt.receive.arms import arm, both_arms
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.clutter.adaptive import (
-    Matched,
-    beams_of,
-    expected_count,
-    like_exponential,
-    map_factor,
-    sampled,
-    scan_threshold,
-)
-from isac_rt.receive.clutter.detectors import cfar_ratio, judge, noise_level
-from isac_rt.receive.clutter.power import (
-    Taper,
-    arm_channels,
-    covariances,
-    joint_channels,
-    power_map,
-    steering,
-)
-from isac_rt.receive.clutter.sense import _beam, _direction
+from isac_rt.receive.clutter.adaptive import Matched, beams_of, expected_count, scan_threshold
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler
+from isac_rt.receive.clutter.detectors import beam_weights, near_beam, noise_level
+from isac_rt.receive.clutter.power import Taper, covariances, expected_power
+from isac_rt.receive.clutter.sample_matrix import SampleMatrix, like_exponential, sampled
+from isac_rt.receive.clutter.threshold_map import map_factor
 from isac_rt.receive.estimate import Estimate
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter
@@ -42,6 +33,11 @@ SHORT = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)
 EXACT = Taper(range_cells=0.0, doppler_bins=0.0, cosine=0.0, fine=12)
 FALSE_FAILURE = 1e-6  # statistical
+
+
+def silent(w: Waveform, antennas: Antennas) -> Known:
+    """What is known of a frame of echoes without data, where the schedule does not matter."""
+    return Known.unmodulated(w, conventional_schedule(3, w.num_chirps, 3), antennas, 2)
 
 
 def scatterers(
@@ -86,12 +82,8 @@ def maps_of(
     seed: int = 0,
 ) -> np.ndarray:
     one = cube(w, schedule, payload, paths, antennas, noise, seed)
-    return channel_maps(
-        clean_spectrum(one, payload.delay_symbols, payload.phases, rows),
-        w,
-        schedule,
-        payload.delay_symbols,
-    )
+    sent = known(w, schedule, payload, antennas)
+    return channel_maps(clean_spectrum(one, sent, rows), sent)
 
 
 @pytest.mark.parametrize(("ranges", "bound"), [((8.0, 26.0), 0.06), ((36.0, 52.0), 0.1)])
@@ -103,7 +95,7 @@ def test_covariance_is_the_sum_over_single_scatterers(ranges: tuple[float, float
     case)."""
     w, schedule, payload = frame(waveform=SHORT)
     paths, rows = scatterers(7, 5, ranges), 220
-    channels = joint_channels(FEW)
+    channels = both_arms(FEW)
     truth = np.zeros((rows, w.num_chirps, len(channels), len(channels)), complex)
     for path in paths:
         one = cube(w, schedule, payload, [path], FEW)
@@ -116,9 +108,9 @@ def test_covariance_is_the_sum_over_single_scatterers(ranges: tuple[float, float
                 (beat + payload.delay_symbols >= w.num_samples)[:, None], one.samples.shape[:3]
             )
         ] = 0  # IF filter
-        spectra = clean_spectrum(one, payload.delay_symbols, payload.phases, rows)
+        spectra = clean_spectrum(one, known(w, schedule, payload, FEW, 2), rows)
         x = np.moveaxis(
-            channel_maps(spectra, w, schedule, payload.delay_symbols)[channels.tx, channels.rx],
+            channel_maps(spectra, known(w, schedule, payload, FEW))[channels.tx, channels.rx],
             0,
             -1,
         )
@@ -127,7 +119,7 @@ def test_covariance_is_the_sum_over_single_scatterers(ranges: tuple[float, float
     wanted = power > 1e-2 * power.max()
     found = np.zeros_like(truth)
     for row, bins, R in covariances(
-        expected(paths), w, channels, wanted, schedule, payload.delay_symbols, EXACT
+        expected(paths), known(w, schedule, payload, FEW), channels, wanted, EXACT
     ):
         found[row, bins] = R
     assert wanted.sum() > 40
@@ -146,9 +138,8 @@ def test_power_map_is_the_mean_power_of_random_clutter():
     for _ in range(60):
         a = rng.standard_normal((40, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         power += accumulate(np.einsum("s,s...->...", a, single).astype(np.complex64)) / 60
-    predicted = power_map(
-        expected(paths), w, 110, schedule, payload.delay_symbols, Taper(0.0, 0.0, 0.0, 8)
-    )
+    sent = known(w, schedule, payload, FEW)
+    predicted = expected_power(expected(paths), sent, 110, Taper(0.0, 0.0, 0.0, 8))
     some = predicted > 1e-3 * predicted.max()
     ratio = power[some] / predicted[some]
     assert power[some].sum() / predicted[some].sum() == pytest.approx(1, abs=4 / np.sqrt(60 * 20))
@@ -164,10 +155,10 @@ def test_scan_threshold_holds_the_rate_in_white_noise(joint: bool, rate: float):
     both axes. Planted bug: e^-t alone as the tail (43 times the rate)."""
     w, rng, draws = Waveform(), np.random.default_rng(6), 60000
     if joint:
-        sets = [(joint_channels(ANTENNAS), (0, 2))]
+        sets = [(both_arms(ANTENNAS), (0, 2))]
     else:
-        sets = [(arm_channels(ANTENNAS, axis), (axis,)) for axis in (0, 2)]
-    beams = [beams_of(c, w, ANTENNAS, axes) for c, axes in sets]
+        sets = [(arm(ANTENNAS, axis), (axis,)) for axis in (0, 2)]
+    beams = [beams_of(c, silent(w, ANTENNAS), axes) for c, axes in sets]
     limit = scan_threshold(tuple(beams), rate)
     hits = 0
     for _ in range(10):
@@ -191,11 +182,11 @@ def test_expected_count_is_that_of_a_fine_scan():
     """One arm scanned 16 times as finely: crossings of t = 7 against the Euler characteristic.
     Planted bug: sqrt(t/pi) without pi."""
     w, rng, draws = Waveform(), np.random.default_rng(4), 40000
-    channels = arm_channels(ANTENNAS, 0)
-    beams = beams_of(channels, w, ANTENNAS, (0,))
+    channels = arm(ANTENNAS, 0)
+    beams = beams_of(channels, silent(w, ANTENNAS), (0,))
     u = np.zeros((513, 3))
     u[:, 0] = np.linspace(-1, 1, 513) * np.sin(ANTENNAS.half_view)
-    fine = steering(channels.places, u, w)
+    fine = channels.steering(u, silent(w, ANTENNAS))
     x = rng.standard_normal((draws, 16, 2)) @ np.array([1, 1j]) / np.sqrt(2)
     above = np.concatenate(
         [(np.abs(part @ fine.conj().T) ** 2).max(axis=1) / 16 > 7 for part in np.array_split(x, 20)]
@@ -284,8 +275,8 @@ def test_sampled_scan_is_the_filter_of_the_cells_around(row: int):
     maps = (rng.standard_normal((3, 5, 90, 120, 2)) @ np.array([1, 1j]) / np.sqrt(2)).astype(
         np.complex64
     )
-    channels = arm_channels(antennas, 0)
-    beams = beams_of(channels, w, antennas, (0,))
+    channels = arm(antennas, 0)
+    beams = beams_of(channels, silent(w, antennas), (0,))
     scan = sampled(maps, channels, beams, 1.3, guard)
     x, size = maps[channels.tx, channels.rx].astype(complex), len(channels)
     rows = [r for r in range(90) if guard < abs(r - row) <= guard + size]
@@ -315,7 +306,9 @@ def test_guard_of_the_sample_matrix_is_that_of_the_range():
     ratio = {}
     for guard in ((4, 1), (4, 6), (1, 4)):
         settings = Receivers(clutter_detector="sample_matrix", guard_cells=guard)
-        ratio[guard] = judge([maps], w, FEW, schedule, payload.delay_symbols, settings)[0].ratio
+        ratio[guard] = (
+            SampleMatrix(settings).judge([maps], known(w, schedule, payload, FEW))[0].ratio
+        )
     assert np.array_equal(ratio[4, 1], ratio[4, 6])
     assert ratio[4, 1][20].max() > 3 * ratio[1, 4][20].max()
 
@@ -341,8 +334,9 @@ def test_background_is_noise_and_expected_clutter():
     guess = expected(scatterers(7, 5, (8.0, 26.0)))
     maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
     settings = Receivers(clutter_detector="angle_doppler")
-    (judged,) = judge([maps], w, FEW, schedule, payload.delay_symbols, settings, guess)
-    noise = judged.level - power_map(guess, w, 110, schedule, payload.delay_symbols)
+    sent = known(w, schedule, payload, FEW)
+    (judged,) = AngleDoppler(settings).judge([maps], sent, guess)
+    noise = judged.level - expected_power(guess, sent, 110)
     assert np.ptp(noise) < 1e-5 * judged.level.max()
     mean = (np.abs(maps) ** 2).mean()
     assert noise.mean() == pytest.approx(mean, rel=0.05)  # the median of a third of the cells
@@ -352,7 +346,7 @@ def test_ratio_of_the_cfar_is_its_decision():
     """Planted bugs: multiplied by the factor; the factor of other rows."""
     rng, settings = np.random.default_rng(15), Receivers(false_alarm_rate=1e-2)
     power = rng.gamma(15, 1 / 15, (90, 60))
-    ratio, level = cfar_ratio(power, 15, settings)
+    ratio, level = CfarRule.of(settings, 15).ratio(power)
     above, same = CfarRule.of(settings, 15).detect(power)
     assert above.sum() > 20 and np.array_equal(ratio > 1, above) and np.array_equal(level, same)
 
@@ -362,13 +356,13 @@ def test_size_of_the_scanned_directions():
     written out; beams half a lobe apart at most. Planted bugs: the variance for the deviation; the
     area without the covariance of the two arms; no limit to the view."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
-    channels = joint_channels(antennas)
+    channels = both_arms(antennas)
     x, z = (
         channels.places[:, 0] - channels.places[:, 0].mean(),
         channels.places[:, 2] - channels.places[:, 2].mean(),
     )
     k, side = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT, 2 * np.sin(antennas.half_view)
-    beams = beams_of(channels, w, antennas, (0, 2))
+    beams = beams_of(channels, silent(w, antennas), (0, 2))
     assert beams.lengths == pytest.approx(
         (side * k * np.sqrt((x * x).mean()), side * k * np.sqrt((z * z).mean())), rel=1e-9, abs=0
     )
@@ -383,7 +377,8 @@ def test_size_of_the_scanned_directions():
         apart = np.diff(np.unique(np.round(beams.cosines[:, axis], 12)))
         assert apart.max() <= lobe / 2 and apart.min() > 0.8 * lobe / 2
     wide, half = (
-        beams_of(channels, w, replace(antennas, half_view=h), (0, 2)) for h in (2.1, np.pi / 2)
+        beams_of(channels, silent(w, replace(antennas, half_view=h)), (0, 2))
+        for h in (2.1, np.pi / 2)
     )  # an arm tells no more apart
     assert wide.lengths == half.lengths and wide.lengths[0] == pytest.approx(
         beams.lengths[0] / np.sin(antennas.half_view)
@@ -399,12 +394,11 @@ def test_direction_within_a_filters_beam():
         np.exp(-1j * k * (places[:, [0, 2]] @ u))
         for places in (antennas.tx_positions, antennas.rx_positions)
     ]
-    found = _direction(
-        Estimate(1e-7, 1e-8, 2.3j * np.outer(*wave)), antennas, w, u + np.array([0.043, -0.038])
-    )
+    estimate = Estimate(1e-7, 1e-8, 2.3j * np.outer(*wave))
+    found = near_beam(estimate, silent(w, antennas), u + np.array([0.043, -0.038]))
     assert np.abs(found - u).max() < 0.003
-    weights = _beam(antennas, w, u)
-    size = len(joint_channels(antennas))
+    weights = beam_weights(silent(w, antennas), u)
+    size = len(both_arms(antennas))
     assert np.count_nonzero(weights) == size
     assert abs((weights.conj() * np.outer(*wave)).sum()) == pytest.approx(
         size, rel=2e-3

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube, frame
+from receiver_cubes import ANTENNAS, Path, cube, frame, known
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active
@@ -72,13 +72,11 @@ def test_what_stands_still_is_removed_and_what_moves_is_not():
     target = [Path(2 * 24.3, 2 * 5.1, 1.0, (0.2, 0.1), (0.2, 0.1))]
     row = round(24.3 / w.range_cell(2))
     alone, both = (
-        clean_spectrum(
-            cube(w, schedule, payload, p, FEW), payload.delay_symbols, payload.phases, 256
-        )
+        clean_spectrum(cube(w, schedule, payload, p, FEW), known(w, schedule, payload, FEW, 1), 256)
         for p in (target, still + target)
     )
     bare = clean_spectrum(
-        cube(w, schedule, payload, still, FEW), payload.delay_symbols, payload.phases, 256
+        cube(w, schedule, payload, still, FEW), known(w, schedule, payload, FEW, 1), 256
     )
     before = np.abs(bare[..., row, :]).max()
     rows = remove_standing(bare, schedule, 15)

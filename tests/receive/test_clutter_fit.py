@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, frame
+from receiver_cubes import ANTENNAS, frame, known
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter.correction import fit
-from isac_rt.receive.clutter.detectors import judge
-from isac_rt.receive.clutter.power import power_map
+from isac_rt.receive.clutter.power import expected_power
+from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
@@ -89,7 +89,7 @@ def test_velocity_and_level_come_back_from_the_clutter(targets: int):
         power = power_of(
             amplitude, np.append(ranges, at[0]), np.append(-(towards @ VELOCITY), at[1]), noise, rng
         )
-        found = fit(power, floor, guess, W, schedule, payload.delay_symbols)
+        found = fit(power, floor, guess, known(W, schedule, payload))
         off = np.abs(found.velocity + MISTAKE)
         assert off[1] < (0.07 if targets else 0.03) and off.max() < 0.13
         mended = found.apply(guess)
@@ -113,7 +113,7 @@ def test_detectors_judge_with_the_corrected_clutter():
     )
     _, schedule, payload = frame(waveform=W)
     noise = 0.02 * W.num_samples * W.num_chirps
-    mean = power_map(truth, W, ROWS, schedule, payload.delay_symbols) + noise
+    mean = expected_power(truth, known(W, schedule, payload), ROWS) + noise
     rng = np.random.default_rng(8)
     white = (
         rng.standard_normal((ANTENNAS.num_tx, ANTENNAS.num_rx, *mean.shape, 2))
@@ -121,15 +121,8 @@ def test_detectors_judge_with_the_corrected_clutter():
         / np.sqrt(2)
     )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
-    judged = judge(
-        [maps],
-        W,
-        ANTENNAS,
-        schedule,
-        payload.delay_symbols,
-        Receivers(clutter_detector="map"),
-        wrong,
-    )[0]
+    detector = ThresholdMap(Receivers(clutter_detector="map"))
+    (judged,) = detector.judge([maps], known(W, schedule, payload), wrong)
     strong = mean > 3 * noise
     off = judged.level[strong] / mean[strong] - 1
     assert strong.sum() > 500 and np.median(np.abs(off)) < 0.15
@@ -142,5 +135,5 @@ def test_noise_alone_corrects_nothing():
     towards, ranges, powers = surroundings(50, np.random.default_rng(4))
     guess = ExpectedClutter(2 * ranges / C, np.zeros(50), 1e-9 * powers, towards, towards)
     _, schedule, payload = frame(waveform=W)
-    found = fit(np.ones((ROWS, W.num_chirps)), 1.0, guess, W, schedule, payload.delay_symbols)
+    found = fit(np.ones((ROWS, W.num_chirps)), 1.0, guess, known(W, schedule, payload))
     assert found.level == 0 and not found.velocity.any()

@@ -12,8 +12,8 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction
-from isac_rt.receive.symbols.powers import confidence_threshold, demodulate
-from isac_rt.receive.symbols.profile import correlate, learn_profile
+from isac_rt.receive.symbols.powers import confidence_threshold
+from isac_rt.receive.symbols.profile import ByProfile, correlate, learn_profile
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 
@@ -51,7 +51,8 @@ def test_the_profile_reads_what_the_strongest_cell_does_not(snr_db: float):
     noise = 10 ** (-snr_db / 10)
     profile = learn_profile(cube(w, schedule, unmodulated(w), paths, ANTENNAS, noise, 1), expected)
     received = cube(w, schedule, payload, paths, ANTENNAS, noise, 2)
-    plain, read = (demodulate(received, expected, 8, None, p) for p in (None, profile))
+    plain = ByProfile(8).read(received, expected, ANTENNAS)
+    read = ByProfile(8).read(received, expected, ANTENNAS, profile)
     assert (plain.delay != payload.delay_symbols).mean() > 0.8
     assert (read.delay != payload.delay_symbols).sum() <= 1
     assert np.median(read.delay_confidence) > confidence_threshold(15, 136, 180)

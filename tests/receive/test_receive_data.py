@@ -8,7 +8,7 @@ from pathlib import Path as File
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube, frame
+from receiver_cubes import ANTENNAS, Path, cube, frame, known
 
 import isac_rt.receive
 from isac_rt.frame.cube import IFCube
@@ -130,11 +130,11 @@ def test_cleaned_frame_is_the_unmodulated_frame(cell: float):
     w, schedule, payload = frame()
     path = [Path(cell * w.range_cell(1), 0.0, 0.7 - 0.4j)]
     modulated = clean_spectrum(
-        cube(w, schedule, payload, path, FEW), payload.delay_symbols, payload.phases, 512
+        cube(w, schedule, payload, path, FEW), known(w, schedule, payload, FEW, 1), 512
     )
     pilot = unmodulated(w)
     plain = clean_spectrum(
-        cube(w, schedule, pilot, path, FEW), pilot.delay_symbols, pilot.phases, 512
+        cube(w, schedule, pilot, path, FEW), known(w, schedule, pilot, FEW, 1), 512
     )
     rounding = 2e-6  # of the peak: complex64 samples and transform
     assert np.abs(plain).max() > 100
@@ -210,7 +210,7 @@ def test_cleaned_spectra_against_their_sums():
         .view(np.complex64)[..., 0]
     )
     received = IFCube(samples=samples, waveform=w, schedule=schedule, start_time=0.0)
-    found = clean_spectrum(received, payload.delay_symbols, payload.phases, 48)
+    found = clean_spectrum(received, known(w, schedule, payload, FEW, 1), 48)
     n, T, alpha = np.arange(48), 48 / w.sampling_rate, w.bandwidth / w.chirp_duration
     assert (payload.delay_symbols > 0).any()
     for m, p in ((0, 3), (1, 7), (2, 11)):

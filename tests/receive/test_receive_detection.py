@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube, frame
+from receiver_cubes import ANTENNAS, Path, cube, frame, known
 from scipy import stats
 from scipy.integrate import quad
 
@@ -24,6 +24,7 @@ from isac_rt.receive.cfar import (
     peaks,
     without_sidelobes,
 )
+from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.estimate import (
     LocalSpectra,
     direction_cosine,
@@ -32,16 +33,18 @@ from isac_rt.receive.estimate import (
     standard_deviations,
     start_point,
 )
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import (
+    Conventional,
+    LatinUnion,
     accumulate,
     channel_maps,
     correlation_operator,
-    slow_times,
     slow_window,
     union_operator,
 )
-from isac_rt.receive.omp import omp
-from isac_rt.receive.sense import sense, velocity_method
+from isac_rt.receive.omp import Omp, omp
+from isac_rt.receive.sense import Cfar
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.receivers import Receivers
 
@@ -74,7 +77,7 @@ def test_union_of_groups_is_the_uniform_sampling(tone: float, bound_db: float):
     groups, slots = np.nonzero(sent)
     late = groups * 2 * w.max_delay + payload.delay_symbols[sent] / (w.slope * w.sampled_duration)
     times = slots + late / w.slot_duration
-    assert np.abs(slow_times(w, payload.delay_symbols)[sent] - times).max() < 1e-12  # rounding
+    assert np.abs(known(w, schedule, payload).slots[sent] - times).max() < 1e-12  # rounding
     middle = (times - np.floor(times)).mean()
     p, bins = np.arange(w.num_chirps), np.fft.fftfreq(w.num_chirps, 1 / w.num_chirps)
     expected = np.exp(-2j * np.pi * np.outer(bins, p) / w.num_chirps) @ (
@@ -92,7 +95,7 @@ def test_sparse_correlation_is_the_sum_over_the_samples():
     """Planted bug: group offsets left out."""
     w = Waveform(num_groups=2)
     schedule, payload = frame(waveform=w)[1:]
-    times = slow_times(w, payload.delay_symbols)[schedule == 2]
+    times = known(w, schedule, payload).slots[schedule == 2]
     values = np.random.default_rng(3).standard_normal(times.size)
     got = correlation_operator(w, times) @ values
     for k in (0, 7, 59, 60, 113):
@@ -132,13 +135,17 @@ def test_omp_recovers_three_tones_beyond_the_unambiguous_velocity_of_one_antenna
 
 def test_method_follows_the_schedule():
     _, schedule, _ = frame()
-    assert velocity_method(SETTINGS, schedule, 3) == "latin_union"
-    assert velocity_method(SETTINGS, schedule[:2], 3) == "omp"
-    assert velocity_method(SETTINGS, conventional_schedule(2, 120, 3), 3) == "conventional"
-    assert velocity_method(Receivers(velocity_method="omp"), schedule, 3) == "omp"
-    assert (
-        velocity_method(Receivers(velocity_method="latin_union"), schedule[:2], 3) == "latin_union"
-    )
+    two = Waveform(num_groups=2)
+
+    def way(method: str, w: Waveform, slots: np.ndarray) -> type:
+        sent = Known.unmodulated(w, slots, ANTENNAS, 2)
+        return type(cfar_of(Receivers(velocity_method=method)).way(sent))
+
+    assert way("auto", Waveform(), schedule) is LatinUnion
+    assert way("auto", two, schedule[:2]) is Omp
+    assert way("auto", two, conventional_schedule(2, 120, 3)) is Conventional
+    assert way("omp", Waveform(), schedule) is Omp
+    assert way("latin_union", two, schedule[:2]) is LatinUnion
 
 
 # --- CFAR
@@ -176,9 +183,9 @@ def test_false_alarm_rate_of_the_whole_chain():
     rate, false, trials = 1e-2, 0, 0
     for seed in range(4):
         spectra = clean_spectrum(
-            white(w, schedule, 3, seed), payload.delay_symbols, payload.phases, 512
+            white(w, schedule, 3, seed), known(w, schedule, payload, ANTENNAS, 1), 512
         )
-        power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
+        power = accumulate(channel_maps(spectra, known(w, schedule, payload, passes=1)))
         above, _ = CfarRule(rate, GUARD, (1, 1), 9).detect(power)
         false, trials = false + int(above.sum()), trials + above.size
     low, high = stats.binom.ppf([FALSE_FAILURE / 2, 1 - FALSE_FAILURE / 2], trials // 3, rate)
@@ -333,7 +340,7 @@ def test_compiled_match_is_the_template():
         .view(np.complex64)[..., 0]
     )
     tau, rate, row = 14.37 * w.delay_step, 3.1e-8, 14
-    got = LocalSpectra(spectra, w, schedule, np.zeros_like(schedule), row).respond(tau, rate)
+    got = LocalSpectra(spectra, known(w, schedule, unmodulated(w)), row).respond(tau, rate)
     rows = np.arange(row - 3, row + 4)
     shape = hann_response(w, w.beat_cells(tau, rate)[..., None] - rows)
     turn = w.phase(tau + rate * w.middle_time, w.window_middle)[..., None] - rows * (
@@ -393,8 +400,8 @@ def test_one_way_angles_use_the_receive_arm_only():
     w, schedule, _ = frame()
     pilot = unmodulated(w)
     signal = cube(w, schedule, pilot, [Path(83.71, 6.6, 1.0, (0.37, -0.21), (-0.55, 0.42))])
-    spectra = clean_spectrum(signal, pilot.delay_symbols, pilot.phases, 512)
-    d = sense(spectra, w, schedule, pilot.delay_symbols, ANTENNAS, SETTINGS, 1).detections
+    spectra = clean_spectrum(signal, known(w, schedule, pilot, ANTENNAS, 1), 512)
+    d = Cfar(SETTINGS).sense(spectra, known(w, schedule, pilot, ANTENNAS, 1)).detections
     assert len(d) == 1 and abs(d.range[0] - 83.71) < 2e-4 and abs(d.velocity[0] - 6.6) < 1e-5
     assert np.abs(d.direction[0] - [0.37, -0.21]).max() < 2e-4
 
@@ -410,9 +417,9 @@ def test_beamformer_against_its_signal(virtual: bool):
             ANTENNAS.rx_positions[:, axis] * u,
         )
         channels = np.exp(-1j * middle * (tx[:, None] + rx[None, :]))
-        assert direction_cosine(channels, ANTENNAS, w, axis, virtual) == pytest.approx(
-            u, abs=1e-4
-        )  # window's middle is 9 samples off
+        sent = known(w, frame()[1], unmodulated(w), passes=2 if virtual else 1)
+        # window's middle is 9 samples off
+        assert direction_cosine(channels, sent, axis) == pytest.approx(u, abs=1e-4)
 
 
 def test_outside_the_field_of_view_there_is_no_direction():
@@ -436,8 +443,8 @@ def test_standard_deviations_match_the_scatter():
         noisy = replace(
             noisy, samples=clean.samples + noisy.samples * np.float32(np.sqrt(10**2.4 / 2))
         )
-        spectra = clean_spectrum(noisy, pilot.delay_symbols, pilot.phases, 512)
-        d = sense(spectra, w, schedule, pilot.delay_symbols, FEW, SETTINGS, 1).detections
+        spectra = clean_spectrum(noisy, known(w, schedule, pilot, ANTENNAS, 1), 512)
+        d = Cfar(SETTINGS).sense(spectra, known(w, schedule, pilot, FEW, 1)).detections
         errors.append([d.range[0] - 71.3, d.velocity[0] + 4.6, *(d.direction[0] - [0.2, -0.3])])
         std = d.std[0]
     scatter = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -475,7 +482,8 @@ def test_stated_deviations_are_the_bound_of_a_tone(passes: int):
     high SNR. Planted bugs: the loss taken twice; the receivers' aperture alone for an echo; the
     share of the other arm."""
     w, few, snr = Waveform(), replace(ANTENNAS, rx_x=5, rx_z=3), 37.3
-    stated = standard_deviations(snr, few, w, passes)
+    sent = known(w, frame()[1], unmodulated(w), few, passes)
+    stated = standard_deviations(snr, sent)
     x = np.linspace(-0.5, 0.5, 20001)  # the share of the axis: its frequency is in cells
     tone = 1 / np.sqrt(2 * snr * np.mean((2 * np.pi * x) ** 2))
     assert stated[0] == pytest.approx(np.sqrt(2) * tone * w.range_cell(passes), rel=1e-3, abs=0)
@@ -497,10 +505,8 @@ def test_stated_deviations_are_the_bound_of_a_tone(passes: int):
         information = 2 * snr * len(places) / (3 * 7) * k**2 * places.var()
         assert stated[2 + i] == pytest.approx(1 / np.sqrt(information), rel=1e-9, abs=0)
     floors = [2e-3 * w.range_cell(passes), 4e-3 * w.velocity_cell(passes), 2e-4, 2e-4]
-    assert standard_deviations(1e9, few, w, passes) == pytest.approx(floors)
-    assert (
-        standard_deviations(0.1, few, w, passes) == standard_deviations(1.0, few, w, passes)
-    ).all()
+    assert standard_deviations(1e9, sent) == pytest.approx(floors)
+    assert (standard_deviations(0.1, sent) == standard_deviations(1.0, sent)).all()
 
 
 def test_the_active_terminal_reports_no_symbols():
@@ -562,13 +568,13 @@ def test_leakage_is_passed_over_and_hides_nothing():
 def test_start_point_is_near_and_refinement_moves_to_the_truth():
     w, schedule, payload = frame()
     signal = cube(w, schedule, payload, [Path(57.77, 9.21)], FEW)
-    spectra = clean_spectrum(signal, payload.delay_symbols, payload.phases, 512)
-    power = accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols))
+    spectra = clean_spectrum(signal, known(w, schedule, payload, ANTENNAS, 1), 512)
+    power = accumulate(channel_maps(spectra, known(w, schedule, payload, passes=1)))
     row, column = (int(i) for i in np.unravel_index(power.argmax(), power.shape))
     delay, rate = start_point(power, row, column, w)
     assert abs(delay * SPEED_OF_LIGHT - 57.77) < 0.2 * w.range_cell(1)
     assert abs(rate * SPEED_OF_LIGHT - 9.21) < 0.1 * w.velocity_cell(1)
-    found = refine(LocalSpectra(spectra, w, schedule, payload.delay_symbols, row), delay, rate)
+    found = refine(LocalSpectra(spectra, known(w, schedule, payload), row), delay, rate)
     assert (
         abs(found.delay * SPEED_OF_LIGHT - 57.77) < 2e-4
         and abs(found.delay_rate * SPEED_OF_LIGHT - 9.21) < 1e-5

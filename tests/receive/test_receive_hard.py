@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube
+from receiver_cubes import ANTENNAS, Path, cube, known
 from scipy import stats
 
 from isac_rt.frame.cube import IFCube
@@ -15,9 +15,8 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import receive_active, receive_passive
-from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.maps import accumulate, channel_maps, conventional_power, own_bins
-from isac_rt.receive.sense import num_looks
+from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.maps import own_bins
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.receivers import Receivers
 
@@ -49,12 +48,11 @@ def bounds(trials: int, rate: float) -> tuple[float, float]:
     return ALIKE * low, ALIKE * high
 
 
-def power_map(signal: IFCube, payload, settings: Receivers) -> np.ndarray:
-    w = signal.waveform
-    spectra = clean_spectrum(signal, payload.delay_symbols, payload.phases, w.num_delay_symbols)
-    if settings.velocity_method == "conventional":
-        return conventional_power(spectra, w, signal.schedule)
-    return accumulate(channel_maps(spectra, w, signal.schedule, payload.delay_symbols))
+def above(signal: IFCube, payload, settings: Receivers) -> np.ndarray:
+    """Cells of the map above the threshold."""
+    detector, sent = cfar_of(settings), known(signal.waveform, signal.schedule, payload, FEW, 1)
+    power = detector.way(sent).power(clean_spectrum(signal, sent), sent)
+    return detector.rule(sent).detect(power)[0]
 
 
 @pytest.mark.parametrize(
@@ -66,12 +64,8 @@ def test_false_alarm_rate_of_each_map(groups: int, method: str):
     well, and the sampling's own spread is not in the law: the rate is within a factor 1.5. Planted
     bug: the groups of the conventional map counted as looks twice."""
     w = Waveform(num_samples=256, num_chirps=48, num_groups=groups)
-    settings, rate, false, trials = (
-        Receivers(velocity_method=method, training_cells=(4, 2)),
-        1e-3,
-        0,
-        0,
-    )
+    rate, false, trials = 1e-3, 0, 0
+    settings = Receivers(velocity_method=method, training_cells=(4, 2), false_alarm_rate=rate)
     for seed in range(24):
         rng = np.random.default_rng([seed, groups])
         schedule = (
@@ -80,12 +74,10 @@ def test_false_alarm_rate_of_each_map(groups: int, method: str):
             else pseudo_random_schedule(groups, 48, 3, rng)
         )
         payload = random_payload(w, schedule, 8, rng)
-        power = power_map(white(w, schedule, seed), payload, settings)
-        rule = CfarRule.of(settings, num_looks(settings, schedule, FEW))
-        above, _ = replace(rule, rate=rate).detect(power)
+        found = above(white(w, schedule, seed), payload, settings)
         if method == "conventional":
-            above = above[:, own_bins(w)]
-        false, trials = false + int(above.sum()), trials + above.size
+            found = found[:, own_bins(w)]
+        false, trials = false + int(found.sum()), trials + found.size
     low, high = bounds(trials, rate)
     slack = 1.5 if method == "omp" else 1.0
     assert low / slack <= false <= high * slack
@@ -97,17 +89,15 @@ def test_false_alarm_rate_beside_a_clutter_edge():
     inside, where one side sees noise only, they are at most twice as many. Planted bug: the smaller
     side."""
     w = Waveform(num_samples=256, num_chirps=48)
-    settings, rate = Receivers(), 1e-3
+    settings, rate = Receivers(false_alarm_rate=1e-3), 1e-3
     profile = np.where((np.arange(256) >= 64) & (np.arange(256) < 128), 100.0, 1.0)
     counts = {"before": np.zeros(2), "inside": np.zeros(2), "deep": np.zeros(2)}
     places = {"before": slice(51, 61), "inside": slice(67, 78), "deep": slice(85, 107)}
     for seed in range(24):
         schedule = pseudo_random_schedule(3, 48, 3, np.random.default_rng(seed))
-        power = power_map(white(w, schedule, seed, profile), unmodulated(w), settings)
-        rule = CfarRule.of(settings, num_looks(settings, schedule, FEW))
-        above, _ = replace(rule, rate=rate).detect(power)
+        found = above(white(w, schedule, seed, profile), unmodulated(w), settings)
         for name, rows in places.items():
-            counts[name] += [above[rows].sum(), above[rows].size]
+            counts[name] += [found[rows].sum(), found[rows].size]
     assert counts["before"][0] <= bounds(int(counts["before"][1]), rate)[1]
     assert counts["inside"][0] <= bounds(int(counts["inside"][1]), 2 * rate)[1]
     low, high = bounds(int(counts["deep"][1]), rate)

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from crb_model import C, bound, samples
-from receiver_cubes import ANTENNAS, frame
+from receiver_cubes import ANTENNAS, frame, known
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.joint.fit import (
-    Frame,
     JointPath,
     _moments,
     _normal_equations,
@@ -25,7 +24,7 @@ from isac_rt.receive.joint.fit import (
     residual_channels,
     tone_sums,
 )
-from isac_rt.receive.joint.separate import _beams, _earlier_reference, _hidden
+from isac_rt.receive.joint.neighbours import _beams, _earlier_reference, _hidden
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.scenario.receivers import Receivers
 
@@ -111,7 +110,7 @@ def test_an_isolated_path_reaches_the_bound(passes: int, snr_db: float):
             np.ones(1),
             np.zeros(4),
         )
-        found = fit(Frame(cube, payload.delay_symbols, payload.phases, FEW, passes), [start])[0]
+        found = fit(cube.samples, known(w, schedule, payload, FEW, passes), [start])[0]
         errors[seed] = [
             found.delay * C / passes - theta[0],
             found.delay_rate * C / passes - theta[1],
@@ -168,7 +167,6 @@ def test_normal_equations_are_those_of_the_signal(passes: int):
         np.stack(columns, axis=1),
         (received - sum(model(w, schedule, payload, t, passes) for t in theta)).ravel(),
     )
-    cube = IFCube(samples=received, waveform=w, schedule=schedule, start_time=0.0)
     paths = [
         JointPath(
             t[0] * w.delay_step,
@@ -180,7 +178,7 @@ def test_normal_equations_are_those_of_the_signal(passes: int):
         for t in theta
     ]
     gradient, gram, power = _normal_equations(
-        Frame(cube, payload.delay_symbols, payload.phases, FEW, passes), paths
+        received, known(w, schedule, payload, FEW, passes), paths
     )
     size = np.sqrt(np.diag((J.conj().T @ J).real))
     apart = 1e-3  # curvature of the wavefront, of the chirps between the paths: 4e-4 at most
@@ -199,10 +197,9 @@ def test_a_path_against_its_own_template_has_no_slope():
     w, schedule, payload = frame(waveform=LONGER)
     wide = replace(ANTENNAS, spacing=5 * ANTENNAS.spacing)
     clean = samples(w, schedule, payload, wide, np.array(NEAR), 2)
-    cube = IFCube(samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0)
-    one = Frame(cube, payload.delay_symbols, payload.phases, wide, 2)
+    sent = known(w, schedule, payload, wide)
     path = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
-    zeroth, first = _moments(one, _tone(one, path))
+    zeroth, first = _moments(clean.astype(np.complex64), sent, _tone(sent, path))
     assert np.abs(zeroth) == pytest.approx(np.abs(zeroth).mean(), rel=1e-3)
     assert np.abs(first).max() < 1e-3 * np.abs(zeroth).mean() * w.num_samples
 
@@ -232,10 +229,10 @@ def test_energy_of_a_path_in_the_residual(passes: int):
     offsets = np.array([-1.5, 0.0, 1.5])
 
     def beams(cube: IFCube) -> tuple[np.ndarray, np.ndarray]:
-        f = Frame(cube, payload.delay_symbols, payload.phases, FEW, passes)
-        ((of, channels, counts, _),) = residual_channels(f, [path], offsets)
+        sent = known(w, schedule, payload, FEW, passes)
+        ((of, channels, counts, _),) = residual_channels(cube.samples, sent, [path], offsets)
         grid = np.array([direction, -direction, [0.1, 0.3]])
-        return _beams(f, of, channels, grid), counts
+        return _beams(sent, of, channels, grid), counts
 
     quiet = IFCube(
         samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0
@@ -281,10 +278,11 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
     start = JointPath(
         theta[0] / C, (theta[1] + 0.5 * w.velocity_cell(1)) / C, theta[2:4], np.ones(1), np.zeros(4)
     )
-    found = decide_phases(Frame(cube, payload.delay_symbols, wrong, FEW, 1), start, 8)
+    sent = known(w, schedule, payload, FEW, 1)
+    found = decide_phases(cube.samples, replace(sent, phases=wrong), start, 8)
     apart = np.abs(found - payload.phases) > 0.1
     assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 4
-    right = decide_phases(Frame(cube, payload.delay_symbols, payload.phases, FEW, 1), start, 8)
+    right = decide_phases(cube.samples, sent, start, 8)
     assert (np.abs(right - payload.phases) > 0.1).sum() <= 4
 
 
@@ -418,11 +416,11 @@ def test_what_is_too_weak_beside_a_path_is_not_looked_at(level_db: float, looked
     w, schedule, payload = frame(waveform=LONGER)
     weak = [NEAR[0] + 0.2 * w.range_cell(2), NEAR[1], -0.4, 0.35, 0.1, 10 ** (level_db / 20)]
     clean = sum(samples(w, schedule, payload, FEW, np.array(e), 2) for e in (NEAR, weak))
-    one = Frame(noisy(w, schedule, clean, 10.0, 3), payload.delay_symbols, payload.phases, FEW, 2)
+    got, sent = noisy(w, schedule, clean, 10.0, 3).samples, known(w, schedule, payload, FEW)
     start = JointPath(
         2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4)
     )
-    found = _hidden(one, fit(one, [start]))
+    found = _hidden(got, sent, fit(got, sent, [start]))
     assert (found is not None) == looked_at
     if found:
         assert found[0] == 0 and found[1].direction == pytest.approx(
@@ -436,12 +434,9 @@ def test_the_earlier_of_two_paths_in_a_cell_is_the_line_of_sight():
     power = np.array([1.0, 0.5, 0.2, 0.3, 0.05])
     source, ranges = np.array([0, 1, 0, 1, 0]), np.array([9.1, 7.0, 8.9, 8.0, 8.5])
     for change, expected in ((1.0, 2), (0.4, 0)):
-        values = {
-            "is_reference": np.array([True, False, False, False, False]),
-            "range": ranges.copy(),
-        }
-        _earlier_reference(values, power * np.array([1, 1, change, 1, 1]), source, 2)
-        assert np.flatnonzero(values["is_reference"]).tolist() == [expected]
+        powers = power * np.array([1, 1, change, 1, 1])
+        found = _earlier_reference(np.arange(5) == 0, ranges, powers, source, 2)
+        assert np.flatnonzero(found).tolist() == [expected]
 
 
 def test_one_path_and_noise_are_not_split():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from receiver_cubes import ANTENNAS, Path, cube
+from receiver_cubes import ANTENNAS, Path, cube, known
 
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
@@ -61,9 +61,8 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     path = Path(
         43.817, 21.3, 0.7 - 0.4j, (0.45, -0.31), (0.45, -0.31) if passes == 2 else (-0.2, 0.1)
     )
-    spectra = clean_spectrum(
-        cube(W, schedule, payload, [path], FEW), payload.delay_symbols, payload.phases, 128
-    )
+    chirps = known(W, schedule, payload, FEW, passes)
+    spectra = clean_spectrum(cube(W, schedule, payload, [path], FEW), chirps, 128)
     k = 2 * np.pi * W.effective_carrier / SPEED_OF_LIGHT
     sent, heard = (
         np.exp(1j * k * places[:, [0, 2]] @ u)
@@ -72,9 +71,7 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
             (FEW.rx_positions, np.array(path.arrival)),
         )
     )
-    near = LocalSpectra(
-        spectra, W, schedule, payload.delay_symbols, round(43.817 / W.range_cell(1))
-    )
+    near = LocalSpectra(spectra, chirps, round(43.817 / W.range_cell(1)))
     delay, rate = 43.817 / SPEED_OF_LIGHT, 21.3 / SPEED_OF_LIGHT
     exact = Estimate(delay, rate, near.respond(delay, rate))
     turned = (
@@ -84,12 +81,12 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     )
     assert np.abs(np.abs(turned) - abs(path.amplitude)).max() < 0.02
     left = spectra.copy()
-    rows = _take_out(left, exact, W, schedule, payload.delay_symbols, FEW, passes)
+    rows = _take_out(left, exact, chirps)
     assert rows.stop - rows.start == 49
     assert (
         np.abs(left).max() < 3e-3 * np.abs(spectra).max()
     )  # the wavefront is plane here and spherical there
-    _take_out(left, exact, W, schedule, payload.delay_symbols, FEW, passes, back=True)
+    _take_out(left, exact, chirps, back=True)
     assert np.abs(left - spectra).max() < 1e-6 * np.abs(spectra).max()
 
 

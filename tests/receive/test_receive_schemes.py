@@ -13,9 +13,10 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.receive.maps import conventional_power, own_bins
-from isac_rt.receive.omp import recovery_limit
-from isac_rt.receive.sense import velocity_method
+from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import Conventional, LatinUnion, conventional_power, own_bins
+from isac_rt.receive.omp import Omp, recovery_limit
 from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
@@ -49,23 +50,21 @@ def heard(w: Waveform, schedule: np.ndarray, paths: list[Path], seed: int, noise
 def test_method_follows_the_schedule():
     """Planted bug: a conventional schedule of two groups taken for random."""
     for groups, conventional, random in (
-        (1, "conventional", "omp"),
-        (2, "conventional", "omp"),
-        (3, "latin_union", "latin_union"),
+        (1, Conventional, Omp),
+        (2, Conventional, Omp),
+        (3, LatinUnion, LatinUnion),
     ):
-        assert velocity_method(SETTINGS, conventional_schedule(groups, 120, 3), 3) == conventional
-        assert (
-            velocity_method(
-                SETTINGS, pseudo_random_schedule(groups, 120, 3, np.random.default_rng(2)), 3
-            )
-            == random
-        )
-    assert (
-        velocity_method(
-            Receivers(velocity_method="conventional"), conventional_schedule(3, 120, 3), 3
-        )
-        == "conventional"
-    )
+        shuffled = pseudo_random_schedule(groups, 120, 3, np.random.default_rng(2))
+        assert way(SETTINGS, conventional_schedule(groups, 120, 3)) is conventional
+        assert way(SETTINGS, shuffled) is random
+    named = Receivers(velocity_method="conventional")
+    assert way(named, conventional_schedule(3, 120, 3)) is Conventional
+
+
+def way(settings: Receivers, schedule: np.ndarray) -> type:
+    """How the map of a frame with this schedule is made."""
+    w = Waveform(num_groups=len(schedule))
+    return type(cfar_of(settings).way(Known.unmodulated(w, schedule, FEW, 2)))
 
 
 def test_conventional_map_is_each_antennas_own_transform():
@@ -79,7 +78,7 @@ def test_conventional_map_is_each_antennas_own_transform():
         .astype(np.float32)
         .view(np.complex64)[..., 0]
     )
-    got = conventional_power(spectra, w, schedule)
+    got = conventional_power(spectra, Known.unmodulated(w, schedule, FEW, 2))
     i = np.arange(8)
     window = np.sin(np.pi * (i + 0.5) / 8) ** 2
     for row, number in ((0, -12), (3, -1), (4, 7)):

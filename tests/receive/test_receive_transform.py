@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from receiver_cubes import ANTENNAS
 from scipy import ndimage
 
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.cfar import peaks
-from isac_rt.receive.maps import power_map, slow_times, slow_window
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import power_map, slow_window
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform, transform_plain
 
@@ -70,11 +72,12 @@ def test_power_map_is_the_mean_over_antennas(groups: int, chirps: int):
     schedule = pseudo_random_schedule(groups, chirps, w.num_tx, rng)
     symbols = rng.integers(0, w.num_delay_symbols, schedule.shape)
     tone, amplitude = np.array([3.3, -7.2]), drawn(rng, w.num_tx, 2, 2)  # tx, rx, row
-    times = slow_times(w, symbols)
+    known = Known(w, schedule, symbols, np.ones(schedule.shape, complex), ANTENNAS, 2)
+    times = known.slots
     spectra = amplitude[schedule].transpose(0, 2, 3, 1) * np.exp(
         2j * np.pi * tone[:, None] * times[:, None, None, :] / chirps
     )
-    got = power_map(spectra.astype(np.complex64), w, schedule, symbols)
+    got = power_map(spectra.astype(np.complex64), known)
     bins = np.fft.fftshift(np.fft.fftfreq(chirps, 1 / chirps))
     window = slow_window(w).astype(float)
     expected = np.zeros((2, chirps))

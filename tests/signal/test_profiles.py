@@ -16,6 +16,7 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.receive import receive_active
+from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.file import ScenarioError, load
 from isac_rt.scenario.receivers import Receivers
@@ -80,7 +81,7 @@ def both(w: Waveform, links: list, cells: int, setting) -> tuple[np.ndarray, np.
     own = links[0][0].payload
     found = range_profiles(w, links, *HEARD, own, num_cells=cells, setting=setting)
     cube = if_signal(w, links, *HEARD, Exact())
-    return found.spectra, clean_spectrum(cube, own.delay_symbols, own.phases, cells)
+    return found.spectra, clean_spectrum(cube, Known.of(cube, own, ANTENNAS, 2), cells)
 
 
 def relative(found, truth):

@@ -14,7 +14,8 @@ chi-squared field of two degrees of freedom):
 
 mu the length and area of the scanned directions in units of the correlation length, which follows
 from the variances of the channels' places. Beams are half a lobe apart. R comes from the mesh
-(`predicted`), or from the cells around (`sampled`), whose finite number makes the tail heavier.
+(`angle_doppler`), or from the cells around (`sample_matrix`), whose finite number makes the tail
+heavier.
 
 References
 ----------
@@ -27,24 +28,14 @@ chi-squared, F and t fields", Adv. Appl.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.clutter.power import Channels, Taper, covariances, steering
-from isac_rt.receive.types import ExpectedClutter
-
-BLOCK = 16
-SIDE_BINS = 1
-"""Doppler bins on each side of a cell whose snapshots train its sample matrix."""
-LOADING = 0.1
-"""Of the sample matrix, relative to the noise."""
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.receive.arms import Channels
+from isac_rt.receive.known import Known
 
 
 @dataclass(frozen=True)
@@ -65,16 +56,14 @@ class Beams:
     area: float
 
 
-def beams_of(
-    channels: Channels, waveform: Waveform, antennas: Antennas, axes: tuple[int, ...]
-) -> Beams:
+def beams_of(channels: Channels, known: Known, axes: tuple[int, ...]) -> Beams:
     """Beams half a lobe apart over the field of view, along the axes (0 is X, 2 is Z) that the
     channels span."""
-    k = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT
-    limit = antennas.view_limit
+    k = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT
+    limit = known.antennas.view_limit
     lines = []
     for axis in axes:
-        aperture = np.ptp(channels.places[:, axis]) + antennas.spacing
+        aperture = np.ptp(channels.places[:, axis]) + known.antennas.spacing
         count = int(np.ceil(2 * limit * k * aperture / np.pi)) + 1
         lines.append(np.linspace(-limit, limit, count))
     grid = np.meshgrid(*lines, indexing="ij")
@@ -87,9 +76,7 @@ def beams_of(
     )
     sides = tuple(2 * limit * float(np.sqrt(covariance[i, i])) for i in range(len(axes)))
     area = float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance))) if len(axes) == 2 else 0.0
-    return Beams(
-        cosines, steering(channels.places, cosines, waveform).astype(np.complex64), sides, area
-    )
+    return Beams(cosines, channels.steering(cosines, known).astype(np.complex64), sides, area)
 
 
 def expected_count(t: np.ndarray, beams: Beams) -> np.ndarray:
@@ -147,100 +134,7 @@ class Scan:
     energy: np.ndarray
 
 
-def predicted(
-    frames: Sequence[np.ndarray],
-    channels: Channels,
-    beams: Beams,
-    noise: Sequence[float],
-    wanted: np.ndarray,
-    clutter: ExpectedClutter,
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    taper: Taper | None = None,
-) -> list[Scan]:
-    """Scans with the covariance that the expected clutter gives, of frames that share it.
-
-    Parameters
-    ----------
-    frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
-    noise : mean noise power of a cell of one channel, of each frame; the covariance is made for
-        their mean
-    wanted : (rows, P) bool, cells with clutter to speak of, Doppler in FFT order; the others are
-        taken to hold noise alone
-    """
-    snapshots = [
-        np.ascontiguousarray(np.moveaxis(maps[channels.tx, channels.rx], 0, -1)) for maps in frames
-    ]  # rows, P, L
-    scans = [_white(x, beams, n) for x, n in zip(snapshots, noise, strict=True)]
-    level = float(np.mean(noise))
-    eye, scale = np.eye(len(channels), dtype=np.complex64), np.float32(np.sqrt(level))
-    for row, bins, R in covariances(
-        clutter, waveform, channels, wanted, schedule, delay_symbols, taper
-    ):
-        matched = Matched.of(R / np.float32(level) + eye, beams)
-        for scan, x in zip(scans, snapshots, strict=True):
-            matched.fill(scan, row, bins, x[row, bins] / scale)
-    return scans
-
-
-def sampled(maps: np.ndarray, channels: Channels, beams: Beams, noise: float, guard: int) -> Scan:
-    """Scan with the sample matrix of the cells around: 2 L range rows outside the guard, half on
-    each side, and a bin on each side.
-
-    T is transformed to what an exponential variable would have to exceed as rarely: with N training
-    snapshots the tail of T is E[(1 + rho T/N)^-(N-L+1)], rho ~ Beta(N-L+2, L-1) [1]_. The range
-    neighbours are windowed, which `TRAINED` counts.
-    """
-    x = np.ascontiguousarray(np.moveaxis(maps[channels.tx, channels.rx], 0, -1))
-    rows, columns, size = x.shape
-    first, second = np.tril_indices(size)
-    scan = _white(x, beams, noise)
-    each = size
-    for low in range(0, rows, BLOCK):
-        block = np.arange(low, min(low + BLOCK, rows))
-        begin, end = max(low - guard - each, 0), min(int(block[-1]) + guard + each + 1, rows)
-        pairs = x[begin:end][..., first] * x[begin:end][..., second].conj()
-        pairs = sum(np.roll(pairs, s, axis=1) for s in range(-SIDE_BINS, SIDE_BINS + 1))
-        total = np.concatenate(
-            [np.zeros_like(pairs[:1]), np.cumsum(pairs, axis=0, dtype=np.complex128)]
-        )
-        for row in block.tolist():
-            spans = [
-                (max(row - guard - each, 0), max(row - guard, 0)),
-                (row + guard + 1, min(row + guard + 1 + each, rows)),
-            ]
-            spans = [(a - begin, b - begin) for a, b in spans if b > a]
-            count = sum(b - a for a, b in spans) * (2 * SIDE_BINS + 1)
-            mean = sum(total[b] - total[a] for a, b in spans) / (count * noise)
-            R = np.zeros((columns, size, size), np.complex64)
-            R[:, first, second] = mean
-            R[:, second, first] = mean.conj()
-            R += np.float32(LOADING) * np.eye(size, dtype=np.complex64)
-            Matched.of(R, beams).fill(
-                scan, row, np.arange(columns), x[row] / np.float32(np.sqrt(noise))
-            )
-    grid = np.geomspace(1e-3, 1e6, 600)
-    equal = like_exponential(grid, 2 * each * (2 * SIDE_BINS + 1) * TRAINED, size)
-    return Scan(np.interp(scan.peak, grid, equal).astype(np.float32), scan.beam, scan.energy)
-
-
-TRAINED = 0.5
-"""Independent snapshots per training cell: neighbours of Hann-windowed axes are correlated."""
-
-
-def like_exponential(t: np.ndarray, snapshots: float, size: int) -> np.ndarray:
-    """-ln P[T > t] of one beam's matched filter whose covariance comes from so many snapshots of
-    `size` channels."""
-    rho = stats.beta(max(snapshots - size + 2, 1), max(size - 1, 1)).ppf(
-        (np.arange(200) + 0.5) / 200
-    )
-    return -np.log(
-        np.mean((1 + rho[:, None] * np.asarray(t) / snapshots) ** -(snapshots - size + 1), axis=0)
-    )
-
-
-def _white(snapshots: np.ndarray, beams: Beams, noise: float) -> Scan:
+def white_scan(snapshots: np.ndarray, beams: Beams, noise: float) -> Scan:
     """The scan where there is noise alone."""
     rows, columns, size = snapshots.shape
     scan = Scan(
@@ -290,16 +184,3 @@ class Matched:
         scan.beam[row, bins] = power.argmax(axis=1)
         scan.peak[row, bins] = power.max(axis=1)
         scan.energy[row, bins] = np.maximum((x.conj() * y).sum(axis=1).real / x.shape[1], 0)
-
-
-def map_factor(level: np.ndarray, looks: int, false_alarm_rate: float) -> np.ndarray:
-    """What the mean power over the channels, in units of the noise, exceeds at a rate where the
-    expected clutter is `level`.
-
-    Noise is a mean of `looks` exponentials. Clutter of one direction is alike on all channels, one
-    exponential: of the laws with this mean the one that reaches highest. The sum is taken as the
-    Gamma variable of its mean and variance.
-    """
-    c = np.asarray(level, float)
-    mean, variance = 1 + c, 1 / looks + c**2
-    return stats.gamma.isf(false_alarm_rate, mean**2 / variance, scale=variance / mean)

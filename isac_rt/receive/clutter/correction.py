@@ -17,9 +17,9 @@ import numpy as np
 import scipy.fft
 from scipy import ndimage
 
-from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.power import REACH, cells_of, doppler_products, kept_slots, range_power
+from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 
 VELOCITY_STD = 0.1
@@ -62,14 +62,7 @@ class Correction:
         )
 
 
-def fit(
-    power: np.ndarray,
-    noise: float,
-    clutter: ExpectedClutter,
-    waveform: Waveform,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-) -> Correction:
+def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known) -> Correction:
     """Correction of the expected clutter of an active terminal's own link.
 
     Parameters
@@ -78,8 +71,9 @@ def fit(
         every chirp, are used
     noise : mean noise power of a cell
     """
-    w, rows = waveform, min(power.shape[0], waveform.num_delay_symbols)
-    response = _Response(w, kept_slots(w, schedule, delay_symbols, 0), rows)
+    w = known.waveform
+    rows = min(power.shape[0], w.num_delay_symbols)
+    response = _Response(w, kept_slots(known, 0), rows)
     towards = clutter.departure + clutter.arrival
     per_velocity = -w.carrier() * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s
     beat, doppler = cells_of(clutter, w)

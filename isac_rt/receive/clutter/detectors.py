@@ -1,52 +1,39 @@
-"""Detectors in clutter, one interface: maps in, in every cell the statistic over its threshold out.
+"""Detectors in clutter: channels' maps in, in every cell the statistic over its threshold out.
 
-- cfar: the mean power over the channels against its surroundings (`isac_rt.receive.cfar`);
-- map: the same power against the clutter power that the mesh predicts for the cell, and the noise;
-- angle_doppler: the adaptive matched filter with the covariance that the mesh and the platform's
-  own velocity predict;
-- sample_matrix: the same filter with the covariance of the cells around.
-
-map and angle_doppler first correct what the terminal believes of its velocity and of the clutter's
-level by the frame's own clutter (`isac_rt.receive.clutter.correction`). `clutter_channels` says
-whether the last two filter each arm of the virtual L by itself and add the two, or both arms
-jointly. The level of angle_doppler is held up by the energy that the filter leaves around a cell,
-the greater of both sides in range, where that is more than predicted.
+Peaks of the statistic are estimated off the grid. A filter that looks at directions also estimates
+there: the beam towards a detection takes out most of the clutter that shares its range-Doppler cell
+from elsewhere. The estimates' beam is the plain one, so that clutter within a lobe still pulls
+them. A new detector is a subclass of `ClutterDetector` in a file of its own, and a line of
+`isac_rt.receive.chain.DETECTORS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.cfar import CfarRule, strong_lobes
-from isac_rt.receive.clutter.adaptive import (
-    Beams,
-    Scan,
-    beams_of,
-    map_factor,
-    predicted,
-    sampled,
-    scan_threshold,
-)
+from isac_rt.receive.arms import Channels, arm, both_arms
+from isac_rt.receive.cfar import CfarRule, first_row, strong_lobes, strongest_peaks
+from isac_rt.receive.clutter.adaptive import Beams, Scan, beams_of, scan_threshold
 from isac_rt.receive.clutter.correction import fit
-from isac_rt.receive.clutter.power import Channels, Taper, arm_channels, joint_channels, power_map
-from isac_rt.receive.maps import accumulate
+from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
+from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import UNION_FLOOR, accumulate, channel_maps
+from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
 QUIET = 0.3
 """Share of the cells, those with the least clutter to be expected, whose median power is taken for
 the noise's."""
-
-LEAST = 0.03
-"""Cells whose expected clutter is less than this share of the noise are taken to hold noise
-alone."""
+FINE = 0.03, 0.01, 0.003
+"""Steps of the search for a direction around the filter's beam [cosine]."""
+SCANNED = {"arms": ((0,), (2,)), "joint": ((0, 2),)}
+"""Axes of the L that are filtered together, by `receivers.clutter_channels`."""
 
 
 @dataclass(frozen=True)
@@ -65,90 +52,154 @@ class Judged:
     level: np.ndarray
     cosines: np.ndarray
 
+    @classmethod
+    def everywhere(cls, ratio: np.ndarray, level: np.ndarray) -> Judged:
+        """The verdict of a detector that does not look at directions."""
+        return cls(ratio, level, np.full((*ratio.shape, 2), np.nan))
 
-def judge(
-    frames: Sequence[np.ndarray],
-    waveform: Waveform,
-    antennas: Antennas,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    settings: Receivers,
-    clutter: ExpectedClutter | None = None,
-    taper: Taper | None = None,
-    fitted: bool = True,
-) -> list[Judged]:
-    """The verdict of the detector that the settings name, on frames that share their data and the
-    expected clutter.
 
-    Parameters
+@dataclass(frozen=True)
+class ClutterDetector:
+    """A detector of echoes that holds cells against something else than their surroundings.
+
+    Attributes
     ----------
-    frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
-    clutter : what is expected; needed by map and angle_doppler
-    taper : how uncertain that is; None: `Taper()`
+    settings : Receivers
+    estimator : of the peaks
+    taper : how uncertain the expected clutter is
     fitted : correct the own velocity and the clutter's level by the first frame
         (`isac_rt.receive.clutter.correction`) before anything is decided
-
-    Raises
-    ------
-    ValueError  If the detector needs the expected clutter and there is none.
     """
-    name, powers = settings.clutter_detector, [accumulate(maps) for maps in frames]
-    looks, rate = frames[0].shape[0] * frames[0].shape[1], settings.false_alarm_rate
-    if name == "cfar":
-        return [Judged(*cfar_ratio(power, looks, settings), _nowhere(power)) for power in powers]
-    scans = _scans(waveform, antennas, settings.clutter_channels)
-    if name == "sample_matrix":
-        noise = [noise_level(power, None, looks) for power in powers]
-        found = [
-            [(sampled(m, c, b, n, settings.guard_cells[0]), b) for c, b in scans]
-            for m, n in zip(frames, noise, strict=True)
+
+    settings: Receivers
+    estimator: Estimator = OFF_GRID
+    taper: Taper = TAPER
+    fitted: bool = True
+
+    def judge(
+        self, frames: Sequence[np.ndarray], known: Known, clutter: ExpectedClutter | None = None
+    ) -> list[Judged]:
+        """The verdict on frames that share their data and the expected clutter.
+
+        Parameters
+        ----------
+        frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
+        known : Known
+        clutter : what is expected, for detectors that need it
+
+        Raises
+        ------
+        ValueError  If the detector needs the expected clutter and there is none.
+        """
+        raise NotImplementedError
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        """Detections in cleaned spectra of echoes."""
+        maps = channel_maps(spectra, known)
+        power, judged = accumulate(maps), self.judge([maps], known, clutter)[0]
+        ratio = judged.ratio.copy()
+        ratio[: first_row(self.settings, known.range_cell)] = 0
+        rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
+        found, towards = [], judged.cosines[rows, bins]
+        for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
+            if np.isfinite(cosines).all():
+                local = BeamSpectra(spectra, known, row, beam_weights(known, cosines))
+                found.append(self.estimator.at(local, ratio, row, column))
+            else:
+                local = LocalSpectra(spectra, known, row)
+                found.append(self.estimator.at(local, power, row, column))
+        snr = np.maximum(power[rows, bins] / judged.level[rows, bins], ratio[rows, bins])
+        on_grid = self.estimator.on_grid
+        detections = describe(found, snr, known, on_grid=on_grid)
+        direction = detections.direction.copy()
+        for i, cosines in enumerate(towards):
+            if np.isfinite(cosines).all():
+                direction[i] = cosines if on_grid else near_beam(found[i], known, cosines)
+        return Sensed(found, replace(detections, direction=direction), power, judged.level)
+
+    def expectation(
+        self, powers: list[np.ndarray], known: Known, clutter: ExpectedClutter | None
+    ) -> tuple[ExpectedClutter, np.ndarray, list[float]]:
+        """The expected clutter, corrected by the first frame, its power (rows, P), and the noise of
+        a cell of every frame."""
+        if clutter is None:
+            raise ValueError(
+                f"receivers.clutter_detector {self.settings.clutter_detector} needs the clutter "
+                "that the mesh predicts; give it, or use cfar"
+            )
+        rows = len(powers[0])
+        expected = expected_power(clutter, known, rows, self.taper)
+        noise = [noise_level(power, expected, known.channels) for power in powers]
+        if self.fitted:
+            clutter = fit(powers[0], noise[0], clutter, known).apply(clutter)
+            expected = expected_power(clutter, known, rows, self.taper)
+        return clutter, expected, noise
+
+    def scans(self, known: Known) -> list[tuple[Channels, Beams]]:
+        """Channels that are filtered together, and the beams in which they are scanned."""
+        sets = [
+            (arm(known.antennas, axes[0]) if len(axes) == 1 else both_arms(known.antennas), axes)
+            for axes in SCANNED[self.settings.clutter_channels]
         ]
-        levels = [np.full_like(power, n) for power, n in zip(powers, noise, strict=True)]
-        return [
-            _directed(parts, level, rate, None) for parts, level in zip(found, levels, strict=True)
-        ]
-    if clutter is None:
-        raise ValueError(
-            f"receivers.clutter_detector {name} needs the clutter that the mesh predicts; give it, "
-            "or use cfar"
+        return [(channels, beams_of(channels, known, axes)) for channels, axes in sets]
+
+    def directed(
+        self, parts: list[tuple[Scan, Beams]], level: np.ndarray, *, held_up: bool
+    ) -> Judged:
+        """Scans added, over their threshold; `held_up`: by the energy that the filter leaves around
+        a cell, the greater of both sides in range, where that is more than predicted."""
+        total = np.fft.fftshift(np.sum([scan.peak for scan, _ in parts], axis=0), axes=1)
+        limit = scan_threshold(tuple(b for _, b in parts), self.settings.false_alarm_rate)
+        ratio = total / limit
+        if held_up:
+            left = np.fft.fftshift(np.mean([scan.energy for scan, _ in parts], axis=0), axes=1)
+            found = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
+            rule = CfarRule.of(self.settings, 1)
+            around = rule.background(left, ~(found | strong_lobes(left)))
+            ratio = ratio / np.maximum(around, 1.0)
+        cosines = np.zeros((*ratio.shape, 2))
+        for scan, beams in parts:
+            # each arm's beams lie along its own axis, so that the sum puts the two together
+            cosines += np.fft.fftshift(beams.cosines[scan.beam][..., [0, 2]], axes=1)
+        return Judged(ratio, level, cosines)
+
+
+class BeamSpectra(LocalSpectra):
+    """The rows around a peak, of which only one beam's power counts."""
+
+    def __init__(self, spectra: np.ndarray, known: Known, row: int, weights: np.ndarray) -> None:
+        super().__init__(spectra, known, row)
+        self._beam = weights.conj()
+
+    def power(self, delay: float, delay_rate: float) -> float:
+        """Power of the beam: what the estimate maximises."""
+        return float(np.abs((self._beam * self.respond(delay, delay_rate)).sum()) ** 2)
+
+
+def beam_weights(known: Known, cosines: np.ndarray) -> np.ndarray:
+    """(L_tx, L_rx) weights of the virtual L towards (u_x, u_z), zero off the L."""
+    channels = both_arms(known.antennas)
+    out = np.zeros((known.antennas.num_tx, known.antennas.num_rx), complex)
+    towards = np.array([[cosines[0], 0.0, cosines[1]]])
+    out[channels.tx, channels.rx] = channels.steering(towards, known)[0]
+    return out
+
+
+def near_beam(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
+    """(u_x, u_z) of the most power of the virtual L near the filter's beam."""
+    channels = both_arms(known.antennas)
+    values = estimate.channels[channels.tx, channels.rx]
+    best = np.array(cosines, float)
+    for step in FINE:
+        i, j = np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij")
+        tried = np.stack(
+            [best[0] + step * i.ravel(), np.zeros(25), best[1] + step * j.ravel()], axis=1
         )
-    expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols, taper)
-    noise = [noise_level(power, expected, looks) for power in powers]
-    if fitted:
-        clutter = fit(powers[0], noise[0], clutter, waveform, schedule, delay_symbols).apply(
-            clutter
-        )
-        expected = power_map(clutter, waveform, powers[0].shape[0], schedule, delay_symbols, taper)
-    if name == "map":
-        limits = [n * map_factor(expected / n, looks, rate) for n in noise]
-        return [
-            Judged(p / limit, n + expected, _nowhere(p))
-            for p, n, limit in zip(powers, noise, limits, strict=True)
-        ]
-    wanted = np.fft.ifftshift(expected > LEAST * np.mean(noise), axes=1)
-    by_scan = [
-        predicted(frames, c, b, noise, wanted, clutter, waveform, schedule, delay_symbols, taper)
-        for c, b in scans
-    ]
-    by_frame = [
-        [(scan, b) for scan, (_, b) in zip(one, scans, strict=True)]
-        for one in zip(*by_scan, strict=True)
-    ]
-    return [
-        _directed(parts, n + expected, rate, settings)
-        for parts, n in zip(by_frame, noise, strict=True)
-    ]
-
-
-def _nowhere(power: np.ndarray) -> np.ndarray:
-    return np.full((*power.shape, 2), np.nan)
-
-
-def cfar_ratio(power: np.ndarray, looks: int, settings: Receivers) -> tuple[np.ndarray, np.ndarray]:
-    """Power over the threshold of `CfarRule.detect`, and the background."""
-    rule = CfarRule.of(settings, looks)
-    level = rule.detect(power)[1]
-    return power / (rule.factors(len(power))[:, None] * level), level
+        power = np.abs(channels.steering(tried, known).conj() @ values) ** 2
+        best = tried[power.argmax()][[0, 2]]
+    return best if (best**2).sum() <= 1 else np.full(2, np.nan)
 
 
 def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> float:
@@ -159,31 +210,3 @@ def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> f
     """
     some = power if expected is None else power[expected <= np.quantile(expected, QUIET)]
     return float(np.median(some)) / (1 - 1 / (9 * looks)) ** 3
-
-
-def _scans(waveform: Waveform, antennas: Antennas, which: str) -> list[tuple[Channels, Beams]]:
-    if which == "joint":
-        channels = joint_channels(antennas)
-        return [(channels, beams_of(channels, waveform, antennas, (0, 2)))]
-    arms = [(arm_channels(antennas, axis), axis) for axis in (0, 2)]
-    return [(channels, beams_of(channels, waveform, antennas, (axis,))) for channels, axis in arms]
-
-
-def _directed(
-    parts: list[tuple[Scan, Beams]], level: np.ndarray, rate: float, settings: Receivers | None
-) -> Judged:
-    """Scans added, over their threshold; with `settings` the left energy of the surroundings is
-    held against them."""
-    total = np.fft.fftshift(np.sum([scan.peak for scan, _ in parts], axis=0), axes=1)
-    limit = scan_threshold(tuple(b for _, b in parts), rate)
-    ratio = total / limit
-    if settings is not None:
-        left = np.fft.fftshift(np.mean([scan.energy for scan, _ in parts], axis=0), axes=1)
-        found = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
-        around = CfarRule.of(settings, 1).background(left, ~(found | strong_lobes(left)))
-        ratio = ratio / np.maximum(around, 1.0)
-    cosines = np.zeros((*ratio.shape, 2))
-    for scan, beams in parts:
-        # each arm's beams lie along its own axis, so that the sum puts the two together
-        cosines += np.fft.fftshift(beams.cosines[scan.beam][..., [0, 2]], axes=1)
-    return Judged(ratio, level, cosines)

@@ -15,6 +15,8 @@ cells on. What happens in a run:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.fft
 from scipy import ndimage, stats
@@ -27,6 +29,18 @@ MARGIN = 2
 """Cells that the window's main lobe reaches beyond a run."""
 FALSE_RATE = 1e-3
 LEAST_FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class ClutterFilter:
+    """The filter, of range cells in runs of at least `least` occupied ones; None: of every cell at
+    the AT, of none at a PT, whose line of sight may stand still too."""
+
+    least: int | None
+
+    def clean(self, spectra: np.ndarray, schedule: Schedule) -> None:
+        """Take what stands still out of the AT's spectra, in place."""
+        remove_standing(spectra, schedule, self.least)
 
 
 def occupied_factor(looks: float) -> float:

@@ -22,10 +22,10 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.arms import Channels
 from isac_rt.receive.estimate import hann_response
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
 from isac_rt.receive.types import ExpectedClutter
 
@@ -54,43 +54,7 @@ class Taper:
     fine: int = 2
 
 
-@dataclass(frozen=True)
-class Channels:
-    """Virtual channels that are combined coherently.
-
-    Attributes
-    ----------
-    tx, rx : (L,) antennas
-    places : (L, 3) sum of the two positions in the body frame [m]
-    """
-
-    tx: np.ndarray
-    rx: np.ndarray
-    places: np.ndarray
-
-    def __len__(self) -> int:
-        return self.tx.size
-
-
-def arm_channels(antennas: Antennas, axis: int) -> Channels:
-    """The virtual arm along X (axis 0) or Z (axis 2) of an echo: transmit and receive elements of
-    that axis."""
-    a = antennas
-    tx = np.arange(a.tx_x) if axis == 0 else np.arange(a.tx_x - 1, a.num_tx)
-    rx = np.arange(a.rx_x) if axis == 0 else np.arange(a.rx_x - 1, a.num_rx)
-    t, r = (i.ravel() for i in np.meshgrid(tx, rx, indexing="ij"))
-    return Channels(t, r, a.tx_positions[t] + a.rx_positions[r])
-
-
-def joint_channels(antennas: Antennas) -> Channels:
-    """Both arms of the virtual L; their common corner once."""
-    x, z = arm_channels(antennas, 0), arm_channels(antennas, 2)
-    new = ~np.isin(z.tx * antennas.num_rx + z.rx, x.tx * antennas.num_rx + x.rx)
-    return Channels(
-        np.append(x.tx, z.tx[new]),
-        np.append(x.rx, z.rx[new]),
-        np.concatenate([x.places, z.places[new]]),
-    )
+TAPER = Taper()
 
 
 def one_each(antennas_sent: int) -> Channels:
@@ -99,13 +63,6 @@ def one_each(antennas_sent: int) -> Channels:
     return Channels(
         np.arange(antennas_sent), np.zeros(antennas_sent, int), np.zeros((antennas_sent, 3))
     )
-
-
-def steering(places: np.ndarray, cosines: np.ndarray, waveform: Waveform) -> np.ndarray:
-    """(K, L) exp(-j k v.u) of echoes from body directions (K, 3), at the frequency of the window's
-    middle."""
-    k = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
-    return np.exp(-1j * k * (cosines @ places.T))
 
 
 def cells_of(clutter: ExpectedClutter, waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
@@ -140,43 +97,38 @@ def doppler_products(waveform: Waveform, kept: np.ndarray, width: float, fine: i
     return np.mean([np.roll(product, s, axis=2) for s in range(-span, span + 1)], axis=0)[..., ::4]
 
 
-def kept_slots(
-    waveform: Waveform, schedule: Schedule, delay_symbols: np.ndarray, row: int
-) -> np.ndarray:
+def kept_slots(known: Known, row: int) -> np.ndarray:
     """(L_tx, P) bool: whether the data let a path of a range row through the IF filter in the
     slot's chirp of each antenna.
 
     Its beat with the data must be below N. A slot in which no group uses the antenna counts as not
     kept.
     """
-    passes = row + delay_symbols < waveform.num_samples
-    return np.stack([(passes & (schedule == tx)).any(axis=0) for tx in range(waveform.num_tx)])
+    passes = row + known.delay_symbols < known.waveform.num_samples
+    return np.stack([(passes & sent).any(axis=0) for sent in known.sent_by])
 
 
 def covariances(
     clutter: ExpectedClutter,
-    waveform: Waveform,
+    known: Known,
     channels: Channels,
     wanted: np.ndarray,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    taper: Taper | None = None,
+    taper: Taper = TAPER,
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Covariance of the clutter in chosen cells, row by row.
 
     Parameters
     ----------
     clutter : ExpectedClutter of an active terminal's own link
+    known : of the frame, one group per transmit antenna; its data gate the rows past N/2
     wanted : (rows, P) bool, cells from range row 0 on, Doppler in FFT order
-    schedule, delay_symbols : (M, P) of the frame, one group per transmit antenna; the data gate the
-        rows past N/2
 
     Yields
     ------
     row, bins, R : of each row with a wanted cell its columns (S,), and (S, L, L) complex64 in units
         of `channel_maps` squared
     """
-    w, t = waveform, taper or Taper()
+    w, t = known.waveform, taper
     beat, doppler = cells_of(clutter, w)
     order = np.argsort(beat, kind="stable")
     clutter, beat, doppler = clutter.select(order), beat[order], doppler[order]
@@ -196,7 +148,7 @@ def covariances(
             else products[pairs].T.astype(np.complex64)
         )
 
-    whole = kernel(kept_slots(w, schedule, delay_symbols, 0))
+    whole = kernel(kept_slots(known, 0))
     rows = np.flatnonzero(wanted.any(axis=1))
     for block in np.array_split(rows, max(1, -(-rows.size // ROWS))) if rows.size else []:
         low, high = int(block[0]) - REACH, int(block[-1]) + REACH
@@ -205,7 +157,7 @@ def covariances(
         grid = np.zeros(
             ((high - low) * t.fine + 1, w.num_chirps * t.fine, first.size), np.complex64
         )
-        steer = steering(channels.places, clutter.arrival[some], w).astype(np.complex64)
+        steer = channels.steering(clutter.arrival[some], known).astype(np.complex64)
         _accumulate(grid, line, column[some], clutter.power[some].astype(np.float32), steer)
         offset = block[:, None] - (low + np.arange(len(grid)) / t.fine)
         response = range_power(w, offset, t.range_cells) * (np.abs(offset) <= REACH)
@@ -215,11 +167,7 @@ def covariances(
             spread.view(np.complex64).reshape(block.size, *grid.shape[1:]),
             strict=True,
         ):
-            turned = (
-                whole
-                if row <= w.num_delay_symbols
-                else kernel(kept_slots(w, schedule, delay_symbols, row))
-            )
+            turned = whole if row <= w.num_delay_symbols else kernel(kept_slots(known, row))
             bins = np.flatnonzero(wanted[row])
             along = _across(turned, line_of, bins * t.fine) * shape
             out = np.empty((bins.size, size, size), np.complex64)
@@ -244,20 +192,14 @@ def _angle_taper(channels: Channels, waveform: Waveform, width: float) -> np.nda
     return np.sinc(k * apart[..., 0] * width) * np.sinc(k * apart[..., 2] * width)
 
 
-def power_map(
-    clutter: ExpectedClutter,
-    waveform: Waveform,
-    num_rows: int,
-    schedule: Schedule,
-    delay_symbols: np.ndarray,
-    taper: Taper | None = None,
+def expected_power(
+    clutter: ExpectedClutter, known: Known, num_rows: int, taper: Taper = TAPER
 ) -> np.ndarray:
     """(num_rows, P) mean clutter power over the channels, Doppler centred as in `accumulate`."""
-    out = np.zeros((num_rows, waveform.num_chirps), np.float32)
-    channels, wanted = one_each(waveform.num_tx), np.ones(out.shape, bool)
-    for row, _, one in covariances(
-        clutter, waveform, channels, wanted, schedule, delay_symbols, taper
-    ):
+    w = known.waveform
+    out = np.zeros((num_rows, w.num_chirps), np.float32)
+    channels, wanted = one_each(w.num_tx), np.ones(out.shape, bool)
+    for row, _, one in covariances(clutter, known, channels, wanted, taper):
         out[row] = np.fft.fftshift(np.maximum(np.einsum("pii->p", one).real, 0)) / len(channels)
     return out
 

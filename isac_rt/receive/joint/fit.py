@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.known import Known
 
 PARAMETERS = 4  # delay, delay rate, u_x, u_z
 LARGEST_STEP = np.array([0.3, 0.3, 0.03, 0.03])
@@ -50,49 +49,19 @@ class JointPath:
     std: np.ndarray
 
 
-@dataclass(frozen=True)
-class Frame:
-    """Samples with all that is known of what was sent in them.
+def rate_bin(waveform: Waveform) -> float:
+    """Delay rate of one Doppler bin."""
+    return 1 / (waveform.frame_duration * waveform.effective_carrier)
 
-    Attributes
-    ----------
-    cube : IFCube
-    delay_symbols, phases : (M, P), as sent or as decided
-    antennas : of both ends
-    passes : 2 for echoes at the AT, 1 at a PT
-    """
 
-    cube: IFCube
-    delay_symbols: np.ndarray
-    phases: np.ndarray
-    antennas: Antennas
-    passes: int
+def units(known: Known) -> np.ndarray:
+    """(4,) steps of the scaled parameters: a cell of delay, a bin of delay rate, and 1 and 1."""
+    return np.array([known.waveform.delay_step, rate_bin(known.waveform), 1.0, 1.0])
 
-    @property
-    def waveform(self) -> Waveform:
-        return self.cube.waveform
 
-    @property
-    def amplitude_index(self) -> np.ndarray:
-        """(M, P) which of a path's amplitudes each chirp has."""
-        return self.cube.schedule if self.passes == 1 else np.zeros_like(self.cube.schedule)
-
-    @property
-    def middle(self) -> np.ndarray:
-        """(M, P) middles of the chirps' samples [s], from the frame's."""
-        w = self.waveform
-        return (
-            w.chirp_time
-            + w.window_start
-            + (w.num_samples - 1) / 2 * w.sample_interval
-            - w.frame_duration / 2
-        )
-
-    @property
-    def units(self) -> np.ndarray:
-        """One cell of delay, one bin of delay rate, and 1 and 1."""
-        w = self.waveform
-        return np.array([w.delay_step, 1 / (w.frame_duration * w.effective_carrier), 1.0, 1.0])
+def amplitude_index(known: Known) -> np.ndarray:
+    """(M, P) which of a path's amplitudes each chirp has."""
+    return known.schedule if known.passes == 1 else np.zeros_like(known.schedule)
 
 
 def element_delays(
@@ -127,25 +96,23 @@ class _Tone:
     slope: np.ndarray
 
 
-def _tone(frame: Frame, path: JointPath) -> _Tone:
-    w, a, T_s = frame.waveform, frame.antennas, frame.waveform.sample_interval
-    radius = path.delay * SPEED_OF_LIGHT / frame.passes
-    radius = max(radius, w.range_cell(frame.passes))
+def _tone(known: Known, path: JointPath) -> _Tone:
+    w, a, schedule = known.waveform, known.antennas, known.schedule
+    T_s, radius = w.sample_interval, known.radius(path.delay)
     e_rx, de_rx = element_delays(a.rx_positions, path.direction, radius)
     e_tx, de_tx = element_delays(a.tx_positions, path.direction, radius)
-    if frame.passes == 1:
+    if known.passes == 1:
         e_tx, de_tx = np.zeros_like(e_tx), np.zeros_like(de_tx)
     u = w.window_start + (w.num_samples - 1) / 2 * T_s
-    t = frame.middle
-    schedule = frame.cube.schedule
-    tau = frame.delay_symbols * w.delay_step + path.delay + path.delay_rate * t + e_tx[schedule]
+    t = known.sampled_times
+    tau = known.delay_symbols * w.delay_step + path.delay + path.delay_rate * t + e_tx[schedule]
     g = w.carrier(tau, u)
     phase = w.phase(tau, u)
     frequency = (path.delay_rate * g + w.slope * tau) * T_s
     apart = e_rx[:, None] * g[:, None, :] - w.slope * e_rx[:, None] ** 2 / 2
-    amplitude = path.amplitude[frame.amplitude_index]
+    amplitude = path.amplitude[amplitude_index(known)]
     constant, slope = _sensitivity(
-        frame, g, t, de_rx, de_tx[:, schedule], amplitude, path.amplitude.size
+        known, g, de_rx, de_tx[:, schedule], amplitude, path.amplitude.size
     )
     return _Tone(
         phase=phase[:, None, :] + apart,
@@ -163,9 +130,8 @@ def _tone(frame: Frame, path: JointPath) -> _Tone:
 
 
 def _sensitivity(
-    frame: Frame,
+    known: Known,
     g: np.ndarray,
-    t: np.ndarray,
     de_rx: np.ndarray,
     de_tx: np.ndarray,
     amplitude: np.ndarray,
@@ -173,7 +139,12 @@ def _sensitivity(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`constant` and `slope` of `_Tone`: j 2 pi a dPhi by the parameters, 1 and j by the
     amplitudes."""
-    w, T_s, units = frame.waveform, frame.waveform.sample_interval, frame.units
+    w, T_s, t, unit = (
+        known.waveform,
+        known.waveform.sample_interval,
+        known.sampled_times,
+        units(known),
+    )
     shape = (g.shape[0], de_rx.shape[1], g.shape[1])
     constant = np.zeros((PARAMETERS + 2 * count, *shape), np.complex128)
     slope = np.zeros_like(constant)
@@ -181,19 +152,19 @@ def _sensitivity(
     lever += [de_rx[i][None, :, None] + de_tx[i][:, None, :] for i in (0, 1)]
     turn = 2j * np.pi * amplitude[:, None, :]
     for i, b in enumerate(lever):
-        constant[i] = turn * g[:, None, :] * b * units[i]
-        slope[i] = turn * w.slope * T_s * b * units[i]
-    slope[1] += turn * g[:, None, :] * T_s * units[1]
+        constant[i] = turn * g[:, None, :] * b * unit[i]
+        slope[i] = turn * w.slope * T_s * b * unit[i]
+    slope[1] += turn * g[:, None, :] * T_s * unit[1]
     for i in range(count):
-        mine = (frame.amplitude_index == i)[:, None, :]
+        mine = (amplitude_index(known) == i)[:, None, :]
         constant[PARAMETERS + 2 * i] = mine
         constant[PARAMETERS + 2 * i + 1] = 1j * mine
     return constant, slope
 
 
-def _moments(frame: Frame, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
+def _moments(samples: np.ndarray, known: Known, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
     """Sums of s T* and n s T* over each chirp, n from its middle: two of (M, rx, P)."""
-    w, samples = frame.waveform, frame.cube.samples
+    w = known.waveform
     n = np.arange(w.num_samples) - (w.num_samples - 1) / 2
     zeroth, first = np.empty((2, *tone.phase.shape), np.complex128)
     ramps = np.exp(
@@ -207,17 +178,17 @@ def _moments(frame: Frame, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
             part = samples[m, rx] * ramps[rx]
             zeroth[m, rx] = np.einsum("pn,pn->p", part, template)
             first[m, rx] = np.einsum("pn,pn->p", part, lever)
-        zeroth[m] *= frame.phases[m].conj()
-        first[m] *= frame.phases[m].conj()
+        zeroth[m] *= known.phases[m].conj()
+        first[m] *= known.phases[m].conj()
     back = np.exp(-2j * np.pi * tone.phase)
     return zeroth * back, first * back
 
 
-def match_chirps(frame: Frame, path: JointPath) -> np.ndarray:
+def match_chirps(samples: np.ndarray, known: Known, path: JointPath) -> np.ndarray:
     """(M, P) the chirps against a path's signal, summed over their samples and the receivers in
     phase."""
-    tone = _tone(frame, path)
-    return (_moments(frame, tone)[0] * tone.amplitude.conj()).sum(axis=1)
+    tone = _tone(known, path)
+    return (_moments(samples, known, tone)[0] * tone.amplitude.conj()).sum(axis=1)
 
 
 def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -242,49 +213,52 @@ def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np
     return sum0, sum1, sum2
 
 
-def _cross(frame: Frame, of: _Tone, at: _Tone) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cross(known: Known, of: _Tone, at: _Tone) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sums of T_of T_at* times 1, n, n^2 over each chirp; the difference of their curvatures (0.003
     cycles) is left out."""
-    sums = tone_sums(of.frequency - at.frequency, frame.waveform.num_samples)
+    sums = tone_sums(of.frequency - at.frequency, known.waveform.num_samples)
     turn = np.exp(2j * np.pi * (of.phase - at.phase))
     return sums[0] * turn, 1j * sums[1] * turn, sums[2] * turn
 
 
-def fit(frame: Frame, paths: list[JointPath], iterations: int = 4) -> list[JointPath]:
+def fit(
+    samples: np.ndarray, known: Known, paths: list[JointPath], iterations: int = 4
+) -> list[JointPath]:
     """Gauss-Newton from near estimates of all paths; amplitudes of the start are not used.
 
     Parameters
     ----------
-    frame : Frame
+    samples : (M, L_rx, P, N)
+    known : Known
     paths : within half a cell of their truths
 
     Returns
     -------
     paths : in the same order
     """
-    paths = _with_amplitudes(frame, paths)
+    paths = _with_amplitudes(samples, known, paths)
     for _ in range(iterations):
-        gradient, gram, left = _normal_equations(frame, paths)
+        gradient, gram, left = _normal_equations(samples, known, paths)
         covariance = np.linalg.inv(gram)
         step = covariance @ gradient
         paths = [
-            _moved(frame, p, s) for p, s in zip(paths, np.split(step, len(paths)), strict=True)
+            _moved(known, p, s) for p, s in zip(paths, np.split(step, len(paths)), strict=True)
         ]
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0) * left / 2)
         if (np.abs(step) < SETTLED * deviation).all():
             break
-    units, size = frame.units, len(step) // len(paths)
+    unit, size = units(known), len(step) // len(paths)
     return [
-        replace(p, std=deviation[i * size : i * size + PARAMETERS] * units)
+        replace(p, std=deviation[i * size : i * size + PARAMETERS] * unit)
         for i, p in enumerate(paths)
     ]
 
 
-def _with_amplitudes(frame: Frame, paths: list[JointPath]) -> list[JointPath]:
+def _with_amplitudes(samples: np.ndarray, known: Known, paths: list[JointPath]) -> list[JointPath]:
     """The least-squares amplitudes of paths whose other parameters are given."""
-    count = frame.antennas.num_tx if frame.passes == 1 else 1
+    count = known.antennas.num_tx if known.passes == 1 else 1
     paths = [replace(p, amplitude=np.ones(count, complex)) for p in paths]
-    gradient, gram, _ = _normal_equations(frame, paths)
+    gradient, gram, _ = _normal_equations(samples, known, paths)
     size = PARAMETERS + 2 * count
     amplitudes = np.concatenate([np.arange(PARAMETERS, size) + i * size for i in range(len(paths))])
     step = np.linalg.solve(gram[np.ix_(amplitudes, amplitudes)], gradient[amplitudes]).reshape(
@@ -296,20 +270,22 @@ def _with_amplitudes(frame: Frame, paths: list[JointPath]) -> list[JointPath]:
     ]
 
 
-def _normal_equations(frame: Frame, paths: list[JointPath]) -> tuple[np.ndarray, np.ndarray, float]:
+def _normal_equations(
+    samples: np.ndarray, known: Known, paths: list[JointPath]
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Gradient and Gram matrix of the scaled parameters, path by path, and the noise power that the
     paths leave."""
-    tones = [_tone(frame, p) for p in paths]
+    tones = [_tone(known, p) for p in paths]
     size, cells = tones[0].constant.shape[0], tones[0].phase.size
     gradient, gram = np.zeros(size * len(paths)), np.zeros((size * len(paths),) * 2)
     explained = 0.0
     for k, at in enumerate(tones):
-        zeroth, first = _moments(frame, at)
+        zeroth, first = _moments(samples, known, at)
         own = slice(k * size, (k + 1) * size)
         c0, c1 = at.constant.reshape(size, cells), at.slope.reshape(size, cells)
         seen = zeroth.copy()
         for j, of in enumerate(tones):
-            G0, G1, G2 = (g.ravel() for g in _cross(frame, of, at))
+            G0, G1, G2 = (g.ravel() for g in _cross(known, of, at))
             zeroth = zeroth - of.amplitude * G0.reshape(zeroth.shape)
             first = first - of.amplitude * G1.reshape(first.shape)
             d0, d1 = of.constant.reshape(size, cells), of.slope.reshape(size, cells)
@@ -317,13 +293,13 @@ def _normal_equations(frame: Frame, paths: list[JointPath]) -> tuple[np.ndarray,
             gram[own, j * size : (j + 1) * size] = block.real
         gradient[own] = (c0.conj() @ zeroth.ravel() + c1.conj() @ first.ravel()).real
         explained += float((at.amplitude.conj() * (seen + zeroth)).real.sum())
-    total = float(np.vdot(frame.cube.samples, frame.cube.samples).real)
-    left = max(total - explained, 1e-12 * total) / frame.cube.samples.size
+    total = float(np.vdot(samples, samples).real)
+    left = max(total - explained, 1e-12 * total) / samples.size
     return gradient, gram, left
 
 
 def residual_channels(
-    frame: Frame, paths: list[JointPath], offsets: np.ndarray
+    samples: np.ndarray, known: Known, paths: list[JointPath], offsets: np.ndarray
 ) -> Iterator[tuple[JointPath, np.ndarray, np.ndarray, float]]:
     """What the paths of a fit leave about each of them, channel by channel.
 
@@ -339,33 +315,29 @@ def residual_channels(
     counts : samples per amplitude of the path
     noise : power of a sample that all paths leave
     """
-    w, schedule = frame.waveform, frame.cube.schedule
-    tones = [_tone(frame, p) for p in paths]
-    left = _normal_equations(frame, paths)[2]
-    turns = np.exp(
-        -2j * np.pi * offsets[:, None, None] * frame.middle / w.frame_duration
-    )  # a bin is one turn per frame
+    w, num_tx = known.waveform, known.antennas.num_tx
+    tones = [_tone(known, p) for p in paths]
+    left = _normal_equations(samples, known, paths)[2]
+    # a bin is one turn per frame
+    turns = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
+    sent = np.array([mine.sum() for mine in known.sent_by]) * w.num_samples
     for path, at in zip(paths, tones, strict=True):
-        residual = _moments(frame, at)[0]
+        residual = _moments(samples, known, at)[0]
         for of in tones:
-            residual = residual - of.amplitude * _cross(frame, of, at)[0]
-        channels = np.empty((len(offsets), frame.antennas.num_tx, residual.shape[1]), np.complex128)
-        sent = (
-            np.array([(schedule == tx).sum() for tx in range(frame.antennas.num_tx)])
-            * w.num_samples
-        )
-        for tx in range(frame.antennas.num_tx):
-            mine = np.where(schedule == tx, turns, 0.0)
-            channels[:, tx] = np.einsum("fmp,mrp->fr", mine, residual) / np.sqrt(sent[tx])
-        counts = (sent if frame.passes == 1 else np.array([sent.sum()])) * frame.antennas.num_rx
+            residual = residual - of.amplitude * _cross(known, of, at)[0]
+        channels = np.empty((len(offsets), num_tx, residual.shape[1]), np.complex128)
+        for tx, mine in enumerate(known.sent_by):
+            turned = np.where(mine, turns, 0.0)
+            channels[:, tx] = np.einsum("fmp,mrp->fr", turned, residual) / np.sqrt(sent[tx])
+        counts = (sent if known.passes == 1 else np.array([sent.sum()])) * known.antennas.num_rx
         yield path, channels, counts, left
 
 
-def _moved(frame: Frame, path: JointPath, step: np.ndarray) -> JointPath:
+def _moved(known: Known, path: JointPath, step: np.ndarray) -> JointPath:
     """A path after a step. The phase turns by 128 cycles per cell of delay: the amplitude follows
     that turn, and not its tangent."""
     change = np.clip(step[:PARAMETERS], -LARGEST_STEP, LARGEST_STEP)
-    constant, index = _tone(frame, path).constant[:PARAMETERS], frame.amplitude_index
+    constant, index = _tone(known, path).constant[:PARAMETERS], amplitude_index(known)
     mine = [
         np.broadcast_to((index == i)[:, None, :], constant.shape[1:])
         for i in range(path.amplitude.size)
@@ -378,7 +350,7 @@ def _moved(frame: Frame, path: JointPath, step: np.ndarray) -> JointPath:
         + 1j * pairs[:, 1]
         + path.amplitude * (turn @ step[:PARAMETERS])
     )
-    move = change * frame.units
+    move = change * units(known)
     return replace(
         path,
         delay=path.delay + float(move[0]),

@@ -23,6 +23,7 @@ from isac_rt.receive.joint.fit import element_delays
 from isac_rt.receive.symbols.powers import (
     EXTRA_CELLS,
     WEAKEST_WEIGHT,
+    ByPowers,
     Symbols,
     known_cycles,
     symbol_cells,
@@ -131,6 +132,22 @@ def demodulate_beams(
     )
 
 
+class ByBeams(ByPowers):
+    """Receivers added in phase towards the tracked paths; in power where the reference has no
+    direction."""
+
+    def read(
+        self,
+        cube: IFCube,
+        prediction: Prediction,
+        antennas: Antennas,
+        profile: np.ndarray | None = None,
+    ) -> Symbols:
+        if not usable_paths(prediction).size:
+            return super().read(cube, prediction, antennas, profile)
+        return demodulate_beams(cube, prediction, antennas, self.order, self.run_cells)
+
+
 def _beam_spectra(
     cube: IFCube, p: Prediction, antennas: Antennas, cells: np.ndarray, run_cells: int | None
 ) -> np.ndarray:
@@ -212,14 +229,8 @@ def _rate_error(
 def soft_delay_bits(likelihood: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood ratios ln P(0)/P(1) of the delay bits, in the order of the payload, and the
     probability of each chirp's best symbol, from log likelihoods (M, P, N/2)."""
-    bits = gray_bits(likelihood.shape[-1])
-    probability = np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
-    probability /= probability.sum(axis=-1, keepdims=True)
-    ones = (probability @ bits).reshape(-1)
-    zeros = (probability @ (1.0 - bits)).reshape(-1)
-    return np.log(np.maximum(zeros, 1e-30)) - np.log(np.maximum(ones, 1e-30)), probability.max(
-        axis=-1
-    )
+    probability = special.softmax(likelihood, axis=-1)
+    return _bit_ratios(probability), probability.max(axis=-1)
 
 
 def soft_phase_bits(summed: np.ndarray, right: np.ndarray, order: int) -> np.ndarray:
@@ -230,10 +241,12 @@ def soft_phase_bits(summed: np.ndarray, right: np.ndarray, order: int) -> np.nda
     and N the noise of a cell. Unless both delay symbols are `right`, the phase says nothing.
     """
     phase = 2 * np.pi / order * np.arange(order)
-    likelihood = (summed[..., None] * np.exp(-1j * phase)).real
-    probability = np.exp(likelihood - likelihood.max(axis=-1, keepdims=True))
-    probability /= probability.sum(axis=-1, keepdims=True)
-    probability = right[..., None] * probability + (1 - right[..., None]) / order
-    bits = gray_bits(order)
+    probability = special.softmax((summed[..., None] * np.exp(-1j * phase)).real, axis=-1)
+    return _bit_ratios(right[..., None] * probability + (1 - right[..., None]) / order)
+
+
+def _bit_ratios(probability: np.ndarray) -> np.ndarray:
+    """ln P(0)/P(1) of the Gray bits of symbols (..., S), flat."""
+    bits = gray_bits(probability.shape[-1])
     ones, zeros = (probability @ bits).reshape(-1), (probability @ (1.0 - bits)).reshape(-1)
     return np.log(np.maximum(zeros, 1e-30)) - np.log(np.maximum(ones, 1e-30))

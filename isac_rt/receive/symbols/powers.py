@@ -8,23 +8,31 @@ where such a slip shows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 from scipy import stats
 
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.spectrum import tones
-from isac_rt.receive.symbols.profile import correlate
 from isac_rt.receive.transform import transform
-from isac_rt.receive.types import Prediction
+from isac_rt.receive.types import Detections, Prediction
 
 EXTRA_CELLS = 4
 WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do not vote on the symbol
+
+
+Decision = Callable[
+    [np.ndarray, list[tuple[float, np.ndarray]], Waveform], tuple[np.ndarray, np.ndarray]
+]
+"""From the power (P, N) of derotated chirps, and the weights and cells (P,) of the paths that vote
+besides, to symbols and their confidences (P,)."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ def demodulate(
     prediction: Prediction,
     dpsk_order: int,
     run_cells: int | None = None,
-    profile: np.ndarray | None = None,
+    decision: Decision | None = None,
 ) -> Symbols:
     """Decide all symbols of a frame.
 
@@ -86,9 +94,7 @@ def demodulate(
     dpsk_order : D
     run_cells : leave runs of so many occupied cells out of the decision
         (`isac_rt.receive.clutter.filter`); None: do not look
-    profile : (N,) power over noise in the cells from the reference on; given, the delay symbols are
-        decided by correlation with it (`isac_rt.receive.symbols.profile`), and predicted paths do
-        not vote
+    decision : of the delay symbols from derotated power, None: `decide`
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
@@ -112,17 +118,7 @@ def demodulate(
         transform(cube.samples[m], turn, cells, spectra, power=power)
         if run_cells is not None:
             power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
-        if profile is not None:
-            power = correlate(power, profile)
-        raw[m], sure[m] = decide(
-            power, [(g, o[m]) for g, o in others] if profile is None else [], w
-        )
-        if (
-            profile is not None
-            # next to the right symbol the template still overlaps itself: the mean of the rest is
-            # not the noise's
-        ):
-            sure[m] = power.max(axis=1) / np.median(power, axis=1)
+        raw[m], sure[m] = (decision or decide)(power, [(g, o[m]) for g, o in others], w)
         picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     known = known_cycles(w, delays[0], rates[0], raw)
@@ -139,6 +135,34 @@ def demodulate(
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
         looks=cube.samples.shape[1],
     )
+
+
+@dataclass(frozen=True)
+class ByPowers:
+    """The paper's reader: the receivers' powers added.
+
+    Attributes
+    ----------
+    order : D of the DPSK
+    run_cells : leave runs of so many occupied cells out of the decision; None: do not look
+    """
+
+    order: int
+    run_cells: int | None = None
+
+    def read(
+        self,
+        cube: IFCube,
+        prediction: Prediction,
+        antennas: Antennas,
+        profile: np.ndarray | None = None,
+    ) -> Symbols:
+        """The symbols of a modulated frame; `profile` is what `learn` has found last."""
+        return demodulate(cube, prediction, self.order, self.run_cells)
+
+    def learn(self, cube: IFCube, detections: Detections) -> np.ndarray | None:
+        """What the reader remembers of an unmodulated frame with its reference."""
+        return None
 
 
 def known_cycles(

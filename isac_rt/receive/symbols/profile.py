@@ -15,12 +15,16 @@ unmodulated frame.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import scipy.fft
 from scipy import stats
 
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.symbols.powers import ByPowers, Symbols, decide, demodulate
 from isac_rt.receive.types import Detections, Prediction
 
 FALSE_RATE = 1e-3
@@ -96,3 +100,36 @@ def correlate(power: np.ndarray, profile: np.ndarray) -> np.ndarray:
         scipy.fft.rfft(power.astype(np.float64) - noise, axis=1) * scipy.fft.rfft(weight).conj()
     )
     return np.maximum(noise + scipy.fft.irfft(spectrum, power.shape[1], axis=1) / spread, 0.0)
+
+
+def decide_by_profile(
+    profile: np.ndarray,
+    power: np.ndarray,
+    others: list[tuple[float, np.ndarray]],
+    waveform: Waveform,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`decide` by correlation with a profile (N,), in which the predicted paths have their vote
+    already."""
+    metric = correlate(power, profile)
+    raw, _ = decide(metric, [], waveform)
+    # next to the right symbol the template still overlaps itself: the mean of the rest is not the
+    # noise's
+    return raw, metric.max(axis=1) / np.median(metric, axis=1)
+
+
+class ByProfile(ByPowers):
+    """Delay symbols by correlation with the range profile of the last unmodulated frame."""
+
+    def read(
+        self,
+        cube: IFCube,
+        prediction: Prediction,
+        antennas: Antennas,
+        profile: np.ndarray | None = None,
+    ) -> Symbols:
+        decision = None if profile is None else partial(decide_by_profile, profile)
+        return demodulate(cube, prediction, self.order, self.run_cells, decision)
+
+    def learn(self, cube: IFCube, detections: Detections) -> np.ndarray | None:
+        found = learn_profile(cube, reference_of(detections))
+        return found if found.any() else None

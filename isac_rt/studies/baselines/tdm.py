@@ -11,6 +11,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive.cfar import CfarRule, strongest_peaks
 from isac_rt.receive.estimate import Estimate
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate
 from isac_rt.receive.sense import describe
 from isac_rt.receive.types import Detections
@@ -85,7 +86,11 @@ def sense_tdm(
         estimate_tdm(maps, power, int(r), int(c), schedule, times, convert, w)
         for r, c in zip(rows, columns, strict=True)
     ]
-    return describe(estimates, power[rows, columns] / level[rows, columns], antennas, w, 2)
+    return describe(
+        estimates,
+        power[rows, columns] / level[rows, columns],
+        Known.unmodulated(w, schedule[None], antennas, 2),
+    )
 
 
 def estimate_tdm(

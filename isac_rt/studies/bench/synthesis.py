@@ -23,6 +23,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import ACCURATE, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import if_signal, range_profiles
@@ -112,9 +113,8 @@ class Job:
 
     def transformed(self, links: list, method: Method) -> np.ndarray:
         """Range profiles of a receiver that knows the data, by way of the samples."""
-        sent = self.sender.payload
-        cells = self.waveform.num_delay_symbols
-        return clean_spectrum(self.cube(links, method), sent.delay_symbols, sent.phases, cells)
+        cube = self.cube(links, method)
+        return clean_spectrum(cube, Known.of(cube, self.sender.payload, self.antennas, 2))
 
     def profiles(self, links: list, setting: Setting) -> np.ndarray:
         return range_profiles(

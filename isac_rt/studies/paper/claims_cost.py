@@ -17,9 +17,11 @@ from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
+from isac_rt.receive.known import Known
 from isac_rt.receive.omp import omp
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions
+from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, table
 
 SCALES = (1, 2, 4, 8)
@@ -105,9 +107,8 @@ def data_removal(seed: int, repeats: int) -> list[Growth]:
 
     def make(**change: int) -> Callable[[], object]:
         cube, payload = _cube(seed, **change)
-        return lambda: clean_spectrum(
-            cube, payload.delay_symbols, payload.phases, cube.waveform.num_delay_symbols
-        )
+        known = Known.of(cube, payload, onepath.antennas(cube.waveform, 1), 2)
+        return lambda: clean_spectrum(cube, known)
 
     name = "range DFT and data removal"
     return [

@@ -10,8 +10,10 @@ from matplotlib.axes import Axes
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
+from isac_rt.receive.known import Known
 from isac_rt.receive.omp import omp, sparse_enough
 from isac_rt.results.metrics import binomial_interval
+from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
 
 CHIRPS, ANTENNAS = 120, 3
@@ -156,6 +158,7 @@ def judged_sparse(tones: int, frames: int, seed: int) -> int:
     rows, receivers, noise, slot = 8, 4, 0.01, np.arange(CHIRPS)
     for _ in range(frames):
         schedule = pseudo_random_schedule(1, CHIRPS, ANTENNAS, rng)
+        known = Known.unmodulated(w, schedule, onepath.antennas(w, receivers), 2)
         tone = np.exp(2j * np.pi * rng.uniform(0, CHIRPS, (rows, tones, 1)) * slot / CHIRPS)
         sent = np.exp(2j * np.pi * rng.random((rows, tones, ANTENNAS)))[..., schedule[0]]
         heard = np.exp(2j * np.pi * rng.random((receivers, rows, tones)))
@@ -164,7 +167,7 @@ def judged_sparse(tones: int, frames: int, seed: int) -> int:
             np.sqrt(noise / 2)
             * rng.standard_normal((*spectra.shape, 2)).view(np.complex128)[..., 0]
         )
-        count += int(sparse_enough(spectra[None], np.arange(rows), noise, w, schedule))
+        count += int(sparse_enough(spectra[None], np.arange(rows), noise, known))
     return count
 
 

@@ -16,6 +16,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT as C
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
 from isac_rt.receive import receive_passive
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
@@ -159,8 +160,8 @@ def unambiguous(num_tx: int, random: bool, seed: int) -> tuple[float, float]:
         schedule = pseudo_random_schedule(1, w.num_chirps, num_tx, rng)
     velocity, pilot = 0.93 * w.max_velocity(2), unmodulated(w)
     cube = onepath.frame(w, schedule, pilot, arrays, delay=2 * 23.7 / C, rate=2 * velocity / C)
-    spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, 256)
-    power = accumulate(channel_maps(spectra, w, schedule, pilot.delay_symbols))
+    known = Known.of(cube, pilot, arrays, 2)
+    power = accumulate(channel_maps(clean_spectrum(cube, known, 256), known))
     found = fig5.judge("", False, power[power.max(axis=1).argmax()], w)
     return found.unambiguous, float(found.velocity[found.power_db.argmax()] - velocity)
 

@@ -31,6 +31,7 @@ from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
@@ -293,6 +294,7 @@ def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.n
     )
     targets, cells = _targets(bench, own, rng)
     cube = bench.scenes.noisy([], "at", kind.clutter, round(kind.speed), frame)
+    known = Known(w, schedule, payload.delay_symbols, payload.phases, bench.antennas, 2)
     parts = {
         "noise": replace(cube, samples=cube.samples / np.float32(np.sqrt(bench.scenes.noise))),
         "targets": _cube(bench, targets, sent),
@@ -311,12 +313,10 @@ def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.n
     for name in ("none", "notch"):
         maps = {}
         for part, one in parts.items():
-            spectra = clean_spectrum(
-                one, payload.delay_symbols, payload.phases, w.num_delay_symbols
-            )
+            spectra = clean_spectrum(one, known)
             if name == "notch":
                 remove_standing(spectra, schedule, None)
-            maps[part] = channel_maps(spectra, w, schedule, payload.delay_symbols)
+            maps[part] = channel_maps(spectra, known)
         for physical_level in (False, True):
             fixed = maps["targets"]
             if "clutter" in maps:

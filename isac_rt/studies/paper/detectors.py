@@ -11,6 +11,7 @@ synthesis and reception are the program's own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +22,12 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator
-from isac_rt.receive.clutter.detectors import judge, noise_level
-from isac_rt.receive.clutter.filter import remove_standing
-from isac_rt.receive.clutter.power import cells_of, power_map
+from isac_rt.receive.cfar import CfarRule
+from isac_rt.receive.chain import DETECTORS as CHAINED
+from isac_rt.receive.chain import filter_of
+from isac_rt.receive.clutter.detectors import ClutterDetector, Judged, noise_level
+from isac_rt.receive.clutter.power import cells_of, expected_power
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter
@@ -149,19 +153,11 @@ class Case:
 
 def strengths(scenes: Scenes, place: str, speed: float, payload: Payload) -> np.ndarray:
     """(rows, P) expected clutter over noise [dB], with the noise as it is in a map."""
-    w, schedule = scenes.setup.waveform, scenes.setup.schedule
-    noise_only = scenes.noisy([], place, "level")
-    power = accumulate(
-        channel_maps(_clean(noise_only, payload), w, schedule, payload.delay_symbols)
-    )
-    level = noise_level(power, None, scenes.setup.antennas.num_tx * scenes.setup.antennas.num_rx)
-    expected = power_map(
-        _expected(scenes, place, speed, None),
-        w,
-        w.num_delay_symbols,
-        schedule,
-        payload.delay_symbols,
-    )
+    known = _known(scenes, payload)
+    power = accumulate(channel_maps(clean_spectrum(scenes.noisy([], place, "level"), known), known))
+    level = noise_level(power, None, known.channels)
+    clutter = _expected(scenes, place, speed, None)
+    expected = expected_power(clutter, known, known.waveform.num_delay_symbols)
     return 10 * np.log10(np.maximum(expected / level, 1e-6))
 
 
@@ -209,13 +205,12 @@ def make_case(scenes: Scenes, place: str, speed: float, target_frames: int, coun
         cells.append(_cells(paths, scenes))
         under.append(strength_db[tuple(cells[-1].T)])
     name = place, round(speed)
-    spectra = [_clean(scenes.noisy(parts, *name, i), payload) for i, parts in enumerate(frames)]
-    without = [_clean(scenes.noisy(parts, *name, i), payload) for i, parts in enumerate(quiet)]
-    w, schedule = scenes.setup.waveform, scenes.setup.schedule
-    maps, empty = (
-        [channel_maps(one, w, schedule, payload.delay_symbols) for one in some]
-        for some in (spectra, without)
+    known = _known(scenes, payload)
+    spectra, without = (
+        [clean_spectrum(scenes.noisy(parts, *name, i), known) for i, parts in enumerate(some)]
+        for some in (frames, quiet)
     )
+    maps, empty = ([channel_maps(one, known) for one in some] for some in (spectra, without))
     return Case(place, speed, payload, spectra, maps, empty, targets, cells, under)
 
 
@@ -231,10 +226,19 @@ def _cells(paths: PathSet, scenes: Scenes) -> np.ndarray:
     ).astype(int)
 
 
-def _clean(cube: IFCube, payload: Payload) -> np.ndarray:
-    return clean_spectrum(
-        cube, payload.delay_symbols, payload.phases, cube.waveform.num_delay_symbols
-    )
+def _known(scenes: Scenes, payload: Payload) -> Known:
+    s = scenes.setup
+    return Known(s.waveform, s.schedule, payload.delay_symbols, payload.phases, s.antennas, 2)
+
+
+class Surroundings(ClutterDetector):
+    """The CFAR as a statistic over its threshold."""
+
+    def judge(
+        self, frames: Sequence[np.ndarray], known: Known, clutter: ExpectedClutter | None = None
+    ) -> list[Judged]:
+        rule = CfarRule.of(self.settings, known.channels)
+        return [Judged.everywhere(*rule.ratio(accumulate(maps))) for maps in frames]
 
 
 def _expected(
@@ -255,34 +259,21 @@ def score(
     scenes: Scenes, case: Case, detector: Detector, tally: Tally, *, quiet: bool = False
 ) -> None:
     """Run one detector on a case's frames."""
-    s = scenes.setup
+    known = _known(scenes, case.payload)
     settings = Receivers(false_alarm_rate=1e-3, **detector.settings)
     frames = case.quiet if quiet else case.maps
-    if settings.clutter_filter != "none":
+    clutter_filter = filter_of(settings)
+    if clutter_filter is not None:
         frames = []
         for spectra in (one.copy() for one in case.spectra):
-            remove_standing(
-                spectra,
-                s.schedule,
-                settings.clutter_run_cells if settings.clutter_filter == "runs" else None,
-            )
-            frames.append(channel_maps(spectra, s.waveform, s.schedule, case.payload.delay_symbols))
+            clutter_filter.clean(spectra, known.schedule)
+            frames.append(channel_maps(spectra, known))
     expected = NOTHING if quiet else _expected(scenes, case.place, case.speed, detector.mistakes)
-    frames = [
-        *frames[2:],
-        *frames[:2],
-    ]  # the first one corrects the terminal, and what is in the air must not hinder that
-    judged = judge(
-        frames,
-        s.waveform,
-        s.antennas,
-        s.schedule,
-        case.payload.delay_symbols,
-        settings,
-        expected,
-        fitted=detector.fitted,
-    )
-    rows = slice(*(round(r / s.waveform.range_cell(2)) for r in SPAN_M))
+    # the first one corrects the terminal, and what is in the air must not hinder that
+    frames = [*frames[2:], *frames[:2]]
+    kind = CHAINED.get(settings.clutter_detector, Surroundings)
+    judged = kind(settings, fitted=detector.fitted).judge(frames, known, expected)
+    rows = slice(*(round(r / known.waveform.range_cell(2)) for r in SPAN_M))
     tally.tuning.append(judged[-2].ratio[rows].ravel())
     tally.free.append(judged[-1].ratio[rows].ravel())
     for one, cells in zip(judged[:-2], case.cells, strict=True):

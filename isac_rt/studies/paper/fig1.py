@@ -18,6 +18,7 @@ from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.studies.paper import onepath
@@ -165,11 +166,10 @@ def coherent_share(
         rate=2 * VELOCITY / SPEED_OF_LIGHT,
     )
     peaks = []
-    for one, known in ((cube, payload if removed else pilot), (reference, pilot)):
-        spectra = clean_spectrum(one, known.delay_symbols, known.phases, w.num_samples)
-        peaks.append(
-            float(accumulate(channel_maps(spectra, w, schedule, known.delay_symbols)).max())
-        )
+    for one, sent in ((cube, payload if removed else pilot), (reference, pilot)):
+        known = Known.of(one, sent, onepath.antennas(w, 1), 2)
+        spectra = clean_spectrum(one, known, w.num_samples)
+        peaks.append(float(accumulate(channel_maps(spectra, known)).max()))
     return peaks[0] / peaks[1]
 
 

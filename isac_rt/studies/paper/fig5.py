@@ -19,6 +19,7 @@ from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, doppler_bins
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.studies.paper import onepath
@@ -86,18 +87,17 @@ def spectra(scheme: str, schedule: Schedule) -> list[Spectrum]:
         delay=2 * RANGE / SPEED_OF_LIGHT,
         rate=2 * velocity / SPEED_OF_LIGHT,
     )
-    clean = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
+    known = Known.of(cube, pilot, arrays, 2)
+    clean = clean_spectrum(cube, known)
     single = replace(w, num_groups=1)
     rows = []
     for m in range(w.num_groups):
-        maps = channel_maps(
-            clean[m : m + 1], single, schedule[m : m + 1], pilot.delay_symbols[m : m + 1]
-        )
-        power = accumulate(maps)
+        alone = Known.unmodulated(single, schedule[m : m + 1], arrays, 2)
+        power = accumulate(channel_maps(clean[m : m + 1], alone))
         rows.append(power[power.max(axis=1).argmax()])
     out = [judge(scheme, False, np.mean(rows, axis=0), w)]
     if w.num_groups > 1:
-        power = accumulate(channel_maps(clean, w, schedule, pilot.delay_symbols))
+        power = accumulate(channel_maps(clean, known))
         out.append(judge(scheme, True, power[power.max(axis=1).argmax()], w))
     return out
 

@@ -25,7 +25,7 @@ from numba import njit
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload
-from isac_rt.frame.schedule import Schedule, pseudo_random_schedule
+from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, make_paths
@@ -34,6 +34,7 @@ from isac_rt.receive import Prediction
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
 from isac_rt.receive.sense import describe
@@ -215,7 +216,9 @@ def hit(case: Case, target: Target, estimate: Estimate, antennas: Antennas) -> b
                 1 / (spacing * antennas.rx_z),
             ]
         )
-    d = describe([estimate], np.ones(1), antennas, w, case.passes)
+    schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
+    known = Known.unmodulated(w, schedule, antennas, case.passes)
+    d = describe([estimate], np.ones(1), known)
     errors = np.abs(np.array([d.range[0], d.velocity[0], *d.direction[0]]) - target.truth)
     return bool((errors < bound).all())  # an angle out of view is NaN and no hit
 
@@ -327,28 +330,25 @@ def _active(
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
     payload = random_payload(w, schedule, case.orders[0], rng)
     cubes = [cube := make_cube(case, target, schedule, payload), replace(cube, samples=noise())]
-    signal, white = (
-        clean_spectrum(c, payload.delay_symbols, payload.phases, w.num_delay_symbols) for c in cubes
-    )
+    known = Known.of(cube, payload, paper_antennas(w), 2)
+    signal, white = (clean_spectrum(c, known) for c in cubes)
     if case.filtered:  # not linear in the samples
         for level in levels(case):
             spectra = signal + np.float32(level) * white
             remove_standing(spectra, schedule, SETTINGS.clutter_run_cells)
-            look = _Look(case, target, spectra, schedule, payload.delay_symbols)
+            look = _Look(case, target, spectra, known)
             note("hits", look.at(one_atom_power(spectra, w, schedule))[0])
-            _note_united(
-                look, accumulate(channel_maps(spectra, w, schedule, payload.delay_symbols)), note
-            )
+            _note_united(look, accumulate(channel_maps(spectra, known)), note)
         return
     sums = {"hits": _Sums(*(correlations(s, w, schedule) for s in (signal, white)))}
     if case.unwindowed:
         sums["hits, no window"] = _Sums(
             *(correlations(plain_spectrum(c, payload), w, schedule) for c in cubes)
         )
-    united = _Parts(*(channel_maps(s, w, schedule, payload.delay_symbols) for s in (signal, white)))
+    united = _Parts(*(channel_maps(s, known) for s in (signal, white)))
     for level in levels(case):
         spectra = signal + np.float32(level) * white
-        look = _Look(case, target, spectra, schedule, payload.delay_symbols)
+        look = _Look(case, target, spectra, known)
         for name, one in sums.items():
             note(name, look.at(one.power(level))[0])
         _note_united(look, united.power(level), note)
@@ -369,8 +369,7 @@ class _Look:
     case: Case
     target: Target
     spectra: np.ndarray
-    schedule: np.ndarray
-    delay_symbols: np.ndarray
+    known: Known
     near: tuple[int, int] | None = None
 
     def by_omp(self) -> bool:
@@ -378,10 +377,10 @@ class _Look:
         only where nothing else is looked at."""
         w, num_rows = self.case.waveform, self.spectra.shape[2]
         if self.near is None:
-            return self.at(one_atom_power(self.spectra, w, self.schedule))[0]
+            return self.at(one_atom_power(self.spectra, w, self.known.schedule))[0]
         rows = slice(max(self.near[0] - GATE_CELLS, 0), self.near[0] + GATE_CELLS + 1)
         power = np.zeros((num_rows, w.num_chirps))
-        power[rows] = one_atom_power(self.spectra[:, :, rows], w, self.schedule)
+        power[rows] = one_atom_power(self.spectra[:, :, rows], w, self.known.schedule)
         return self.at(power)[0]
 
     def at(self, power: np.ndarray) -> tuple[bool, tuple[int, int]]:
@@ -390,9 +389,9 @@ class _Look:
         row, column = strongest(
             power, first_row(self.case, w.range_cell(self.case.passes)), self.near
         )
-        local = LocalSpectra(self.spectra, w, self.schedule, self.delay_symbols, row)
+        local = LocalSpectra(self.spectra, self.known, row)
         estimate = refine(local, *start_point(power, row, column, w))
-        return hit(self.case, self.target, estimate, paper_antennas(w)), (row, column)
+        return hit(self.case, self.target, estimate, self.known.antennas), (row, column)
 
 
 class _Sums:
@@ -527,9 +526,10 @@ def _read(
     predicted: Prediction,
 ) -> bool:
     """Whether sensing hits with these symbols taken out."""
-    spectra = clean_spectrum(cube, delay_symbols, phases, case.waveform.num_delay_symbols)
-    near = predicted_cell(predicted, case.waveform) if case.gated else None
-    return _Look(case, target, spectra, cube.schedule, delay_symbols, near).by_omp()
+    w = case.waveform
+    known = Known(w, cube.schedule, delay_symbols, phases, paper_antennas(w), 1)
+    near = predicted_cell(predicted, w) if case.gated else None
+    return _Look(case, target, clean_spectrum(cube, known), known, near).by_omp()
 
 
 def _predict(case: Case, target: Target, rng: np.random.Generator) -> Prediction:

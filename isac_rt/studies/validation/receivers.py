@@ -15,12 +15,14 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.receive import Prediction, receive_active
+from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule, greatest_of_factor
 from isac_rt.receive.clutter.filter import remove_standing
-from isac_rt.receive.estimate import arm, direction_cosine
+from isac_rt.receive.estimate import direction_cosine
+from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator
 from isac_rt.receive.omp import omp
-from isac_rt.receive.sense import sense
+from isac_rt.receive.sense import Cfar
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.scenario.radio import Noise
@@ -275,9 +277,9 @@ def false_alarms_of_the_whole_chain() -> float:
     w, alarms, cells = Waveform(num_samples=256), 0, 0
     rule = CfarRule.of(Receivers(false_alarm_rate=5e-3), 9)
     for seed in range(16):
-        cube, pilot = _noise_cube(w, seed), unmodulated(w)
-        spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
-        power = accumulate(channel_maps(spectra, w, cube.schedule, pilot.delay_symbols))
+        cube = _noise_cube(w, seed)
+        known = Known.unmodulated(w, cube.schedule, FEW, 1)
+        power = accumulate(channel_maps(clean_spectrum(cube, known), known))
         above, _ = rule.detect(power)
         alarms, cells = alarms + int(above.sum()), cells + above.size
     return abs(alarms / cells / 5e-3 - 1)
@@ -328,11 +330,10 @@ def scatter_of_range_and_velocity() -> float:
     w, schedule, _ = stage.frame(w=Waveform(num_samples=256, num_chirps=60))
     pilot, length, rate, noise, count = unmodulated(w), 41.3, -4.6, 10**1.5, 100
     clean = stage.cube_of(w, schedule, pilot, [(length, rate, 1.0)])
-    errors = []
+    known, errors = Known.unmodulated(w, schedule, FEW, 1), []
     for seed in range(count):
         cube = stage.noisy(clean, noise, seed)
-        spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
-        d = sense(spectra, w, schedule, pilot.delay_symbols, FEW, Receivers(), 1).detections
+        d = Cfar(Receivers()).sense(clean_spectrum(cube, known), known).detections
         best = int(np.argmax(d.snr))
         errors.append([d.range[best] - length, d.velocity[best] - rate])
     fast = (
@@ -359,6 +360,7 @@ def scatter_of_directions() -> Errors:
     """Direction cosines along both arms, one-way and two-way, scatter as the bound says, without
     bias."""
     w, rng, count, noise = Waveform(), np.random.default_rng(14), 400, 0.02
+    schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
     scale = (
         2
         * np.pi
@@ -371,7 +373,9 @@ def scatter_of_directions() -> Errors:
             FULL.rx_positions[:, axis] * u,
         )
         clean = np.exp(-1j * scale * (tx[:, None] + rx[None, :]))
-        t, _, place = arm(FULL, axis, virtual)
+        known = Known.unmodulated(w, schedule, FULL, 2 if virtual else 1)
+        line = arm(FULL, axis, known.passes)
+        t, place = line.tx, line.places[:, axis]
         spread = (
             ((place - place.mean()) ** 2).sum()
             if virtual
@@ -382,7 +386,7 @@ def scatter_of_directions() -> Errors:
             channels = clean + np.sqrt(noise / 2) * rng.normal(size=(*clean.shape, 2)) @ np.array(
                 [1, 1j]
             )
-            errors.append(direction_cosine(channels, FULL, w, axis, virtual) - u)
+            errors.append(direction_cosine(channels, known, axis) - u)
         sigma = np.sqrt(noise / 2 / spread) / scale
         yield abs(np.mean(np.square(errors)) / sigma**2 - 1) / np.sqrt(2 / count)
         yield abs(np.mean(errors)) / sigma * np.sqrt(count)
@@ -398,12 +402,11 @@ def processing_gain() -> float:
     """The link budget's gain from a sample to a cell of the map, against a path and noise sent
     through the receiver."""
     w, schedule, _ = stage.frame(w=Waveform(num_samples=256))
-    pilot = unmodulated(w)
+    pilot, known = unmodulated(w), Known.unmodulated(w, schedule, FEW, 1)
     clean = stage.cube_of(w, schedule, pilot, [(40.1 * w.range_cell(1), 0.07, 1.0)])
 
     def level(cube: IFCube) -> np.ndarray:
-        spectra = clean_spectrum(cube, pilot.delay_symbols, pilot.phases, w.num_delay_symbols)
-        return accumulate(channel_maps(spectra, w, schedule, pilot.delay_symbols))
+        return accumulate(channel_maps(clean_spectrum(cube, known), known))
 
     measured = 10 * np.log10(level(clean).max() / level(_noise_cube(w, 3)).mean())
     claimed = link_budget(

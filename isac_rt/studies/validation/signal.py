@@ -13,6 +13,7 @@ from isac_rt.frame.payload import demodulate_bits, modulate, running_phases, unm
 from isac_rt.frame.schedule import is_latin, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation import PathKind, make_paths
+from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
@@ -521,11 +522,10 @@ def data_are_taken_out() -> Errors:
     pilot = unmodulated(w)
     for cell in (0.61, 22.5, 87.28, 100.93):
         path = [(cell * w.range_cell(1), 0.0, 0.7 - 0.4j)]
-        one = clean_spectrum(
-            stage.cube_of(w, schedule, payload, path), payload.delay_symbols, payload.phases, 128
-        )
-        other = clean_spectrum(
-            stage.cube_of(w, schedule, pilot, path), pilot.delay_symbols, pilot.phases, 128
+        one, other = (
+            clean_spectrum(cube, Known.of(cube, sent, stage.FEW, 1), 128)
+            for sent in (payload, pilot)
+            for cube in [stage.cube_of(w, schedule, sent, path)]
         )
         yield np.abs(one - other).max() / np.abs(other).max()
 

@@ -14,7 +14,15 @@ import numpy as np
 from scipy import stats
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.receive.joint.fit import Frame, JointPath, element_delays, fit, residual_channels
+from isac_rt.receive.joint.fit import (
+    JointPath,
+    element_delays,
+    fit,
+    rate_bin,
+    residual_channels,
+    units,
+)
+from isac_rt.receive.known import Known
 from isac_rt.receive.types import Detections
 
 MAX_PATHS = 8
@@ -30,7 +38,9 @@ FARTHEST = np.array([1.5, 3.0])
 """Cells and bins that a path found beside another one may move away from it in the fit."""
 
 
-def separate(frame: Frame, detections: Detections) -> tuple[Detections, np.ndarray]:
+def refine_jointly(
+    samples: np.ndarray, known: Known, detections: Detections
+) -> tuple[Detections, np.ndarray]:
     """Detections with joint estimates, strongest first after a reference, and the power of each
     path per sample (NaN if not fitted)."""
     d = detections
@@ -38,27 +48,26 @@ def separate(frame: Frame, detections: Detections) -> tuple[Detections, np.ndarr
     order = usable[np.argsort(~d.is_reference[usable], kind="stable")][:MAX_PATHS]
     if not order.size:
         return d, np.full(len(d), np.nan)
-    start = [_path(frame, d, i) for i in order]
-    paths = fit(frame, start)
+    start = [_path(known, d, i) for i in order]
+    paths = fit(samples, known, start)
     parent = list(range(len(paths)))
-    if not all(_near(frame, p, s) for p, s in zip(paths, start, strict=True)):
-        return d, np.full(
-            len(d), np.nan
-        )  # two detections of one path: the fit has no single answer
+    if not all(_near(known, p, s) for p, s in zip(paths, start, strict=True)):
+        # two detections of one path: the fit has no single answer
+        return d, np.full(len(d), np.nan)
     for _ in range(MAX_HIDDEN):
-        found = _hidden(frame, paths)
+        found = _hidden(samples, known, paths)
         if found is None:
             break
         beside, other = found
-        trial = fit(frame, [*paths, other], iterations=8)
-        if not _credible(frame, trial, [*paths, paths[beside]]):
+        trial = fit(samples, known, [*paths, other], iterations=8)
+        if not _credible(known, trial, [*paths, paths[beside]]):
             break
         paths, parent = trial, [*parent, parent[beside]]
-    return _merged(frame, d, order, paths, parent)
+    return _merged(known, d, order, paths, parent)
 
 
-def _path(frame: Frame, d: Detections, i: int) -> JointPath:
-    scale = frame.passes / SPEED_OF_LIGHT
+def _path(known: Known, d: Detections, i: int) -> JointPath:
+    scale = known.passes / SPEED_OF_LIGHT
     return JointPath(
         float(d.range[i]) * scale,
         float(d.velocity[i]) * scale,
@@ -68,56 +77,58 @@ def _path(frame: Frame, d: Detections, i: int) -> JointPath:
     )
 
 
-def _near(frame: Frame, path: JointPath, start: JointPath) -> bool:
-    moved = np.abs([path.delay - start.delay, path.delay_rate - start.delay_rate]) / frame.units[:2]
+def _near(known: Known, path: JointPath, start: JointPath) -> bool:
+    moved = (
+        np.abs([path.delay - start.delay, path.delay_rate - start.delay_rate]) / units(known)[:2]
+    )
     return bool(
         np.isfinite(moved).all() and (moved < FARTHEST).all() and (path.direction**2).sum() < 1
     )
 
 
-def _credible(frame: Frame, paths: list[JointPath], near: list[JointPath]) -> bool:
+def _credible(known: Known, paths: list[JointPath], near: list[JointPath]) -> bool:
     """Whether a fit stayed near its start, and the new path, the last, is within `WEAKEST_DB` of
     its neighbour and not on top of it."""
-    if not all(_near(frame, p, n) for p, n in zip(paths, near, strict=True)):
+    if not all(_near(known, p, n) for p, n in zip(paths, near, strict=True)):
         return False
     power = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     beside = max(power[i] for i, n in enumerate(near[:-1]) if n is near[-1])
     return power[-1] > beside * 10 ** (-WEAKEST_DB / 10) and power[-1] < beside * 10
 
 
-def _hidden(frame: Frame, paths: list[JointPath]) -> tuple[int, JointPath] | None:
+def _hidden(
+    samples: np.ndarray, known: Known, paths: list[JointPath]
+) -> tuple[int, JointPath] | None:
     """The surest path that the residual of a fit holds about one of its paths, with that path's
     number."""
-    limit = frame.antennas.view_limit
+    limit = known.antennas.view_limit
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[(grid**2).sum(axis=1) < 0.98]
     best: tuple[float, int, JointPath] | None = None
-    sums = 1 if frame.passes == 2 else frame.antennas.num_tx
+    sums = 1 if known.passes == 2 else known.antennas.num_tx
     level = stats.gamma(sums).isf(FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
     for k, (path, channels, counts, noise) in enumerate(
-        residual_channels(frame, paths, DOPPLER_OFFSETS)
+        residual_channels(samples, known, paths, DOPPLER_OFFSETS)
     ):
-        power = (
-            _beams(frame, path, channels, grid) / noise
-        )  # (direction, offset), a sum of `sums` exponentials in noise
+        # (direction, offset), a sum of `sums` exponentials in noise
+        power = _beams(known, path, channels, grid) / noise
         i, j = np.unravel_index(power.argmax(), power.shape)
         floor = (
             10 ** (-WEAKEST_DB / 10) * float((np.abs(path.amplitude) ** 2 * counts).sum()) / noise
         )
         if power[i, j] > max(level, floor) and (best is None or power[i, j] > best[0]):
-            rate = path.delay_rate + DOPPLER_OFFSETS[j] * frame.units[1]
+            rate = path.delay_rate + DOPPLER_OFFSETS[j] * rate_bin(known.waveform)
             best = float(power[i, j]), k, replace(path, delay_rate=rate, direction=grid[i].copy())
     return None if best is None else best[1:]
 
 
-def _beams(frame: Frame, path: JointPath, channels: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Power of channel residuals (offset, L_tx, L_rx) in the directions of `grid` (G, 2): over both
     arrays for an echo; at a PT over the receivers, added over the transmit antennas. Normalised to
     what one beam of white noise holds per unit `noise`."""
-    w, a = frame.waveform, frame.antennas
-    radius = max(path.delay * SPEED_OF_LIGHT / frame.passes, w.range_cell(frame.passes))
-    turn = 2j * np.pi * w.effective_carrier
+    a, radius = known.antennas, known.radius(path.delay)
+    turn = 2j * np.pi * known.waveform.effective_carrier
 
     def steer(positions: np.ndarray) -> np.ndarray:
         own = element_delays(positions, path.direction, radius)[0]
@@ -126,51 +137,43 @@ def _beams(frame: Frame, path: JointPath, channels: np.ndarray, grid: np.ndarray
         )
 
     beams = channels @ steer(a.rx_positions).conj().T  # (offset, L_tx, G)
-    if frame.passes == 2:
+    if known.passes == 2:
         beams = np.einsum("otg,gt->og", beams, steer(a.tx_positions).conj())[:, None, :]
-    share = a.num_rx * (a.num_tx if frame.passes == 2 else 1)
+    share = a.num_rx * (a.num_tx if known.passes == 2 else 1)
     return (np.abs(beams) ** 2).sum(axis=1).T / share
 
 
 def _merged(
-    frame: Frame, d: Detections, order: np.ndarray, paths: list[JointPath], parent: list[int]
+    known: Known, d: Detections, order: np.ndarray, paths: list[JointPath], parent: list[int]
 ) -> tuple[Detections, np.ndarray]:
     """The detections with the fitted ones in place of theirs and the new ones behind."""
-    scale, extra = SPEED_OF_LIGHT / frame.passes, len(paths) - order.size
-    rows = np.concatenate([order, np.arange(len(d), len(d) + extra)])
-    source = np.concatenate(
-        [np.arange(len(d)), order[parent[order.size :]] if extra else np.zeros(0, int)]
-    ).astype(int)
-    values = {
-        name: getattr(d, name)[source].copy()
-        for name in ("range", "velocity", "direction", "snr", "std", "is_reference")
-    }
-    power = np.full(len(source), np.nan)
+    old, scale = len(d), known.metres
+    source = np.append(np.arange(old), order[parent[order.size :]])
+    rows = np.append(order, np.arange(old, source.size))
+    power = np.full(source.size, np.nan)
     power[rows] = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
-    values["range"][rows] = [p.delay * scale for p in paths]
-    values["velocity"][rows] = [p.delay_rate * scale for p in paths]
-    limit = frame.antennas.view_limit
-    values["direction"][rows] = [
+    v = {name: value[source] for name, value in vars(d).items()}
+    v["range"][rows] = [p.delay * scale for p in paths]
+    v["velocity"][rows] = [p.delay_rate * scale for p in paths]
+    limit = known.antennas.view_limit
+    v["direction"][rows] = [
         np.where(np.abs(p.direction) <= limit, p.direction, np.nan) for p in paths
     ]
-    values["std"][rows] = [p.std * [scale, scale, 1, 1] for p in paths]
-    values["snr"][len(d) :] *= power[len(d) :] / power[source[len(d) :]]
-    values["is_reference"][len(d) :] = False
-    _earlier_reference(values, power, source, len(d))
-    return Detections(**values), power
+    v["std"][rows] = [p.std * [scale, scale, 1, 1] for p in paths]
+    v["snr"][old:] *= power[old:] / power[source[old:]]
+    v["is_reference"][old:] = False
+    v["is_reference"] = _earlier_reference(v["is_reference"], v["range"], power, source, old)
+    return Detections(**v), power
 
 
 def _earlier_reference(
-    values: dict[str, np.ndarray], power: np.ndarray, source: np.ndarray, old: int
-) -> None:
-    """Of paths found in the reference's cell within 10 dB of it the earliest is the line of sight.
-    In place."""
-    reference = np.flatnonzero(values["is_reference"])
-    if not reference.size:
-        return
-    r = int(reference[0])
-    siblings = np.concatenate(
-        [[r], old + np.flatnonzero((source[old:] == r) & (power[old:] > 0.1 * power[r]))]
-    )
-    values["is_reference"][r] = False
-    values["is_reference"][siblings[np.argmin(values["range"][siblings])]] = True
+    reference: np.ndarray, ranges: np.ndarray, power: np.ndarray, source: np.ndarray, old: int
+) -> np.ndarray:
+    """(Q,) bool, the reference: of paths found in its cell within 10 dB of it the earliest is the
+    line of sight."""
+    out = np.zeros(reference.size, bool)
+    for r in np.flatnonzero(reference)[:1]:
+        beside = old + np.flatnonzero((source[old:] == r) & (power[old:] > 0.1 * power[r]))
+        siblings = np.append(r, beside)
+        out[siblings[np.argmin(ranges[siblings])]] = True
+    return out

@@ -1,0 +1,62 @@
+"""Virtual channels of the L: which antennas go together, and where their phase centres lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.receive.known import Known
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Virtual channels that are looked at together.
+
+    Attributes
+    ----------
+    tx, rx : (L,) antennas
+    places : (L, 3) by which their phases tell the direction, in the body frame [m]
+    """
+
+    tx: np.ndarray
+    rx: np.ndarray
+    places: np.ndarray
+
+    def __len__(self) -> int:
+        return self.tx.size
+
+    def steering(self, cosines: np.ndarray, known: Known) -> np.ndarray:
+        """(K, L) exp(-j k v.u) of paths from body directions (K, 3), at the frequency of the
+        window's middle."""
+        return np.exp(-1j * known.wavenumber * (cosines @ self.places.T))
+
+
+@lru_cache(maxsize=32)
+def arm(antennas: Antennas, axis: int, passes: int = 2) -> Channels:
+    """Channels along X (axis 0) or Z (axis 2) of the L: transmit and receive elements of the axis
+    together for an echo, whose places add; for one pass the receive arm with every transmit
+    antenna, whose direction of departure is another."""
+    a = antennas
+    rx = np.arange(a.rx_x) if axis == 0 else np.arange(a.rx_x - 1, a.num_rx)
+    along = np.arange(a.tx_x) if axis == 0 else np.arange(a.tx_x - 1, a.num_tx)
+    tx = along if passes == 2 else np.arange(a.num_tx)
+    t, r = (i.ravel() for i in np.meshgrid(tx, rx, indexing="ij"))
+    places = a.rx_positions[r] + (a.tx_positions[t] if passes == 2 else 0.0)
+    for array in (t, r, places):
+        array.setflags(write=False)
+    return Channels(t, r, places)
+
+
+@lru_cache(maxsize=32)
+def both_arms(antennas: Antennas) -> Channels:
+    """Both arms of the virtual L of an echo; their common corner once."""
+    x, z = arm(antennas, 0), arm(antennas, 2)
+    new = ~np.isin(z.tx * antennas.num_rx + z.rx, x.tx * antennas.num_rx + x.rx)
+    return Channels(
+        np.append(x.tx, z.tx[new]),
+        np.append(x.rx, z.rx[new]),
+        np.concatenate([x.places, z.places[new]]),
+    )

@@ -1,0 +1,82 @@
+"""Receivers as chains of values, each built once from the settings by a table.
+
+A new detector, estimator or symbol reader is one file and one line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler
+from isac_rt.receive.clutter.detectors import ClutterDetector
+from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.clutter.sample_matrix import SampleMatrix
+from isac_rt.receive.clutter.threshold_map import ThresholdMap
+from isac_rt.receive.estimate import Estimator
+from isac_rt.receive.joint.neighbours import refine_jointly
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import Conventional, LatinUnion
+from isac_rt.receive.omp import Omp
+from isac_rt.receive.pursuit import Pursuit
+from isac_rt.receive.sense import Cfar, Detector
+from isac_rt.receive.symbols.beams import ByBeams
+from isac_rt.receive.symbols.powers import ByPowers
+from isac_rt.receive.symbols.profile import ByProfile
+from isac_rt.receive.types import Detections
+from isac_rt.scenario.receivers import Receivers
+
+Refiner = Callable[[np.ndarray, Known, Detections], tuple[Detections, np.ndarray]]
+"""From samples, what is known of them and near estimates to better ones and the paths' powers."""
+
+FILTERS: dict[str, Callable[[Receivers], ClutterFilter | None]] = {
+    "none": lambda settings: None,
+    "zero_doppler": lambda settings: ClutterFilter(None),
+    "runs": lambda settings: ClutterFilter(settings.clutter_run_cells),
+}
+CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
+    "auto": Cfar,
+    "latin_union": partial(Cfar, doppler=LatinUnion()),
+    "conventional": partial(Cfar, doppler=Conventional()),
+    "omp": partial(Cfar, doppler=Omp()),
+    "pursuit": Pursuit,
+}
+DETECTORS: dict[str, type[ClutterDetector]] = {
+    "map": ThresholdMap,
+    "angle_doppler": AngleDoppler,
+    "sample_matrix": SampleMatrix,
+}
+ESTIMATORS = {"grid": Estimator(on_grid=True), "local": Estimator(), "joint": Estimator()}
+REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": refine_jointly}
+READERS = {"powers": ByPowers, "profile": ByProfile, "beams": ByBeams}
+
+
+def filter_of(settings: Receivers) -> ClutterFilter | None:
+    """The clutter filter that the settings name."""
+    return FILTERS[settings.clutter_filter](settings)
+
+
+def cfar_of(settings: Receivers) -> Cfar:
+    """The CFAR that the settings name, which decides at passive terminals."""
+    return CFARS[settings.velocity_method](settings, ESTIMATORS[settings.refinement])
+
+
+def detector_of(settings: Receivers) -> Detector:
+    """The active terminal's detector."""
+    if settings.clutter_detector not in DETECTORS:
+        return cfar_of(settings)
+    return DETECTORS[settings.clutter_detector](settings, ESTIMATORS[settings.refinement])
+
+
+def refiner_of(settings: Receivers) -> Refiner | None:
+    """What makes the estimates better with all paths at once."""
+    return REFINERS[settings.refinement]
+
+
+def reader_of(settings: Receivers, dpsk_order: int) -> ByPowers:
+    """The symbol reader that the settings name."""
+    hidden = filter_of(settings)
+    run_cells = None if hidden is None else hidden.least
+    return READERS[settings.symbol_decision](dpsk_order, run_cells)

@@ -1,0 +1,107 @@
+"""What a receiver knows of a frame beside its samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.payload import Payload, unmodulated
+from isac_rt.frame.schedule import Schedule, is_latin
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """The chirps of a frame as sent or as decided, and the arrays at both ends.
+
+    Attributes
+    ----------
+    waveform : Waveform
+    schedule : (M, P) transmit antenna of each chirp
+    delay_symbols : (M, P) int
+    phases : (M, P) complex, beta of the DPSK
+    antennas : of both ends
+    passes : 2 for echoes at the active terminal, 1 at a passive one (`Link.passes`)
+    """
+
+    waveform: Waveform
+    schedule: Schedule
+    delay_symbols: np.ndarray
+    phases: np.ndarray
+    antennas: Antennas
+    passes: int
+
+    @classmethod
+    def of(
+        cls, cube: IFCube | RangeProfiles, payload: Payload, antennas: Antennas, passes: int
+    ) -> Known:
+        """What a receiver of a frame knows to which the payload is known."""
+        sent = payload.delay_symbols, payload.phases
+        return cls(cube.waveform, cube.schedule, *sent, antennas, passes)
+
+    @classmethod
+    def unmodulated(
+        cls, waveform: Waveform, schedule: Schedule, antennas: Antennas, passes: int
+    ) -> Known:
+        """What is known of a frame without data."""
+        pilot = unmodulated(waveform)
+        return cls(waveform, schedule, pilot.delay_symbols, pilot.phases, antennas, passes)
+
+    @cached_property
+    def channels(self) -> int:
+        """Virtual channels: pairs of a transmit and a receive antenna."""
+        return self.antennas.num_tx * self.antennas.num_rx
+
+    @cached_property
+    def full(self) -> bool:
+        """Whether the groups together sample every antenna in every slot."""
+        num_tx = self.waveform.num_tx
+        return len(self.schedule) == num_tx and is_latin(self.schedule, num_tx)
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """(M, P) middles of the chirps' windows [s] since mid-frame; with data a window lies tau_D
+        later."""
+        return self.waveform.middle_time + self.delay_symbols * self.waveform.delay_step
+
+    @cached_property
+    def slots(self) -> np.ndarray:
+        """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a
+        chirp with data lies tau_D later."""
+        w = self.waveform
+        return (w.chirp_time + self.delay_symbols * w.delay_step) / w.slot_duration
+
+    @cached_property
+    def sampled_times(self) -> np.ndarray:
+        """(M, P) middles of the chirps' samples [s] since mid-frame."""
+        w = self.waveform
+        half = (w.num_samples - 1) / 2 * w.sample_interval
+        return w.chirp_time + w.window_start + half - w.frame_duration / 2
+
+    @cached_property
+    def sent_by(self) -> list[np.ndarray]:
+        """Of each transmit antenna the chirps that it sends, (M, P) bool."""
+        return [self.schedule == tx for tx in range(self.waveform.num_tx)]
+
+    @cached_property
+    def wavenumber(self) -> float:
+        """2 pi f / c [rad/m], f the frequency at the middle of the window."""
+        return 2 * np.pi * float(self.waveform.carrier()) / SPEED_OF_LIGHT
+
+    @property
+    def metres(self) -> float:
+        """Reported range per delay, and velocity per delay rate [m/s]."""
+        return SPEED_OF_LIGHT / self.passes
+
+    @property
+    def range_cell(self) -> float:
+        """Reported range of one cell [m]."""
+        return self.waveform.range_cell(self.passes)
+
+    def radius(self, delay: float) -> float:
+        """Radius of the wavefront of a path [m], one cell at least."""
+        return max(delay * SPEED_OF_LIGHT / self.passes, self.range_cell)
