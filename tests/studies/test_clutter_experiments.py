@@ -1,5 +1,5 @@
 """The clutter experiments' own pieces: statistics against closed forms, symbol counts against the
-formula, weeding, thresholds."""
+formula, what is left out, thresholds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from isac_rt.studies.paper.clutter import (
     pt_errors,
     resting,
     strongest_mean,
-    weeded,
+    without_weakest,
 )
 from isac_rt.studies.paper.clutter_statistics import statistics
 from isac_rt.studies.paper.detectors import RATE, Tally, summarise
@@ -79,14 +79,14 @@ def test_symbols_without_clutter_have_the_known_error_rate():
     assert 0.70 < wrong["delay", "strongest cell"][0] / 120 < 0.95
 
 
-def test_run_and_weeding():
-    """45 equal cells and a weak floor: their mean is found, the floor is weeded, the run is not.
+def test_run_and_weakest():
+    """45 equal cells and a weak floor: their mean is found, the floor is left out, the run is not.
     Planted bug: mean over the whole profile."""
     ranges = np.arange(1, 400) * W.range_cell(2)
     gains = np.where((np.arange(1, 400) >= 100) & (np.arange(1, 400) < 145), 3.0, 0.01)
     paths = resting(ranges, gains, 2, 0.0, np.array([0.0, 1.0, 0.0]))
     assert strongest_mean(paths, W) == pytest.approx(9, rel=1e-6)
-    assert len(weeded(paths)) == 45
+    assert len(without_weakest(paths)) == 45
 
 
 def test_paths_of_some_frames_before():

@@ -26,7 +26,7 @@ from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
@@ -36,7 +36,6 @@ from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
 from isac_rt.receive.symbols.profile import correlate, learn_profile
-from isac_rt.receive.types import Prediction
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import add_noise, if_signal
@@ -44,8 +43,16 @@ from isac_rt.signal.methods import Auto
 from isac_rt.studies.paper import clutter_statistics as numbers
 from isac_rt.studies.paper.clutter_figure import draw
 from isac_rt.studies.paper.clutter_scenes import PLACES, SMALL_UAV_M2, SPEED, Scenes, scenario
-from isac_rt.studies.paper.outcome import Judgement, Outcome, Progress, Verdict, proportion
+from isac_rt.studies.paper.outcome import (
+    Outcome,
+    Progress,
+    Sentences,
+    Verdict,
+    proportion,
+    table,
+)
 from isac_rt.studies.paper.symbols import make_cells
+from isac_rt.studies.waves import AT_TO_PT, prediction, sender, waves
 from isac_rt.world.swarm import Pose
 
 LEVEL_DB = 10.0
@@ -59,10 +66,12 @@ TARGETS = 16
 CLEAR_ROWS = 4
 """Range cells from a target within which a crossing of the threshold is not counted as a false
 alarm."""
+LEVELS = "paper", "physical"
 PILOTS = {"profile": 1, "old profile": 12}
 """Frames from the pilot that a range profile is learned from to the data: one, and half of
 `modulation.pilot_every_frames`' 25."""
 ORDER = 8
+OWN = Link("AT", "AT")
 
 
 @dataclass(frozen=True)
@@ -81,17 +90,9 @@ def resting(
     ranges: np.ndarray, gains: np.ndarray, passes: int, epoch: float, direction: np.ndarray
 ) -> PathSet:
     """Paths that stand still, all from one direction."""
-    along = np.tile(direction, (ranges.size, 1))
-    return make_paths(
-        gain=gains,
-        delay=passes * ranges / SPEED_OF_LIGHT,
-        departure=along,
-        arrival=along if passes == 2 else -along,
-        kind=int(PathKind.DIFFUSE),
-        epoch=epoch,
-        tx="AT",
-        rx="AT" if passes == 2 else "PT",
-    )
+    link, arrival = (OWN, direction) if passes == 2 else (AT_TO_PT, -direction)
+    delay, ends = passes * ranges / SPEED_OF_LIGHT, (direction, arrival)
+    return waves(epoch, delay, gain=gains, ends=ends, kind=PathKind.DIFFUSE, link=link)
 
 
 def strongest_mean(paths: PathSet, waveform: Waveform) -> float:
@@ -102,7 +103,7 @@ def strongest_mean(paths: PathSet, waveform: Waveform) -> float:
     return float(power[numbers.strongest_run(power)].mean())
 
 
-def weeded(paths: PathSet, share: float = 0.005) -> PathSet:
+def without_weakest(paths: PathSet, share: float = 0.005) -> PathSet:
     """Without the weakest paths that have this share of the power together."""
     order = np.argsort(paths.power)
     return paths.select(np.sort(order[np.cumsum(paths.power[order]) > share * paths.power.sum()]))
@@ -148,7 +149,7 @@ class Bench:
             LinkState(Link(*names), self.scenes.epoch, start, end), self.antennas
         )
         other_draw = own_rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
-        paths = weeded(
+        paths = without_weakest(
             replace(paths, gain=_mean_amplitude(self.scenes, paths, names, start, end) * other_draw)
         )
         gain = self.antennas.gain
@@ -156,13 +157,10 @@ class Bench:
             return replace(
                 paths, gain=paths.gain * np.sqrt(10 ** (LEVEL_DB / 10) / strongest_mean(paths, w))
             )
+        reference = friis_amplitude(w.wavelength, DISTANCE)
         if passes == 2:
-            return replace(
-                paths,
-                gain=paths.gain
-                / (gain * radar_amplitude(w.wavelength, SMALL_UAV_M2, UAV_M, UAV_M)),
-            )
-        return replace(paths, gain=paths.gain / (gain * friis_amplitude(w.wavelength, DISTANCE)))
+            reference = radar_amplitude(w.wavelength, SMALL_UAV_M2, UAV_M, UAV_M)
+        return replace(paths, gain=paths.gain / (gain * reference))
 
 
 def _mean_amplitude(
@@ -181,21 +179,18 @@ def pt_errors(
     symbols from the cells so decided."""
     w = replace(bench.waveform, num_groups=1)
     own, other = bench.poses(kind)
-    schedule, rng = (
-        bench.scenes.setup.schedule[:1],
-        generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame),
-    )
-    sight, clutter = _sight(bench, own, other), bench.clutter(kind, 1, frame, physical)
+    rng = generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame)
+    schedule = bench.scenes.setup.schedule[:1]
+    ahead = (other.position - own.position) / DISTANCE  # they fly side by side
+    delay, ends = DISTANCE / SPEED_OF_LIGHT, (ahead, -ahead)
+    sight = waves(bench.scenes.epoch, delay, ends=ends, radius=DISTANCE)
+    clutter = bench.clutter(kind, 1, frame, physical)
 
     def received(payload: Payload, before: int) -> IFCube:
-        sent = Transmission(
-            name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload
-        )
-        links = (
-            [(sent, sight)]
-            if clutter is None
-            else [(sent, sight), (sent, earlier(clutter, before * w.frame_duration))]
-        )
+        sent = sender(bench.antennas, schedule, payload, own)
+        links = [(sent, sight)]
+        if clutter is not None:
+            links += [(sent, earlier(clutter, before * w.frame_duration))]
         return if_signal(w, links, ReceiveArray(other, bench.antennas), Reference(0.0), Auto(1e-3))
 
     payload = random_payload(w, schedule, ORDER, rng)
@@ -211,15 +206,7 @@ def pt_errors(
         np.sqrt(w.num_samples / 2)
     )
     cells = make_cells(cube.samples[0].copy(), beats, pairs.view(np.complex64))
-    one = np.ones(1)
-    reference = Prediction(
-        range=DISTANCE * one,
-        velocity=0 * one,
-        direction=np.zeros((1, 2)),
-        range_std=one,
-        velocity_std=one,
-        weight=one,
-    )
+    reference = prediction(DISTANCE, 0.0, std=(1.0, 1.0))
     wrong: dict[tuple[str, str], list[int]] = {
         (symbol, d): [] for symbol in ("delay", "dpsk") for d in ("strongest cell", *pilots)
     }
@@ -227,46 +214,20 @@ def pt_errors(
         power = cells.power(level)
         metrics = {"strongest cell": power}
         for name, pilot in pilots.items():
-            words = seed_sequence(
-                bench.seed, "pilot noise", name, kind.clutter, frame, number
-            ).generate_state(2)
-            profile = learn_profile(
-                add_noise(replace(pilot, samples=pilot.samples.copy()), level**2, words), reference
-            )
+            heard = replace(pilot, samples=pilot.samples.copy())
+            key = "pilot noise", name, kind.clutter, frame, number
+            words = seed_sequence(bench.seed, *key).generate_state(2)
+            profile = learn_profile(add_noise(heard, level**2, words), reference)
             metrics[name] = correlate(power, profile) if profile.any() else power
         for name, metric in metrics.items():
             raw = decide(metric, [], w)[0]
-            wrong["delay", name].append(
-                int((np.clip(raw, 0, w.num_delay_symbols - 1) != payload.delay_symbols[0]).sum())
-            )
+            decided = np.clip(raw, 0, w.num_delay_symbols - 1)
+            wrong["delay", name].append(int((decided != payload.delay_symbols[0]).sum()))
             known = known_cycles(w, DISTANCE / SPEED_OF_LIGHT, 0.0, raw[None])
             picked = cells.at(raw % w.num_samples, level) * np.exp(-2j * np.pi * known)[:, None]
-            wrong["dpsk", name].append(
-                int(
-                    (
-                        decide_transitions(picked, schedule, w.num_tx, ORDER)[0]
-                        != payload.transitions
-                    ).sum()
-                )
-            )
+            turned = decide_transitions(picked, schedule, w.num_tx, ORDER)[0]
+            wrong["dpsk", name].append(int((turned != payload.transitions).sum()))
     return {name: np.array(counts) for name, counts in wrong.items()}
-
-
-def _sight(bench: Bench, own: Pose, other: Pose) -> PathSet:
-    """The line of sight from AT to PT, of unit amplitude; they fly side by side."""
-    ahead = (other.position - own.position) / DISTANCE
-    return make_paths(
-        gain=np.ones(1),
-        delay=np.array([DISTANCE / SPEED_OF_LIGHT]),
-        departure=ahead[None],
-        arrival=-ahead[None],
-        kind=int(PathKind.LINE_OF_SIGHT),
-        epoch=bench.scenes.epoch,
-        tx="AT",
-        rx="PT",
-        tx_radius=DISTANCE,
-        rx_radius=DISTANCE,
-    )
 
 
 def earlier(paths: PathSet, seconds: float) -> PathSet:
@@ -289,9 +250,7 @@ def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.n
     own, _ = bench.poses(kind)
     rng = generator(bench.seed, "at data", kind.clutter, round(kind.speed), frame)
     payload = random_payload(w, schedule, 8, rng)
-    sent = Transmission(
-        name="AT", pose=own, antennas=bench.antennas, schedule=schedule, payload=payload
-    )
+    sent = sender(bench.antennas, schedule, payload, own)
     targets, cells = _targets(bench, own, rng)
     cube = bench.scenes.noisy([], "at", kind.clutter, round(kind.speed), frame)
     known = Known(w, schedule, payload.delay_symbols, payload.phases, bench.antennas, 2)
@@ -365,16 +324,14 @@ def _targets(bench: Bench, own: Pose, rng: np.random.Generator) -> tuple[PathSet
     place = np.array(cells)
     u = rng.uniform(-0.6, 0.6, (TARGETS, 2))
     towards = own.to_world(unit_vector(u))
-    paths = make_paths(
+    paths = waves(
+        bench.scenes.epoch,
+        place[:, 0] * w.range_cell(2) * 2 / SPEED_OF_LIGHT,
+        place[:, 1] * w.velocity_cell(2) * 2 / SPEED_OF_LIGHT,
         gain=np.exp(2j * np.pi * rng.uniform(size=TARGETS)),
-        delay=place[:, 0] * w.range_cell(2) * 2 / SPEED_OF_LIGHT,
-        delay_rate=place[:, 1] * w.velocity_cell(2) * 2 / SPEED_OF_LIGHT,
-        departure=towards,
-        arrival=towards,
-        kind=int(PathKind.TARGET),
-        epoch=bench.scenes.epoch,
-        tx="AT",
-        rx="AT",
+        ends=(towards, towards),
+        kind=PathKind.TARGET,
+        link=OWN,
     )
     beat = place[:, 0] + place[:, 1] * w.sampled_duration / w.frame_duration
     return paths, np.stack(
@@ -410,12 +367,11 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         for physical in (False, True) if kind.clutter in PLACES else (False,):
             errors = each(pt_errors, kind, physical)
             for symbol, name in errors[0]:
-                wrong, trials = (
-                    np.sum([e[symbol, name] for e in errors], axis=0),
-                    (120 if symbol == "delay" else 117) * frames,
-                )
+                wrong = np.sum([e[symbol, name] for e in errors], axis=0)
+                trials = (120 if symbol == "delay" else 117) * frames
+                point = kind.clutter, kind.speed, LEVELS[physical], name
                 symbols += [
-                    {"symbol": symbol, **_row(kind, physical, name, s, n, trials)}
+                    (symbol, *point, s, int(n), trials, n / trials)
                     for s, n in zip(PT_SNR, wrong, strict=True)
                 ]
         found = each(at_hits, kind)
@@ -423,18 +379,15 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
             if physical and kind.clutter not in PLACES:
                 continue
             count = np.sum([f[physical, name] for f in found], axis=0)
+            point, trials = (kind.clutter, kind.speed, LEVELS[physical], name), TARGETS * frames
             hits += [
-                {
-                    **_row(kind, physical, name, s, n, TARGETS * frames),
-                    "false_alarms": int(a),
-                    "free_cells": int(c),
-                    "false_alarm_rate": a / c,
-                }
+                (*point, s, int(n), trials, n / trials, int(a), int(c), a / c)
                 for s, (n, a, c) in zip(AT_SNR, count, strict=True)
             ]
+    columns = "clutter speed_mps level decision snr_db count trials rate"
     tables = {
-        "symbols": pd.DataFrame(symbols),
-        "hits": pd.DataFrame(hits),
+        "symbols": table("symbol " + columns, symbols),
+        "hits": table(columns + " false_alarms free_cells false_alarm_rate", hits),
         "statistics": _statistics(scenes),
     }
     settings = {
@@ -446,28 +399,8 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "places": {p: PLACES[p].text for p in PLACES_USED},
         "speed_mps": SPEED,
     }
-    return Outcome(
-        "clutter",
-        "Three kinds of clutter",
-        tables,
-        draw(tables, scenes),
-        _verdicts(tables),
-        settings,
-    )
-
-
-def _row(kind: Kind, physical: bool, decision: str, snr: float, count: int, trials: int) -> dict:
-    level = "physical" if physical else "paper"
-    return {
-        "clutter": kind.clutter,
-        "speed_mps": kind.speed,
-        "level": level,
-        "decision": decision,
-        "snr_db": snr,
-        "count": int(count),
-        "trials": trials,
-        "rate": count / trials,
-    }
+    figure, verdicts = draw(tables, scenes), _verdicts(tables)
+    return Outcome("clutter", "Three kinds of clutter", tables, figure, verdicts, settings)
 
 
 def _statistics(scenes: Scenes) -> pd.DataFrame:
@@ -484,125 +417,120 @@ def _statistics(scenes: Scenes) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+say = Sentences("""
+level: Urban clutter is about 10 dB over the target
+  median over the cells of 20 to 100 m, place by place, over a small UAV: {median} dB; 10th
+  percentiles {low}, 90th {high} dB
+
+extent: It fills 40 to 50 range cells
+  cells within 20 dB of the strongest: {cells}
+
+law: Its amplitudes are Rayleigh
+  E|a|^4/(E|a|^2)^2 over the strongest 45 cells: {moment} (2 is Rayleigh); each cell by itself is
+  Rayleigh, the levels differ; correlation of neighbouring cells' levels {correlation}
+
+rest: It stands still
+  hovering yes; at {speed:g} m/s a cell's power spreads by {rms} m/s rms over {cells} Doppler cells,
+  and its amplitude correlates from frame to frame by {frames} (hovering 1)
+
+symbols: A passive terminal reads its symbols in urban clutter at +10 dB
+  delay symbols at {snr:g} dB SNR by the strongest cell: mesh {plain} wrong, Rayleigh {r[0]}; by the
+  range profile learned one frame before: mesh {read}, Rayleigh {r[1]}; learned {age} frames before
+  at {speed:g} m/s: mesh {old}; at the physical level, mesh, by the strongest cell: {physical}. DPSK
+  symbols (D = {order}), mesh: by the profile at +10 dB {dpsk[0]}, at the physical level {dpsk[1]}
+
+hits: The clutter filter gives the active terminal its targets back
+  hits at {snr:g} dB SNR, mesh at +10 dB: hovering {found[none]} without and {found[notch]} with a
+  zero-Doppler notch; at {speed:g} m/s {flying[none]} without and {flying[notch]} with it. False
+  alarms per cell, {design:g} by design: hovering {rate[none]:.1e} and {rate[notch]:.1e}, at
+  {speed:g} m/s {moving[none]:.1e} and {moving[notch]:.1e}; at the physical level and {speed:g} m/s
+  {physical[none]:.1e} and {physical[notch]:.1e}
+""")
+
+
 def _verdicts(tables: dict[str, pd.DataFrame]) -> tuple[Verdict, ...]:
-    return (
-        *_of_the_model(tables["statistics"]),
-        _of_the_symbols(tables["symbols"]),
-        _of_the_hits(tables["hits"]),
-    )
-
-
-def _judged(always: bool, sometimes: bool = False) -> Judgement:
-    return "holds" if always else "holds under a condition" if sometimes else "does not hold"
+    statistics, symbols, hits = (tables[name] for name in ("statistics", "symbols", "hits"))
+    return (*_of_the_model(statistics), _of_the_symbols(symbols), _of_the_hits(hits))
 
 
 def _of_the_model(found: pd.DataFrame) -> list[Verdict]:
     """What the Rayleigh model assumes."""
     mesh = found[found.clutter != "rayleigh"]
-    moving, standing = mesh[mesh.speed_mps > 0], mesh[mesh.speed_mps == 0]
+    flying, hovering = mesh[mesh.speed_mps > 0], mesh[mesh.speed_mps == 0]
 
-    def span(part: pd.DataFrame, name: str, form: str = ".1f") -> str:
-        return f"{part[name].min():{form}} to {part[name].max():{form}}"
+    def span(part: pd.Series, form: str = ".1f") -> str:
+        return f"{part.min():{form}} to {part.max():{form}}"
 
+    level = {
+        "median": span(hovering.level_over_uav_db),
+        "low": span(hovering.level_p10_db),
+        "high": span(hovering.level_p90_db),
+    }
+    law = {
+        "moment": span(hovering.fourth_moment, ".2f"),
+        "correlation": span(hovering.level_correlation, ".2f"),
+    }
+    motion = {
+        "rms": span(flying.doppler_rms_mps, ".2f"),
+        "cells": span(flying.doppler_cells, ".0f"),
+        "frames": span(flying.frame_correlation, ".3f"),
+    }
+    still = [bool((part.frame_correlation > 0.99).all()) for part in (flying, hovering)]
     near = abs(float(mesh.level_over_uav_db.median()) - LEVEL_DB) <= 5
+    filled = bool(mesh.cells_within_20_db.between(40, 50).all())
     return [
-        Verdict(
-            "Urban clutter is about 10 dB over the target",
-            _judged(near),
-            "median over the cells of 20 to 100 m, place by place, over a small UAV: "
-            f"{span(standing, 'level_over_uav_db')} dB; 10th percentiles "
-            f"{span(standing, 'level_p10_db')}, 90th {span(standing, 'level_p90_db')} dB",
-        ),
-        Verdict(
-            "It fills 40 to 50 range cells",
-            _judged(bool(mesh.cells_within_20_db.between(40, 50).all())),
-            f"cells within 20 dB of the strongest: {span(standing, 'cells_within_20_db', '.0f')}",
-        ),
-        Verdict(
-            "Its amplitudes are Rayleigh",
-            _judged(bool((mesh.fourth_moment < 2.2).all())),
-            "E|a|^4/(E|a|^2)^2 over the strongest 45 cells: "
-            f"{span(standing, 'fourth_moment', '.2f')} (2 is Rayleigh); each cell by "
-            f"itself is Rayleigh, the levels differ; correlation of neighbouring cells' levels "
-            f"{span(standing, 'level_correlation', '.2f')}",
-        ),
-        Verdict(
-            "It stands still",
-            _judged(*(bool((part.frame_correlation > 0.99).all()) for part in (moving, standing))),
-            f"hovering yes; at {SPEED:g} m/s a cell's power spreads by "
-            f"{span(moving, 'doppler_rms_mps', '.2f')} m/s rms over "
-            f"{span(moving, 'doppler_cells', '.0f')} Doppler cells, and its amplitude correlates "
-            f"from frame to frame by {span(moving, 'frame_correlation', '.3f')} (hovering 1)",
-        ),
+        say("level", near, **level),
+        say("extent", filled, cells=span(hovering.cells_within_20_db, ".0f")),
+        say("law", bool((mesh.fourth_moment < 2.2).all()), **law),
+        say("rest", *still, speed=SPEED, **motion),
     ]
 
 
-def _share(
-    table: pd.DataFrame,
-    decision: str,
-    level: str,
-    clutter: tuple[str, ...] = PLACES_USED,
-    speed: float | None = None,
-    value: tuple[str, str] = ("count", "trials"),
-) -> tuple[int, int]:
-    """Counts of the highest SNR, of some kinds of clutter together."""
-    part = table[
-        (table.snr_db == table.snr_db.max()) & (table.decision == decision) & (table.level == level)
-    ]
-    part = part[
-        part.clutter.isin(clutter) & ((part.speed_mps == speed) if speed is not None else True)
-    ]
-    return int(part[value[0]].sum()), int(part[value[1]].sum())
+def _best_snr(
+    found: pd.DataFrame, decision: str, level: str, speed: float | None = None
+) -> pd.DataFrame:
+    """Rows of the highest SNR in a mesh's clutter."""
+    part = found[(found.snr_db == found.snr_db.max()) & found.clutter.isin(PLACES_USED)]
+    part = part[(part.decision == decision) & (part.level == level)]
+    return part if speed is None else part[part.speed_mps == speed]
+
+
+def _share(part: pd.DataFrame) -> str:
+    return proportion(int(part["count"].sum()), int(part.trials.sum()))
 
 
 def _of_the_symbols(symbols: pd.DataFrame) -> Verdict:
     delay, dpsk = (symbols[symbols.symbol == name] for name in ("delay", "dpsk"))
-    plain, read = (_share(delay, d, "paper") for d in ("strongest cell", "profile"))
-    rayleigh = [
-        proportion(*_share(delay, d, "paper", ("rayleigh",))) for d in ("strongest cell", "profile")
-    ]
-    old = _share(delay, "old profile", "paper", speed=SPEED)
-    phases = [
-        proportion(*_share(dpsk, *which))
-        for which in (("profile", "paper"), ("strongest cell", "physical"))
-    ]
-    return Verdict(
-        "A passive terminal reads its symbols in urban clutter at +10 dB",
-        _judged(plain[0] < 0.01 * plain[1], read[0] < 0.01 * read[1]),
-        f"delay symbols at {PT_SNR[-1]:g} dB SNR by the strongest cell: mesh {proportion(*plain)} "
-        f"wrong, Rayleigh {rayleigh[0]}; by the range profile learned one frame before: mesh "
-        f"{proportion(*read)}, Rayleigh {rayleigh[1]}; learned {PILOTS['old profile']} frames "
-        f"before at {SPEED:g} m/s: mesh {proportion(*old)}; at the physical level, mesh, by the "
-        f"strongest cell: {proportion(*_share(delay, 'strongest cell', 'physical'))}. DPSK "
-        f"symbols (D = {ORDER}), mesh: by the profile at +10 dB {phases[0]}, at the physical "
-        f"level {phases[1]}",
+    rayleigh = delay[(delay.clutter == "rayleigh") & (delay.snr_db == delay.snr_db.max())]
+    plain, read = (_best_snr(delay, d, "paper") for d in ("strongest cell", "profile"))
+    low = [part["count"].sum() < 0.01 * part.trials.sum() for part in (plain, read)]
+    ways = (("profile", "paper"), ("strongest cell", "physical"))
+    return say(
+        "symbols",
+        *low,
+        snr=PT_SNR[-1],
+        plain=_share(plain),
+        read=_share(read),
+        r=[_share(rayleigh[rayleigh.decision == d]) for d in ("strongest cell", "profile")],
+        age=PILOTS["old profile"],
+        speed=SPEED,
+        old=_share(_best_snr(delay, "old profile", "paper", SPEED)),
+        physical=_share(_best_snr(delay, "strongest cell", "physical")),
+        order=ORDER,
+        dpsk=[_share(_best_snr(dpsk, *way)) for way in ways],
     )
 
 
 def _of_the_hits(hits: pd.DataFrame) -> Verdict:
-    found = {
-        (d, v): proportion(*_share(hits, d, "paper", speed=v))
-        for d in ("none", "notch")
-        for v in (0.0, SPEED)
-    }
-    rate = {}
-    for d, v, level in (
-        (d, v, level)
-        for d in ("none", "notch")
-        for v in (0.0, SPEED)
-        for level in ("paper", "physical")
-    ):
-        crossed, cells = _share(hits, d, level, speed=v, value=("false_alarms", "free_cells"))
-        rate[d, v, level] = crossed / cells
-    kept = [rate["notch", v, "paper"] < 2 * FALSE_ALARMS for v in (SPEED, 0.0)]
-    return Verdict(
-        "The clutter filter gives the active terminal its targets back",
-        _judged(*kept),
-        f"hits at {AT_SNR[-1]:g} dB SNR, mesh at +10 dB: hovering {found['none', 0.0]} without "
-        f"and {found['notch', 0.0]} with a zero-Doppler notch; at {SPEED:g} m/s "
-        f"{found['none', SPEED]} without and {found['notch', SPEED]} with it. False alarms per "
-        f"cell, {FALSE_ALARMS:g} by design: hovering {rate['none', 0.0, 'paper']:.1e} and "
-        f"{rate['notch', 0.0, 'paper']:.1e}, at {SPEED:g} m/s {rate['none', SPEED, 'paper']:.1e} "
-        f"and {rate['notch', SPEED, 'paper']:.1e}; at the physical level and {SPEED:g} m/s "
-        f"{rate['none', SPEED, 'physical']:.1e} and {rate['notch', SPEED, 'physical']:.1e}",
-    )
+    def rates(level: str, speed: float) -> dict[str, float]:
+        parts = {name: _best_snr(hits, name, level, speed) for name in ("none", "notch")}
+        return {n: p.false_alarms.sum() / p.free_cells.sum() for n, p in parts.items()}
+
+    def shares(speed: float) -> dict[str, str]:
+        return {name: _share(_best_snr(hits, name, "paper", speed)) for name in ("none", "notch")}
+
+    moving, still = rates("paper", SPEED), rates("paper", 0.0)
+    kept = [rate["notch"] < 2 * FALSE_ALARMS for rate in (moving, still)]
+    told = {"found": shares(0.0), "flying": shares(SPEED), "snr": AT_SNR[-1], "speed": SPEED}
+    told |= {"rate": still, "moving": moving, "physical": rates("physical", SPEED)}
+    return say("hits", *kept, design=FALSE_ALARMS, **told)

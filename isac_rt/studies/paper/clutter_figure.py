@@ -12,13 +12,13 @@ from isac_rt.studies.paper.clutter_scenes import SMALL_UAV_M2, Scenes
 from isac_rt.studies.paper.clutter_statistics import cell_powers, strongest_run
 from isac_rt.studies.paper.outcome import blank, style
 
-COLOURS = {
-    "gaussian": "#000000",
-    "rayleigh": "#E69F00",
-    "square": "#0072B2",
-    "street": "#009E73",
-    "roofs": "#CC79A7",
-}
+COLOURS = dict(
+    zip(
+        ("gaussian", "rayleigh", "square", "street", "roofs"),
+        ("#000000", "#E69F00", "#0072B2", "#009E73", "#CC79A7"),
+        strict=True,
+    )
+)
 LINES = {"strongest cell": "-", "none": "-", "profile": "--", "notch": "--", "old profile": ":"}
 WORDS = {
     "strongest cell": "by the strongest cell",
@@ -64,22 +64,11 @@ def draw(tables: dict[str, pd.DataFrame], scenes: Scenes) -> Figure:
             axes[2, column].set(ylim=(-0.03, 1.05))
             axes[3, column].set(yscale="log", ylim=(4e-5, 0.1))
         for name, colour in COLOURS.items():
-            axes[2, 0].plot(
-                [],
-                [],
-                color=colour,
-                label=name if name in ("gaussian", "rayleigh") else f"mesh, {name}",
-            )
+            label = name if name in ("gaussian", "rayleigh") else f"mesh, {name}"
+            axes[2, 0].plot([], [], color=colour, label=label)
         axes[2, 0].legend(loc="lower right")
-        axes[0, 0].text(
-            0.98,
-            0.1,
-            "in the grey: no error",
-            transform=axes[0, 0].transAxes,
-            ha="right",
-            fontsize=8,
-            color="#555555",
-        )
+        note = {"transform": axes[0, 0].transAxes, "fontsize": 8, "color": "#555555"}
+        axes[0, 0].text(0.98, 0.1, "in the grey: no error", ha="right", **note)
         for ax, names in (
             (axes[0, 2], ("strongest cell", "profile", "old profile")),
             (axes[2, 1], ("none", "notch")),
@@ -87,11 +76,8 @@ def draw(tables: dict[str, pd.DataFrame], scenes: Scenes) -> Figure:
             for name in names:
                 ax.plot([], [], LINES[name], color="#555555", label=WORDS[name])
             ax.legend(loc="upper right" if ax is axes[0, 2] else "lower right")
-        for ax, words in zip(
-            axes[4],
-            ("level of the mesh's clutter", "its Doppler in flight", "its amplitudes"),
-            strict=True,
-        ):
+        titles = "level of the mesh's clutter", "its Doppler in flight", "its amplitudes"
+        for ax, words in zip(axes[4], titles, strict=True):
             ax.set_title(words)
         _below(axes[4], scenes)
     return figure
@@ -104,9 +90,7 @@ def _curves(ax, table: pd.DataFrame, value: str, level: str, speed: float, least
         here = part[(part.level == level) & (part.speed_mps == speed)]
         if clutter == "gaussian" or (clutter == "rayleigh" and level == "paper"):
             here = part[part.level == "paper"]
-        shown = (
-            np.maximum(here[value], least) if "symbol" in table else np.maximum(here[value], 1e-9)
-        )
+        shown = np.maximum(here[value], least if "symbol" in table else 1e-9)
         ax.plot(here.snr_db, shown, LINES[decision], color=COLOURS[clutter], marker="o", ms=2.5)
 
 
@@ -117,57 +101,35 @@ def _below(axes, scenes: Scenes) -> None:
     level, doppler, law = axes
     at = np.arange(40, w.num_delay_symbols - 40)
     ranges = at * w.range_cell(2)
-    uav = (
-        scenes.amplitude
-        * gain
-        * np.asarray(radar_amplitude(w.wavelength, SMALL_UAV_M2, ranges, ranges))
-    ) ** 2
+    uav = np.asarray(radar_amplitude(w.wavelength, SMALL_UAV_M2, ranges, ranges))
+    uav = (scenes.amplitude * gain * uav) ** 2
     rng = np.random.default_rng(1)
     for place in [name for name in COLOURS if name in scenes.setup.swarm.uavs]:
         clutter = scenes.expectation.clutter(
             place, scenes.pose(place, 10.0), scenes.epoch, scenes.amplitude
         )
         cell, power = cell_powers(clutter, w)
-        level.plot(
-            ranges, 10 * np.log10(np.maximum(power[at], 1e-30) / uav), color=COLOURS[place], lw=0.8
-        )
+        look = {"color": COLOURS[place], "lw": 1}
+        over = 10 * np.log10(np.maximum(power[at], 1e-30) / uav)
+        level.plot(ranges, over, color=COLOURS[place], lw=0.8)
         run = strongest_run(power)
         inside = (cell >= run.start) & (cell < run.stop)
         velocity = clutter.delay_rate[inside] * SPEED_OF_LIGHT / 2
-        spectrum, edges = np.histogram(
-            velocity, np.arange(-12, 4, w.velocity_cell(2)), weights=clutter.power[inside]
-        )
-        doppler.plot(
-            edges[:-1],
-            10 * np.log10(np.maximum(spectrum / spectrum.max(), 1e-6)),
-            color=COLOURS[place],
-            lw=1,
-        )
-        amplitude = np.sqrt(
-            np.repeat(power[run], 400)
-            * rng.exponential(size=400 * (run.stop - run.start))
-            / power[run].mean()
-        )
-        law.plot(
-            np.sort(amplitude),
-            1 - np.arange(amplitude.size) / amplitude.size,
-            color=COLOURS[place],
-            lw=1,
-        )
+        edges = np.arange(-12, 4, w.velocity_cell(2))
+        spectrum, _ = np.histogram(velocity, edges, weights=clutter.power[inside])
+        shown = 10 * np.log10(np.maximum(spectrum / spectrum.max(), 1e-6))
+        doppler.plot(edges[:-1], shown, **look)
+        drawn = rng.exponential(size=400 * (run.stop - run.start))
+        amplitude = np.sqrt(np.repeat(power[run], 400) * drawn / power[run].mean())
+        share = 1 - np.arange(amplitude.size) / amplitude.size
+        law.plot(np.sort(amplitude), share, **look)
     level.fill_between([20, 31], 8, 12, color=COLOURS["rayleigh"], alpha=0.5, lw=0)
     level.set(xlabel="range [m]", ylabel="clutter in a cell over a small UAV [dB]", ylim=(-30, 30))
     level.text(32, 9, "the Rayleigh model", fontsize=7, color="#9A6B00")
     doppler.axvline(0, color=COLOURS["rayleigh"], lw=2)
-    doppler.set(
-        xlabel="radial velocity in the strongest 45 cells, 10 m/s [m/s]",
-        ylabel="power [dB]",
-        ylim=(-40, 3),
-    )
+    doppler.set(xlabel="radial velocity in the strongest 45 cells, 10 m/s [m/s]")
+    doppler.set(ylabel="power [dB]", ylim=(-40, 3))
     x = np.linspace(0, 5, 100)
     law.plot(x, np.exp(-(x**2)), color=COLOURS["rayleigh"], lw=2)
-    law.set(
-        xlabel="amplitude over rms in the strongest 45 cells",
-        ylabel="exceeded with probability",
-        yscale="log",
-    )
-    law.set(ylim=(1e-3, 1.2), xlim=(0, 5))
+    law.set(xlabel="amplitude over rms in the strongest 45 cells", xlim=(0, 5))
+    law.set(ylabel="exceeded with probability", yscale="log", ylim=(1e-3, 1.2))

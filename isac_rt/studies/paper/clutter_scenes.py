@@ -102,7 +102,7 @@ def scenario(
         }
     return Scenario.model_validate(
         {
-            "name": "places over Munich",
+            "name": "places_over_munich",
             "seed": seed,
             "frames": 4,
             "swarm": uavs,

@@ -11,11 +11,13 @@ synthesis and reception are the program's own.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy import ndimage
 
 from isac_rt.frame.cube import IFCube
@@ -42,13 +44,14 @@ from isac_rt.studies.paper.clutter_scenes import (
     scenario,
 )
 from isac_rt.studies.paper.outcome import (
-    Judgement,
     Outcome,
     Progress,
+    Sentences,
     Verdict,
     blank,
     proportion,
     style,
+    table,
 )
 from isac_rt.terminal.expectation import Mistakes
 
@@ -85,6 +88,9 @@ class Detector:
 
 ALL_WRONG = Mistakes((0.07, 0.07, 0.0), -3.0, 0.1)
 """0.1 m/s, 3 dB too low, 0.1 m rms of every face."""
+VELOCITY_WRONG = Mistakes(ALL_WRONG.velocity)
+LEVEL_WRONG = Mistakes(level_db=ALL_WRONG.level_db)
+MESH_WRONG = Mistakes(mesh_std=ALL_WRONG.mesh_std)
 PER_ARM = {"clutter_detector": "angle_doppler"}
 JOINT = {"clutter_detector": "angle_doppler", "clutter_channels": "joint"}
 DETECTORS = {
@@ -95,15 +101,9 @@ DETECTORS = {
     "map": Detector("threshold map from the mesh", {"clutter_detector": "map"}),
     "arms": Detector("mesh and velocity, per arm", PER_ARM),
     "joint": Detector("mesh and velocity, joint", JOINT),
-    "velocity_wrong": Detector(
-        "per arm, velocity 0.1 m/s off", PER_ARM, Mistakes(ALL_WRONG.velocity)
-    ),
-    "level_wrong": Detector(
-        "per arm, level 3 dB off", PER_ARM, Mistakes(level_db=ALL_WRONG.level_db)
-    ),
-    "mesh_wrong": Detector(
-        "per arm, mesh 0.1 m off", PER_ARM, Mistakes(mesh_std=ALL_WRONG.mesh_std)
-    ),
+    "velocity_wrong": Detector("per arm, velocity 0.1 m/s off", PER_ARM, VELOCITY_WRONG),
+    "level_wrong": Detector("per arm, level 3 dB off", PER_ARM, LEVEL_WRONG),
+    "mesh_wrong": Detector("per arm, mesh 0.1 m off", PER_ARM, MESH_WRONG),
     "arms_wrong": Detector("per arm, all three off", PER_ARM, ALL_WRONG),
     "joint_wrong": Detector("joint, all three off", JOINT, ALL_WRONG),
     "unfitted": Detector("per arm, all three off, not corrected", PER_ARM, ALL_WRONG, fitted=False),
@@ -128,7 +128,7 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Case:
+class Recorded:
     """One place and speed: cleaned spectra of every frame, and what is known of it.
 
     Attributes
@@ -185,7 +185,7 @@ def choose_targets(
     return in_the_air(scenes, place, ranges, doppler * w.velocity_cell(2), rng)
 
 
-def make_case(scenes: Scenes, place: str, speed: float, target_frames: int, count: int) -> Case:
+def make_case(scenes: Scenes, place: str, speed: float, target_frames: int, count: int) -> Recorded:
     """Samples of one place and speed."""
     payload = scenes.payload(place, round(speed))
     sent = scenes.transmission(place, speed, payload)
@@ -211,7 +211,7 @@ def make_case(scenes: Scenes, place: str, speed: float, target_frames: int, coun
         for some in (frames, quiet)
     )
     maps, empty = ([channel_maps(one, known) for one in some] for some in (spectra, without))
-    return Case(place, speed, payload, spectra, maps, empty, targets, cells, under)
+    return Recorded(place, speed, payload, spectra, maps, empty, targets, cells, under)
 
 
 def _cells(paths: PathSet, scenes: Scenes) -> np.ndarray:
@@ -256,7 +256,7 @@ NOTHING = ExpectedClutter(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)
 
 
 def score(
-    scenes: Scenes, case: Case, detector: Detector, tally: Tally, *, quiet: bool = False
+    scenes: Scenes, case: Recorded, detector: Detector, tally: Tally, *, quiet: bool = False
 ) -> None:
     """Run one detector on a case's frames."""
     known = _known(scenes, case.payload)
@@ -290,7 +290,7 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     chosen = {k: d for k, d in DETECTORS.items() if not (quick and k in LEFT_OUT_QUICK)}
     bounds = {k: DETECTORS[of] for k, of in BOUNDS.items() if of in chosen}
     tallies = {name: Tally() for name in [*chosen, *bounds]}
-    about: list[dict] = []
+    about: list[tuple] = []
     done, steps = 0, 2 * len(places)
     for place in places:
         for speed in (0.0, SPEED):
@@ -300,20 +300,12 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
             for name, detector in bounds.items():
                 score(scenes, case, detector, tallies[name], quiet=True)
             for some, strength in zip(case.targets, case.strength_db, strict=True):
-                about += [
-                    {
-                        "place": place,
-                        "speed_mps": speed,
-                        "range_m": r,
-                        "velocity_mps": v,
-                        "clutter_db": c,
-                    }
-                    for r, v, c in zip(some.range, some.velocity, strength, strict=True)
-                ]
+                values = some.range, some.velocity, strength
+                about += [(place, speed, *row) for row in zip(*values, strict=True)]
             done += 1
             progress(done, steps)
-    targets = pd.DataFrame(about)
-    table, hits = summarise(tallies, targets)
+    targets = table("place speed_mps range_m velocity_mps clutter_db", about)
+    summary, hits = summarise(tallies, targets)
     settings = {
         "quick": quick,
         "seed": seed,
@@ -325,14 +317,10 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "strong_targets": int((targets.clutter_db > STRONG_DB).sum()),
         "span_m": list(SPAN_M),
     }
-    tables = {"summary": table, "targets": pd.concat([targets, hits], axis=1)}
+    tables = {"summary": summary, "targets": pd.concat([targets, hits], axis=1)}
+    figure, verdicts = _figure(summary, targets, hits), _verdicts(summary)
     return Outcome(
-        "detectors",
-        "Detectors in geometric clutter",
-        tables,
-        _figure(table, targets, hits),
-        _verdicts(table, quick),
-        settings,
+        "detectors", "Detectors in geometric clutter", tables, figure, verdicts, settings
     )
 
 
@@ -343,157 +331,113 @@ def summarise(
     rows, hits = [], {}
     strong = (targets.clutter_db > STRONG_DB).to_numpy()
     moving = (targets.speed_mps > 0).to_numpy()
+    parts = strong, strong & ~moving, strong & moving, ~strong
     for name, tally in tallies.items():
         scale, free = tally.scale(), np.concatenate(tally.free)
-        hit = np.concatenate(tally.hits) > scale
-        hits[name] = hit
+        hits[name] = hit = np.concatenate(tally.hits) > scale
         events = int((free > scale).sum())
-        low, high = binomial_interval(events, free.size)
-        row = {
-            "detector": name,
-            "false_alarms": events,
-            "cells": free.size,
-            "rate": events / free.size,
-            "rate_low": low,
-            "rate_high": high,
-            "rate_as_designed": float((free > 1).mean()),
-            "scale": scale,
-            "pd": hit.mean(),
-        }
-        parts = {
-            "strong": strong,
-            "strong_hovering": strong & ~moving,
-            "strong_moving": strong & moving,
-            "weak": ~strong,
-        }
-        for part, which in parts.items():
-            row[f"pd_{part}"] = hit[which].mean() if which.any() else np.nan
-            row[f"n_{part}"] = int(which.sum())
-        rows.append(row)
-    return pd.DataFrame(rows).set_index("detector", drop=False), pd.DataFrame(hits)
+        false = events, free.size, events / free.size, *binomial_interval(events, free.size)
+        found = [(hit[w].mean() if w.any() else np.nan, int(w.sum())) for w in parts]
+        designed = float((free > 1).mean())
+        rows.append((name, *false, designed, scale, hit.mean(), *itertools.chain(*found)))
+    names = "strong", "strong_hovering", "strong_moving", "weak"
+    columns = "detector false_alarms cells rate rate_low rate_high rate_as_designed scale pd "
+    summary = table(columns + " ".join(f"pd_{n} n_{n}" for n in names), rows)
+    return summary.set_index("detector", drop=False), pd.DataFrame(hits)
 
 
 def rate_text(row: pd.Series) -> str:
     return proportion(int(row.false_alarms), int(row.cells))
 
 
-def _verdicts(table: pd.DataFrame, quick: bool) -> tuple[Verdict, ...]:
-    """The issue's demands, by name."""
-    best = (
-        "joint"
-        if "joint" in table.index and table.pd_strong["joint"] >= table.pd_strong["arms"]
-        else "arms"
-    )
-    bound = max((n for n in table.index if n.startswith("bound_")), key=lambda n: table.pd[n])
-    top, limit, threshold_map = table.loc[best], table.loc[bound], table.loc["map"]
-    wrong = table.loc[f"{best}_wrong"]
+say = Sentences("""
+false alarms: False alarms are at most 1e-3 per cell on target-free frames, counted on at least
+100 events
+  worst {worst.detector}: {worst_rate}; {best}: {rate}
 
-    alone = [table.loc[n] for n in ("velocity_wrong", "level_wrong", "mesh_wrong")]
+bound: The angle-Doppler filter comes within 0.03 of the clutter-free bound over all UAVs
+  {best} {top.pd:.4f}, bound {limit.pd:.4f}, {uavs} UAVs
 
-    def judged(good: bool) -> Judgement:
-        return "holds" if good else "does not hold"
+strong: In strong-clutter cells the filter finds at least 0.95
+  {best} {strong}; bound {strong_limit}; hovering {top.pd_strong_hovering:.3f}, at {speed:g} m/s
+  {top.pd_strong_moving:.3f}; {top.n_strong} UAVs in cells with clutter over {level:g} dB
+
+map: There the filter is at least 0.1 above the threshold map
+  {best} {top.pd_strong:.3f}, threshold map {map.pd_strong:.3f}
+
+wrong: The filter holds this with 0.1 m/s of velocity error, 3 dB of level error and
+0.1 m of mesh error
+  all three at once, {wrong.detector}: {wrong.pd:.4f} over all, {strong} in strong clutter, false
+  alarms {rate}; {alone}; not corrected by the frame {raw.pd:.4f} and {raw.pd_strong:.3f}
+
+others: What the others reach (no claim; stated beside the filter)
+  {losers}
+""")
+
+
+def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
+    """What is demanded of the filter, by name."""
+    joint = "joint" in found.index and found.pd_strong["joint"] >= found.pd_strong["arms"]
+    best = "joint" if joint else "arms"
+    bound = max((n for n in found.index if n.startswith("bound_")), key=lambda n: found.pd[n])
+    top, limit, threshold_map = found.loc[best], found.loc[bound], found.loc["map"]
+    wrong, raw = found.loc[f"{best}_wrong"], found.loc["unfitted"]
+    alone = [found.loc[n] for n in ("velocity_wrong", "level_wrong", "mesh_wrong")]
 
     def strong(row: pd.Series) -> str:
         return proportion(round(row.pd_strong * row.n_strong), int(row.n_strong))
 
-    worst = table[~table.index.str.startswith("bound_")].sort_values("rate").iloc[-1]
-    count = f"{int(top.n_strong)} UAVs in cells with clutter over {STRONG_DB:g} dB"
+    worst = found[~found.index.str.startswith("bound_")].sort_values("rate").iloc[-1]
+    quiet = worst.rate <= WORST_RATE and found.false_alarms.min() >= 100
+    kept = all(row.pd >= limit.pd - 0.03 and row.pd_strong >= 0.95 for row in (wrong, *alone))
+    each = ", ".join(f"{row.detector} alone {row.pd:.4f} and {row.pd_strong:.3f}" for row in alone)
     losers = ", ".join(
-        f"{DETECTORS[n].text} {table.pd[n]:.3f} ({table.pd_strong[n]:.3f} in strong clutter)"
-        for n in table.index
+        f"{DETECTORS[n].text} {found.pd[n]:.3f} ({found.pd_strong[n]:.3f} in strong clutter)"
+        for n in found.index
         if n in ("cfar", "runs", "notch", "sample", "map")
     )
+    rates = {"worst_rate": rate_text(worst), "rate": rate_text(top)}
+    both = {"strong": strong(top), "strong_limit": strong(limit)}
+    cells = {"speed": SPEED, "level": STRONG_DB}
+    uavs, told = int(top.n_strong + top.n_weak), {"best": best, "top": top}
+    failed = {"strong": strong(wrong), "rate": rate_text(wrong), "alone": each}
     return (
-        Verdict(
-            "False alarms are at most 1e-3 per cell on target-free frames, counted on at least 100 "
-            "events",
-            judged(worst.rate <= WORST_RATE and table.false_alarms.min() >= 100),
-            f"worst {worst.detector}: {rate_text(worst)}; {best}: {rate_text(top)}",
-        ),
-        Verdict(
-            "The angle-Doppler filter comes within 0.03 of the clutter-free bound over all UAVs",
-            judged(top.pd >= limit.pd - 0.03),
-            f"{best} {top.pd:.4f}, bound {limit.pd:.4f}, {int(top.n_strong + top.n_weak)} UAVs",
-        ),
-        Verdict(
-            "In strong-clutter cells the filter finds at least 0.95",
-            judged(top.pd_strong >= 0.95),
-            f"{best} {strong(top)}; bound {strong(limit)}; hovering {top.pd_strong_hovering:.3f}, "
-            f"at {SPEED:g} m/s {top.pd_strong_moving:.3f}; {count}",
-        ),
-        Verdict(
-            "There the filter is at least 0.1 above the threshold map",
-            judged(top.pd_strong >= threshold_map.pd_strong + 0.1),
-            f"{best} {top.pd_strong:.3f}, threshold map {threshold_map.pd_strong:.3f}",
-        ),
-        Verdict(
-            "The filter holds this with 0.1 m/s of velocity error, 3 dB of level error and 0.1 m "
-            "of mesh error",
-            judged(
-                all(row.pd >= limit.pd - 0.03 and row.pd_strong >= 0.95 for row in (wrong, *alone))
-            ),
-            f"all three at once, {wrong.detector}: {wrong.pd:.4f} over all, {strong(wrong)} in "
-            f"strong clutter, false alarms {rate_text(wrong)}; "
-            + ", ".join(
-                f"{row.detector} alone {row.pd:.4f} and {row.pd_strong:.3f}" for row in alone
-            )
-            + f"; not corrected by the frame {table.pd['unfitted']:.4f} and "
-            f"{table.pd_strong['unfitted']:.3f}",
-        ),
-        Verdict("What the others reach (no claim; stated beside the filter)", "holds", losers),
+        say("false alarms", quiet, best=best, worst=worst, **rates),
+        say("bound", top.pd >= limit.pd - 0.03, **told, limit=limit, uavs=uavs),
+        say("strong", top.pd_strong >= 0.95, **told, **both, **cells),
+        say("map", top.pd_strong >= threshold_map.pd_strong + 0.1, **told, map=threshold_map),
+        say("wrong", kept, wrong=wrong, raw=raw, **failed),
+        say("others", True, losers=losers),
     )
 
 
-def _figure(table: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame):
-    names = [n for n in [*DETECTORS, *BOUNDS] if n in table.index]
+DRAWN = "cfar", "notch", "sample", "map", "arms", "arms_wrong", "bound_arms"
+
+
+def _figure(found: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame) -> Figure:
+    names = [n for n in [*DETECTORS, *BOUNDS] if n in found.index]
     text = {n: DETECTORS[n].text if n in DETECTORS else f"no clutter, {BOUNDS[n]}" for n in names}
     with style():
         figure, axes = blank(1, 2, (10.5, 4.6), width_ratios=(1.25, 1))
         ax, curve = axes[0]
-        y = np.arange(len(names))[::-1]
-        ax.barh(y + 0.2, table.pd[names], 0.36, color="#4C78A8", label="all UAVs")
-        ax.barh(
-            y - 0.2,
-            table.pd_strong[names],
-            0.36,
-            color="#E45756",
-            label=f"clutter > {STRONG_DB:g} dB over noise",
-        )
+        y, strong = np.arange(len(names))[::-1], f"clutter > {STRONG_DB:g} dB over noise"
+        ax.barh(y + 0.2, found.pd[names], 0.36, color="#4C78A8", label="all UAVs")
+        ax.barh(y - 0.2, found.pd_strong[names], 0.36, color="#E45756", label=strong)
         for at, n in zip(y, names, strict=True):
-            ax.text(1.01, at, f"{table.rate[n]:.1e}", fontsize=7, va="center")
+            ax.text(1.01, at, f"{found.rate[n]:.1e}", fontsize=7, va="center")
         ax.set_yticks(y, [text[n] for n in names])
-        ax.set(
-            xlim=(0, 1.2), xlabel="probability of detection; right: false alarms per cell, measured"
-        )
-        ax.legend(loc="upper right", fontsize=7, ncols=2, bbox_to_anchor=(1.0, 1.09), framealpha=1)
+        ax.set(xlabel="probability of detection; right: false alarms per cell, measured")
+        ax.set(xlim=(0, 1.2))
+        outside = {"fontsize": 7, "ncols": 2, "framealpha": 1}
+        ax.legend(loc="upper right", bbox_to_anchor=(1.0, 1.09), **outside)
         edges = np.array([-100.0, 0, 10, 15, 20, 25, 30, 60])
         bins = np.digitize(targets.clutter_db, edges)
-        at = [
-            float(np.clip(targets.clutter_db[bins == b].mean(), -10, 60))
-            for b in range(1, edges.size)
-            if (bins == b).sum() > 4
-        ]
-        marks = {
-            "cfar": "v",
-            "notch": "<",
-            "sample": "x",
-            "map": "s",
-            "arms": "o",
-            "arms_wrong": "D",
-            "bound_arms": "+",
-        }
-        for n, mark in marks.items():
+        inside = [w for b in range(1, edges.size) if (w := bins == b).sum() > 4]
+        at = [float(np.clip(targets.clutter_db[w].mean(), -10, 60)) for w in inside]
+        for n, mark in zip(DRAWN, "v<xsoD+", strict=True):
             if n in names:
-                values = [
-                    hits[n][bins == b].mean() for b in range(1, edges.size) if (bins == b).sum() > 4
-                ]
-                curve.plot(at, values, mark + "-", label=text[n])
-        curve.set(
-            xlabel="clutter over noise in the UAV's cell [dB]",
-            ylabel="probability of detection",
-            ylim=(-0.02, 1.04),
-        )
-        curve.legend(
-            loc="upper center", fontsize=7, ncols=2, bbox_to_anchor=(0.5, -0.13), framealpha=1
-        )
+                curve.plot(at, [hits[n][w].mean() for w in inside], mark + "-", label=text[n])
+        curve.set(xlabel="clutter over noise in the UAV's cell [dB]")
+        curve.set(ylabel="probability of detection", ylim=(-0.02, 1.04))
+        curve.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), **outside)
     return figure
