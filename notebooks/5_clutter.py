@@ -13,6 +13,8 @@
 # ground, at the velocity that the terminal's own flight gives them, fading with distance.
 
 # %%
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -83,13 +85,8 @@ for model in ("diffuse", "field"):
     a, b = (setup.frame(k).paths["AT", "AT"] for k in (0, 1))
     # the same instant seen from both frames: the second one's scatterers taken back by their rates
     dt = a.epoch - b.epoch
-    back = irt.PathSet(
-        **{
-            **vars(b),
-            "delay": b.delay + b.delay_rate * dt + b.delay_accel * dt**2 / 2,
-            "epoch": a.epoch,
-        }
-    )
+    delay = b.delay + b.delay_rate * dt + b.delay_accel * dt**2 / 2
+    back = replace(b, delay=delay, epoch=a.epoch)
     x, y = profile(a, setup.waveform), profile(back, setup.waveform)
     print(
         f"{model:8s} correlation from frame to frame "

@@ -89,7 +89,7 @@ class FreeSpace:
         for k, name in enumerate(others):
             rcs, row = self.uavs[name].rcs, slice(k, k + 1)
             if rcs.model == "relative":
-                amplitude[k] = self.reference_amplitude(poses, *state.link)
+                amplitude[k] = self.reference_amplitude(poses, state.link)
                 amplitude[k] *= 10 ** (rcs.level_db / 20)
             else:
                 amplitude[k] = self._echo(name, poses, there.select(row), back.select(row))
@@ -118,7 +118,7 @@ class FreeSpace:
         )
         return float(radar_amplitude(self.wavelength, section, there.length, back.length)[0])
 
-    def reference_amplitude(self, poses: dict[str, Pose], tx: str, rx: str) -> float:
+    def reference_amplitude(self, poses: dict[str, Pose], link: Link) -> float:
         """Amplitude of a link's reference path as if unshadowed and on boresight at both ends.
 
         The line of sight of a link between two terminals; for a terminal's own echoes the strongest
@@ -128,7 +128,8 @@ class FreeSpace:
         ------
         ValueError  If a terminal's own link has no such UAV.
         """
-        if tx != rx:
+        tx, rx = link
+        if not Link(tx, rx).own:
             distance = np.linalg.norm(poses[rx].position - poses[tx].position)
             return float(friis_amplitude(self.wavelength, distance) * self.antennas.gain)
         return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self.antennas.gain

@@ -173,7 +173,7 @@ def make_paths(
     """A PathSet from what is known; the rest gets its neutral value. Arrays are copied."""
     given: dict[str, Any] = {name: v for name, v in columns.items() if v is not None}
     count = np.asarray(given["delay"]).shape[0]
-    flat = {
+    flat: dict[str, Any] = {
         name: np.array(np.broadcast_to(given.get(name, neutral), (count,)), dtype=dtype)
         for name, (dtype, neutral) in _NEUTRAL.items()
     }
@@ -205,5 +205,7 @@ def merge(parts: list[PathSet]) -> PathSet:
         return np.pad(a, width, constant_values=np.nan if name == "points" else -1)
 
     columns = [p.arrays() for p in parts]
-    joined = {n: np.concatenate([padded(n, c[n]) for c in columns]) for n in columns[0]}
+    joined: dict[str, Any] = {
+        name: np.concatenate([padded(name, c[name]) for c in columns]) for name in columns[0]
+    }
     return replace(first, **joined)

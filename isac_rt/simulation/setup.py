@@ -195,7 +195,7 @@ class Setup:
         noise, rise = self.scenario.noise, noise_rise(self.scenario.clutter)
         if noise.model == "link_budget":
             return rise * thermal_noise_power(noise, self.waveform)
-        amplitude = self.reference.reference_amplitude(poses, *link)
+        amplitude = self.reference.reference_amplitude(poses, link)
         return rise * noise_power(noise, self.waveform, amplitude)
 
     def frame(self, number: int) -> Frame:
@@ -267,16 +267,17 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
     """The link budget of every link at the first frame."""
     poses = setup.swarm.poses(setup.timetable.epoch(0))
     rows = []
-    for tx, rx in setup.timetable.links(0):
-        if tx == rx and not setup.reference.has_target(tx):
+    for link in setup.timetable.links(0):
+        tx, rx = link
+        if link.own and not setup.reference.has_target(tx):
             continue
-        amplitude = setup.reference.reference_amplitude(poses, tx, rx)
-        name = rx if tx != rx else setup.reference.strongest_target(poses, tx)
+        amplitude = setup.reference.reference_amplitude(poses, link)
+        name = setup.reference.strongest_target(poses, tx) if link.own else rx
         distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
-        what = "line of sight" if tx != rx else f"echo of {name}"
+        what = f"echo of {name}" if link.own else "line of sight"
         rows.append(
             link_budget(
-                Link(tx, rx),
+                link,
                 what,
                 distance,
                 amplitude,

@@ -128,7 +128,7 @@ def test_paths_of_a_run(link, passes):
     assert np.ptp(where) == pytest.approx(44 * cell, rel=1e-5, abs=0)
     assert not d.delay_rate.any()
     assert not d.delay_accel.any()
-    power = (np.abs(d.gain) ** 2).mean() / setup.reference.reference_amplitude(poses, *link) ** 2
+    power = (np.abs(d.gain) ** 2).mean() / setup.reference.reference_amplitude(poses, link) ** 2
     assert power == pytest.approx(
         10, rel=5 / np.sqrt(45), abs=0
     )  # mean of 45 exponentials, 5 sigma

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.geometry import (
     edges_in_any_order,
@@ -531,14 +532,14 @@ def test_relative_echo_stands_at_its_level(rx, reference):
 def test_no_reference_is_an_error_that_says_so():
     uavs = {n: u.model_copy(update={"rcs": Rcs(model="relative")}) for n, u in UAVS.items()}
     with pytest.raises(ValueError, match="cross-section of its own"):
-        free_space(uavs).reference_amplitude(POSES, "A", "A")
+        free_space(uavs).reference_amplitude(POSES, Link("A", "A"))
 
 
 def test_reference_is_the_strongest_echo_unshadowed_and_on_boresight():
     """The passive terminal is nearer and larger here, so it is the reference."""
     d = np.linalg.norm(RX.position - TX.position)
     expected = 3.7 * LAMBDA * np.sqrt(10**-0.33 / (4 * np.pi) ** 3) / d**2
-    assert free_space().reference_amplitude(POSES, "A", "A") == near(expected, 1e-12)
+    assert free_space().reference_amplitude(POSES, Link("A", "A")) == near(expected, 1e-12)
     assert free_space().strongest_target(POSES, "A") == "P"
 
 

@@ -105,7 +105,7 @@ class Seen(Ways):
 
 
 class Rows(NamedTuple):
-    """The arrays of `Seen`, as the kernels take them."""
+    """The arrays of `Seen` in their order, as the kernels take them."""
 
     length: np.ndarray
     rate: np.ndarray
@@ -114,7 +114,7 @@ class Rows(NamedTuple):
     rx_radius: np.ndarray
     departure: np.ndarray
     arrival: np.ndarray
-    index: np.ndarray
+    cell: np.ndarray
     magnitude: np.ndarray
 
 
@@ -192,7 +192,7 @@ class ClutterField:
             index=index,
             magnitude=np.empty(count, np.float32),
         )
-        c, rows, motion = self.cells, Rows(**vars(found)), (start.motion(), end.motion())
+        c, rows, motion = self.cells, Rows(*vars(found).values()), (start.motion(), end.motion())
         _advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
         if bodies is not None:
             points = self.cells.points[index]
@@ -274,9 +274,9 @@ def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _advance(surfaces, points, face, area, share, scale, start, end, own, rows):
-    """Fill all `rows` but `index`; they are independent. `start`, `end`: position, velocity,
+    """Fill all `rows` but `cell`; they are independent. `start`, `end`: position, velocity,
     acceleration; `own`: both are one body, and `arrival` is `departure`."""
-    index, length, rate, accel = rows.index, rows.length, rows.rate, rows.accel
+    index, length, rate, accel = rows.cell, rows.length, rows.rate, rows.accel
     tx_radius, rx_radius, magnitude = rows.tx_radius, rows.rx_radius, rows.magnitude
     departure, arrival = rows.departure, rows.arrival
     for row in range(index.size):

@@ -110,7 +110,7 @@ class RayleighClutter:
             if not own:
                 arrival = poses[rx].to_world(self._directions(ranges.size, rng))
         return make_paths(
-            gain=self._reference.reference_amplitude(poses, tx, rx) * amplitudes,
+            gain=self._reference.reference_amplitude(poses, paths.link) * amplitudes,
             delay=passes * ranges / SPEED_OF_LIGHT,
             departure=departure,
             arrival=arrival,

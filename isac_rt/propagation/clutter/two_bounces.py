@@ -196,12 +196,9 @@ class TwoBounces:
         else:
             end = mirror.image(state.end)
         count, c = index.size, self._field.cells
-        rows = Rows(
-            *(np.empty(count, dtype) for dtype in (float, float, np.float32, float, float)),
-            *np.empty((2, count, 3)),
-            index,
-            np.empty(count, np.float32),
-        )
+        numbers = (np.empty(count, dtype) for dtype in (float, float, np.float32, float, float))
+        ends = np.empty((count, 3)), np.empty((count, 3))
+        rows = Rows._make([*numbers, *ends, index, np.empty(count, np.float32)])
         _lay_out(c.points, mirror.normal, start, end, before, rows)
         met = rows.departure if before else rows.arrival
         slab = slab_coefficients(
@@ -233,8 +230,8 @@ def _lay_out(points, normal, start, end, before, rows):
     """Geometry of ways over scatterers from `start` to `end` (position, velocity, acceleration),
     one of them an image behind the mirror; directions are those at the terminals themselves."""
     departure, arrival = rows.departure, rows.arrival
-    for row in range(rows.index.size):
-        i = rows.index[row]
+    for row in range(rows.cell.size):
+        i = rows.cell[row]
         r1, v1, a1, x1, y1, z1 = leg_to(points[i, 0], points[i, 1], points[i, 2], start)
         r2, v2, a2, x2, y2, z2 = leg_to(points[i, 0], points[i, 1], points[i, 2], end)
         if before:
@@ -299,8 +296,8 @@ def _weigh(surfaces, face, area, share, scale, normal, slab, before, rows, gain)
     """Complex gains of ways over scatterers; the scatterers' own amplitudes left out."""
     normals, departure, arrival = surfaces.normals, rows.departure, rows.arrival
     mirror = normal[0], normal[1], normal[2]
-    for row in range(rows.index.size):
-        i = rows.index[row]
+    for row in range(rows.cell.size):
+        i = rows.cell[row]
         f, te, tm = face[i], slab[0][row], slab[1][row]
         n = normals[f, 0], normals[f, 1], normals[f, 2]
         away = departure[row, 0], departure[row, 1], departure[row, 2]

@@ -72,8 +72,8 @@ class TracedLegs(NamedTuple):
 def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth: int) -> LegSet:
     """One set of (amplitude, legs, faces, planes) of chains of one length each, padded to
     `depth`."""
-    scalars, vectors = [np.zeros(0)] * 3, [np.zeros((0, 3))] * 2
-    nothing = Legs(*scalars, *vectors, np.zeros((0, depth, 3)))
+    shapes = (0,), (0,), (0,), (0, 3), (0, 3), (0, depth, 3)
+    nothing = Legs(*map(np.zeros, shapes))
     chain = np.zeros((0, depth), np.int64)
     parts = [(np.zeros(0, complex), nothing, chain, chain), *parts]
 
@@ -92,8 +92,9 @@ def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth:
 
     amplitudes, legs, faces, planes = zip(*parts, strict=True)
     *columns, points = zip(*(vars(part).values() for part in legs), strict=True)
-    every = Legs(*map(np.concatenate, columns), joined(points, np.nan))
-    return LegSet(np.concatenate(amplitudes), every, joined(faces, -1), joined(planes, -1))
+    arrays = [*map(np.concatenate, columns), joined(points, np.nan)]
+    amplitude, chains = np.concatenate(amplitudes), (joined(faces, -1), joined(planes, -1))
+    return LegSet(amplitude, Legs(*arrays), *chains)
 
 
 class Between:

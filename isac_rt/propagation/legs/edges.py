@@ -99,10 +99,11 @@ class ShadowEdges:
         lit = self._shadows.clear(starts, ends)
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
+        edges = self._edges
         found = [
-            _near(*vars(self._edges).values(), s, e, far)
+            _near(edges.start, edges.span, edges.wings, s, e, far)
             for s, e, far in zip(starts, ends, reach, strict=True)
-        ]  # type: ignore[call-arg]
+        ]
         path = np.repeat(np.arange(count), [len(f[0]) for f in found])
         if not path.size:
             return Bends(nu, points)

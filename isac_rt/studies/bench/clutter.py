@@ -16,7 +16,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,6 +34,10 @@ from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.scenes import alone
 from isac_rt.world.swarm import Pose
 
+if TYPE_CHECKING:
+    from isac_rt.propagation.clutter.field import ClutterField
+    from isac_rt.propagation.raytrace import RayTracer
+
 AREAS = (1.0, 0.25, 0.06, 0.015)
 """Largest area of a cell over its distance [m]: four times fewer scatterers each."""
 LEFT_OUT = (1e-4, 1e-3, 1e-2, 1e-1)
@@ -42,7 +46,7 @@ FRAMES = 24
 """Frames in a row that are advanced: 4 m of flight, so eight tests of sight."""
 BLOCKS = 3
 PILOT_RAYS = 20_000
-LINK = ("AT", "AT")
+LINK = Link("AT", "AT")
 
 
 def rows(quick: bool) -> list[dict[str, object]]:
@@ -53,6 +57,18 @@ def rows(quick: bool) -> list[dict[str, object]]:
         setup = prepare(_scene(model="field", cell_area_per_metre_m=area))
         out += _of_tracing(setup, hits, floor)
     return out + _of_samples(setup, floor, 3 if quick else 7)
+
+
+def _tracer(setup: Setup) -> RayTracer:
+    tracer = tracer_of(setup)
+    assert tracer is not None
+    return tracer
+
+
+def _field(setup: Setup) -> ClutterField:
+    field = _tracer(setup).field
+    assert field is not None
+    return field
 
 
 def _scene(**clutter: Any) -> Scenario:
@@ -67,12 +83,12 @@ def _hits_per_ray() -> float:
 def advance(setup: Setup, frames: range) -> tuple[float, float, int]:
     """CPU seconds per frame of advancing the field through some frames, its mean power gain and how
     many scatterers were in sight."""
-    field, power, seen = tracer_of(setup).field, 0.0, 0
+    field, power, seen = _field(setup), 0.0, 0
     begin = time.process_time()
     for frame in frames:
         when = setup.timetable.epoch(frame)
         pose = _local(setup, when)
-        found = field.seen(LinkState(Link(*LINK), when, pose, pose))
+        found = field.seen(LinkState(LINK, when, pose, pose))
         gain = field.cells.amplitude[found.index] * found.magnitude
         power += float((found.magnitude.astype(float) ** 2).sum())
         seen = len(gain)
@@ -86,7 +102,7 @@ def _local(setup: Setup, when: float) -> Pose:
 
 def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[str, object]]:
     """Advancing and tracing anew in turns, the first turn to warm up."""
-    scatterers = len(tracer_of(setup).field.cells)
+    scatterers = len(_field(setup).cells)
     again = prepare(_scene(model="diffuse", rays=round(scatterers / hits_per_ray)))
     seconds: dict[str, list[float]] = {"advanced": [], "traced anew by Sionna RT": []}
     powers: list[list[float]] = []
@@ -96,7 +112,7 @@ def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[st
         seconds["advanced"].append(cost)
         when = setup.timetable.epoch(frames[FRAMES // 2])
         begin = time.process_time()
-        amplitude = tracer_of(again)._diffuse_hits({"AT": _local(setup, when)}, [LINK])[LINK][0]
+        amplitude = _tracer(again)._diffuse_hits({"AT": _local(setup, when)}, [LINK])[LINK][0]
         seconds["traced anew by Sionna RT"].append(time.process_time() - begin)
         powers.append([power, float((amplitude**2).sum())])
     total = np.sum(powers, axis=0)
