@@ -45,6 +45,7 @@ TESTS_OF = {
     "signal/gridded.py": "test_ifsignal test_gridding",
     "signal/profiles.py": "test_gridding test_ifsignal",
     "kernels/fourier.py": "test_gridding test_receive_transform",
+    "kernels/jit.py": "test_jit",
     "signal/separable.py": "test_separable",
     "signal/if_signal.py": "test_ifsignal test_hard_signal",
     "signal/choice.py": "test_costs",
@@ -100,17 +101,6 @@ TESTS_OF = {
     "receive/clutter/sample_matrix.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
-COMPILED_FROM = {
-    "kernels/vector.py": ("signal/direct.py", "signal/gridded.py", "receive/transform.py"),
-    "kernels/fourier.py": ("signal/gridded.py", "receive/transform.py"),
-    "signal/profiles.py": ("signal/gridded.py",),
-    "signal/direct.py": ("signal/gridded.py",),
-    "signal/noise.py": ("signal/gridded.py",),
-    "propagation/clutter/field.py": ("propagation/clutter/two_bounces.py",),
-    "propagation/clutter/mirrors.py": ("propagation/clutter/two_bounces.py",),
-}
-"""The modules in whose compiled code a module's own is held; their cache does not know that it
-changed."""
 LIMIT = 400
 """Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by
 then has been noticed."""
@@ -310,43 +300,22 @@ class Copy:
             ),
             # two changes of one length within a second would look alike
             "PYTHONDONTWRITEBYTECODE": "1",
+            "ISAC_RT_CACHE": str(folder / "compiled"),
         }
 
     def source(self, file: str) -> str:
         """A file of the package as it was when the copy was made."""
         return (self._whole / file).read_text()
 
-    def keep_compiled(self) -> None:
-        """Take what has been compiled by now as that of the unchanged files."""
-        for compiled in (self.folder / "isac_rt").rglob("*.nb?"):
-            kept = self._whole / compiled.relative_to(self.folder / "isac_rt")
-            kept.parent.mkdir(exist_ok=True)
-            shutil.copy2(compiled, kept)
-
     @contextmanager
     def changed(self, file: str, source: str) -> Iterator[None]:
-        """A file changed, and put back with what was compiled from it."""
+        """A file changed, and put back."""
         target = self.folder / "isac_rt" / file
         target.write_text(source)
-        files = [Path(name) for name in (file, *COMPILED_FROM.get(file, ()))]
-        self._forget(files)
         try:
             yield
         finally:
             shutil.copy2(self._whole / file, target)
-            self._forget(files)
-            for one in files:
-                for compiled in (self._whole / one.parent / "__pycache__").glob(
-                    f"{one.stem}.*.nb?"
-                ):
-                    shutil.copy2(compiled, self.folder / "isac_rt" / one.parent / "__pycache__")
-
-    def _forget(self, files: list[Path]) -> None:
-        for one in files:
-            for compiled in (self.folder / "isac_rt" / one.parent / "__pycache__").glob(
-                f"{one.stem}.*.nb?"
-            ):
-                compiled.unlink()
 
 
 @dataclass(frozen=True)
@@ -381,7 +350,6 @@ class Record:
                 env=environment,
                 check=True,
             )
-        copy.keep_compiled()
         found = Record(**json.loads(out.read_text()))
         files = sorted({t.partition("::")[0] for t in found.seconds})
         command = [
@@ -579,7 +547,6 @@ def check_planted(words: str) -> int:
     wrong, count = 0, 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
-        copy.keep_compiled()
         server = Server(copy)
         for one in all_cases():
             if not any(word in f"{one.group}: {one.name}" for word in words.split(",")):

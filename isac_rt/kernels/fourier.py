@@ -11,8 +11,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import load, splat, store
 
 ROW = 32  # float32 numbers in a row
@@ -54,7 +54,7 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(radices, np.int64), np.concatenate(parts).view(np.float32), order
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@jit(inline=True)
 def _put(table, at, re, im, twiddles, t):
     """Store re + j im times a twiddle factor."""
     c, s = splat(twiddles[t]), splat(twiddles[t + 1])
@@ -62,7 +62,7 @@ def _put(table, at, re, im, twiddles, t):
     store(table, at + 16, re * s + im * c)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _two(table, at, step, twiddles, t):
     ar, ai, br, bi = (
         load(table, at),
@@ -75,7 +75,7 @@ def _two(table, at, step, twiddles, t):
     _put(table, at + step, ar - br, ai - bi, twiddles, t)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _three(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -88,7 +88,7 @@ def _three(table, at, step, twiddles, t):
     _put(table, at + 2 * step, mr + di, mi - dr, twiddles, t + 2)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _four(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -103,7 +103,7 @@ def _four(table, at, step, twiddles, t):
     _put(table, at + 3 * step, mr + ni, mi - nr, twiddles, t + 4)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _five(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -123,7 +123,7 @@ def _five(table, at, step, twiddles, t):
     _put(table, at + 3 * step, xr + yi, xi - yr, twiddles, t + 4)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def transform(table, first, size, radices, twiddles):
     """sum_g x_g exp(+j 2 pi g k/size) of the rows from float `first` of the flat `table`, in place,
     in the order of `plan`."""

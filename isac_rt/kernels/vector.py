@@ -13,13 +13,14 @@ from math import factorial
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 from numba.np.arrayobj import make_array
 
+from isac_rt.kernels.jit import FAST, jit
+
 LANES = 16
-_FLAGS = ("contract", "nnan", "ninf", "nsz")
 
 
 class _Vector(types.Type):
@@ -151,9 +152,9 @@ def _two(method):
     return both
 
 
-_add = _two(lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
-_sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
-_mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_add = _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST))
+_sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST))
+_mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST))
 zip_low = _two(
     lambda builder, a, b: builder.shuffle_vector(
         a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))
@@ -222,7 +223,7 @@ _COS = tuple(
 )
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@jit(inline=True)
 def cos_sin(cycles):
     """Cosine and sine of 2 pi `cycles` (float32, within [-0.55, 0.55]) by the series of half the
     angle; errors below 1.3e-6."""
@@ -248,7 +249,7 @@ _SINE = tuple((-1.0) ** i / factorial(2 * i + 1) for i in range(8))
 _COSINE = tuple((-1.0) ** i / factorial(2 * i) for i in range(8))
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@jit(inline=True)
 def cos_sin_exact(cycles):
     """Cosine and sine of 2 pi `cycles` (float64, within [-0.5, 0.5]) to 1e-10, as float32."""
     h = cycles * splat(np.pi)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy import ndimage, optimize, stats
 
+from isac_rt.kernels.jit import jit
 from isac_rt.scenario.receivers import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
@@ -229,7 +229,7 @@ def peaks(
     return rows[order], bins[order]
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _largest(power, rows, bins, along, across):  # pragma: no cover - compiled
     """Whether nothing within reach is larger, of each cell."""
     num_rows, num_bins = power.shape

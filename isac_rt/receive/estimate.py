@@ -17,10 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import arm
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -131,7 +131,7 @@ class LocalSpectra:
         return float(((out.real**2 + out.imag**2) * energy).sum())
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz"})
+@jit
 def _match(
     data, weight, tx, time, first, numbers, delay, delay_rate, out, energy
 ):  # pragma: no cover - compiled

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 
 from isac_rt.frame.waveform import Waveform, hann
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.known import Known
 
 UNION_FLOOR = 1e-5
@@ -137,7 +137,7 @@ class Conventional(LatinUnion):
         return above & own_bins(known.waveform)
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
     """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]."""
     for i in range(out.shape[1]):
@@ -149,7 +149,7 @@ def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
 
 # no fused products: which of two is fused the compiler may decide anew, and bits would differ
 # between processes
-@njit(nogil=True, cache=True)
+@jit
 def _add_both_bins(made, power):  # pragma: no cover - compiled
     """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
     num_chirps = power.shape[1]
@@ -162,7 +162,7 @@ def _add_both_bins(made, power):  # pragma: no cover - compiled
             line[num_chirps - k] += (ax[k] + by[k]) ** 2 + (ay[k] - bx[k]) ** 2
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _unite(flat, places, num_chirps, out):  # pragma: no cover - compiled
     """out[i, s] = flat[i P + places[s]]; unsigned, so that no index is checked for its sign."""
     for i in range(out.shape[0]):
@@ -195,7 +195,7 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
     return np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
 
 
-@njit(nogil=True, cache=True)
+@jit
 def add_power(power, values):  # pragma: no cover - compiled
     """power += |values|^2 of two matrices, float32 and complex64."""
     for i in range(power.shape[0]):

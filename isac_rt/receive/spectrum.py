@@ -17,9 +17,9 @@ count tau_D to the chirp's time.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from isac_rt.frame.cube import IFCube
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
 
@@ -41,7 +41,7 @@ def _factors(
     return out
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _fill_factors(symbols, starts, length, places, roots, out):  # pragma: no cover - compiled
     """Sines of sums made of few sines: `places` are those of the window, `roots` those of the
     transform."""
@@ -68,7 +68,7 @@ def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
     return out
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _fill_tones(start, step, out):  # pragma: no cover - compiled
     for p in range(out.shape[0]):
         for n in range(out.shape[1]):

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
-from numba import njit
 
 from isac_rt.kernels import fourier as lanefft
 from isac_rt.kernels.fourier import ROW
+from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, aligned, load, store, transpose, zip_high, zip_low
 
 
@@ -83,7 +83,7 @@ def transform_plain(
             out[r] *= turn
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@jit
 def _transform(
     samples, factor, turn, power, out, radices, twiddles, place, at, table, factors, turns, added
 ):  # pragma: no cover
@@ -114,7 +114,7 @@ def _transform(
                 power[first + lane, k] += added[k * LANES + lane]
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
     """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
     chirps are turned over at a time."""
@@ -128,7 +128,7 @@ def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
         transpose(table, n * LANES)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _multiply(table, factors):  # pragma: no cover - compiled
     for i in range(0, table.size, ROW):
         a, b, c, d = (
@@ -141,14 +141,14 @@ def _multiply(table, factors):  # pragma: no cover - compiled
         store(table, i + LANES, a * d + b * c)
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _add_power(table, place, added):  # pragma: no cover - compiled
     for k in range(place.size):
         a, b = load(table, place[k]), load(table, place[k] + LANES)
         store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
 
 
-@njit(nogil=True, error_model="numpy")
+@jit
 def _write(table, at, turns, first, count, out):  # pragma: no cover - compiled
     """out[i, first + l] = the cells, times g where there is one."""
     flat, width, spare = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)

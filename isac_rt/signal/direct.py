@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import (
     LANES,
     aligned,
@@ -19,9 +19,6 @@ from isac_rt.kernels.vector import (
     zip_low,
 )
 from isac_rt.signal.tones import Tones, sources
-
-FAST = {"contract", "nnan", "ninf", "nsz"}
-"""Freedoms of the compiler that do not depend on the vector width."""
 
 
 def numbers(waveform: Waveform) -> np.ndarray:
@@ -44,7 +41,7 @@ def numbers(waveform: Waveform) -> np.ndarray:
     )
 
 
-@njit(inline="always")
+@jit(inline=True)
 def chirp_terms(w, tau, rate, accel):
     """Start phase [cycles], frequency [cycles/sample] and quadratic term of a path about the middle
     sample.
@@ -61,7 +58,7 @@ def chirp_terms(w, tau, rate, accel):
     return phase - np.floor(phase), frequency, quadratic
 
 
-@njit(inline="always")
+@jit(inline=True)
 def passed(w, tau):
     """Gain of the IF filter for the centroid's delay `tau`."""
     beat = w[1] * tau
@@ -73,7 +70,7 @@ def passed(w, tau):
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _turn(out, at, cycles, amplitude):
     """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at
     + 16:]."""
@@ -83,7 +80,7 @@ def _turn(out, at, cycles, amplitude):
     store(out, at + 16, re * s + im * c)
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadratic):
     """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`: of
     each 16 samples real parts, then imaginary ones.
@@ -115,7 +112,7 @@ def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadrat
             store(sums, at + 16, (load(sums, at + 16) + pr * li + pi * lr) + (qr * mi + qi * mr))
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _flush(out, to, num_samples, sums, fresh):
     """Write the sums of one chirp to its samples, from out[to] on, or add them, and clear them."""
     zero = splat(np.float32(0))
@@ -137,7 +134,7 @@ def _flush(out, to, num_samples, sums, fresh):
         store(sums, at + 16, zero)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _direct(
     out,
     shape,

@@ -25,11 +25,11 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.fft
-from numba import njit
 
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.fourier import ROW, plan, transform
+from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import (
     LANES,
     aligned,
@@ -45,7 +45,7 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.direct import FAST, chirp_terms, numbers, passed
+from isac_rt.signal.direct import chirp_terms, numbers, passed
 from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
@@ -160,7 +160,7 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(*both, rcond=None)[0]
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _prepare(
     work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size
 ):
@@ -201,7 +201,7 @@ def _prepare(
     store(work, 64, narrow((tau - splat(view[1] * ts)) * splat(1 / (ts * half))))
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _gate(work, table, at, life, f, w, time, symbol):
     """Multiply the factors of 16 paths by the filter's gain, and by 0 when they are not alive."""
     for i in range(16):
@@ -212,7 +212,7 @@ def _gate(work, table, at, life, f, w, time, symbol):
         work[32 + i] *= gain
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _weigh(work, scratch, poly, taps, wideband, cubic):
     """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as
     they are."""
@@ -241,7 +241,7 @@ def _weigh(work, scratch, poly, taps, wideband, cubic):
             store(scratch, _STEP * j + 48, v3)
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _spread(grid, base, places, scratch, count, taps, steer, k):
     """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`."""
     for i in range(count):
@@ -256,7 +256,7 @@ def _spread(grid, base, places, scratch, count, taps, steer, k):
         k += 32
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+@jit(inline=True)
 def _centred(steer, work, i, k):
     """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary),
     theta and q."""
@@ -268,7 +268,7 @@ def _centred(steer, work, i, k):
     return pr * cosine + pi * sine, pi * cosine - pr * sine, theta, splat(work[48 + i])
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
@@ -289,7 +289,7 @@ def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, c
         k += 48
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same to the third order: strengths of 1, j x, x^2 - c and j (x^3 - 3/5 x)."""
     for i in range(count):
@@ -321,7 +321,7 @@ def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, cent
         k += 48
 
 
-@njit(nogil=True)
+@jit(fast=True)
 def _fold(grid, size, low, width):
     """Wrap the margins: row g + low is frequency g, taken modulo the size of the grid."""
     for i in range(0, low * ROW, 16):
@@ -330,7 +330,7 @@ def _fold(grid, size, low, width):
         store(grid, i, load(grid, i) + load(grid, size * ROW + i))
 
 
-@njit(nogil=True)
+@jit(fast=True)
 def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolution, tile, fresh):
     """Write the rows of the samples, divided by the kernel's response: channel r of sample n to
     out[at + r stride + 2 n]."""
@@ -361,7 +361,7 @@ def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolutio
                     out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
 
 
-@njit(nogil=True)
+@jit(fast=True)
 def _in_band(work, places, count, limit):
     """Strike out the paths from the frequency `limit` on; the number up to the last one that
     stays."""
@@ -374,7 +374,7 @@ def _in_band(work, places, count, limit):
     return last
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _chirps(
     out,
     shape,
@@ -536,7 +536,7 @@ def _chirps(
                 )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
     """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from
     the last element on."""

@@ -16,7 +16,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, uint32
+from numba import uint32
+
+from isac_rt.kernels.jit import jit
 
 
 class WhiteNoise(NamedTuple):
@@ -33,12 +35,6 @@ class WhiteNoise(NamedTuple):
 
 
 _PARITY = np.uint32(0x1BD11BDA)  # Threefish key-schedule constant, 32-bit variant
-_FAST = {
-    "contract",
-    "nnan",
-    "ninf",
-    "nsz",
-}  # no reassociation: the result does not depend on the vector width
 _LN2 = np.float32(np.log(2.0))
 _TURN = np.float32(2 * np.pi)
 _UNIT = np.float32(2.0**-32)
@@ -50,7 +46,7 @@ _SIN = tuple(np.float32(c) for c in (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
 _COS = tuple(np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
 
 
-@njit(inline="always")
+@jit(inline=True)
 def _mix(a, b, r):
     """One Threefry round: add, rotate, exclusive or (all modulo 2^32)."""
     a = uint32(a + b)
@@ -58,7 +54,7 @@ def _mix(a, b, r):
     return a, uint32(b ^ a)
 
 
-@njit(inline="always")
+@jit(inline=True)
 def _four_rounds(a, b, even):
     """Rounds with the rotations 13, 15, 26, 6 (even groups of four) or 17, 29, 16, 24 (odd
     groups)."""
@@ -73,7 +69,7 @@ def _four_rounds(a, b, even):
     return _mix(a, b, 24)
 
 
-@njit(inline="always")
+@jit(inline=True)
 def _threefry(counter0, counter1, key0, key1):
     """Two random words of a two-word counter under a two-word key (20 rounds)."""
     key2 = uint32(uint32(key0 ^ key1) ^ _PARITY)
@@ -90,7 +86,7 @@ def _threefry(counter0, counter1, key0, key1):
     return uint32(a + key2), uint32(b + uint32(key0 + uint32(5)))
 
 
-@njit(inline="always")
+@jit(inline=True)
 def _minus_log(word):
     """-ln of the uniform (word + 1/2) / 2^32, float32; at most 22.9 (an amplitude of 6.8 sigma)."""
     u = np.float32(word) * _UNIT + _HALF * _UNIT
@@ -103,7 +99,7 @@ def _minus_log(word):
     return -(np.float32(exponent) * _LN2 + log)
 
 
-@njit(inline="always")
+@jit(inline=True)
 def _cos_sin(word):
     """Cosine and sine of 2 pi word / 2^32, float32."""
     cycles = np.float32(np.int32(word)) * _UNIT
@@ -122,7 +118,7 @@ def _cos_sin(word):
     return cosine, sine
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@jit(fast=True)
 def add_stream(out, power, key0, key1, first):
     """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1])."""
     for i in range(out.shape[0] // 2):
@@ -134,7 +130,7 @@ def add_stream(out, power, key0, key1, first):
         out[2 * i + 1] += r * s
 
 
-@njit(cache=True)
+@jit
 def _words(counters, keys):
     """Threefry-2x32-20 of (n, 2) counters and (n, 2) keys, for the known-answer test."""
     out = np.empty_like(counters)

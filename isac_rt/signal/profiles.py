@@ -28,12 +28,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-from numba import njit
 
 from isac_rt.frame.waveform import hann
 from isac_rt.kernels.fourier import ROW, plan, transform
+from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, aligned, load, splat, store, stream, transpose
-from isac_rt.signal.direct import FAST
 from isac_rt.signal.noise import WhiteNoise, add_stream
 
 PAD = 32
@@ -105,7 +104,7 @@ def no_band() -> Band:
     )
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def to_cells(grid, low, rows, deconvolution, band, first, slot):
     """Window, noise and transform of the chirp in `grid` (rows `rows` after `low`), to place `slot`
     of the stage.
@@ -139,7 +138,7 @@ def to_cells(grid, low, rows, deconvolution, band, first, slot):
         store(stage, to + 16, re * s + im * c)
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@jit(fast=True)
 def write_cells(out, at, stride, channels, count, num_chirps, cells, stage, tile):
     """Write `count` staged chirps: cell k of channel r to out[at + r stride + 2 k num_chirps];
     `out` begins at a multiple of 64 bytes."""

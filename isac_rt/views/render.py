@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_bytes
 from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
@@ -73,7 +73,7 @@ def view_from(
     return View(np.stack([right, np.cross(right, away), away]), centre, half)
 
 
-@numba.njit(cache=True)
+@jit
 def _rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
     """Depth buffer of triangles (F, 3, 3) in pixels and metres of depth; a pixel belongs to a
     triangle if its middle does."""

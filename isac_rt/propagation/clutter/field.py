@@ -36,10 +36,10 @@ from math import comb
 from typing import NamedTuple
 
 import mitsuba as mi
-import numba
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Cells, Density, cut
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Shadows, Sight
 from isac_rt.propagation.legs.bodies import Bodies
@@ -272,7 +272,7 @@ def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
     return total / 2.0**alpha
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@jit
 def _advance(surfaces, points, face, area, share, scale, start, end, own, rows):
     """Fill all `rows` but `cell`; they are independent. `start`, `end`: position, velocity,
     acceleration; `own`: both are one body, and `arrival` is `departure`."""
@@ -306,7 +306,7 @@ def _advance(surfaces, points, face, area, share, scale, start, end, own, rows):
         magnitude[row] = scale * share[i] * np.sqrt(power) / (r1 * r2)
 
 
-@numba.njit(inline="always", error_model="numpy")
+@jit(inline=True)
 def scattered_power(surfaces, face, area, into, back, between, part):
     """Of the power density at a cell, what it scatters into a direction, per steradian: the
     effective-roughness integrand without its distances.
@@ -334,7 +334,7 @@ def scattered_power(surfaces, face, area, into, back, between, part):
     return power
 
 
-@numba.njit(inline="always", error_model="numpy")
+@jit(inline=True)
 def leg_to(px, py, pz, body):
     """Distance from a moving body to a point, its rate and acceleration, and the unit vector
     towards the point."""

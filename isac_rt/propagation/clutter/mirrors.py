@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.sight import LIFT, Flight, Shadows
 from isac_rt.propagation.legs.geometry import plane_of_each_face
@@ -157,7 +157,7 @@ def shown(
     return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _on_the_wall(points, place, normal, offset, corners):
     """Points on the viewer's side of a mirror whose way to it meets one of its triangles, and
     where."""
@@ -187,7 +187,7 @@ def _on_the_wall(points, place, normal, offset, corners):
     return np.array(which, np.int32), np.array(where).reshape(-1, 3)
 
 
-@numba.njit(inline="always")
+@jit(inline=True)
 def _inside(x, y, z, corners, normal):
     """Whether a point of the plane is in a triangle, whichever way round its corners go; seams
     belong to both sides."""

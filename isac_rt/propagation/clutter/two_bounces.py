@@ -25,10 +25,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.field import ClutterField, Rows, Seen, leg_to, scattered_power
 from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
 from isac_rt.propagation.legs.bodies import Bodies
@@ -225,7 +225,7 @@ class TwoBounces:
         )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@jit
 def _lay_out(points, normal, start, end, before, rows):
     """Geometry of ways over scatterers from `start` to `end` (position, velocity, acceleration),
     one of them an image behind the mirror; directions are those at the terminals themselves."""
@@ -246,24 +246,24 @@ def _lay_out(points, normal, start, end, before, rows):
         arrival[row, 0], arrival[row, 1], arrival[row, 2] = x2, y2, z2
 
 
-@numba.njit(inline="always")
+@jit(inline=True)
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(inline="always")
+@jit(inline=True)
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(inline="always")
+@jit(inline=True)
 def _turned(u, n):
     """A direction after a mirror of normal n."""
     k = 2 * _dot(u, n)
     return u[0] - k * n[0], u[1] - k * n[1], u[2] - k * n[2]
 
 
-@numba.njit(inline="always", error_model="numpy")
+@jit(inline=True)
 def _upright(u):
     """The spherical unit vector theta of a direction: the field of a vertically polarised isotropic
     element."""
@@ -272,7 +272,7 @@ def _upright(u):
     return u[2] * x, u[2] * y, -flat
 
 
-@numba.njit(inline="always", error_model="numpy")
+@jit(inline=True)
 def _mirrored(u, out, n, te, tm):
     """Field (three complex parts) along `out` after a mirror of normal n, of a wave along u with
     the upright field."""
@@ -291,7 +291,7 @@ def _mirrored(u, out, n, te, tm):
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@jit
 def _weigh(surfaces, face, area, share, scale, normal, slab, before, rows, gain):
     """Complex gains of ways over scatterers; the scatterers' own amplitudes left out."""
     normals, departure, arrival = surfaces.normals, rows.departure, rows.arrival

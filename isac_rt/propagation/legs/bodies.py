@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
 from isac_rt.scenario.swarm import Uav
 from isac_rt.world.swarm import Pose
@@ -101,7 +101,7 @@ class Bodies:
                 out[path] *= tapered(disc(nu, size), nu - size)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _near(starts, ends, before, total, place, radius, wavelength, reach):
     """Paths whose straight part passes the body within its shadow's reach, the distance of its
     centre, and that along the path."""

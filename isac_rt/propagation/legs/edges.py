@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
 from isac_rt.world.city.mesh import CityMesh
@@ -126,7 +126,7 @@ class ShadowEdges:
         return Bends(nu, points)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _near(start, span, wings, source, sink, reach):
     """Of silhouette edges: detours [m] (of at most `reach`, shortest first), points on the edges,
     directions away from what they bound."""

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numba import njit
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.known import Known
@@ -204,7 +204,7 @@ def expected_power(
     return out
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _accumulate(grid, line, column, power, steer):  # pragma: no cover - compiled
     """grid[line, column] += power * (lower triangle of a a^H, row by row)."""
     size = steer.shape[1]

@@ -20,13 +20,13 @@ from typing import Literal
 
 import numpy as np
 import scipy.fft
-from numba import njit
 
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.randomness import generator
@@ -469,7 +469,7 @@ def correlations(
             yield found.reshape(*group.shape[:2], num_chirps)
 
 
-@njit(nogil=True, cache=True)
+@jit
 def _add_strongest(total, found):  # pragma: no cover - compiled
     """Of every vector of (L_rx, rows, P) the strongest power onto its place in `total`."""
     for one in found:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from isac_rt.kernels.jit import jit
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 
 PLANE_TOLERANCE = 1e-6
@@ -165,7 +165,7 @@ def _read_only(array: NDArray) -> NDArray:
     return array
 
 
-@numba.njit(cache=True)
+@jit
 def _group_planes(
     corners: NDArray, normals: NDArray, offsets: NDArray, tolerance: float
 ) -> NDArray:

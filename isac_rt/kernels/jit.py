@@ -1,0 +1,120 @@
+"""The decorator of every compiled function, and where their machine code is kept.
+
+Machine code holds that of the functions which are called and the constants which are named, from
+whatever module they come. It is therefore kept in a folder whose name is a digest of the source of
+every module that defines compiled functions, and of those that these import constants from: changed
+source never finds old code. The folder stands in the one that the variable `CACHE` of the
+environment names, else NUMBA_CACHE_DIR, else the user's cache. Where it cannot be written, every
+process compiles for itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numba
+from numba.core import caching
+
+CACHE = "ISAC_RT_CACHE"
+"""Variable of the environment: folder of the machine code."""
+KEPT = 8
+"""Digests whose machine code is kept, the last used."""
+FAST = ("contract", "nnan", "ninf", "nsz")
+"""Freedoms of the compiler that do not depend on the vector width."""
+_COMPILES = re.compile(rb"^(from|import) (numba|isac_rt\.kernels\.jit)\b", re.MULTILINE)
+_IMPORT = re.compile(rb"^from isac_rt\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
+_CONSTANT = re.compile(rb"\b_?[A-Z][A-Z0-9_]+\b")
+
+
+def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = False) -> Any:
+    """Compile a function: it runs without the interpreter's lock and divides by zero as numpy does.
+
+    Parameters
+    ----------
+    fast : products and sums are fused; NaN, infinities and the sign of zero are not minded
+    inline : a part of the functions that call it, whose freedom it shares
+    """
+    if function is None:
+        return partial(jit, fast=fast, inline=inline)
+    made = numba.njit(
+        nogil=True,
+        error_model="numpy",
+        fastmath=set(FAST) if fast else False,
+        inline="always" if inline else "never",
+    )(function)
+    if not inline and cache_folder() is not None:
+        made._cache = _Cache(function)
+    return made
+
+
+@lru_cache(maxsize=1)
+def digest() -> str:
+    """Of the source of all that the machine code of the package depends on."""
+    root = Path(__file__).parents[1]
+    sources = {path: path.read_bytes() for path in root.rglob("*.py")}
+    chosen = [path for path, text in sources.items() if _COMPILES.search(text)]
+    for path in chosen:  # grows while it is read
+        for module, names in _IMPORT.findall(sources[path]):
+            source = root.joinpath(*module.decode().split(".")).with_suffix(".py")
+            if _CONSTANT.search(names) and source in sources and source not in chosen:
+                chosen.append(source)
+    found = hashlib.sha256()
+    for path in sorted(chosen):
+        found.update(f"{path.relative_to(root)}:{len(sources[path])}:".encode() + sources[path])
+    return found.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def cache_folder() -> Path | None:
+    """Folder of this source's machine code, made if need be; None where none can be written.
+
+    Those of other sources are removed but for the last used.
+    """
+    named = os.environ.get(CACHE) or os.environ.get("NUMBA_CACHE_DIR")
+    try:
+        user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "isac_rt"
+        folder = (Path(named) if named else user) / f"kernels-{digest()}"
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()  # which also says that it was used today
+        others = sorted(folder.parent.glob("kernels-*"), key=lambda f: f.stat().st_mtime)
+    except (OSError, RuntimeError):
+        return None
+    for old in others[:-KEPT]:
+        shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+class _Locator(caching._CacheLocator):
+    """Says where numba keeps a function's machine code."""
+
+    def __init__(self, function: Callable) -> None:
+        self._function = function
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        return digest()
+
+    def get_disambiguator(self) -> str:
+        return f"{self._function.__module__}-{self._function.__code__.co_firstlineno}"
+
+    @classmethod
+    def from_function(cls, py_func: Callable, py_file: str) -> _Locator:
+        return cls(py_func)
+
+
+class _Implementation(caching.CompileResultCacheImpl):
+    _locator_classes: ClassVar = [_Locator]
+
+
+class _Cache(caching.Cache):
+    _impl_class = _Implementation

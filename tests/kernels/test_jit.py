@@ -1,0 +1,120 @@
+"""Compiled functions: the machine code that is kept is that of the source as it is."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "isac_rt"
+INNER = """from isac_rt.kernels.jit import jit
+
+@jit
+def inner(x):
+    return x + 1000
+"""
+OUTER = """from isac_rt.kernels.inner import inner
+from isac_rt.kernels.jit import jit
+from isac_rt.randomness import SHIFT
+
+@jit
+def outer(x):
+    return inner(x) + SHIFT
+"""
+RUN = "from isac_rt.kernels.outer import outer; print(outer(1), len(outer.stats.cache_hits))"
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy of the package with two small kernels of its own in it."""
+    shutil.copytree(PACKAGE, tmp_path / "isac_rt", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "isac_rt/kernels/outer.py").write_text(OUTER)
+    (tmp_path / "isac_rt/kernels/inner.py").write_text(INNER)
+    constants = tmp_path / "isac_rt/randomness.py"
+    constants.write_text(constants.read_text() + "\nSHIFT = 20000\n")
+    return tmp_path
+
+
+def run(folder: Path, code: str = RUN, **environment: str) -> list[str]:
+    """What a process says that runs the copy."""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ
+        | {"PYTHONPATH": str(folder), "ISAC_RT_CACHE": str(folder / "cache")}
+        | {"PYTHONDONTWRITEBYTECODE": "1"}
+        | environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.split()
+
+
+def change(file: Path, old: str, new: str) -> None:
+    """Another line of the same length at the same time: nothing but the text tells."""
+    when = file.stat()
+    assert len(old) == len(new) and file.read_text().count(old) == 1
+    file.write_text(file.read_text().replace(old, new))
+    os.utime(file, ns=(when.st_atime_ns, when.st_mtime_ns))
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "answer"),
+    [
+        ("kernels/outer.py", "inner(x) + SHIFT", "inner(x) - SHIFT", "-18999"),
+        ("kernels/inner.py", "x + 1000", "x + 4000", "24001"),
+        ("randomness.py", "SHIFT = 20000", "SHIFT = 70000", "71001"),
+    ],
+)
+def test_a_changed_line_runs(copy, file, old, new, answer):
+    """In the function itself, in one that it calls and in a constant from another module. Planted
+    bug: `digest` of kernels/jit.py alone (the called function's and the constant's old values
+    answer)."""
+    assert run(copy) == ["21001", "0"]
+    assert run(copy) == ["21001", "1"]
+    change(copy / "isac_rt" / file, old, new)
+    assert run(copy) == [answer, "0"]
+    change(copy / "isac_rt" / file, new, old)
+    assert run(copy) == ["21001", "1"]
+
+
+@pytest.mark.parametrize("file", ["signal/noise.py", "kernels/vector.py", "receive/maps.py"])
+def test_every_kernel_counts(copy, file):
+    """A line of any kernel changes the folder; one of a module without kernels does not."""
+    code = "from isac_rt.kernels.jit import cache_folder; print(cache_folder().name)"
+    first = run(copy, code)
+    (copy / "isac_rt/views/report.py").write_text("")
+    assert run(copy, code) == first
+    with (copy / "isac_rt" / file).open("a") as source:
+        source.write("\n")
+    assert run(copy, code) != first
+
+
+def test_where_nothing_can_be_written_every_process_compiles(copy):
+    (copy / "file").write_text("")
+    assert run(copy, ISAC_RT_CACHE=str(copy / "file")) == ["21001", "0"]
+
+
+def test_old_machine_code_goes(copy):
+    """Of twelve sources the eight last used stay."""
+    for number in range(11):
+        old = copy / f"cache/kernels-{number:02}"
+        old.mkdir(parents=True)
+        os.utime(old, (number, number))
+    run(copy)
+    left = sorted(f.name for f in (copy / "cache").iterdir())
+    assert len(left) == 8 and "kernels-03" not in left and "kernels-04" in left
+
+
+def test_two_processes_compile_at_once(copy):
+    code = f"{RUN}; from isac_rt.kernels.inner import inner; inner(1.5)"
+    environment = os.environ | {"PYTHONPATH": str(copy), "ISAC_RT_CACHE": str(copy / "cache")}
+    settings = {"env": environment, "cwd": copy, "stdout": subprocess.PIPE, "text": True}
+    both = [subprocess.Popen([sys.executable, "-c", code], **settings) for _ in range(2)]
+    assert [p.communicate()[0].split()[0] for p in both] == ["21001"] * 2
+    assert run(copy) == ["21001", "1"]
