@@ -9,6 +9,14 @@ from pydantic import Field
 
 from isac_rt.scenario.node import Node, Positive, Problem
 
+COUNTS_WITH = {
+    "velocity_method": ("clutter_detector", ("cfar",)),
+    "clutter_channels": ("clutter_detector", ("angle_doppler", "sample_matrix")),
+    "clutter_run_cells": ("clutter_filter", ("runs",)),
+    "cluster_cells": ("velocity_method", ("auto", "omp", "latin_union", "conventional")),
+}
+"""Keys of `receivers` that play a part only with some values of another key."""
+
 
 class Receivers(Node):
     """How terminals detect targets and decode data."""
@@ -81,6 +89,25 @@ class Receivers(Node):
                 (("active_input",), ("refinement",)),
                 "joint refinement needs samples; set active_input: samples or another one",
             )
+        if self.refinement == "grid" and self.velocity_method == "pursuit":
+            yield Problem(
+                (("refinement",), ("velocity_method",)),
+                "has no meaning with velocity_method pursuit, which finds paths off the grid; set "
+                "refinement to local or joint, or change velocity_method",
+            )
+        for key, (other, values) in COUNTS_WITH.items():
+            value, default = getattr(self, key), type(self).model_fields[key].default
+            if value != default and getattr(self, other) not in values:
+                yield Problem(
+                    ((key,), (other,)),
+                    f"has no meaning with {other} {getattr(self, other)}, only with "
+                    f"{' or '.join(values)}; leave it out, or change {other}",
+                )
+
+    @property
+    def needs_mesh(self) -> bool:
+        """Whether the detector predicts clutter from a city's mesh."""
+        return self.clutter_detector in ("map", "angle_doppler")
 
 
 class Tracking(Node):

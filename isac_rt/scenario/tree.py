@@ -297,7 +297,7 @@ class Scenario(Node):
                 "from; "
                 "add them or set clutter.model to none",
             )
-        if self.receivers.clutter_detector in ("map", "angle_doppler") and (
+        if self.receivers.needs_mesh and (
             self.propagation.model != "ray_traced" or self.city is None
         ):
             yield Problem(

@@ -353,15 +353,9 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         timetable,
         Connections(),
         plan,
-        make_expectation(
-            scenario.receivers.clutter_detector,
-            scenario.clutter,
-            swarm,
-            city,
-            waveform,
-            antennas,
-            scenario.seed,
-        ),
+        make_expectation(scenario.clutter, swarm, city, waveform, antennas, scenario.seed)
+        if scenario.receivers.needs_mesh
+        else None,
     )
     return replace(_connected(setup), seconds=time.perf_counter() - begin)
 

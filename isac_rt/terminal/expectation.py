@@ -134,10 +134,6 @@ class MeshExpectation:
         )
 
 
-MESH_DETECTORS = ("map", "angle_doppler")
-"""Values of `receivers.clutter_detector` that predict clutter from the mesh."""
-
-
 class ClutterExpectation(Protocol):
     """What simulate needs of a terminal's copy of the mesh."""
 
@@ -148,17 +144,14 @@ class ClutterExpectation(Protocol):
 
 
 def make_expectation(
-    detector: str,
     clutter: Clutter,
     swarm: Swarm,
     city: CityMesh,
     waveform: Waveform,
     antennas: Antennas,
     seed: int,
-) -> ClutterExpectation | None:
-    """The receivers' copy of the mesh where their detector needs one; starts the JIT back end."""
-    if detector not in MESH_DETECTORS:
-        return None
+) -> ClutterExpectation:
+    """The receivers' copy of the mesh; starts the JIT back end."""
     from isac_rt import runtime
 
     runtime.activate()

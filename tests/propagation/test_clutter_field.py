@@ -417,7 +417,7 @@ def expectation(city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s)
     swarm, antennas = swarm_of(s), antennas_of(s, w)
-    copy = make_expectation("map", s.clutter, swarm, city, w, antennas, s.seed)
+    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
     return copy, swarm.poses(0.0)["A"]
 
 

@@ -549,7 +549,7 @@ def test_what_a_terminal_expects_of_mirrors():
     antennas, city = antennas_of(s, w), joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
     model = propagation_in(city, s)
     swarm = swarm_of(s)
-    copy = make_expectation("map", s.clutter, swarm, city, w, antennas, s.seed)
+    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
     pose = swarm.poses(0.0)["A"]
     parts = copy._two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
     once = len(copy._field.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)

@@ -119,6 +119,29 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
             "receivers.guard_cells = [1]: has too few numbers",
         ),
         (
+            BASE + "receivers: {velocity_method: omp, clutter_detector: sample_matrix}\n",
+            "receivers.velocity_method = omp: has no meaning with clutter_detector sample_matrix, "
+            "only with cfar; leave it out, or change clutter_detector",
+        ),
+        (
+            BASE + "receivers: {velocity_method: pursuit, refinement: grid}\n",
+            "receivers.refinement = grid: has no meaning with velocity_method pursuit",
+        ),
+        (
+            BASE + "receivers: {velocity_method: pursuit, cluster_cells: [2, 2]}\n",
+            "receivers.cluster_cells = [2, 2]: has no meaning with velocity_method pursuit, only "
+            "with auto or omp or latin_union or conventional",
+        ),
+        (
+            BASE + "receivers: {clutter_channels: joint}\n",
+            "receivers.clutter_channels = joint: has no meaning with clutter_detector cfar, only "
+            "with angle_doppler or sample_matrix",
+        ),
+        (
+            BASE + "receivers: {clutter_filter: zero_doppler, clutter_run_cells: 20}\n",
+            "receivers.clutter_run_cells = 20: has no meaning with clutter_filter zero_doppler",
+        ),
+        (
             BASE + "tracking: {confirm_hits: 6}\n",
             "tracking.confirm_hits = 6: 6 hits cannot be reached within confirm_window = 5",
         ),
