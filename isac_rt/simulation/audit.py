@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
@@ -37,7 +37,7 @@ from isac_rt.simulation.plan import (
     missed_chains,
     standing,
 )
-from isac_rt.simulation.setup import Setup
+from isac_rt.simulation.setup import Frame, Setup
 from isac_rt.simulation.simulate import stage_seconds
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
@@ -62,20 +62,21 @@ class Item:
 
     Attributes
     ----------
-    link : "TX->RX", or "all"
+    what : is modelled
     modelled, left_out : in words
     estimate : of the error, None where there is none
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative",
         "chains/frame" or "of the power radiated"
+    link : "TX->RX", or "all"
     seconds : per frame, None where it has no time of its own
     """
 
     what: str
-    link: str
     modelled: str
-    left_out: str
-    estimate: float | None
-    unit: str
+    left_out: str = "nothing"
+    estimate: float | None = None
+    unit: str = ""
+    link: str = "all"
     seconds: float | None = None
 
 
@@ -107,10 +108,8 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     plan, tracer = setup.plan, tracer_of(setup)
     frames = _spread(plan.traced_frames, PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
-    trace, phases = (
-        [],
-        {"directions that turn within the frame": 0.0, "motion during the flight of light": 0.0},
-    )
+    trace: list[float] = []
+    phases: dict[str, float] = {}
     for frame in frames:
         begin = time.perf_counter()
         poses, found = setup.find(frame)
@@ -119,21 +118,20 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         last = setup.frame_of(frame, poses, found)
         for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
-            for what, value in standing(
-                found[link].select(found[link].power > 0), setup.antennas, setup.waveform, fastest
-            ).items():
-                phases[what] = max(phases[what], value)
+            paths = found[link].select(found[link].power > 0)
+            for what, value in standing(paths, setup.antennas, setup.waveform, fastest).items():
+                phases[what] = max(phases.get(what, 0.0), value)
     stages = stage_seconds(last, setup, receive)
     advance, missed = _advance(setup)
     share = len(plan.traced_frames) / plan.timetable.frames
-    traced = float(np.median(trace))
-    items = [_tracing_item(setup, share, missed, traced * share + advance * (1 - share))]
+    tracing = float(np.median(trace)) * share + advance * (1 - share)
+    items = [_tracing_item(setup, share, missed, tracing)]
     items += _scene_items(setup)
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link, stages.get(link))
-    items += [Item(what, "all", "no", "always", value, "rad") for what, value in phases.items()]
+    items += [Item(what, "no", "always", value, "rad") for what, value in phases.items()]
     seconds = {
-        "trace": traced * share + advance * (1 - share),
+        "trace": tracing,
         "synthesis": sum(s["synthesis"] for s in stages.values()),
     }
     if receive:
@@ -178,42 +176,29 @@ def missed_per_frame(between: Any) -> float:
 
 def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> Item:
     if tracer_of(setup) is None:
-        return Item("propagation", "all", "closed forms", "the city", None, "", seconds)
+        return Item("propagation", "closed forms", "the city", seconds=seconds)
     number = len(setup.plan.traced_frames)
     if share == 1:
-        return Item("tracing", "all", f"all {number} frames", "nothing", None, "", seconds)
-    said = f"{number} of {setup.scenario.frames} frames traced, unfolded in between"
-    return Item(
-        "tracing",
-        "all",
-        said,
-        "chains that live between two traces",
-        missed,
-        "chains/frame",
-        seconds,
-    )
+        return Item("tracing", f"all {number} frames", seconds=seconds)
+    said = f"{number} of {setup.timetable.frames} frames traced, unfolded in between"
+    left = "chains that live between two traces"
+    return Item("tracing", said, left, missed, "chains/frame", seconds=seconds)
 
 
 def _scene_items(setup: Setup) -> list[Item]:
     """Lines of the mesh and of its scatterers, with the reason for each count."""
     out, record = [], extent(setup.city, setup.propagation.census(), setup.scenario.clutter)
-    if record["city_faces"] + record["city_faces_beyond_reach"]:
-        gone = record["city_faces_beyond_reach"]
+    faces, gone = record["city_faces"], record["city_faces_beyond_reach"]
+    if faces + gone:
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
-        why = (
-            "nothing"
-            if whole
-            else f"{gone} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
-        )
-        out.append(Item("mesh", "all", f"{record['city_faces']} faces", why, None, ""))
-    if record["scatterers"] is not None:
-        hidden = record["scatterer_cells"] - record["scatterers"]
-        said = (
-            f"{record['scatterers']} scatterers, one for {record['cell_area_per_metre_m']:.3g} "
-            "m2 and metre from the flights"
-        )
-        why, error = f"{hidden} cells that no transmitter sees", record["clutter_error_db"]
-        out.append(Item("clutter field", "all", said, why, error, "dB of a cell's mean"))
+        why = f"{gone} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
+        out.append(Item("mesh", f"{faces} faces", "nothing" if whole else why))
+    if (count := record["scatterers"]) is not None:
+        hidden = record["scatterer_cells"] - count
+        density = f"{record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
+        said, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
+        error = record["clutter_error_db"]
+        out.append(Item("clutter field", said, f"{hidden} {why}", error, "dB of a cell's mean"))
         out.append(_mirrors_item(record["mirrors"]))
     return out
 
@@ -221,15 +206,9 @@ def _scene_items(setup: Setup) -> list[Item]:
 def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
     """The line of two-bounce clutter: mirrors by terminal, and what the mirrors left out would have
     sent on."""
+    what = "clutter by mirrors"
     if record is None:
-        return Item(
-            "clutter by mirrors",
-            "all",
-            "none: one bounce",
-            "two bounces; clutter.mirrors adds them",
-            None,
-            "",
-        )
+        return Item(what, "none: one bounce", "two bounces; clutter.mirrors adds them")
     counts = ", ".join(f"{row['count']} of {name}" for name, row in record.items())
     shares = [100 * row["share"] for row in record.values()]
     kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
@@ -238,21 +217,14 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
         "radiates"
     )
     rest = max(row["share_left_out"] for row in record.values())
-    return Item(
-        "clutter by mirrors",
-        "all",
-        said,
-        "weaker mirrors, more than one on a way",
-        rest,
-        "of the power radiated",
-    )
+    return Item(what, said, "weaker mirrors, more than one on a way", rest, "of the power radiated")
 
 
 def _link_items(
     setup: Setup, link: Link, uses: list[Use], stages: dict[str, float] | None
 ) -> list[Item]:
     """Lines of one link."""
-    name, share = "->".join(link), setup.plan.phase_share
+    name, at, share = str(link), stages or {}, setup.plan.phase_share
     mean = {
         key: float(np.mean([getattr(use, key) for use in uses]))
         for key in ("found", "unheard", "weak", "plane", "straight")
@@ -261,79 +233,59 @@ def _link_items(
     kept = ", ".join(
         f"{np.mean([use.kept.get(k, 0) for use in uses]):.3g} {k.replace('_', ' ')}" for k in kinds
     )
+    said = f"{kept or 'none'}; up to {max(use.bounces for use in uses)} bounces"
+    gone = f"{mean['weak']:.3g} too weak, {mean['unheard']:.3g} out of reach"
+    left = decibels(min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest))
     num_kept = max(mean["found"] - mean["unheard"] - mean["weak"], 1.0)
-    left = min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest)
-    depth = max(use.bounces for use in uses)
-    at = stages or {}
+
+    def phase(errors: Iterable[float]) -> float:
+        return float(min(PHASE_MARGIN * max(errors), share))
+
+    plane, straight = mean["plane"], mean["straight"]
     method = setup.plan.synthesis(int(num_kept))
     error = 1e-6 if isinstance(method, Direct) else setup.plan.synthesis_error
-    return [
-        Item(
-            "paths",
-            name,
-            f"{kept or 'none'}; up to {depth} bounces",
-            f"{mean['weak']:.3g} too weak, {mean['unheard']:.3g} out of reach",
-            decibels(left),
-            "dB",
-        ),
+    seconds = at.get("synthesis")
+    out = [
+        Item("paths", said, gone, left, "dB", name),
         Item(
             "wavefronts",
-            name,
-            f"{num_kept - mean['plane']:.3g} spherical",
-            f"{mean['plane']:.3g} taken as plane",
-            _phase(uses, "plane_error", share),
+            f"{num_kept - plane:.3g} spherical",
+            f"{plane:.3g} taken as plane",
+            phase(use.plane_error for use in uses),
             "rad",
+            name,
         ),
         Item(
             "flight in a frame",
-            name,
-            f"{num_kept - mean['straight']:.3g} accelerated",
-            f"{mean['straight']:.3g} taken as straight",
-            _phase(uses, "straight_error", share),
+            f"{num_kept - straight:.3g} accelerated",
+            f"{straight:.3g} taken as straight",
+            phase(use.straight_error for use in uses),
             "rad",
-        ),
-        Item(
-            "synthesis",
             name,
-            method.name,
-            "rounding of the grid",
-            error,
-            "relative",
-            at.get("synthesis"),
         ),
-    ] + (
-        [Item("reception", name, "all", "nothing", None, "", at["receive"])]
-        if "receive" in at
-        else []
-    )
-
-
-def _phase(uses: list[Use], name: str, share: float) -> float:
-    return float(min(PHASE_MARGIN * max(getattr(use, name) for use in uses), share))
+        Item("synthesis", method.name, "rounding of the grid", error, "relative", name, seconds),
+    ]
+    if "receive" in at:
+        out.append(Item("reception", "all", link=name, seconds=at["receive"]))
+    return out
 
 
 def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
     """The true errors on frames drawn at random, link by link: the largest of them beside the
     largest bound of the same frames."""
-    rng = generator(setup.scenario.seed, "budget check")
-    chosen = sorted(
-        rng.choice(
-            setup.scenario.frames, min(frames, setup.scenario.frames), replace=False
-        ).tolist()
-    )
+    rng, count = generator(setup.scenario.seed, "budget check"), setup.timetable.frames
+    chosen = sorted(rng.choice(count, min(frames, count), replace=False).tolist())
     tracer = tracer_of(setup)
-    out: dict[str, dict[str, Any]] = {}
-    for frame in chosen:
-        poses, used = setup.find(frame)
-        truth = (
-            used
-            if tracer is None or tracer.between is None
-            else _in_full(setup, frame, poses, list(used))
-        )
-        for link, paths in used.items():
-            row = _errors(setup, frame, poses, link, paths, truth[link])
-            into = out.setdefault("->".join(link), {})
-            for key, value in row.items():
+    out: dict[str, dict[str, float]] = {}
+    for number in chosen:
+        poses, found = setup.find(number)
+        frame, truth = setup.frame_of(number, poses, found), found
+        if tracer is not None and tracer.between is not None:
+            epoch = setup.timetable.epoch(number)
+            truth = tracer.every_frame().trace(poses, epoch, list(found)).paths
+        for link in found:
+            into = out.setdefault(str(link), {})
+            for key, value in _errors(setup, frame, link, found[link], truth[link]).items():
                 into[key] = max(into.get(key, 0.0), value)
     return {"frames": chosen, "links": {name: _in_decibels(row) for name, row in out.items()}}
 
@@ -346,38 +298,29 @@ def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
     }
 
 
-def _in_full(
-    setup: Setup, frame: int, poses: dict[str, Pose], links: list[Link]
-) -> dict[Link, PathSet]:
-    tracer = tracer_of(setup)
-    assert tracer is not None
-    return tracer.every_frame().trace(poses, setup.timetable.epoch(frame), links).paths
-
-
 def _errors(
-    setup: Setup, frame: int, poses: dict[str, Pose], link: Link, found: PathSet, full: PathSet
+    setup: Setup, frame: Frame, link: Link, found: PathSet, full: PathSet
 ) -> dict[str, float]:
     """True errors of one link and frame; powers are over the noise of a cell."""
-    plan, w = setup.plan, setup.waveform
-    level = setup.noise_power(poses, link)
-    kept, use = plan.apply(found, level)
+    plan, level = setup.plan, frame.noise_power(link)
+    kept, use = frame.paths[link], frame.uses[link]
     ratio = plan.cell_noise_gain() / level
     heard, weak, _ = plan.chosen(found, level)
     missed = ~present(full, found) & (full.delay <= plan.longest_delay)
-    cell = np.floor(np.append(found.delay[weak], full.delay[missed]) / w.delay_step).astype(int)
+    delay = np.append(found.delay[weak], full.delay[missed])
+    cell = np.floor(delay / setup.waveform.delay_step).astype(int)
     power = np.append(found.power[weak], full.power[missed]) * ratio
     lost = np.bincount(cell - cell.min(), power) if cell.size else np.zeros(1)
-    raw = found.select(heard & ~weak)
     return {
         "left_out": float(lost.max()),
         "left_out_bound": use.left_out,
         "missed_chains": float(missed.sum()),
         "missed_strongest": float((full.power[missed] * ratio).max(initial=0.0)),
-        "plane_rad": _plane_error(setup, poses, link, raw, kept),
+        "plane_rad": _plane_error(setup, frame, link, found.select(heard & ~weak)),
         "plane_bound_rad": use.plane_error,
-        "flight_rad": _flight_error(setup, frame, link, kept),
+        "flight_rad": _flight_error(setup, frame.number, kept),
         "straight_bound_rad": use.straight_error,
-        "synthesis": _synthesis_error(setup, frame, poses, link, kept, level),
+        "synthesis": _synthesis_error(setup, frame, link, level),
     }
 
 
@@ -397,20 +340,18 @@ def present(paths: PathSet, among: PathSet) -> np.ndarray:
     return out
 
 
-def _plane_error(
-    setup: Setup, poses: dict[str, Pose], link: Link, raw: PathSet, kept: PathSet
-) -> float:
+def _plane_error(setup: Setup, frame: Frame, link: Link, raw: PathSet) -> float:
     """Largest phase by which the kept wavefronts that are plane differ from point sources' [rad],
     both ends added."""
-    plane = np.isinf(kept.rx_radius) & np.isfinite(raw.rx_radius)
+    plane = np.isinf(frame.paths[link].rx_radius) & np.isfinite(raw.rx_radius)
     if not plane.any():
         return 0.0
     k = 2 * np.pi * setup.waveform.effective_carrier / SPEED_OF_LIGHT
     total = np.zeros(int(plane.sum()))
     raw = raw.select(plane)
     ends = (
-        (poses[link[0]], setup.antennas.tx_positions, raw.departure, raw.tx_radius),
-        (poses[link[1]], setup.antennas.rx_positions, raw.arrival, raw.rx_radius),
+        (frame.poses[link.tx], setup.antennas.tx_positions, raw.departure, raw.tx_radius),
+        (frame.poses[link.rx], setup.antennas.rx_positions, raw.arrival, raw.rx_radius),
     )
     for pose, positions, direction, radius in ends:
         elements = pose.to_world(positions)
@@ -421,7 +362,7 @@ def _plane_error(
     return float(k * total.max())
 
 
-def _flight_error(setup: Setup, frame: int, link: Link, kept: PathSet) -> float:
+def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
     """Largest phase by which the kept delays differ at the ends of the frame from those over the
     true positions there [rad]."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
@@ -473,20 +414,18 @@ def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.nd
     return out
 
 
-def _synthesis_error(
-    setup: Setup, frame: int, poses: dict[str, Pose], link: Link, kept: PathSet, level: float
-) -> float:
+def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
     """Relative RMS error of the synthesis that the run uses, on some of a frame's paths."""
+    kept = frame.paths[link]
     if not len(kept):
         return 0.0
-    rng = generator(setup.scenario.seed, "synthesis check", *link, frame)
+    rng = generator(setup.scenario.seed, "synthesis check", *link, frame.number)
     some = kept.select(np.sort(rng.choice(len(kept), min(len(kept), MOST_COMPARED), replace=False)))
-    sent: Transmission = setup.transmission(link[0], frame, poses[link[0]])
-    start = setup.timetable.start_time(frame, link[0])
-
-    receiver = ReceiveArray(poses[link[1]], setup.antennas)
+    links = [(frame.sent[link.tx], some)]
+    receiver = ReceiveArray(frame.poses[link.rx], setup.antennas)
+    reference = Reference(setup.timetable.start_time(frame.number, link.tx))
     exact, fast = (
-        if_signal(setup.waveform, [(sent, some)], receiver, Reference(start), method).samples
+        if_signal(setup.waveform, links, receiver, reference, method).samples
         for method in (Direct(), setup.plan.synthesis(len(kept), level))
     )
     scale = float(np.linalg.norm(exact))
