@@ -118,7 +118,7 @@ class Scenario(Node):
 
     @property
     def flight_duration_s(self) -> float:
-        """From the start of the first frame to the end of the last, with the last one's pause."""
+        """Time from the start of the first frame to the end of the last and its pause."""
         return self.frames * (self.frame_interval_s or self.frame_duration_s)
 
     def problems(self) -> Iterator[Problem]:

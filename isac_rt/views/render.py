@@ -25,7 +25,7 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 ELEVATION = np.deg2rad(38.0)
-"""Of the view above the horizon."""
+"""Angle of the view above the horizon [rad]."""
 SUN = np.array([-0.45, -0.35, 0.82]) / np.linalg.norm([-0.45, -0.35, 0.82])
 _SKY, _GROUND, _ROOF, _WALL = (
     np.array(c) / 255 for c in ((236, 241, 246), (222, 220, 212), (214, 190, 170), (226, 224, 220))
@@ -179,7 +179,7 @@ def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarr
 
 
 def best_view(city: CityMesh, tracks: np.ndarray, aspect: float) -> View:
-    """Of sixteen directions the one from which the city hides least of the `tracks` (..., 3)
+    """The one of sixteen views from which the city hides least of the `tracks` (..., 3)
     [m]."""
     low, high = tracks.reshape(-1, 3).min(axis=0), tracks.reshape(-1, 3).max(axis=0)
     centre = (low + high) / 2

@@ -182,7 +182,7 @@ def small() -> Scenario:
 
 
 def digest(run) -> str:
-    """Of every number of a run, the order of the variables included, but for times taken."""
+    """Digest of every number of a run and of the order of variables, but for times taken."""
     out = hashlib.sha256()
     for name in sorted(run.dataset.variables):
         values = run.dataset[name].values

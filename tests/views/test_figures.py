@@ -22,7 +22,7 @@ from isac_rt.views.figures import (
 )
 
 INK_VARIANCE = 1e-3
-"""Of pixel values in [0, 1]: an empty framed axis has about 1e-4, one line more than this."""
+"""Variance of pixels in [0, 1]: an empty framed axis has about 1e-4, one line more than this."""
 
 
 @pytest.fixture(scope="module")
