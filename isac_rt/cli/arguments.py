@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,7 +37,7 @@ def check_frame(scenario: Scenario, frame: int) -> None:
         )
 
 
-def check_names(names: list[str], known: tuple[str, ...], what: str) -> None:
+def check_names(names: list[str], known: Sequence[str], what: str) -> None:
     """Refuse names that are not among the known."""
     if unknown := [name for name in names if name not in known]:
         raise InputProblem(f"{', '.join(unknown)}: no such {what}; choose from {', '.join(known)}")

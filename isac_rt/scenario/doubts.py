@@ -1,13 +1,14 @@
-"""Values that may stand but look as if they were in another unit: by a factor of a thousand for
-most keys."""
+"""What may stand in a scenario but is probably not meant: values that look as if they were in
+another unit (by a factor of a thousand for most keys), and settings that never act."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from functools import reduce
-from typing import Any
+from itertools import combinations, pairwise
 
 from isac_rt.scenario.node import Key, Problem
+from isac_rt.scenario.tree import Scenario
 
 PLAUSIBLE: dict[Key, tuple[float, float, str]] = {
     ("radio", "carrier_hz"): (1e9, 1e12, "hertz"),
@@ -37,17 +38,23 @@ PLAUSIBLE: dict[Key, tuple[float, float, str]] = {
 PLAUSIBLE_RCS = (-90.0, 70.0)
 
 
-def implausible(scenario: Any) -> Iterator[Problem]:
-    """What of a scenario lies outside the plausible."""
+FASTEST_MPS = 200.0
+FARTHEST_M = 1e5
+
+
+def doubts(scenario: Scenario) -> Iterator[Problem]:
+    """What a person should be asked about a scenario."""
+    for (a, first), (b, second) in combinations(scenario.first_blocks().items(), 2):
+        if abs(first - second) < scenario.radio.groups:
+            said = f"{b} and {a} send in the same resource blocks; shall they collide?"
+            yield Problem((("swarm", b, "resource_block"),), said)
     for key, (low, high, unit) in PLAUSIBLE.items():
-        value = reduce(lambda at, name: getattr(at, str(name), None), key, scenario)
+        value: object = scenario
+        for name in key:
+            value = getattr(value, str(name), None)
         if isinstance(value, int | float) and not low <= value <= high:
             yield Problem((key,), f"{value:g} is outside {low:g} to {high:g}; is it in {unit}?")
     if scenario.array.fall_back and not _can_fall_back(scenario):
-        said = (
-            "never acts: it needs the pseudo_random schedule and velocities from sparse "
-            "sampling, by OMP"
-        )
         yield Problem(
             (
                 ("array", "fall_back"),
@@ -55,19 +62,43 @@ def implausible(scenario: Any) -> Iterator[Problem]:
                 ("radio", "groups"),
                 ("receivers", "velocity_method"),
             ),
-            said,
+            "never acts: it needs the pseudo_random schedule and velocities from sparse sampling, "
+            "by OMP",
         )
+    yield from _doubts_of_flights(scenario)
+
+
+def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
     low, high = PLAUSIBLE_RCS
     for name, uav in scenario.swarm.items():
         if not low <= uav.rcs.value_dbsm <= high:
-            said = (
-                f"{uav.rcs.value_dbsm:g} is outside {low:g} to {high:g}; is it in decibels over "
-                "a square metre?"
+            yield Problem(
+                (("swarm", name, "rcs", "value_dbsm"),),
+                f"{uav.rcs.value_dbsm:g} is outside {low:g} to {high:g}; is it in decibels over a "
+                "square metre?",
             )
-            yield Problem((("swarm", name, "rcs", "value_dbsm"),), said)
+        speeds: dict[Key, float] = {}
+        places: dict[Key, tuple[float, ...]] = {}
+        if uav.waypoints is None:
+            speeds["swarm", name, "velocity_mps"] = math.hypot(*uav.velocity_mps)
+            places["swarm", name, "position_m"] = uav.place(0.0)
+        else:
+            for i, (a, b) in enumerate(pairwise(uav.waypoints), start=1):
+                speed = math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s)
+                speeds["swarm", name, "waypoints", i] = speed
+            for i, w in enumerate(uav.waypoints):
+                places["swarm", name, "waypoints", i, "position_m"] = w.position_m
+        for key, speed in speeds.items():
+            if speed > FASTEST_MPS:
+                said = f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}"
+                yield Problem((key,), f"{said}; is it in metres and seconds?")
+        for key, place in places.items():
+            if math.hypot(*place) > FARTHEST_M:
+                said = f"lies {math.hypot(*place):.4g} m from the origin, more than {FARTHEST_M:g}"
+                yield Problem((key,), f"{said}; is it in metres?")
 
 
-def _can_fall_back(scenario: Any) -> bool:
+def _can_fall_back(scenario: Scenario) -> bool:
     """Whether a receiver of this scenario ever judges sparsity: some have fewer groups than there
     are transmit antennas."""
     m = scenario.modulation

@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr
 
-from isac_rt.scenario.doubts import implausible
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio, chirp_times, num_resource_blocks
@@ -24,8 +23,6 @@ from isac_rt.scenario.swarm import Access, RoleChange, Uav
 
 NEAREST_M = 0.05
 """Two bodies nearer than this are one to the ray tracer."""
-FASTEST_MPS = 200.0
-FARTHEST_M = 1e5
 
 
 class Scenario(Node):
@@ -306,49 +303,6 @@ class Scenario(Node):
                 "propagation.model ray_traced and a city; "
                 "add them or set receivers.clutter_detector to cfar or sample_matrix",
             )
-
-    def doubts(self) -> Iterator[Problem]:
-        """What may stand but is probably not meant: values in the wrong unit, active UAVs that talk
-        over each other."""
-        for (a, first), (b, second) in itertools.combinations(self.first_blocks().items(), 2):
-            if abs(first - second) < self.radio.groups:
-                yield Problem(
-                    (("swarm", b, "resource_block"),),
-                    f"{b} and {a} send in the same resource blocks; shall they collide?",
-                )
-        yield from implausible(self)
-        for name, uav in self.swarm.items():
-            if uav.waypoints is None:
-                speeds: list[tuple[Key, float]] = [
-                    (("swarm", name, "velocity_mps"), math.hypot(*uav.velocity_mps))
-                ]
-                places: list[tuple[Key, tuple[float, ...]]] = [
-                    (("swarm", name, "position_m"), uav.place(0.0))
-                ]
-            else:
-                legs = enumerate(itertools.pairwise(uav.waypoints), start=1)
-                key = ("swarm", name, "waypoints")
-                speeds = [
-                    ((*key, i), math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s))
-                    for i, (a, b) in legs
-                ]
-                places = [
-                    ((*key, i, "position_m"), w.position_m) for i, w in enumerate(uav.waypoints)
-                ]
-            for where, speed in speeds:
-                if speed > FASTEST_MPS:
-                    yield Problem(
-                        (where,),
-                        f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}; is it in metres and "
-                        "seconds?",
-                    )
-            for where, place in places:
-                if math.hypot(*place) > FARTHEST_M:
-                    yield Problem(
-                        (where,),
-                        f"lies {math.hypot(*place):.4g} m from the origin, more than "
-                        f"{FARTHEST_M:g}; is it in metres?",
-                    )
 
 
 def json_schema() -> dict[str, Any]:

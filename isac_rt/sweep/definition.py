@@ -21,7 +21,8 @@ from pydantic import Field, ValidationError, field_validator
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
 from isac_rt.results.provenance import path_content, program_fingerprint
-from isac_rt.scenario.file import ScenarioError, check_tree, complain, load, plain_tree, read_tree
+from isac_rt.scenario.document import Document, ScenarioError
+from isac_rt.scenario.file import load, plain_tree
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
 from isac_rt.world.area import file_digest
@@ -311,11 +312,11 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
         One line per problem, with the place in the file.
     """
     path = Path(path)
-    data, places = read_tree(path, "a sweep needs a scenario and axes")
-    sweep = check_tree(Sweep, path, data, places)
+    document = Document(path, "a sweep needs a scenario and axes")
+    sweep = document.check(Sweep)
 
     def refuse(key: Key, text: str) -> ScenarioError:
-        return complain(Sweep, path, data, places, Problem((key,), text))
+        return ScenarioError(document.complaint(Problem((key,), text)))
 
     if sweep.num_points > max_points:
         factors = " x ".join(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.results.files import write_text
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
@@ -32,7 +33,7 @@ def scene_3d(
     swarm: Swarm,
     times: np.ndarray,
     time: float,
-    paths: Mapping[tuple[str, str], PathSet],
+    paths: Mapping[Link, PathSet],
     reach: float = 150.0,
 ) -> Figure:
     """The scene as a Plotly figure; kinds of path and UAVs can be switched off in its legend.
@@ -148,7 +149,7 @@ def _mesh(city: CityMesh, tracks: np.ndarray, reach: float) -> dict[str, object]
 
 
 def _lines(
-    paths: Mapping[tuple[str, str], PathSet], kind: PathKind, swarm: Swarm, time: float
+    paths: Mapping[Link, PathSet], kind: PathKind, swarm: Swarm, time: float
 ) -> tuple[np.ndarray, int]:
     """The strongest paths of a kind, over all links, as one broken line (rows of NaN between them),
     and how many there are in all."""

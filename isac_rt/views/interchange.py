@@ -19,6 +19,7 @@ import xarray as xr
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column
@@ -34,7 +35,7 @@ _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
 
 
 def write_ledger(
-    paths: Mapping[tuple[str, str], PathSet],
+    paths: Mapping[Link, PathSet],
     file: str | Path,
     carrier_frequency: float,
     attributes: Mapping[str, str | int],
@@ -89,7 +90,7 @@ def write_ledger(
     }
     out: dict[str, xr.Variable] = {}
     for name, column in columns.items():
-        parts = [np.asarray(column.read(p), column.dtype) for p in paths.values()]
+        parts: list[np.ndarray] = [np.asarray(column.read(p), column.dtype) for p in paths.values()]
         values = np.concatenate([np.zeros(shapes.get(name, 0), column.dtype), *parts])
         about = {"units": column.units, "long_name": column.meaning}
         out[name] = xr.Variable(("path", "bounce", "axis")[: values.ndim], values, about)

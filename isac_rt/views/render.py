@@ -17,6 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from isac_rt.frame.link import Link
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_bytes
@@ -226,7 +227,7 @@ def _line(
 
 def _draw_paths(
     ax: Axes,
-    paths: Mapping[tuple[str, str], PathSet],
+    paths: Mapping[Link, PathSet],
     poses: Mapping[str, Pose],
     view: View,
     depth: np.ndarray,
@@ -342,7 +343,7 @@ def view_scene(
     swarm: Swarm,
     times: np.ndarray,
     time: float,
-    paths: Mapping[tuple[str, str], PathSet],
+    paths: Mapping[Link, PathSet],
     width: int = 1500,
     height: int = 940,
 ) -> Figure:

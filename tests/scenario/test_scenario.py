@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from isac_rt.frame.waveform import waveform_of
+from isac_rt.scenario.document import MAX_MESSAGES, ScenarioError
 from isac_rt.scenario.environment import CITY_KEYS, City
-from isac_rt.scenario.file import MAX_MESSAGES, ScenarioError, ScenarioWarning, load, to_yaml
+from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario, json_schema
 

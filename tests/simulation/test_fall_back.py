@@ -13,6 +13,7 @@ from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Reception
 from isac_rt.receive.types import no_detections
+from isac_rt.scenario.doubts import doubts
 from isac_rt.scenario.environment import Propagation
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.swarm import Uav
@@ -120,9 +121,12 @@ def empty():
 
 def test_a_fall_back_that_can_never_act_is_doubted():
     """With all groups at hand the union needs no sparsity. Planted bug: streams forgotten."""
-    doubts = lambda s: any("never acts" in p.text for p in s.doubts())  # noqa: E731
-    assert not doubts(scenario())
+
+    def doubted(s: Scenario) -> bool:
+        return any("never acts" in p.text for p in doubts(s))
+
+    assert not doubted(scenario())
     three = Radio(samples_per_chirp=256)
-    assert doubts(scenario(radio=three))
-    assert not doubts(scenario(radio=three, modulation=Modulation(streams={"P": (0,)})))
-    assert doubts(scenario(array=Array(fall_back=True, schedule="conventional")))
+    assert doubted(scenario(radio=three))
+    assert not doubted(scenario(radio=three, modulation=Modulation(streams={"P": (0,)})))
+    assert doubted(scenario(array=Array(fall_back=True, schedule="conventional")))
