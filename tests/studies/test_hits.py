@@ -20,7 +20,7 @@ from isac_rt.receive.omp import omp_power
 from isac_rt.studies.baselines import resolution
 from isac_rt.studies.paper import fig14, hits
 from isac_rt.studies.paper.hits import (
-    Case,
+    Setting,
     Target,
     count_hits,
     draw_target,
@@ -37,11 +37,13 @@ LOUD = 20.0
 @pytest.mark.parametrize(
     "case",
     [
-        Case(name="F", kind="FMCW", snr_db=(LOUD,), speed=0.3),
-        Case(name="L", kind="LoRadar", snr_db=(LOUD,), speed=0.3),
-        Case(name="A", kind="AT", snr_db=(LOUD,)),
-        Case(name="P", kind="PT", snr_db=(LOUD,), orders=(4,), samples=512),
-        Case(name="G", kind="PT", snr_db=(LOUD,), samples=512, fixed=True, speed=0.0, gated=True),
+        Setting(name="F", kind="FMCW", snr_db=(LOUD,), speed=0.3),
+        Setting(name="L", kind="LoRadar", snr_db=(LOUD,), speed=0.3),
+        Setting(name="A", kind="AT", snr_db=(LOUD,)),
+        Setting(name="P", kind="PT", snr_db=(LOUD,), orders=(4,), samples=512),
+        Setting(
+            name="G", kind="PT", snr_db=(LOUD,), samples=512, fixed=True, speed=0.0, gated=True
+        ),
     ],
     ids=lambda case: case.name,
 )
@@ -57,7 +59,7 @@ def test_a_hit_is_within_one_resolution_in_all_four():
     both sides of the limit).
 
     Planted bug: any of the four instead of all."""
-    case = Case(name="A", kind="AT", snr_db=(0.0,))
+    case = Setting(name="A", kind="AT", snr_db=(0.0,))
     w = case.waveform
     truth = np.array([37.3, 4.1, 0.31, -0.22])
     u = np.array([truth[2], 0.0, truth[3]])
@@ -81,7 +83,7 @@ def test_echoes_are_those_of_the_equation():
     here (0.03 rad at 23 m), and mixing conjugates a path's gain.
 
     Planted bug: one pass instead of two."""
-    case = Case(name="A", kind="AT", snr_db=(0.0,), samples=512)
+    case = Setting(name="A", kind="AT", snr_db=(0.0,), samples=512)
     w, rng = case.waveform, np.random.default_rng(2)
     schedule = pseudo_random_schedule(1, 120, 3, rng)
     payload = random_payload(w, schedule, 8, rng)
@@ -97,7 +99,7 @@ def test_echoes_are_those_of_the_equation():
 
 def test_one_atom_is_omp_with_sparsity_one():
     """Planted bug: no shift of the Doppler axis."""
-    case = Case(name="A", kind="AT", snr_db=(0.0,), groups=2)
+    case = Setting(name="A", kind="AT", snr_db=(0.0,), groups=2)
     w, rng = case.waveform, np.random.default_rng(6)
     schedule = pseudo_random_schedule(2, 120, 3, rng)
     spectra = (rng.standard_normal((2, 4, 5, 120, 2)) @ [1, 1j]).astype(np.complex64)
@@ -109,7 +111,7 @@ def test_one_atom_is_omp_with_sparsity_one():
 def test_maps_at_a_level_are_those_of_the_mixed_samples():
     """One map from signal and noise apart, and of both together. Planted bugs: the cross term
     halved; the level squared for the noise."""
-    case = Case(name="A", kind="AT", snr_db=(-30.0,), samples=512)
+    case = Setting(name="A", kind="AT", snr_db=(-30.0,), samples=512)
     w, rng, level = case.waveform, np.random.default_rng(5), 0.7
     schedule = pseudo_random_schedule(1, 120, 3, rng)
     signal, white = (
@@ -130,7 +132,7 @@ def test_maps_at_a_level_are_those_of_the_mixed_samples():
 def test_spectra_without_a_window_hold_all_samples():
     """A tone on a cell, with data: N in its cell and nothing beside it. Planted bug: the turn of
     the cross term left out."""
-    case = Case(name="A", kind="AT", snr_db=(0.0,), samples=512)
+    case = Setting(name="A", kind="AT", snr_db=(0.0,), samples=512)
     w, rng = case.waveform, np.random.default_rng(9)
     schedule = pseudo_random_schedule(1, 120, 3, rng)
     payload = random_payload(w, schedule, 8, rng)
@@ -157,7 +159,7 @@ def test_detected_hits_are_the_receivers():
     """The same samples through `receive_active`: where a united hit is detected here there is a
     detection within one resolution, and nowhere else. Planted bug: the CFAR's threshold for one
     channel."""
-    case = Case(name="A", kind="AT", snr_db=(-47.0, -40.0), groups=3)
+    case = Setting(name="A", kind="AT", snr_db=(-47.0, -40.0), groups=3)
     w, antennas = case.waveform, hits.paper_antennas(case.waveform)
     for index in (0, 1):
         counted = count_hits(case, 4, index)["hits, united, detected"][0]

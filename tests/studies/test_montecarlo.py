@@ -30,7 +30,7 @@ from isac_rt.studies.paper.montecarlo import (
     sample,
 )
 from isac_rt.studies.paper.symbols import (
-    Link,
+    Setting,
     cell_noise,
     count_errors,
     draw_frame,
@@ -199,9 +199,13 @@ def test_steps_of_a_run_that_stops_early_are_filled_up():
 @pytest.mark.parametrize(
     "link",
     [
-        Link(name="plain", waveform=link_waveform(512), orders=(4,)),
-        Link(name="filtered", waveform=link_waveform(512), orders=(4,), clutter=True, run_cells=15),
-        Link(name="profile", waveform=link_waveform(512), orders=(4,), clutter=True, profile=True),
+        Setting(name="plain", waveform=link_waveform(512), orders=(4,)),
+        Setting(
+            name="filtered", waveform=link_waveform(512), orders=(4,), clutter=True, run_cells=15
+        ),
+        Setting(
+            name="profile", waveform=link_waveform(512), orders=(4,), clutter=True, profile=True
+        ),
     ],
     ids=lambda link: link.name,
 )
@@ -246,7 +250,7 @@ def test_errors_are_those_of_the_receiver(link):
 def test_the_filter_finds_the_receivers_runs():
     """Cells left out, against `chirp_runs` on the samples. Planted bug: half of Hann's
     neighbours."""
-    link = Link(name="filtered", waveform=link_waveform(512), clutter=True, run_cells=15)
+    link = Setting(name="filtered", waveform=link_waveform(512), clutter=True, run_cells=15)
     size, frame, noise, level = 512, draw_frame(link, 5, 2), cell_noise(link, 5, 2), 10 ** (24 / 20)
     beats = np.full(120, 20.3)
     turn = np.exp(-2j * np.pi * beats[:, None] * np.arange(size) / size)
@@ -261,7 +265,7 @@ def test_the_filter_finds_the_receivers_runs():
 
 def test_errors_without_a_prediction_error_are_the_theorys():
     """Ten frames at four SNRs: 4 sigma. Planted bug: noise of variance N/2 in a cell."""
-    link = Link(name="theory", waveform=link_waveform(1024), orders=(4,), exact_prediction=True)
+    link = Setting(name="theory", waveform=link_waveform(1024), orders=(4,), exact_prediction=True)
     snr = np.array([-34.0, -31.0, -29.0, -27.0])
     found = [count_errors(link, snr, 3, i) for i in range(10)]
     for name, p in (

@@ -7,11 +7,12 @@ import numpy as np
 
 from isac_rt.studies.paper import tracks
 from isac_rt.studies.paper.flight import fly
-from isac_rt.studies.paper.outcome import Judgement, Outcome, Progress, Verdict, proportion
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, proportion
 
 FRAMES = 500
 QUICK_EVERY = 10
 WARM_UP = 3
+UAVS = "AT", "PT2"
 PRINTED_FRAMES = 10
 """Frames of the run as printed, spread over the flight: PT1 hears nothing in any of them."""
 
@@ -23,14 +24,12 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     frames = FRAMES // every
     total = frames + PRINTED_FRAMES
     found = fly("consistent", "PT1", frames, every, seed, lambda k, n: progress(k, total))
-    printed = fly(
-        "printed",
-        "PT1",
-        PRINTED_FRAMES,
-        FRAMES // PRINTED_FRAMES,
-        seed,
-        lambda k, n: progress(frames + k, total),
-    )
+    apart = FRAMES // PRINTED_FRAMES
+
+    def report(done: int, _: int) -> None:
+        progress(frames + done, total)
+
+    printed = fly("printed", "PT1", PRINTED_FRAMES, apart, seed, report)
     settings = {
         "quick": quick,
         "seed": seed,
@@ -41,14 +40,13 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "scene": "paper_swarm_consistent.yaml; as printed: paper_swarm.yaml",
     }
     tables = {
-        "consistent": tracks.table([found], every, ("AT", "PT2")),
-        "printed": tracks.table([printed], FRAMES // PRINTED_FRAMES, ("AT", "PT2")),
+        "consistent": tracks.table([found], every, UAVS),
+        "printed": tracks.table([printed], apart, UAVS),
     }
     grid = tracks.on_grid([found], ("AT",), every, "PT1")
-    figure = tracks.figure([found], every, ("AT",), ("AT", "PT2"), (107, 359), grid)
-    return Outcome(
-        "fig10", "Tracking at PT1", tables, figure, _verdicts(found, printed, every, grid), settings
-    )
+    figure = tracks.figure([found], every, ("AT",), UAVS, (107, 359), grid)
+    verdicts = _verdicts(found, printed, every, grid)
+    return Outcome("fig10", "Tracking at PT1", tables, figure, verdicts, settings)
 
 
 def _seen(mask: np.ndarray, every: int) -> str:
@@ -57,40 +55,35 @@ def _seen(mask: np.ndarray, every: int) -> str:
     return f"{frames.min()} to {frames.max()}" if frames.size else "none"
 
 
+say = Sentences("""
+tracked: The AT stays within PT1's field of view and is tracked
+  consistent variant: tracked in {share} frames after {warm_up}; as printed heard in {heard} of
+  {printed}, for the AT is behind PT1
+
+data: Data demodulation is achieved
+  consistent variant: delay symbols wrong in {delay}, DPSK symbols in {dpsk}; condition: unmodulated
+  frames first, fractional decisions, all data phases removed
+
+appears: PT2 appears between frames 107 and 359
+  consistent variant: in view in frames {view}, detected in {seen} of {total}{frames}; as printed in
+  {printed}
+""")
+
+
 def _verdicts(found, printed, every: int, grid: tracks.Pairs) -> tuple[Verdict, ...]:
     followed = tracks.followed([found], "AT", WARM_UP)
-    heard = int(np.isfinite(printed.sel(uav="AT").detected_range.values).sum())
+    heard = {u: int(np.isfinite(printed.sel(uav=u).detected_range.values).sum()) for u in UAVS}
     wrong, symbols = (found[f"symbol_{name}"].values.sum(axis=0) for name in ("errors", "total"))
     two = found.sel(uav="PT2")
-    seen = np.isfinite(two.detected_range.values)
-    frames = np.flatnonzero(seen) * every
-    tracked: Judgement = (
-        "holds under a condition" if followed[0] == followed[1] else "does not hold"
-    )
-    clean: Judgement = "holds under a condition" if wrong[:2].sum() == 0 else "does not hold"
+    seen, view = np.isfinite(two.detected_range.values), two.in_view.values
+    said = {"warm_up": WARM_UP, "heard": heard["AT"], "printed": PRINTED_FRAMES}
+    rates = [proportion(int(n), int(of)) for n, of in zip(wrong[:2], symbols[:2], strict=True)]
+    where = {"view": _seen(view, every), "seen": seen.sum(), "total": int(view.sum())}
+    where["frames"] = f", frames {_seen(seen, every)}" if seen.any() else ""
+    clean = wrong[:2].sum() == 0
     return (
-        Verdict(
-            "The AT stays within PT1's field of view and is tracked",
-            tracked,
-            f"consistent variant: tracked in {proportion(*followed)} frames after {WARM_UP}; as "
-            f"printed heard in {heard} of {PRINTED_FRAMES}, for the AT is behind PT1",
-        ),
-        Verdict(
-            "Data demodulation is achieved",
-            clean,
-            "consistent variant: delay symbols wrong in "
-            f"{proportion(int(wrong[0]), int(symbols[0]))}, DPSK symbols in "
-            f"{proportion(int(wrong[1]), int(symbols[1]))}; condition: unmodulated frames first, "
-            "fractional decisions, all data phases removed",
-        ),
-        Verdict(
-            "PT2 appears between frames 107 and 359",
-            "does not hold",
-            f"consistent variant: in view in frames {_seen(two.in_view.values, every)}, detected "
-            f"in {seen.sum()} of {int(two.in_view.values.sum())}"
-            + (f", frames {frames.min()} to {frames.max()}" if frames.size else "")
-            + "; as printed in "
-            f"{int(np.isfinite(printed.sel(uav='PT2').detected_range.values).sum())}",
-        ),
+        say("tracked", False, followed[0] == followed[1], share=proportion(*followed), **said),
+        say("data", False, clean, delay=rates[0], dpsk=rates[1]),
+        say("appears", False, **where, printed=heard["PT2"]),
         tracks.filter_verdict([found], ("AT",), "PT1", grid),
     )

@@ -23,11 +23,10 @@ from isac_rt.studies.paper.montecarlo import (
     dpsk_error_rate,
     sample,
 )
-from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, blank, style
 from isac_rt.studies.paper.symbols import (
-    RANGE_ERROR_CELLS,
-    VELOCITY_ERROR,
-    Link,
+    PREDICTION_ERROR,
+    Setting,
     decibels,
     difference,
     link_waveform,
@@ -41,25 +40,25 @@ LORADAR_SNR_DB = np.arange(-28.0, -19.0)
 LORADAR_BATCH = 8
 
 
-def links() -> tuple[Link, ...]:
+def links() -> tuple[Setting, ...]:
     """The paper's curves, those by its letter, and the clutter with and without knowledge of its
     profile."""
     return (
-        Link(name="T = 51.2 us", waveform=_LONG, orders=MODULATION_ORDERS),
-        Link(name="letter", waveform=_LONG, orders=(8,), literal=True),
-        Link(name="T = 25.6 us", waveform=_SHORT, orders=(8,)),
-        Link(
+        Setting(name="T = 51.2 us", waveform=_LONG, orders=MODULATION_ORDERS),
+        Setting(name="letter", waveform=_LONG, orders=(8,), literal=True),
+        Setting(name="T = 25.6 us", waveform=_SHORT, orders=(8,)),
+        Setting(
             name="exact prediction", waveform=_LONG, orders=MODULATION_ORDERS, exact_prediction=True
         ),
-        Link(name="clutter", waveform=_LONG, orders=(8,), clutter=True),
-        Link(
+        Setting(name="clutter", waveform=_LONG, orders=(8,), clutter=True),
+        Setting(
             name="clutter, filtered",
             waveform=_LONG,
             orders=(8,),
             clutter=True,
             run_cells=Receivers().clutter_run_cells,
         ),
-        Link(
+        Setting(
             name="clutter, profile known", waveform=_LONG, orders=(8,), clutter=True, profile=True
         ),
     )
@@ -101,19 +100,12 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "symbols_per_frame": 117,
         "loradar_symbols_per_batch": LORADAR_BATCH,
         "snr": "per complex IF sample and receive antenna, line of sight, before processing",
-        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or "
-        f"{precision.limit} frames",
+        "stop": f"{precision.text} or {precision.limit} frames",
         "interval": INTERVAL,
-        "prediction_error": f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s",
+        "prediction_error": PREDICTION_ERROR,
     }
-    return Outcome(
-        "fig11",
-        "DPSK symbol error rate",
-        {"fig11": pd.concat(lines)},
-        _figure(curves, theory),
-        _verdicts(curves),
-        settings,
-    )
+    tables, figure = {"fig11": pd.concat(lines)}, _figure(curves, theory)
+    return Outcome("fig11", "DPSK symbol error rate", tables, figure, _verdicts(curves), settings)
 
 
 def _loradar(seed: int, index: int) -> Counts:
@@ -128,48 +120,30 @@ def _loradar(seed: int, index: int) -> Counts:
     return {"mmWave-LoRadar": (np.array(wrong), LORADAR_BATCH)}
 
 
+_LOOKS = {
+    "T = 25.6 us: 8": ("v--", "C4", "D = 8, T = 25.6 us"),
+    "clutter, profile known: 8": ("P-.", "C5", "D = 8, clutter, its profile known"),
+    "clutter, filtered: 8": ("+:", "C8", "D = 8, clutter, the paper's filter"),
+    "clutter: 8": ("x:", "C6", "D = 8, clutter, line of sight tracked alone"),
+    "letter: 8 literal": ("1:", "C7", "D = 8, data phases left in (as printed)"),
+    "mmWave-LoRadar": ("*--", "k", "mmWave-LoRadar"),
+}
+
+
 def _figure(curves: dict[str, Curve], theory: dict[int, np.ndarray]) -> Figure:
     with style():
         figure, axes = blank(1, 2, size=(10.5, 4.8), sharey=True)
-        marks = dict(zip(MODULATION_ORDERS, "osD^", strict=True))
         left, right = axes[0]
-        for i, d in enumerate(MODULATION_ORDERS):
-            draw_rate(
-                left, curves[f"T = 51.2 us: {d}"], marks[d] + "-", f"C{i}", f"D = {d}, T = 51.2 us"
-            )
-            draw_rate(
-                right,
-                curves[f"exact prediction: {d} known delay"],
-                marks[d],
-                f"C{i}",
-                f"D = {d}, velocity exact",
-            )
-            draw_rate(
-                right,
-                curves[f"T = 51.2 us: {d} known delay"],
-                marks[d] + ":",
-                f"C{i}",
-                f"D = {d}, velocity within 0.25 m/s",
-            )
-            right.plot(SNR_DB, theory[d], color=f"C{i}", lw=0.9, label=f"theory, D = {d}")
-        draw_rate(left, curves["T = 25.6 us: 8"], "v--", "C4", "D = 8, T = 25.6 us")
-        draw_rate(
-            left,
-            curves["clutter, profile known: 8"],
-            "P-.",
-            "C5",
-            "D = 8, clutter, its profile known",
-        )
-        draw_rate(
-            left, curves["clutter, filtered: 8"], "+:", "C8", "D = 8, clutter, the paper's filter"
-        )
-        draw_rate(
-            left, curves["clutter: 8"], "x:", "C6", "D = 8, clutter, line of sight tracked alone"
-        )
-        draw_rate(
-            left, curves["letter: 8 literal"], "1:", "C7", "D = 8, data phases left in (as printed)"
-        )
-        draw_rate(left, curves["mmWave-LoRadar"], "*--", "k", "mmWave-LoRadar")
+        for i, (d, mark) in enumerate(zip(MODULATION_ORDERS, "osD^", strict=True)):
+            long, colour = f"T = 51.2 us: {d}", f"C{i}"
+            exact = curves[f"exact prediction: {d} known delay"]
+            within = f"D = {d}, velocity within 0.25 m/s"
+            draw_rate(left, curves[long], mark + "-", colour, f"D = {d}, T = 51.2 us")
+            draw_rate(right, exact, mark, colour, f"D = {d}, velocity exact")
+            draw_rate(right, curves[f"{long} known delay"], mark + ":", colour, within)
+            right.plot(SNR_DB, theory[d], color=colour, lw=0.9, label=f"theory, D = {d}")
+        for name, (look, colour, label) in _LOOKS.items():
+            draw_rate(left, curves[name], look, colour, label)
         left.set(
             ylabel="DPSK symbol error rate", yscale="log", ylim=(3e-4, 1.5), title="end to end"
         )
@@ -179,6 +153,29 @@ def _figure(curves: dict[str, Curve], theory: dict[int, np.ndarray]) -> Figure:
         left.legend(fontsize=6.5, loc="lower left")
         right.legend(fontsize=6.5, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
     return figure
+
+
+say = Sentences("""
+floor: At very low SNR the SER levels off at a value that depends on D
+  at -36 dB {floor} by guessing
+
+orders: For T = 51.2 us the SER grows with D
+  SER {level} at {levels}; at -26 dB {rates}
+
+short: A smaller T raises the SER
+  D = 8, T = 25.6 us (all times halved): SER {level} comes {later} later
+
+loradar: For D <= 16 mmWave-LoRadar's SER is worse
+  for D in {better}; SER {level} of LoRadar (delay and timing known) comes at {radar}, after DPSK by
+  {finding}
+
+bits: A frame carries 4293 bits against LoRadar's 1800
+  {bits} with D = 8 and M = 3; {others}
+
+printed: The detector as printed decides the symbols
+  without compensating the data's phases (and with the conjugate it lacks) the SER is {rate} at -18
+  dB, guessing
+""")
 
 
 def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
@@ -195,48 +192,13 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
     better = [d for d in MODULATION_ORDERS if apart[d][1] > 0]
     finding = "; ".join(f"D = {d}: {decibels(a)}" for d, a in apart.items())
     bits, others = replace(_LONG, num_groups=3).bits_per_frame(8), LoRadar(_LONG).bits_per_frame
+    half = {"radar": decibels(radar.threshold(LEVEL)), "finding": finding, "level": LEVEL}
     return (
-        Verdict(
-            "At very low SNR the SER levels off at a value that depends on D",
-            "holds",
-            f"at -36 dB {floor} by guessing",
-        ),
-        Verdict(
-            "For T = 51.2 us the SER grows with D",
-            "holds" if rising else "does not hold",
-            f"SER {LEVEL} at {levels}; at -26 dB {rates}",
-        ),
-        Verdict(
-            "A smaller T raises the SER",
-            "holds" if later[1] > 0 else "does not hold",
-            f"D = 8, T = 25.6 us (all times halved): SER {LEVEL} comes {decibels(later)} later",
-        ),
-        clutter_verdict(
-            "With urban clutter a higher SNR is needed, and at high SNR the system is still robust",
-            long[8],
-            curves["clutter: 8"],
-            curves["clutter, filtered: 8"],
-            curves["clutter, profile known: 8"],
-        ),
-        Verdict(
-            "For D <= 16 mmWave-LoRadar's SER is worse",
-            "holds"
-            if len(better) == 4
-            else "holds under a condition"
-            if better
-            else "does not hold",
-            f"for D in {better}; SER {LEVEL} of LoRadar (delay and timing known) comes at "
-            f"{decibels(radar.threshold(LEVEL))}, after DPSK by {finding}",
-        ),
-        Verdict(
-            "A frame carries 4293 bits against LoRadar's 1800",
-            "holds" if (bits, others) == (4293, 1800) else "does not hold",
-            f"{bits} with D = 8 and M = 3; {others}",
-        ),
-        Verdict(
-            "The detector as printed decides the symbols",
-            "does not hold",
-            "without compensating the data's phases (and with the conjugate it lacks) the SER is "
-            f"{curves['letter: 8 literal'].text(-18)} at -18 dB, guessing",
-        ),
+        say("floor", True, floor=floor),
+        say("orders", rising, level=LEVEL, levels=levels, rates=rates),
+        say("short", later[1] > 0, level=LEVEL, later=decibels(later)),
+        clutter_verdict("dpsk clutter", long[8], curves, ": 8"),
+        say("loradar", len(better) == 4, len(better) > 0, better=better, **half),
+        say("bits", (bits, others) == (4293, 1800), bits=bits, others=others),
+        say("printed", False, rate=curves["letter: 8 literal"].text(-18)),
     )

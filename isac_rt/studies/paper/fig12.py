@@ -13,18 +13,17 @@ from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
 from isac_rt.studies.paper.outcome import (
-    Judgement,
     Outcome,
     Progress,
+    Sentences,
     Verdict,
     blank,
     proportion,
     style,
 )
 from isac_rt.studies.paper.symbols import (
-    RANGE_ERROR_CELLS,
-    VELOCITY_ERROR,
-    Link,
+    PREDICTION_ERROR,
+    Setting,
     decibels,
     difference,
     link_waveform,
@@ -37,22 +36,22 @@ SNR_DB = np.array(
 _LONG, _SHORT = link_waveform(1024), link_waveform(512)
 
 
-def links() -> tuple[Link, ...]:
+def links() -> tuple[Setting, ...]:
     """Orders have draws of their own; the paper's letter is followed at the fixed and at a random
     fraction of a cell."""
     return (
-        *(Link(name=f"D = {d}", waveform=_LONG, literal=d == 8) for d in MODULATION_ORDERS),
-        Link(name="random fraction", waveform=_LONG, random_fraction=True, literal=True),
-        Link(name="exact prediction", waveform=_LONG, exact_prediction=True),
-        Link(name="T = 25.6 us", waveform=_SHORT),
-        Link(name="clutter", waveform=_LONG, clutter=True),
-        Link(
+        *(Setting(name=f"D = {d}", waveform=_LONG, literal=d == 8) for d in MODULATION_ORDERS),
+        Setting(name="random fraction", waveform=_LONG, random_fraction=True, literal=True),
+        Setting(name="exact prediction", waveform=_LONG, exact_prediction=True),
+        Setting(name="T = 25.6 us", waveform=_SHORT),
+        Setting(name="clutter", waveform=_LONG, clutter=True),
+        Setting(
             name="clutter, filtered",
             waveform=_LONG,
             clutter=True,
             run_cells=Receivers().clutter_run_cells,
         ),
-        Link(name="clutter, profile known", waveform=_LONG, clutter=True, profile=True),
+        Setting(name="clutter, profile known", waveform=_LONG, clutter=True, profile=True),
     )
 
 
@@ -91,18 +90,12 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "symbols_per_frame": 120,
         "snr": "per complex IF sample and receive antenna, line of sight, before processing",
         "interval": INTERVAL,
-        "stop": f"half-width <= max({precision.relative} p, {precision.absolute}) or "
-        f"{precision.limit} frames",
-        "prediction_error": f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s",
+        "stop": f"{precision.text} or {precision.limit} frames",
+        "prediction_error": PREDICTION_ERROR,
     }
-    return Outcome(
-        "fig12",
-        "Delay symbol error rate",
-        {"fig12": pd.concat(lines)},
-        _figure(curves, closed),
-        _verdicts(curves),
-        settings,
-    )
+    tables, figure = {"fig12": pd.concat(lines)}, _figure(curves, closed)
+    verdicts = _verdicts(curves)
+    return Outcome("fig12", "Delay symbol error rate", tables, figure, verdicts, settings)
 
 
 _LOOKS = {
@@ -129,13 +122,8 @@ def _figure(curves: dict[str, Curve], closed: dict[str, np.ndarray]) -> Figure:
             ax.plot(SNR_DB, p, color="k", lw=0.9, label=label)
         for i, (name, (look, label)) in enumerate(_LOOKS.items()):
             draw_rate(ax, curves[name], look, f"C{i % 10}", label)
-        ax.set(
-            xlabel="SNR per sample and antenna [dB]",
-            ylabel="delay symbol error rate",
-            yscale="log",
-            ylim=(3e-4, 1.5),
-            xlim=(-36, -18),
-        )
+        ax.set(xlabel="SNR per sample and antenna [dB]", xlim=(-36, -18))
+        ax.set(ylabel="delay symbol error rate", yscale="log", ylim=(3e-4, 1.5))
         ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -145,16 +133,32 @@ def draw_rate(ax, curve: Curve, look: str, colour: str, label: str, zeros: bool 
     cannot show."""
     t = curve.table()
     t = t if zeros else t[t.events > 0]
-    ax.errorbar(
-        t.snr_db,
-        t.rate,
-        [t.rate - t.low, t.high - t.rate],
-        fmt=look,
-        color=colour,
-        label=label,
-        capsize=1.5,
-        elinewidth=0.6,
-    )
+    ends = [t.rate - t.low, t.high - t.rate]
+    look_of = {"fmt": look, "color": colour, "label": label}
+    ax.errorbar(t.snr_db, t.rate, ends, **look_of, capsize=1.5, elinewidth=0.6)
+
+
+say = Sentences("""
+orders: For T = 51.2 us the SER remains largely unchanged as D grows
+  at -30 dB {rates}; equal with p = {chance:.2f}. Exactly so: turning a chirp leaves every power as
+  it was
+
+short: With T = 25.6 us the SER is higher, as the time-bandwidth product is smaller
+  SER 0.5 at {long} (51.2 us) and {short} (25.6 us, all times halved): {later} later; at -25 dB
+  {rate} with 51.2 us
+
+floor: The symbol is floor(peak - prediction)
+  with the prediction's fraction kept, at a random fraction of a cell, {floor} fail at -18 dB;
+  derotating by the prediction first, {derotated}
+
+dpsk clutter: With urban clutter a higher SNR is needed, and at high SNR the system is still robust
+  at -18 dB {shown} fail, without clutter {without}. SER {level} at {known} with the profile,
+  {filtered} with the filter and {plain} without clutter
+
+delay clutter: Urban clutter degrades the delay demodulation to a certain degree
+  at -18 dB {shown} fail, without clutter {without}. SER {level} at {known} with the profile,
+  {filtered} with the filter and {plain} without clutter
+""")
 
 
 def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
@@ -165,53 +169,31 @@ def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
         f"D = {d}: {proportion(*c)}" for d, c in zip(MODULATION_ORDERS, counts, strict=True)
     )
     later = difference(short, eight, 0.5)
+    half = {"long": decibels(eight.threshold(0.5)), "short": decibels(short.threshold(0.5))}
+    rounded = {"floor": curves["random fraction, floor"], "derotated": curves["random fraction"]}
     return (
-        Verdict(
-            "For T = 51.2 us the SER remains largely unchanged as D grows",
-            "holds" if chance > 0.01 else "does not hold",
-            f"at -30 dB {rates}; equal with p = {chance:.2f}. Exactly so: turning a chirp leaves "
-            "every power as it was",
-        ),
-        Verdict(
-            "With T = 25.6 us the SER is higher, as the time-bandwidth product is smaller",
-            "holds" if later[1] > 0 else "does not hold",
-            f"SER 0.5 at {decibels(eight.threshold(0.5))} (51.2 us) and "
-            f"{decibels(short.threshold(0.5))} (25.6 us, all times "
-            f"halved): {decibels(later)} later; at -25 dB {eight.text(-25)} with 51.2 us",
-        ),
-        clutter_verdict(
-            "Urban clutter degrades the delay demodulation to a certain degree",
-            eight,
-            curves["clutter"],
-            curves["clutter, filtered"],
-            curves["clutter, profile known"],
-        ),
-        Verdict(
-            "The symbol is floor(peak - prediction)",
-            "does not hold",
-            "with the prediction's fraction kept, at a random fraction of a cell, "
-            f"{curves['random fraction, floor'].text(-18)} fail "
-            f"at -18 dB; derotating by the prediction first, {curves['random fraction'].text(-18)}",
-        ),
+        say("orders", bool(chance > 0.01), rates=rates, chance=chance),
+        say("short", later[1] > 0, **half, later=decibels(later), rate=eight.text(-25)),
+        clutter_verdict("delay clutter", eight, curves),
+        say("floor", False, **{name: c.text(-18) for name, c in rounded.items()}),
     )
 
 
 def clutter_verdict(
-    claim: str, without: Curve, alone: Curve, filtered: Curve, known: Curve, level: float = 0.1
+    claim: str, without: Curve, curves: dict[str, Curve], suffix: str = "", level: float = 0.1
 ) -> Verdict:
     """Robust if a tenth at most fails at -18 dB without knowledge of the clutter, with or without
     the filter; else under a condition."""
-    cases = {"nothing known": alone, "the filter": filtered, "its profile known": known}
-    robust = {name: c.at(-18)[0] / c.at(-18)[1] <= level for name, c in cases.items()}
-    judged: Judgement = "does not hold" if not any(robust.values()) else "holds under a condition"
-    if robust["nothing known"] or robust["the filter"]:
-        judged = "holds"
+    kinds = {
+        "nothing known": "",
+        "the filter": ", filtered",
+        "its profile known": ", profile known",
+    }
+    cases = {name: curves[f"clutter{kind}{suffix}"] for name, kind in kinds.items()}
+    alone, filtered, known = (c.at(-18)[0] / c.at(-18)[1] <= level for c in cases.values())
+    at = {"known": "its profile known", "filtered": "the filter"}
+    passes = {name: decibels(cases[which].threshold(level)) for name, which in at.items()}
+    passes["plain"] = decibels(without.threshold(level))
     shown = "; ".join(f"with {name} {c.text(-18)}" for name, c in cases.items())
-    return Verdict(
-        claim,
-        judged,
-        f"at -18 dB {shown} fail, without clutter {without.text(-18)}. SER {level} at "
-        f"{decibels(known.threshold(level))} with the profile, "
-        f"{decibels(filtered.threshold(level))} with the filter and "
-        f"{decibels(without.threshold(level))} without clutter",
-    )
+    texts = {"shown": shown, "without": without.text(-18), "level": level}
+    return say(claim, alone or filtered, known, **texts, **passes)

@@ -21,7 +21,7 @@ from isac_rt.randomness import generator
 from isac_rt.receive.omp import omp
 from isac_rt.studies.paper.fig12 import draw_rate
 from isac_rt.studies.paper.montecarlo import INTERVAL, Counts, Curve, Precision, Steps, sample
-from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, blank, style
 from isac_rt.studies.paper.symbols import decibels
 
 PULSES, SLOTS = 40, 120
@@ -31,7 +31,7 @@ VECTORS = 50
 
 
 @dataclass(frozen=True)
-class Case:
+class Curves:
     """`span`: share of the velocity range in use (1/3 is the FFT's own); `pulses` that OMP has;
     channels summed in power."""
 
@@ -43,12 +43,12 @@ class Case:
 
 
 CASES = (
-    Case("40 pulses each, FFT's range", 1 / 3, 40, False),
-    Case("40 pulses each, FFT's range, off the grid", 1 / 3, 40, True),
-    Case("40 pulses each, full range", 1.0, 40, False),
-    Case("OMP with 120 pulses, FFT's range", 1 / 3, 120, False),
-    Case("OMP with 120 pulses, FFT's range, off the grid", 1 / 3, 120, True),
-    Case("40 pulses each, 45 channels", 1 / 3, 40, False, 45),
+    Curves("40 pulses each, FFT's range", 1 / 3, 40, False),
+    Curves("40 pulses each, FFT's range, off the grid", 1 / 3, 40, True),
+    Curves("40 pulses each, full range", 1.0, 40, False),
+    Curves("OMP with 120 pulses, FFT's range", 1 / 3, 120, False),
+    Curves("OMP with 120 pulses, FFT's range, off the grid", 1 / 3, 120, True),
+    Curves("40 pulses each, 45 channels", 1 / 3, 40, False, 45),
 )
 
 
@@ -59,39 +59,30 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     curves: dict[str, Curve] = {}
     for case in CASES:
         precision = Precision(_limit(case, quick), absolute=0.02 if quick else 0.005)
-        found = sample(
-            partial(hits, case, seed),
-            SNR_DB,
-            precision,
-            steps.part(precision.limit),
-            key=f"{seed} {case}",
-        )
-        curves |= {f"{case.name}: {name}": c for name, c in found.items()}
-    table = pd.concat([c.table().assign(curve=name) for name, c in curves.items()])
+        part = steps.part(precision.limit)
+        got = sample(partial(hits, case, seed), SNR_DB, precision, part, key=f"{seed} {case}")
+        curves |= {f"{case.name}: {name}": c for name, c in got.items()}
+    found = pd.concat([c.table().assign(curve=name) for name, c in curves.items()])
     settings = {
         "quick": quick,
         "seed": seed,
         "trials": {name: VECTORS * len(c.events) for name, c in curves.items()},
-        "stop": f"half-width <= max(0.1 p, {0.02 if quick else 0.005}) or the limit of batches",
+        "stop": f"{precision.text} or the limit of batches",
         "interval": INTERVAL,
         "snr": "per pulse after the range transform; 30.1 dB less per IF sample",
         "hit": "velocity error below one Doppler bin",
     }
+    tables, figure = {"fig8": found}, _figure(curves)
     return Outcome(
-        "fig8",
-        "Velocity by OMP and by FFT",
-        {"fig8": table},
-        _figure(curves),
-        _verdicts(curves),
-        settings,
+        "fig8", "Velocity by OMP and by FFT", tables, figure, _verdicts(curves), settings
     )
 
 
-def _limit(case: Case, quick: bool) -> int:
+def _limit(case: Curves, quick: bool) -> int:
     return (20 if quick else 200) // (5 if case.channels > 1 else 1)
 
 
-def hits(case: Case, seed: int, index: int) -> Counts:
+def hits(case: Curves, seed: int, index: int) -> Counts:
     """How many of VECTORS velocities OMP and FFT find, at every SNR."""
     rng = generator(seed, "fig8", case.name, index)
     bins = rng.uniform(-0.5, 0.5, VECTORS) * (SLOTS * case.span - 1)
@@ -146,36 +137,32 @@ def advantage(curves: dict[str, Curve], case: str) -> tuple[np.ndarray, np.ndarr
     return SNR_DB[(omp_.low > fft.high).to_numpy()], SNR_DB[(fft.low > omp_.high).to_numpy()]
 
 
+say = Sentences("""
+crossing: At low SNR OMP finds the velocity less often than the FFT, at moderate SNR more often, at
+high SNR both find it
+  40 pulses each, in the FFT's range and on its grid: half are found at {omp} (OMP) and {fft} (FFT);
+  OMP is better beyond the intervals at {equal[0]}, worse at {equal[1]}. With all 120 pulses OMP
+  needs {more_omp}: better at {more[0]}, worse at {more[1]}. Velocities over the full range: better
+  at {wide[0]}, worse at {wide[1]}; there the FFT folds and ends at 1/3
+
+range: Pseudo-random pulses keep the full velocity range
+  velocities over the full range at {snr:g} dB: OMP {full[0]}, FFT {full[1]}
+""")
+
+
 def _verdicts(curves: dict[str, Curve]) -> tuple[Verdict, ...]:
-    equal, more, wide = CASES[0].name, CASES[3].name, CASES[2].name
-    above, below = advantage(curves, equal)
-    above_more, below_more = advantage(curves, more)
-    half = {
-        n: decibels(curves[n].threshold(0.5))
-        for case in (equal, more)
-        for n in (f"{case}: OMP", f"{case}: FFT")
-    }
-    crosses = bool(above.size and below.size)
-    full = {n: curves[f"{wide}: {n}"].text(SNR_DB[-1]) for n in ("OMP", "FFT")}
-    above_wide, below_wide = advantage(curves, wide)
+    equal, wide, more = (CASES[i].name for i in (0, 2, 3))
+    better = {name: advantage(curves, name) for name in (equal, wide, more)}
+    crosses = all(points.size for points in better[equal])
+    words = {name: [_list(points) for points in both] for name, both in better.items()}
+    half = [f"{equal}: OMP", f"{equal}: FFT", f"{more}: OMP"]
+    omp_, fft, more_omp = (decibels(curves[name].threshold(0.5)) for name in half)
+    found = {"omp": omp_, "fft": fft, "more_omp": more_omp}
+    parts = {"equal": words[equal], "more": words[more], "wide": words[wide]}
+    full = [curves[f"{wide}: {name}"].text(SNR_DB[-1]) for name in ("OMP", "FFT")]
     return (
-        Verdict(
-            "At low SNR OMP finds the velocity less often than the FFT, at moderate SNR more "
-            "often, at high SNR both find it",
-            "holds" if crosses else "does not hold",
-            "40 pulses each, in the FFT's range and on its grid: half are found at "
-            f"{half[f'{equal}: OMP']} (OMP) and {half[f'{equal}: FFT']} (FFT); OMP is better "
-            f"beyond the intervals at {_list(above)}, worse at {_list(below)}. With all 120 "
-            f"pulses OMP needs {half[f'{more}: OMP']}: better at {_list(above_more)}, worse at "
-            f"{_list(below_more)}. Velocities over the full range: better at {_list(above_wide)}, "
-            f"worse at {_list(below_wide)}; there the FFT folds and ends at 1/3",
-        ),
-        Verdict(
-            "Pseudo-random pulses keep the full velocity range",
-            "holds" if above_wide.size else "does not hold",
-            f"velocities over the full range at {SNR_DB[-1]:g} dB: OMP {full['OMP']}, FFT "
-            f"{full['FFT']}",
-        ),
+        say("crossing", crosses, **found, **parts),
+        say("range", bool(better[wide][0].size), snr=SNR_DB[-1], full=full),
     )
 
 

@@ -6,10 +6,11 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+import xarray as xr
 
 from isac_rt.studies.paper import tracks
 from isac_rt.studies.paper.flight import fly
-from isac_rt.studies.paper.outcome import Judgement, Outcome, Progress, Verdict, proportion
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, proportion
 
 FRAMES, EVERY = 25, 20
 """The paper's interval of the AT: frames 0, 20, ... 480."""
@@ -24,25 +25,13 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     """Runs of the consistent variant that differ in noise and data, and one as printed."""
     count = QUICK_RUNS if quick else RUNS
     total = count * FRAMES + PRINTED_FRAMES
-    runs = [
-        fly(
-            "consistent",
-            "AT",
-            FRAMES,
-            EVERY,
-            seed + i,
-            partial(_report, progress, i * FRAMES, total),
-        )
-        for i in range(count)
-    ]
-    printed = fly(
-        "printed",
-        "AT",
-        PRINTED_FRAMES,
-        PRINTED_EVERY,
-        seed,
-        partial(_report, progress, count * FRAMES, total),
-    )
+
+    def flown(before: int, variant: str, frames: int, every: int, seed: int) -> xr.Dataset:
+        report = partial(_report, progress, before, total)
+        return fly(variant, "AT", frames, every, seed, report)
+
+    runs = [flown(i * FRAMES, "consistent", FRAMES, EVERY, seed + i) for i in range(count)]
+    printed = flown(count * FRAMES, "printed", PRINTED_FRAMES, PRINTED_EVERY, seed)
     grid = tracks.on_grid(runs, ("PT1", "PT2"), EVERY, "AT")
     settings = {
         "quick": quick,
@@ -59,9 +48,8 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "printed": tracks.table([printed], PRINTED_EVERY, ("PT1", "PT2")),
     }
     figure = tracks.figure(runs, EVERY, ("PT1", "PT2"), ("PT1", "PT2"), (160,), grid)
-    return Outcome(
-        "fig9", "Tracking at the AT", tables, figure, _verdicts(runs, printed, grid), settings
-    )
+    verdicts = _verdicts(runs, printed, grid)
+    return Outcome("fig9", "Tracking at the AT", tables, figure, verdicts, settings)
 
 
 def _report(progress: Progress, before: int, total: int, done: int, _: int) -> None:
@@ -72,34 +60,30 @@ def _range(values: list[int]) -> str:
     return str(values[0]) if min(values) == max(values) else f"{min(values)} to {max(values)}"
 
 
+say = Sentences("""
+tracks: The AT tracks PT1 and PT2 at once
+  consistent variant: PT1 in {one}, PT2 in {two} of its processed frames in view, after {warm_up} to
+  confirm a track; as printed PT2 is detected in {there} of {printed}
+
+enters: PT2 enters the AT's field of view at about frame 160
+  consistent variant: in view from 132, first processed and detected in frame {first}, with a
+  confirmed track from {confirmed} ({runs} runs); as printed never
+""")
+
+
 def _verdicts(runs, printed, grid) -> tuple[Verdict, ...]:
     one, two = (tracks.followed(runs, uav, WARM_UP) for uav in ("PT1", "PT2"))
-    first = [
-        int(np.flatnonzero(np.isfinite(r.sel(uav="PT2").detected_range.values))[0]) * EVERY
-        for r in runs
-    ]
-    confirmed = [
-        int(np.flatnonzero(np.isfinite(r.sel(uav="PT2").tracked_range.values))[0]) * EVERY
-        for r in runs
-    ]
+
+    def first(values: str) -> str:
+        seen = [np.isfinite(r.sel(uav="PT2")[values].values) for r in runs]
+        return _range([int(np.flatnonzero(s)[0]) * EVERY for s in seen])
+
     there = int(np.isfinite(printed.sel(uav="PT2").detected_range.values).sum())
-    tracked: Judgement = (
-        "holds under a condition" if one[0] == one[1] and two[0] == two[1] else "does not hold"
-    )
+    shares = {"one": proportion(*one), "two": proportion(*two), "warm_up": WARM_UP}
+    both = one[0] == one[1] and two[0] == two[1]
+    begin = {"first": first("detected_range"), "confirmed": first("tracked_range")}
     return (
-        Verdict(
-            "The AT tracks PT1 and PT2 at once",
-            tracked,
-            f"consistent variant: PT1 in {proportion(*one)}, PT2 in {proportion(*two)} of its "
-            f"processed frames in view, after {WARM_UP} to confirm a track; as printed PT2 is "
-            f"detected in {there} of {PRINTED_FRAMES}",
-        ),
-        Verdict(
-            "PT2 enters the AT's field of view at about frame 160",
-            "does not hold",
-            "consistent variant: in view from 132, first processed and detected in frame "
-            f"{_range(first)}, with a confirmed "
-            f"track from {_range(confirmed)} ({len(first)} runs); as printed never",
-        ),
+        say("tracks", False, both, **shares, there=there, printed=PRINTED_FRAMES),
+        say("enters", False, **begin, runs=len(runs)),
         tracks.filter_verdict(runs, ("PT1", "PT2"), "AT", grid),
     )

@@ -63,7 +63,7 @@ Kind = Literal["FMCW", "AT", "PT", "LoRadar"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class Setting:
     """What is simulated.
 
     Attributes
@@ -121,7 +121,7 @@ class Target:
     amplitudes: np.ndarray
 
 
-def draw_target(case: Case, rng: np.random.Generator) -> Target:
+def draw_target(case: Setting, rng: np.random.Generator) -> Target:
     """A target anywhere in view or PT1's place, and clutter."""
     w = case.waveform
     (u, away), distance = _directions(rng), rng.uniform(NEAREST, FARTHEST)
@@ -144,7 +144,7 @@ def _directions(rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload) -> IFCube:
+def make_cube(case: Setting, target: Target, schedule: np.ndarray, payload: Payload) -> IFCube:
     """Noise-free samples of a target of unit amplitude, and clutter from the same direction."""
     w, antennas = case.waveform, paper_antennas(case.waveform)
     (distance, velocity), u = target.truth[:2], unit_vector(target.truth[2:])
@@ -169,7 +169,7 @@ def make_cube(case: Case, target: Target, schedule: np.ndarray, payload: Payload
     return if_signal(w, [(sent, paths)], ReceiveArray(pose, antennas), Reference(0.0), method)
 
 
-def make_noise(case: Case, seed: int, index: int) -> np.ndarray:
+def make_noise(case: Setting, seed: int, index: int) -> np.ndarray:
     """(M, L_rx, P, N) complex64 of unit power."""
     w, rng = case.waveform, generator(seed, "hit noise", case.name, index)
     pairs = rng.standard_normal((w.num_groups, 15, w.num_chirps, 2 * w.num_samples), np.float32)
@@ -177,7 +177,7 @@ def make_noise(case: Case, seed: int, index: int) -> np.ndarray:
     return pairs.view(np.complex64)
 
 
-def count_hits(case: Case, seed: int, index: int) -> Counts:
+def count_hits(case: Setting, seed: int, index: int) -> Counts:
     """Hits of frame `index` by method, at every SNR of the case."""
     found: dict[str, list[tuple[int, int]]] = {}
 
@@ -197,12 +197,12 @@ Note = Callable[..., None]
 MakeNoise = Callable[[], np.ndarray]
 
 
-def levels(case: Case) -> np.ndarray:
+def levels(case: Setting) -> np.ndarray:
     """Noise amplitudes of the SNR points; a sample of the target has unit power."""
     return 10 ** (-np.array(case.snr_db) / 20)
 
 
-def hit(case: Case, target: Target, estimate: Estimate, antennas: Antennas) -> bool:
+def hit(case: Setting, target: Target, estimate: Estimate, antennas: Antennas) -> bool:
     """Whether all four errors are below the resolution."""
     w = case.waveform
     bound = resolution(w, antennas)
@@ -242,13 +242,13 @@ def is_detected(power: np.ndarray, row: int, column: int, looks: int) -> bool:
     return bool(CfarRule.of(SETTINGS, looks).detect(power)[0][row, column])
 
 
-def first_row(case: Case, cell: float) -> int:
+def first_row(case: Setting, cell: float) -> int:
     """Rows before it are not searched."""
     return int(np.ceil(SETTINGS.min_range_m / cell))
 
 
 def _fmcw(
-    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+    case: Setting, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
 ) -> None:
     w, schedule, payload = fmcw_frame(case.waveform)
     times = np.arange(w.num_chirps) * w.slot_duration
@@ -271,7 +271,7 @@ def _fmcw(
 
 
 def _loradar(
-    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+    case: Setting, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
 ) -> None:
     system, (r, v, *u) = LoRadar(case.waveform), target.truth
     antennas = paper_antennas(case.waveform)
@@ -296,7 +296,7 @@ def _loradar(
 
 
 def _tdm(
-    case: Case,
+    case: Setting,
     target: Target,
     both: list[np.ndarray],
     schedule: np.ndarray,
@@ -324,7 +324,7 @@ def _tdm(
 
 
 def _active(
-    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+    case: Setting, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
 ) -> None:
     w = case.waveform
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
@@ -366,7 +366,7 @@ def _note_united(look: _Look, power: np.ndarray, note: Note) -> None:
 class _Look:
     """Cleaned spectra of one frame at one SNR and what is known of them."""
 
-    case: Case
+    case: Setting
     target: Target
     spectra: np.ndarray
     known: Known
@@ -483,7 +483,7 @@ def _add_strongest(total, found):  # pragma: no cover - compiled
 
 
 def _passive(
-    case: Case, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
+    case: Setting, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
 ) -> None:
     w = case.waveform
     schedule = pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
@@ -518,7 +518,7 @@ def _passive(
 
 
 def _read(
-    case: Case,
+    case: Setting,
     target: Target,
     cube: IFCube,
     delay_symbols: np.ndarray,
@@ -532,7 +532,7 @@ def _read(
     return _Look(case, target, clean_spectrum(cube, known), known, near).by_omp()
 
 
-def _predict(case: Case, target: Target, rng: np.random.Generator) -> Prediction:
+def _predict(case: Setting, target: Target, rng: np.random.Generator) -> Prediction:
     """The line of sight with the errors of figures 11 and 12, and the clutter where its profile is
     known."""
     error, rate = (

@@ -70,6 +70,10 @@ class Precision:
     relative: float = 0.1
     absolute: float = 0.01
 
+    @property
+    def text(self) -> str:
+        return f"half-width <= max({self.relative} p, {self.absolute})"
+
     def reached(self, events: np.ndarray, trials: int) -> bool:
         """Whether all points of a curve are known well enough, from events (frames, points) of
         `trials` possible ones in a frame."""

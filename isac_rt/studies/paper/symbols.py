@@ -40,6 +40,9 @@ VELOCITY_ERROR = 0.25
 """Of the prediction: standard deviation in range cells, and largest error [m/s], uniform."""
 
 
+PREDICTION_ERROR = f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s"
+
+
 def link_waveform(num_samples: int) -> Waveform:
     """One group of the paper's frame; 512 samples (T = 25.6 us) halve all times and keep the sweep
     of 640 MHz."""
@@ -52,7 +55,7 @@ def paper_antennas(waveform: Waveform) -> Antennas:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Link:
+class Setting:
     """What is simulated.
 
     Attributes
@@ -84,7 +87,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LinkFrame:
     """One trial: noise-free samples (L_rx, P, N) of unit amplitude, what was sent, and what the
     receiver expects."""
 
@@ -97,7 +100,7 @@ class Frame:
     weights: np.ndarray
 
 
-def draw_frame(link: Link, seed: int, index: int) -> Frame:
+def draw_frame(link: Setting, seed: int, index: int) -> LinkFrame:
     """Schedule, data, path and prediction of frame `index`. `lengths`, `weights`: predicted paths,
     line of sight first."""
     w, rng = link.waveform, generator(seed, "symbols", link.name, index)
@@ -143,7 +146,7 @@ def draw_frame(link: Link, seed: int, index: int) -> Frame:
         else (RANGE_ERROR_CELLS * rng.standard_normal(), rng.uniform(-1, 1) * VELOCITY_ERROR)
     )
     predicted = lengths + errors[0] * w.range_cell(1)
-    return Frame(cube.samples[0], schedule, symbols, transitions, predicted, errors[1], weights)
+    return LinkFrame(cube.samples[0], schedule, symbols, transitions, predicted, errors[1], weights)
 
 
 def _path(
@@ -170,7 +173,7 @@ def _path(
     )
 
 
-def cell_noise(link: Link, seed: int, index: int, num_rx: int = 15) -> np.ndarray:
+def cell_noise(link: Setting, seed: int, index: int, num_rx: int = 15) -> np.ndarray:
     """(L_rx, P, N) complex64 noise of the range cells, variance N: the transform of white noise of
     unit power."""
     w = link.waveform
@@ -244,7 +247,7 @@ def make_cells(
     )
 
 
-def count_errors(link: Link, snr_db: np.ndarray, seed: int, index: int) -> Counts:
+def count_errors(link: Setting, snr_db: np.ndarray, seed: int, index: int) -> Counts:
     """Errors of frame `index`: "delay", "dpsk D" (end to end), "dpsk D known delay", and by the
     paper's letter "delay floor", "delay round", "dpsk D literal"."""
     w, frame, noise = link.waveform, draw_frame(link, seed, index), cell_noise(link, seed, index)
@@ -291,15 +294,15 @@ def count_errors(link: Link, snr_db: np.ndarray, seed: int, index: int) -> Count
 
 
 def _dpsk_errors(
-    picked: np.ndarray, frame: Frame, order: int, sent: np.ndarray, w: Waveform
+    picked: np.ndarray, frame: LinkFrame, order: int, sent: np.ndarray, w: Waveform
 ) -> int:
     turned = picked * running_phases(sent, frame.schedule, order)[:, None]
     return int((decide_transitions(turned, frame.schedule, w.num_tx, order)[0] != sent).sum())
 
 
 def _by_the_letter(
-    link: Link,
-    frame: Frame,
+    link: Setting,
+    frame: LinkFrame,
     noise: np.ndarray,
     beats: np.ndarray,
     snr_db: np.ndarray,
@@ -322,7 +325,7 @@ def _by_the_letter(
 
 
 def run_link(
-    link: Link, snr_db: np.ndarray, precision: Precision, seed: int, progress: Progress
+    link: Setting, snr_db: np.ndarray, precision: Precision, seed: int, progress: Progress
 ) -> dict[str, Curve]:
     """The curves of a link, by what they count; each is called "LINK: COUNT"."""
     return sample(

@@ -4,12 +4,11 @@ geometry."""
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.studies.paper.flight import VARIANTS, closing_speed, scenario, span, views
-from isac_rt.studies.paper.outcome import Judgement, Outcome, Progress, Verdict, blank, style
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, blank, style, table
 
 _COLOURS = {"printed": "#D55E00", "consistent": "#0072B2"}
 Views = dict[str, dict[tuple[str, str], np.ndarray]]
@@ -23,27 +22,13 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         seen[variant] = views(scene)
         progress(i + 1, len(scenes))
     rows = [
-        {
-            "variant": variant,
-            "who": who,
-            "whom": whom,
-            "frames_in_view": int(mask.sum()),
-            "frames": span(mask),
-        }
-        for variant, table in seen.items()
-        for (who, whom), mask in table.items()
+        (variant, who, whom, int(mask.sum()), span(mask))
+        for variant, every in seen.items()
+        for (who, whom), mask in every.items()
     ]
-    for variant, table in seen.items():
-        joint = table["AT", "PT2"] & table["PT1", "PT2"]
-        rows.append(
-            {
-                "variant": variant,
-                "who": "AT and PT1",
-                "whom": "PT2",
-                "frames_in_view": int(joint.sum()),
-                "frames": span(joint),
-            }
-        )
+    for variant, every in seen.items():
+        joint = every["AT", "PT2"] & every["PT1", "PT2"]
+        rows.append((variant, "AT and PT1", "PT2", int(joint.sum()), span(joint)))
     speed = {variant: closing_speed(scene, "AT", "PT2") for variant, scene in scenes.items()}
     limit = waveform_of(scenes["printed"]).max_velocity(2)
     settings = {
@@ -52,71 +37,52 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "frames": scenes["printed"].frames,
         "counted_at": "middle of a frame",
     }
-    return Outcome(
-        "table2",
-        "Table II",
-        {"table2": pd.DataFrame(rows)},
-        _figure(seen),
-        _verdicts(seen, speed, limit),
-        settings,
-    )
+    tables = {"table2": table("variant who whom frames_in_view frames", rows)}
+    verdicts = _verdicts(seen, speed, limit)
+    return Outcome("table2", "Table II", tables, _figure(seen), verdicts, settings)
+
+
+say = Sentences("""
+PT1: PT1 stays in the AT's field of view
+  {text}
+
+AT: The AT stays in PT1's field of view
+  {text}
+
+PT2: PT2 enters the AT's field of view
+  {text}
+
+160: PT2 enters the AT's field of view at about frame 160
+  {text}
+
+by the AT: PT1 has PT2 by way of the AT in frames 107 to 359
+  {text}; 107 also contradicts the 160 of the AT, whose field of view is needed as well
+
+speed: The radial velocities stay unambiguous
+  {text}; limit {limit:.2f} m/s
+""")
 
 
 def _verdicts(
     seen: Views, speed: dict[str, tuple[float, float]], limit: float
 ) -> tuple[Verdict, ...]:
-    printed, mended = seen["printed"], seen["consistent"]
+    def both(masks: list[np.ndarray]) -> str:
+        return f"as printed: {span(masks[0])}; consistent variant: {span(masks[1])}"
 
-    def judge(as_printed: bool, as_mended: bool) -> Judgement:
-        return (
-            "holds" if as_printed else "holds under a condition" if as_mended else "does not hold"
-        )
-
-    def both(who: str, whom: str) -> str:
-        return (
-            f"as printed: {span(printed[who, whom])}; consistent variant: {span(mended[who, whom])}"
-        )
-
-    first = [
-        int(np.argmax(t["AT", "PT2"])) if t["AT", "PT2"].any() else -1 for t in (printed, mended)
-    ]
-    joint = [t["AT", "PT2"] & t["PT1", "PT2"] for t in (printed, mended)]
-    here = [span(j) == "107 to 359" for j in joint]
+    views = {pair: [every[pair] for every in seen.values()] for pair in seen["printed"]}
+    one, back, two = (views[pair] for pair in (("AT", "PT1"), ("PT1", "AT"), ("AT", "PT2")))
+    joint = [a & b for a, b in zip(two, views["PT1", "PT2"], strict=True)]
+    there = [bool(mask.any()) for mask in two]
+    at_160 = [bool(mask.any()) and 150 <= int(np.argmax(mask)) <= 170 for mask in two]
+    inside = [speed[v][1] < limit for v in VARIANTS]
+    speeds = (f"AT to PT2 {v}: {speed[v][0]:.1f} to {speed[v][1]:.1f} m/s" for v in VARIANTS)
     return (
-        Verdict(
-            "PT1 stays in the AT's field of view",
-            judge(*(bool(t["AT", "PT1"].all()) for t in (printed, mended))),
-            both("AT", "PT1"),
-        ),
-        Verdict(
-            "The AT stays in PT1's field of view",
-            judge(*(bool(t["PT1", "AT"].all()) for t in (printed, mended))),
-            both("PT1", "AT"),
-        ),
-        Verdict(
-            "PT2 enters the AT's field of view",
-            judge(first[0] >= 0, first[1] >= 0),
-            both("AT", "PT2"),
-        ),
-        Verdict(
-            "PT2 enters the AT's field of view at about frame 160",
-            judge(*(150 <= f <= 170 for f in first)),
-            both("AT", "PT2"),
-        ),
-        Verdict(
-            "PT1 has PT2 by way of the AT in frames 107 to 359",
-            judge(*here),
-            f"as printed: {span(joint[0])}; consistent variant: {span(joint[1])}; 107 also "
-            "contradicts the 160 of the AT, whose field of view is needed as well",
-        ),
-        Verdict(
-            "The radial velocities stay unambiguous",
-            judge(*(speed[v][1] < limit for v in VARIANTS)),
-            "; ".join(
-                f"AT to PT2 {v}: {speed[v][0]:.1f} to {speed[v][1]:.1f} m/s" for v in VARIANTS
-            )
-            + f"; limit {limit:.2f} m/s",
-        ),
+        say("PT1", *(bool(mask.all()) for mask in one), text=both(one)),
+        say("AT", *(bool(mask.all()) for mask in back), text=both(back)),
+        say("PT2", *there, text=both(two)),
+        say("160", *at_160, text=both(two)),
+        say("by the AT", *(span(j) == "107 to 359" for j in joint), text=both(joint)),
+        say("speed", *inside, text="; ".join(speeds), limit=limit),
     )
 
 
@@ -126,23 +92,17 @@ def _figure(seen: Views) -> Figure:
         figure, axes = blank(size=(6.8, 3.4))
         ax, pairs = axes[0, 0], list(seen["printed"])
         for i, pair in enumerate(pairs):
-            for offset, (variant, table) in zip((0.18, -0.18), seen.items(), strict=True):
-                edges = np.flatnonzero(np.diff(np.concatenate([[0], table[pair].astype(int), [0]])))
+            for offset, (variant, masks) in zip((0.18, -0.18), seen.items(), strict=True):
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], masks[pair].astype(int), [0]])))
                 bars = [(a, b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-                ax.broken_barh(
-                    bars,
-                    (-i + offset - 0.15, 0.3),
-                    color=_COLOURS[variant],
-                    label=variant if i == 0 else None,
-                )
+                label = variant if i == 0 else None
+                place = (-i + offset - 0.15, 0.3)
+                ax.broken_barh(bars, place, color=_COLOURS[variant], label=label)
         for frame, text in ((160, "160"), (107, "107"), (359, "359")):
             ax.axvline(frame, color="#303030", lw=0.9, ls="--")
             ax.text(frame + 4, 0.62, text, fontsize=8)
-        ax.set(
-            xlabel="frame (dashed: the paper's 160, 107 and 359)",
-            xlim=(0, 500),
-            ylim=(-len(pairs) + 0.4, 1.0),
-        )
+        ax.set(xlabel="frame (dashed: the paper's 160, 107 and 359)", xlim=(0, 500))
+        ax.set(ylim=(-len(pairs) + 0.4, 1.0))
         ax.set_yticks([-i for i in range(len(pairs))], [f"{a} has {b} in view" for a, b in pairs])
         handles, labels = ax.get_legend_handles_labels()
         figure.legend(
