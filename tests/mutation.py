@@ -133,7 +133,7 @@ EXCUSED = [
     ("signal/gridded.py", "t.link[k[:, 1]]", "the paths of a block are of one link"),
     ("signal/gridded.py", "lag[:, 1]", "and of one offset"),
     ("signal/separable.py", "* fast) % 2)", "whole turns, one or two"),
-    ("propagation/clutter/penumbra.py", "lift / side", "a quotient by a sign"),
+    ("propagation/clutter/penumbra.py", "LIFT / side", "a quotient by a sign"),
     ("propagation/legs/between.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
     ("receive/omp.py", "support] = -2", "less than any modulus, as -1 is"),
     (

@@ -37,7 +37,6 @@ import sionna.rt as rt
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.resampled import scatterer_phase
-from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.between import Between, LegSet, TracedLegs, leg_set
@@ -52,6 +51,7 @@ from isac_rt.propagation.legs.geometry import (
     straight,
     unfold,
 )
+from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.ways import LinkState, Ways
@@ -92,7 +92,8 @@ class RayTracer:
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
         scene, wavelength = self._handle.scene.mi_scene, free.wavelength
-        self._edges = ShadowEdges(city, Shadows(scene), wavelength)
+        shadows = Shadows(scene)
+        self._edges = ShadowEdges(city, shadows, wavelength)
         self.field: ClutterField | None = None
         """The scatterers on the city's surfaces."""
         self.two_bounces: TwoBounces | None = None
@@ -108,7 +109,7 @@ class RayTracer:
         if len(instants) > 1:
             mirrors = self._normals, self._offsets
             self.between = Between(
-                np.array(instants), self._legs_on_the_way, city, mirrors, scene, wavelength
+                np.array(instants), self._legs_on_the_way, city, mirrors, shadows, wavelength
             )
         self._clearance = Clearance(city)
         self._handle.scene.tx_array = self._handle.scene.rx_array = rt.PlanarArray(

@@ -41,8 +41,10 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Cells, Density, cut
-from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Shadows, Sight
+from isac_rt.propagation.clutter.penumbra import Facets
+from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight
 from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState, Ways
@@ -161,9 +163,8 @@ class ClutterField:
             city.normals[candidates.face],
         )
         cells = candidates.select(np.flatnonzero(kept))
-        sight = Sight(
-            shadows, flights, cells.points, city.normals[cells.face], cells.area, wavelength
-        )
+        facets = Facets(cells.points, city.normals[cells.face], cells.area)
+        sight = Sight(shadows, flights, facets, wavelength)
         return cls(city, cells, sight, wavelength, len(candidates))
 
     @property

@@ -22,8 +22,9 @@ import numpy as np
 
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Density, cut
-from isac_rt.propagation.clutter.sight import LIFT, Flight, Shadows
+from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.geometry import plane_of_each_face
+from isac_rt.propagation.legs.rays import LIFT, Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh

@@ -19,12 +19,14 @@ Import only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.legs.diffraction import knife_edge
+from isac_rt.propagation.legs.rays import LIFT, rays
 
 HALVINGS = 6
 """Of the flight between two knots; what is left is 8 mm of half a metre."""
@@ -58,7 +60,7 @@ class Triangles:
     hit takes as long as a million rays."""
 
     def __init__(self, scene: mi.Scene) -> None:
-        parts = [np.zeros((0, 3, 3), np.float32)]
+        self.scene, parts = scene, [np.zeros((0, 3, 3), np.float32)]
         self._first: dict[int, int] = {}
         for shape in scene.shapes():
             values = mi.traverse(shape)
@@ -97,37 +99,35 @@ class Crossings:
     gained: np.ndarray
 
 
-def crossings(
-    scene: mi.Scene,
-    triangles: Triangles,
-    knots: np.ndarray,
-    seen: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    lift: float,
-    area: np.ndarray,
-    wavelength: float,
-) -> Crossings:
-    """What changes between two knots (2, 3), of N points on surfaces, seen (2, N) from either.
+class Facets(NamedTuple):
+    """N points on surfaces with unit normals (N, 3), local coordinates, and the areas (N,) of the
+    cells that they stand for [m^2]."""
 
-    Parameters
-    ----------
-    lift : rays start this far off the surface [m]
-    area : (N,) of the cells that the points stand for [m^2]
-    """
+    points: np.ndarray
+    normals: np.ndarray
+    area: np.ndarray
+
+    def select(self, which: np.ndarray) -> Facets:
+        """The points that an index array chooses."""
+        return Facets(self.points[which], self.normals[which], self.area[which])
+
+
+def crossings(
+    triangles: Triangles, knots: np.ndarray, seen: np.ndarray, facets: Facets, wavelength: float
+) -> Crossings:
+    """What changes between two knots (2, 3), of N points on surfaces, seen (2, N) from either."""
     index = np.flatnonzero(seen[0] != seen[1]).astype(np.int32)
     gained = seen[1][index].astype(bool)
-    p, n = points[index], normals[index]
+    some = facets.select(index)
     low, high = np.zeros(index.size), np.ones(index.size)
     for _ in range(HALVINGS if index.size else 0):
         middle = (low + high) / 2
-        now = ~np.asarray(scene.ray_test(_rays(p, n, _between(knots, middle), lift)))
+        ray = _rays(some, _between(knots, middle))
+        now = ~np.asarray(triangles.scene.ray_test(ray))
         after = now == gained
         low, high = np.where(after, low, middle), np.where(after, middle, high)
     where = (low + high) / 2
-    width = _widths(
-        scene, triangles, knots, np.where(gained, low, high), p, n, lift, area[index], wavelength
-    )
+    width = _widths(triangles, knots, np.where(gained, low, high), some, wavelength)
     return Crossings(index, where.astype(np.float32), width.astype(np.float32), gained)
 
 
@@ -135,28 +135,25 @@ def _between(knots: np.ndarray, share: np.ndarray) -> np.ndarray:
     return knots[0] + share[:, None] * (knots[1] - knots[0])
 
 
-def _rays(points: np.ndarray, normals: np.ndarray, places: np.ndarray, lift: float) -> mi.Ray3f:
+def _rays(facets: Facets, places: np.ndarray) -> mi.Ray3f:
     """From points lifted off their surfaces to a place each."""
-    side = np.sign(((places - points) * normals).sum(1))
-    start = points + lift * side[:, None] * normals
+    side = np.sign(((places - facets.points) * facets.normals).sum(1))
+    start = facets.points + LIFT * side[:, None] * facets.normals
     span = places - start
     length = np.linalg.norm(span, axis=1)
-    span /= length[:, None]
-    ray = mi.Ray3f(
-        mi.Point3f(*np.ascontiguousarray(start.T, np.float32)),
-        mi.Vector3f(*np.ascontiguousarray(span.T, np.float32)),
-    )
-    ray.maxt = mi.Float((length - lift).astype(np.float32))  # type: ignore[assignment]
-    return ray
+    return rays(start, span / length[:, None], length - LIFT)
 
 
-def _widths(scene, triangles, knots, dark, points, normals, lift, area, wavelength):  # type: ignore[no-untyped-def]
+def _widths(
+    triangles: Triangles, knots: np.ndarray, dark: np.ndarray, facets: Facets, wavelength: float
+) -> np.ndarray:
     """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way
     between two knots."""
+    points, normals, area = facets
     if not points.shape[0]:
         return np.zeros(0)
     places = _between(knots, dark)
-    hit = scene.ray_intersect_preliminary(_rays(points, normals, places, lift))
+    hit = triangles.scene.ray_intersect_preliminary(_rays(facets, places))
     dr.eval(hit)  # once, not for each of its parts
     near, triangle = np.asarray(hit.t, np.float64), triangles.rows(hit)
     found = triangle >= 0
@@ -164,7 +161,7 @@ def _widths(scene, triangles, knots, dark, points, normals, lift, area, waveleng
     span = points - places
     length = np.linalg.norm(span, axis=1)
     ray = span / length[:, None]
-    behind = np.clip(near, lift, length - lift)
+    behind = np.clip(near, LIFT, length - LIFT)
     at = points - behind[:, None] * ray
     along = np.roll(corners, -1, axis=1) - corners
     size = np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)

@@ -11,22 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 from scipy.interpolate import BSpline
 
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
-from isac_rt.propagation.clutter.penumbra import Crossings, Triangles, crossings, penumbra
+from isac_rt.propagation.clutter.penumbra import Crossings, Facets, Triangles, crossings, penumbra
+from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.world.swarm import Pose, Trajectory
 
 KNOT_SPACING = 0.5
 """Flight from one test of the rays to the next [m]."""
 OFF_FLIGHT = 1e-3
 """A pose farther than this from the planned flight [m] has its rays tested by itself."""
-LIFT = 2e-3
-"""Rays start this far from the surface and end as far before the viewer [m]; float32 corners and
-rays are good to a tenth of it."""
-CHUNK = 1 << 20
 REACH = 3
 """Knots on each side that matter to a blend, which is how sight by way of mirrors comes and
 goes."""
@@ -36,46 +32,6 @@ WIDEST = (AROUND - 1) / PENUMBRA
 """Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is
 forgotten."""
 BLEND = BSpline.basis_element(np.arange(-REACH, REACH + 1))
-
-
-class Shadows:
-    """Ray tests in a Mitsuba scene, local coordinates."""
-
-    def __init__(self, scene: mi.Scene) -> None:
-        self.scene = scene
-
-    def sees(self, place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(N,) whether `place` sees points (N, 3) on surfaces with unit normals (N, 3) (of either
-        side)."""
-        out = np.empty(len(points), bool)
-        for first in range(0, len(points), CHUNK):
-            part = slice(first, first + CHUNK)
-            span = place - points[part]
-            side = np.where((span * normals[part]).sum(1) < 0, -LIFT, LIFT)
-            start = points[part] + side[:, None] * normals[part]
-            span = place - start
-            length = np.linalg.norm(span, axis=1)
-            span /= np.maximum(length, LIFT)[:, None]
-            ray = mi.Ray3f(mi.Point3f(*_rows(start)), mi.Vector3f(*_rows(span)))
-            ray.maxt = mi.Float(np.maximum(length - LIFT, 0.0).astype(np.float32))  # type: ignore[assignment]
-            out[part] = ~np.asarray(self.scene.ray_test(ray))
-        return out
-
-    def clear(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """(N,) whether nothing stands between points (N, 3) and points (N, 3)."""
-        span = ends - starts
-        length = np.linalg.norm(span, axis=1)
-        ray = mi.Ray3f(
-            mi.Point3f(*_rows(starts)),
-            mi.Vector3f(*_rows(span / np.maximum(length, 1e-9)[:, None])),
-        )
-        ray.maxt = mi.Float(length.astype(np.float32))  # type: ignore[assignment]
-        return ~np.asarray(self.scene.ray_test(ray))
-
-
-def _rows(vectors: np.ndarray) -> np.ndarray:
-    """(3, N) float32 of (N, 3)."""
-    return np.ascontiguousarray(vectors.T, np.float32)
 
 
 class Flight:
@@ -135,27 +91,15 @@ class Sight:
     ----------
     shadows : for rays
     flights : by terminal
-    points, normals : (N, 3) on surfaces, local coordinates
-    area : (N,) of the cells that the points stand for [m^2]
+    facets : the N points
     wavelength : [m]
     """
 
     def __init__(
-        self,
-        shadows: Shadows,
-        flights: dict[str, Flight],
-        points: np.ndarray,
-        normals: np.ndarray,
-        area: np.ndarray,
-        wavelength: float,
+        self, shadows: Shadows, flights: dict[str, Flight], facets: Facets, wavelength: float
     ) -> None:
         self.shadows, self.flights = shadows, flights
-        self._points, self._normals, self._area, self._wavelength = (
-            points,
-            normals,
-            area,
-            wavelength,
-        )
+        self._facets, self._wavelength = facets, wavelength
         self._seen: dict[tuple[str, int], np.ndarray] = {}
         self._crossed: dict[tuple[str, int], Crossings] = {}
         self._nearby: dict[str, _Nearby] = {}
@@ -173,7 +117,7 @@ class Sight:
         """(N,) float32 for a terminal at a pose, local coordinates."""
         flight = self.flights[name]
         if not flight.holds(pose, time):
-            return self.shadows.sees(pose.position, self._points, self._normals).astype(np.float32)
+            return self._test(pose.position).astype(np.float32)
         q = flight.number(time)
         knot = int(np.clip(np.rint(q), 0, len(flight.knots) - 1))
         if name not in self._nearby or self._nearby[name].knot != knot:
@@ -231,24 +175,17 @@ class Sight:
             if self._triangles is None:
                 self._triangles = Triangles(self.shadows.scene)
             self._crossed[name, number] = crossings(
-                self.shadows.scene,
-                self._triangles,
-                knots,
-                seen,
-                self._points,
-                self._normals,
-                LIFT,
-                self._area,
-                self._wavelength,
+                self._triangles, knots, seen, self._facets, self._wavelength
             )
         return self._crossed[name, number]
 
     def _knot(self, name: str, knot: int) -> np.ndarray:
         if (name, knot) not in self._seen:
-            self._seen[name, knot] = np.packbits(
-                self.shadows.sees(self.flights[name].knots[knot], self._points, self._normals)
-            )
-        return np.unpackbits(self._seen[name, knot], count=len(self._points))
+            self._seen[name, knot] = np.packbits(self._test(self.flights[name].knots[knot]))
+        return np.unpackbits(self._seen[name, knot], count=len(self._facets.points))
+
+    def _test(self, place: np.ndarray) -> np.ndarray:
+        return self.shadows.sees(place, self._facets.points, self._facets.normals)
 
 
 @dataclass(frozen=True)

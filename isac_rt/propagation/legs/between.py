@@ -16,12 +16,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import mitsuba as mi
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation.clutter.sight import LIFT, _rows
 from isac_rt.propagation.legs.geometry import EDGE, Legs, unfold
+from isac_rt.propagation.legs.rays import LIFT, Shadows
 from isac_rt.propagation.legs.reflection import mirror_amplitude
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
@@ -106,7 +105,7 @@ class Between:
     trace : traces an instant
     city : CityMesh
     mirrors : normals (F, 3) and offsets (F,) of the plane that each face lies in
-    scene : for rays
+    shadows : for rays
     wavelength : [m]
     """
 
@@ -116,11 +115,11 @@ class Between:
         trace: Callable[[float], TracedLegs],
         city: CityMesh,
         mirrors: tuple[np.ndarray, np.ndarray],
-        scene: mi.Scene,
+        shadows: Shadows,
         wavelength: float,
     ) -> None:
         self._instants, self._trace, self._city, self._mirrors = instants, trace, city, mirrors
-        self._scene, self._wavelength = scene, wavelength
+        self._shadows, self._wavelength = shadows, wavelength
         self._kept: dict[int, TracedLegs] = {}
         self._interval: tuple[int, list[_Chains]] = (0, [])
         self.num_traced = 0
@@ -194,10 +193,10 @@ class Between:
             (end[:, :-1], 2 * part.stops[part.doubtful, 1:-1] - end[:, :-1])
             for part, (_, end) in zip(found, lifted, strict=True)
         ]
-        clear = ~self._blocked(
+        clear = self._shadows.clear(
             *(np.concatenate([rays[side].reshape(-1, 3) for rays in lifted]) for side in (0, 1))
         )
-        on_wall = self._blocked(
+        on_wall = ~self._shadows.clear(
             *(np.concatenate([rays[side].reshape(-1, 3) for rays in walls]) for side in (0, 1))
         )
         a = b = 0
@@ -208,16 +207,6 @@ class Between:
                 count, depth
             ).all(axis=1)
             a, b = a + count * (depth + 1), b + count * depth
-
-    def _blocked(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(N,) whether something stands between points (N, 3) and points (N, 3)."""
-        if not len(begin):
-            return np.zeros(0, bool)
-        span = end - begin
-        length = np.linalg.norm(span, axis=1)
-        ray = mi.Ray3f(mi.Point3f(*_rows(begin)), mi.Vector3f(*_rows(span / length[:, None])))
-        ray.maxt = mi.Float(length.astype(np.float32))  # type: ignore[assignment]
-        return np.asarray(self._scene.ray_test(ray))
 
     def _settled(self, found: list[_Unfolded], pairs: list[Link], depth: int) -> dict[Link, LegSet]:
         """What lives, sorted by pair, bounces and length, with its amplitudes."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.propagation.clutter.sight import Shadows
 from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
+from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.world.city.mesh import CityMesh
 
 BESIDE = 0.01

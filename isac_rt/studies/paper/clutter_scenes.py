@@ -213,7 +213,7 @@ class Scenes:
 
     def sees(self, place: str, points: np.ndarray) -> np.ndarray:
         """(K,) whether the terminal sees points (K, 3) in the air."""
-        from isac_rt.propagation.clutter.sight import Shadows
+        from isac_rt.propagation.legs.rays import Shadows
         from isac_rt.world.city.scene import shared_scene
 
         s = self.setup
