@@ -91,6 +91,60 @@ def _norm(v):
     return np.sqrt((v * v).sum())
 
 
+def tones_to_second_order(w, t, wideband, cubic):
+    """IF samples (M, L_rx, P, N) of `Tones` t by the series that the gridded method sums:
+
+        z exp(j 2 pi (f0 + f1 n)) s_l exp(-j theta lambda) (1 - c theta^2/2 + j theta (1 + j q k) x
+        + (j q - theta^2/2) (x^2 - c)),
+
+    x = n/(N/2) from the middle sample, f0, f1 and q the phase's first coefficients there, theta the
+    turn of a receive element over half a chirp, lambda = tau/(T/2), k = 4/15; to the third order
+    with j theta (j q - theta^2/6) (x^3 - 3x/5) and theta^2/10 less of x. Narrowband: theta = 0.
+    """
+    ld = np.longdouble
+    step, half = ld(1) / ld(w.sampling_rate), w.num_samples // 2
+    window = w.num_samples * step
+    longest = ld(w.sampling_rate) * window / (ld(w.bandwidth) - 2 * ld(w.sampling_rate))
+    slope = ld(w.bandwidth) / (window + 2 * longest)
+    slot, middle = window + 2 * (1 + w.num_tx) * longest, 2 * longest + half * step
+    first = middle - w.num_chirps * slot / 2
+    since = np.poly1d(np.array([step, middle]))
+    n = np.arange(w.num_samples) - half
+    x = n / half
+    c = (x**2).mean()
+    out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), complex)
+    for k, m, source, p in np.ndindex(t.delay.size, w.num_groups, w.num_groups, w.num_chirps):
+        q = t.link[k]
+        time = first + p * slot + 2 * m * longest
+        if not t.begin[k] <= time < t.end[k]:
+            continue
+        rate, late = t.rate[k] + t.accel[k] * time, 2 * (source - m) * longest
+        tau = t.symbol_delay[q, source, p] + t.delay[k] + late
+        tau = tau + (t.rate[k] + t.accel[k] * time / 2) * time
+        beat, skirt = float(slope * tau), w.filter_transition
+        outside = min(max(-beat, beat - w.sampling_rate, 0.0) / skirt, 1.0)
+        z = t.factor[k] * t.send[q, source, p] * np.cos(np.pi * outside / 2) ** 2
+        if z == 0:
+            continue
+        sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
+        delay = np.poly1d(np.array([t.accel[k] * step**2 / 2, rate * step, sent]))
+        phase = delay * ld(w.carrier_frequency) + delay * (since - delay / 2) * slope
+        f0, f1, bend = (float(phase[i] % 1) if i < 2 else float(phase[i]) for i in range(3))
+        bow = 2 * np.pi * bend * half**2
+        e = t.rx_delay[k].astype(ld)
+        turn = (ld(w.carrier_frequency) + slope * middle) * e - slope * e**2 / 2
+        theta = (2 * np.pi * slope * step * half * e * wideband).astype(float)[:, None]
+        third = theta * cubic
+        series = 1 - c * theta**2 / 2 + (1j * bow - theta**2 / 2) * (x**2 - c)
+        series = series + 1j * theta * (1 + 4j / 15 * bow - third**2 / 10) * x
+        series = series + 1j * third * (1j * bow - third**2 / 6) * (x**3 - 3 / 5 * x)
+        start = np.exp(2j * np.pi * (turn % 1).astype(float))[:, None]
+        start = start * np.exp(-1j * theta * float(tau / (step * half)))
+        tone = z * np.exp(2j * np.pi * (f0 + f1 * n) + 1j * bow * c)
+        out[m, :, p] += start * tone * series
+    return out
+
+
 def splitmix64(state: int, word: int) -> int:
     """The state moved on by the golden ratio's multiple and mixed, in whole numbers of Python; the
     published generator with word 0."""

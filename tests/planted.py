@@ -302,8 +302,8 @@ OF_CASES = {
     ),
     "filter skirts": Bug(
         "signal/direct.py",
-        "outside = max(-beat, beat - w[7]) / w[8]",
-        "outside = max(-beat, beat - w[7]) / (2 * w[8])",
+        "outside = max(-beat, beat - w.rate) / w.transition",
+        "outside = max(-beat, beat - w.rate) / (2 * w.transition)",
     ),
     "spherical waves": Bug(
         "signal/tones.py",
@@ -311,7 +311,9 @@ OF_CASES = {
         "0 * square - 2 * far * along[some]",
     ),
     "clock errors": Bug("signal/tones.py", "moved + t.clock_offset", "moved - t.clock_offset"),
-    "births and deaths": Bug("signal/direct.py", "or time >= end[k]", "or time >= end[k] + 1e9"),
+    "births and deaths": Bug(
+        "signal/direct.py", "or time >= t.end[k]", "or time >= t.end[k] + 1e9"
+    ),
     "data are taken out": Bug(
         "receive/spectrum.py",
         "tones(shift[m] / num_samples, num_rows).T",

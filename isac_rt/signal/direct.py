@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
@@ -21,24 +23,37 @@ from isac_rt.kernels.vector import (
 from isac_rt.signal.tones import Tones, sources
 
 
-def numbers(waveform: Waveform) -> np.ndarray:
-    """The waveform as a vector for the kernels; the order is that of `chirp_terms` and its
-    callers."""
+class Numbers(NamedTuple):
+    """The waveform's numbers in compiled code.
+
+    Attributes
+    ----------
+    carrier, slope : f_c [Hz], alpha [Hz/s]
+    step, middle : of a sample, and of the middle sample since the start of the reference chirp [s]
+    slot, spacing : from slot to slot, and from group to group [s]
+    first : middle sample of the first chirp since mid-frame [s]
+    rate, transition : of the IF filter: width and skirts [Hz]
+    """
+
+    carrier: float
+    slope: float
+    step: float
+    middle: float
+    slot: float
+    spacing: float
+    first: float
+    rate: float
+    transition: float
+
+
+def numbers(waveform: Waveform) -> Numbers:
+    """The numbers of a waveform."""
     w = waveform
     middle = w.fast_time[w.num_samples // 2]
-    return np.array(
-        [
-            w.carrier_frequency,
-            w.slope,
-            w.sample_interval,
-            middle,
-            w.slot_duration,
-            w.group_spacing,
-            middle - w.frame_duration / 2,
-            w.sampling_rate,
-            w.filter_transition,
-        ]
-    )
+    first = middle - w.frame_duration / 2
+    times = w.sample_interval, middle, w.slot_duration, w.group_spacing, first
+    every = w.carrier_frequency, w.slope, *times, w.sampling_rate, w.filter_transition
+    return Numbers(*map(float, every))
 
 
 @jit(inline=True)
@@ -49,7 +64,7 @@ def chirp_terms(w, tau, rate, accel):
     `tau`, `rate`: there, elements included. What is left out is cubic, below 1e-8 cycles for 10
     m/s^2.
     """
-    f_c, slope, ts, u = w[0], w[1], w[2], w[3]
+    f_c, slope, ts, u = w.carrier, w.slope, w.step, w.middle
     b = rate * ts
     a = accel * ts * ts / 2
     phase = f_c * tau + slope * tau * (u - tau / 2)
@@ -61,8 +76,8 @@ def chirp_terms(w, tau, rate, accel):
 @jit(inline=True)
 def passed(w, tau):
     """Gain of the IF filter for the centroid's delay `tau`."""
-    beat = w[1] * tau
-    outside = max(-beat, beat - w[7]) / w[8]
+    beat = w.slope * tau
+    outside = max(-beat, beat - w.rate) / w.transition
     if outside <= 0.0:
         return 1.0
     if outside >= 1.0:
@@ -81,14 +96,15 @@ def _turn(out, at, cycles, amplitude):
 
 
 @jit(fast=True)
-def _tone(sums, starts, lane, places, half, amplitude, phase, frequency, quadratic):
-    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to `sums`: of
+def _tone(room, half, amplitude, phase, frequency, quadratic):
+    """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to the sums: of
     each 16 samples real parts, then imaginary ones.
 
     With X the middle of 16 samples and i = x - X the tone is exp(phase + frequency X + quadratic
     X^2) exp(frequency i + quadratic i^2) (1 + j 4 pi quadratic X i), all phases reduced in float64;
     what is left out is the square of the last term, 1e-8 at 15 m/s.
     """
+    sums, starts, lane, places = room
     within = load(places, 0)
     _turn(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
     lr, li, offset = load(lane, 0), load(lane, 16), narrow(within)
@@ -134,34 +150,19 @@ def _flush(out, to, num_samples, sums, fresh):
         store(sums, at + 16, zero)
 
 
+class _Room(NamedTuple):
+    """Memory of the kernel: sums of a chirp, phasors of 16 blocks and within one, and the places of
+    the 16 within a block and of the 16 blocks' middles."""
+
+    sums: np.ndarray
+    starts: np.ndarray
+    lane: np.ndarray
+    places: np.ndarray
+
+
 @jit(fast=True)
-def _direct(
-    out,
-    shape,
-    w,
-    path,
-    offset,
-    link,
-    factor,
-    delay,
-    rate,
-    accel,
-    begin,
-    end,
-    tx,
-    rx,
-    row,
-    cross,
-    symbol,
-    send,
-    antenna,
-    fresh,
-    sums,
-    starts,
-    lane,
-    places,
-):
-    """Add the listed (path, group offset) to the samples of `shape`, or write them."""
+def _direct(out, shape, w, path, offset, t, fresh, room):
+    """Add the listed (path, group offset) of the tones to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
     half = float(num_samples // 2)
     terms = np.empty((path.shape[0], 3))
@@ -169,27 +170,27 @@ def _direct(
     chosen = np.empty(path.shape[0], np.int64)
     for m in range(groups):
         for p in range(chirps):
-            time = w[6] + p * w[4] + m * w[5]
+            time = w.first + p * w.slot + m * w.spacing
             count = 0
             for i in range(path.shape[0]):
                 k, source = path[i], m - offset[i]
-                if source < 0 or source >= groups or time < begin[k] or time >= end[k]:
+                if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
                     continue
-                q = link[k]
+                q = t.link[k]
                 tau = (
-                    symbol[q, source, p]
-                    + delay[k]
-                    + (rate[k] + accel[k] * time / 2) * time
-                    - offset[i] * w[5]
+                    t.symbol_delay[q, source, p]
+                    + t.delay[k]
+                    + (t.rate[k] + t.accel[k] * time / 2) * time
+                    - offset[i] * w.spacing
                 )
-                amplitude = factor[k] * send[q, source, p] * passed(w, tau)
+                amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
                 if amplitude == 0:
                     continue
                 chosen[count], weight[count] = i, amplitude
                 terms[count, 0], terms[count, 1], terms[count, 2] = (
                     tau,
-                    rate[k] + accel[k] * time,
-                    antenna[q, source, p],
+                    t.rate[k] + t.accel[k] * time,
+                    t.antenna[q, source, p],
                 )
                 count += 1
             if count == 0 and not fresh:
@@ -197,11 +198,20 @@ def _direct(
             for r in range(num_rx):
                 for i in range(count):
                     k, a = path[chosen[i]], int(terms[i, 2])
-                    element = terms[i, 0] + tx[k, a] + rx[k, r] + cross[row[k], a, r]
-                    phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], accel[k])
-                    _tone(sums, starts, lane, places, half, weight[i], phase, frequency, quadratic)
+                    element = (
+                        terms[i, 0]
+                        + t.tx_delay[k, a]
+                        + t.rx_delay[k, r]
+                        + t.cross[t.cross_row[k], a, r]
+                    )
+                    phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], t.accel[k])
+                    _tone(room, half, weight[i], phase, frequency, quadratic)
                 _flush(
-                    out, 2 * num_samples * ((m * num_rx + r) * chirps + p), num_samples, sums, fresh
+                    out,
+                    2 * num_samples * ((m * num_rx + r) * chirps + p),
+                    num_samples,
+                    room.sums,
+                    fresh,
                 )
 
 
@@ -224,34 +234,11 @@ def add_direct(
         if fresh:
             samples[:] = 0
         return
-    t, lanes = tones, np.arange(LANES)
+    lanes = np.arange(LANES)
     places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
         [-1.0, 1.0], LANES
     )
     blocks = -(-samples.shape[3] // LANES)
-    _direct(
-        samples.reshape(-1).view(np.float32),
-        samples.shape,
-        numbers(waveform),
-        path,
-        offset,
-        t.link,
-        t.factor,
-        t.delay,
-        t.rate,
-        t.accel,
-        t.begin,
-        t.end,
-        t.tx_delay,
-        t.rx_delay,
-        t.cross_row,
-        t.cross,
-        t.symbol_delay,
-        t.send,
-        t.antenna,
-        fresh,
-        aligned(2 * LANES * blocks),
-        aligned(4 * LANES),
-        aligned(2 * LANES),
-        places,
-    )
+    room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
+    flat = samples.reshape(-1).view(np.float32)
+    _direct(flat, samples.shape, numbers(waveform), path, offset, tones, fresh, room)

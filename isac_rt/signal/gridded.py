@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -45,8 +46,7 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.direct import chirp_terms, numbers, passed
-from isac_rt.signal.exact import filter_gain
+from isac_rt.signal.direct import numbers, passed
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
 from isac_rt.signal.tones import Tones, sources
@@ -160,50 +160,125 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(*both, rcond=None)[0]
 
 
+class _View(NamedTuple):
+    """What of a chirp is wanted: numbers of one chirp, or arrays (M P,) of all.
+
+    Attributes
+    ----------
+    shift : cycles per sample taken off every frequency
+    origin : samples from the chirp's middle one to the origin
+    share : samples of the chirp to one of the grid's
+    below : frequencies below zero that are kept
+    limit : first frequency left out
+    turn : complex, factor of the chirp's paths
+    """
+
+    shift: Any
+    origin: Any
+    share: Any
+    below: Any
+    limit: Any
+    turn: Any
+
+
+class _Grid(NamedTuple):
+    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path, the
+    orders of the wideband term, `weights`, the `plan` of the transform, and the chirps for which
+    the paths are read once."""
+
+    half: float
+    centre: float
+    taps: tuple[int, ...]
+    wideband: bool
+    cubic: bool
+    poly: np.ndarray
+    deconvolution: np.ndarray
+    radices: np.ndarray
+    twiddles: np.ndarray
+    rows: np.ndarray
+    together: int
+
+
+class _Blocks(NamedTuple):
+    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one
+    offset.
+
+    Attributes
+    ----------
+    path : (16 B,) index into the tones, the last repeated where a block is not full
+    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit
+        element
+    factor : float32, of each block 16 real and 16 imaginary parts
+    life : float64, of each block 16 begins and 16 ends
+    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
+    bounds : (B, 2) least and greatest delay in the frame, without data
+    """
+
+    path: np.ndarray
+    table: np.ndarray
+    factor: np.ndarray
+    life: np.ndarray
+    blocks: np.ndarray
+    bounds: np.ndarray
+
+
+class _Room(NamedTuple):
+    """Memory of the kernel: the grids, numbers of 16 paths, their weights, and what is emitted."""
+
+    grid: np.ndarray
+    work: np.ndarray
+    scratch: np.ndarray
+    tile: np.ndarray
+
+
 @jit(fast=True)
-def _prepare(
-    work, places, table, at, tx, factor, f, w, view, time, symbol, send, half, centre, size
-):
+def _prepare(work, places, b, block, w, g, view, time, symbol, send, antenna):
     """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the
     middle of the cell, complex factor (less the filter's gain), quadratic term [rad] and lambda, 16
-    floats of each, to `work`. `view`: see `views_of`."""
-    f_c, slope, ts, u = w[0], w[1], w[2], w[3] + view[1] * w[2]
+    floats of each, to `work`."""
+    f_c, slope, ts, u = w.carrier, w.slope, w.step, w.middle + view.origin * w.step
+    half, size, f = g.half, g.rows.shape[0], 32 * block
+    table, at = b.table, block * (b.table.shape[0] // b.blocks.shape[0])
     delay, rate, accel, extra = (
         load(table, at),
         load(table, at + 16),
         load(table, at + 32),
-        load(table, at + tx),
+        load(table, at + (_FIELDS + antenna) * 16),
     )
     tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
     element = tau + extra
-    b, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
+    step, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
     carrier = splat(f_c + slope * u)
     sent = carrier - splat(slope) * element
     cycles = element * (carrier - splat(slope / 2) * element)
-    frequency = sent * b + splat(slope * ts) * element
-    wanted = frequency - splat(view[0])
-    fold = floor(wanted + splat(view[3]))
-    wanted, cycles = wanted - fold, cycles - fold * splat(view[1])
+    frequency = sent * step + splat(slope * ts) * element
+    wanted = frequency - splat(view.shift)
+    fold = floor(wanted + splat(view.below))
+    wanted, cycles = wanted - fold, cycles - fold * splat(view.origin)
     store(places, 16, wanted)
-    wanted = wanted * splat(view[2])
+    wanted = wanted * splat(view.share)
     place = (wanted - floor(wanted)) * splat(size * _BELOW)
     cell = floor(place)
     store(places, 0, cell)
     store(work, 0, narrow(place - cell) - splat(_HALF))
-    bend = narrow((sent * a + splat(slope) * b * (splat(ts) - splat(0.5) * b)) * splat(half * half))
-    c, s = cos_sin(narrow(cycles - floor(cycles + splat(0.5))) + bend * splat(np.float32(centre)))
-    br, bi = load(factor, f), load(factor, f + 16)
+    bend = narrow(
+        (sent * a + splat(slope) * step * (splat(ts) - splat(0.5) * step)) * splat(half * half)
+    )
+    c, s = cos_sin(narrow(cycles - floor(cycles + splat(0.5))) + bend * splat(np.float32(g.centre)))
+    br, bi = load(b.factor, f), load(b.factor, f + 16)
     sr, si = splat(np.float32(send.real)), splat(np.float32(send.imag))
     ar, ai = br * sr - bi * si, br * si + bi * sr
     store(work, 16, ar * c - ai * s)
     store(work, 32, ar * s + ai * c)
     store(work, 48, bend * splat(np.float32(2 * np.pi)))
-    store(work, 64, narrow((tau - splat(view[1] * ts)) * splat(1 / (ts * half))))
+    store(work, 64, narrow((tau - splat(view.origin * ts)) * splat(1 / (ts * half))))
 
 
 @jit(fast=True)
-def _gate(work, table, at, life, f, w, time, symbol):
+def _gate(work, b, block, w, time, symbol):
     """Multiply the factors of 16 paths by the filter's gain, and by 0 when they are not alive."""
+    table, life, f = b.table, b.life, 32 * block
+    at = block * (table.shape[0] // b.blocks.shape[0])
     for i in range(16):
         tau = table[at + i] + symbol + (table[at + 16 + i] + table[at + 32 + i] * time / 2) * time
         alive = life[f + i] <= time < life[f + 16 + i]
@@ -331,10 +406,11 @@ def _fold(grid, size, low, width):
 
 
 @jit(fast=True)
-def _emit(out, at, stride, channels, num_samples, grid, low, order, deconvolution, tile, fresh):
+def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fresh):
     """Write the rows of the samples, divided by the kernel's response: channel r of sample n to
     out[at + r stride + 2 n]."""
-    half, size = num_samples // 2, order.shape[0]
+    num_samples, size = deconvolution.shape[0], order.shape[0]
+    half = num_samples // 2
     for start in range(0, num_samples, 16):
         count = min(16, num_samples - start)
         for i in range(count):
@@ -375,165 +451,75 @@ def _in_band(work, places, count, limit):
 
 
 @jit(fast=True)
-def _chirps(
-    out,
-    shape,
-    first_channel,
-    chirps,
-    together,
-    w,
-    views,
-    turns,
-    half,
-    centre,
-    taps,
-    wideband,
-    cubic,
-    poly,
-    deconvolution,
-    radices,
-    twiddles,
-    rows,
-    table,
-    factor,
-    life,
-    blocks,
-    bounds,
-    steer,
-    symbol,
-    send,
-    antenna,
-    fresh,
-    band,
-    grid,
-    work,
-    scratch,
-    tile,
-):
-    """Synthesise the listed chirps (m P + p) of up to 16 receive elements: spread, transform, emit,
-    one chirp after the other."""
-    _, num_rx, num_chirps, num_samples = shape
-    groups, size, low = send.shape[1], rows.shape[0], len(taps) // 2 - 1
-    channels, per_block, cells = (
-        min(16, num_rx - first_channel),
-        table.shape[0] // max(blocks.shape[0], 1),
-        band.turn.shape[0],
-    )
-    top, skirt, per_delay = w[7] / w[1], w[8] / w[1], w[1] * w[2]
+def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fresh):
+    """Synthesise all chirps for up to 16 receive elements: spread, transform, emit, one chirp after
+    the other."""
+    grid, work, scratch, tile = room
+    groups, num_rx, num_chirps, num_samples = shape
+    size, width, cells = g.rows.shape[0], len(g.taps), band.turn.shape[0]
+    low, centre, channels = width // 2 - 1, np.float32(g.centre), min(16, num_rx - first_channel)
+    top, skirt, per_delay = w.rate / w.slope, w.transition / w.slope, w.slope * w.step
     cut = top + skirt
     stride, places = (size + _MARGIN) * ROW, np.zeros(32)
-    for start in range(0, chirps.shape[0], together):
-        now = chirps[start : start + together]
+    for start in range(0, groups * num_chirps, g.together):
+        count = min(g.together, groups * num_chirps - start)
         grid[:] = np.float32(0)
-        for b in range(blocks.shape[0]):
-            at, count = b * per_block, blocks[b, 2]
-            for g in range(now.shape[0]):
-                m, p, view = now[g] // num_chirps, now[g] % num_chirps, views[now[g]]
-                q, source = blocks[b, 0], m - blocks[b, 1]
-                if source < 0 or source >= groups or send[q, source, p] == 0:
+        for i in range(b.blocks.shape[0]):
+            q, used = b.blocks[i, 0], b.blocks[i, 2]
+            for c in range(count):
+                m, p = (start + c) // num_chirps, (start + c) % num_chirps
+                source = m - b.blocks[i, 1]
+                if source < 0 or source >= groups or t.send[q, source, p] == 0:
                     continue
-                time, delay = w[6] + view[1] * w[2] + p * w[4] + m * w[5], symbol[q, source, p]
-                tx = (_FIELDS + antenna[q, source, p]) * 16
-                least, most = bounds[b, 0] + delay, bounds[b, 1] + delay
+                view = _View(
+                    views.shift[start + c],
+                    views.origin[start + c],
+                    views.share[start + c],
+                    views.below[start + c],
+                    views.limit[start + c],
+                    views.turn[start + c],
+                )
+                time = w.first + view.origin * w.step + p * w.slot + m * w.spacing
+                delay = t.symbol_delay[q, source, p]
+                least, most = b.bounds[i, 0] + delay, b.bounds[i, 1] + delay
                 if least > cut or most < -skirt:
                     continue
-                low_end, high_end = least * per_delay - view[0], most * per_delay - view[0]
-                if low_end > view[4] + _DOPPLER and high_end < 1 - view[3] - _DOPPLER:
+                low_end, high_end = least * per_delay - view.shift, most * per_delay - view.shift
+                if low_end > view.limit + _DOPPLER and high_end < 1 - view.below - _DOPPLER:
                     continue
-                sent = send[q, source, p] * turns[now[g]]
-                _prepare(
-                    work,
-                    places,
-                    table,
-                    at,
-                    tx,
-                    factor,
-                    32 * b,
-                    w,
-                    view,
-                    time,
-                    delay,
-                    sent,
-                    half,
-                    centre,
-                    size,
-                )
-                if blocks[b, 3] or least < 0 or most > top:
-                    _gate(work, table, at, life, 32 * b, w, time, delay)
-                used = _in_band(work, places, count, view[4]) if cells else count
-                _weigh(work, scratch, poly, taps, wideband, cubic)
-                if cubic:
-                    _spread_cubic(
-                        grid,
-                        g * stride,
-                        places,
-                        scratch,
-                        used,
-                        taps,
-                        steer,
-                        b * 16 * 48,
-                        work,
-                        np.float32(centre),
-                    )
-                elif wideband:
+                sent = t.send[q, source, p] * view.turn
+                antenna = t.antenna[q, source, p]
+                _prepare(work, places, b, i, w, g, view, time, delay, sent, antenna)
+                if b.blocks[i, 3] or least < 0 or most > top:
+                    _gate(work, b, i, w, time, delay)
+                last = _in_band(work, places, used, view.limit) if cells else used
+                _weigh(work, scratch, g.poly, g.taps, g.wideband, g.cubic)
+                to, k = c * stride, i * 16 * 48
+                if g.cubic:
+                    _spread_cubic(grid, to, places, scratch, last, g.taps, steer, k, work, centre)
+                elif g.wideband:
                     _spread_wideband(
-                        grid,
-                        g * stride,
-                        places,
-                        scratch,
-                        used,
-                        taps,
-                        steer,
-                        b * 16 * 48,
-                        work,
-                        np.float32(centre),
+                        grid, to, places, scratch, last, g.taps, steer, k, work, centre
                     )
                 else:
-                    _spread(grid, g * stride, places, scratch, used, taps, steer, b * 16 * 32)
-        for g in range(now.shape[0]):
-            m, p = now[g] // num_chirps, now[g] % num_chirps
-            table_g = grid[g * stride : (g + 1) * stride]
-            _fold(table_g, size, low, len(taps))
-            transform(table_g, low * ROW, size, radices, twiddles)
+                    _spread(grid, to, places, scratch, last, g.taps, steer, i * 16 * 32)
+        for c in range(count):
+            m, p = (start + c) // num_chirps, (start + c) % num_chirps
+            table = grid[c * stride : (c + 1) * stride]
+            _fold(table, size, low, width)
+            transform(table, low * ROW, size, g.radices, g.twiddles)
+            line = m * num_rx + first_channel
             if cells == 0:
-                to = 2 * num_samples * ((m * num_rx + first_channel) * num_chirps + p)
-                _emit(
-                    out,
-                    to,
-                    2 * num_samples * num_chirps,
-                    channels,
-                    num_samples,
-                    table_g,
-                    low,
-                    rows,
-                    deconvolution,
-                    tile,
-                    fresh,
-                )
+                to, step = 2 * num_samples * (line * num_chirps + p), 2 * num_samples * num_chirps
+                samples = g.deconvolution
+                _emit(out, to, step, channels, samples, table, low, g.rows, tile, fresh)
                 continue
-            block = (first_channel // 16 * shape[0] + m) * num_chirps + p
-            to_cells(
-                table_g,
-                low,
-                rows,
-                deconvolution,
-                band,
-                block * deconvolution.shape[0] * LANES,
-                p % CHIRPS,
-            )
+            draw = ((first_channel // 16 * groups + m) * num_chirps + p) * g.deconvolution.shape[0]
+            to_cells(table, low, g.rows, g.deconvolution, band, draw * LANES, p % CHIRPS)
             if p % CHIRPS == CHIRPS - 1 or p == num_chirps - 1:
-                to = 2 * ((m * num_rx + first_channel) * cells * num_chirps + p - p % CHIRPS)
-                write_cells(
-                    out,
-                    to,
-                    2 * cells * num_chirps,
-                    channels,
-                    p % CHIRPS + 1,
-                    num_chirps,
-                    cells,
-                    band.stage,
-                    tile,
-                )
+                to = 2 * (line * cells * num_chirps + p - p % CHIRPS)
+                done, step = p % CHIRPS + 1, 2 * cells * num_chirps
+                write_cells(out, to, step, channels, done, num_chirps, cells, band.stage, tile)
 
 
 @jit(fast=True)
@@ -565,30 +551,6 @@ def _steering(
     turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
     _steer(out, planes, path, rx_delay, first, middle, w.slope, turn, np.zeros(LANES))
     return out
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """Paths sixteen by sixteen, neighbours on the grid together, each block of one link and one
-    offset.
-
-    Attributes
-    ----------
-    path : (16 B,) index into the tones, the last repeated where a block is not full
-    table : float64, of each block 16 delays, rates, accelerations and delays of each transmit
-        element
-    factor : float32, of each block 16 real and 16 imaginary parts
-    life : float64, of each block 16 begins and 16 ends
-    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
-    bounds : (B, 2) least and greatest delay in the frame, without data
-    """
-
-    path: np.ndarray
-    table: np.ndarray
-    factor: np.ndarray
-    life: np.ndarray
-    blocks: np.ndarray
-    bounds: np.ndarray
 
 
 def _blocks(waveform: Waveform, t: Tones) -> _Blocks:
@@ -645,26 +607,12 @@ def add_gridded(
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
     """
-    if (
-        not _synthesise(
-            samples,
-            samples.shape,
-            waveform,
-            tones,
-            setting,
-            fresh,
-            no_band(),
-            *_as_it_is(waveform),
-        )
-        and fresh
-    ):
-        samples[:] = 0
-
-
-def _as_it_is(waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
-    """`views` and `turns` of `_synthesise` for samples."""
     count = waveform.num_groups * waveform.num_chirps
-    return np.tile([0.0, 0.0, 1.0, 0.0, 1.0], (count, 1)), np.ones(count, complex)
+    none, one = np.zeros(count), np.ones(count)
+    views = _View(none, none, one, none, one, one.astype(complex))
+    heard = _synthesise(samples, samples.shape, waveform, tones, setting, fresh, no_band(), views)
+    if fresh and not heard:
+        samples[:] = 0
 
 
 def range_cells(
@@ -706,23 +654,20 @@ def range_cells(
     limit = num_cells / w.num_samples + pad if size < w.num_samples else 1.0
     middle = start + length / 2 - w.num_samples // 2
     one = np.ones(start.size)
-    views = np.stack(
-        [
-            delay_symbols.ravel() / w.num_samples,
-            middle,
-            w.num_samples / size * one,
-            pad * one,
-            limit * one,
-        ],
-        axis=1,
-    )
     shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
     out = cube_memory((*shape[:2], num_cells, w.num_chirps))
     cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(
         w.data_phase(delay_symbols)
     )
-    turns = np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0))
-    _synthesise(out, shape, w, tones, setting, True, band, views, turns)
+    views = _View(
+        shift=delay_symbols.ravel() / w.num_samples,
+        origin=middle,
+        share=w.num_samples / size * one,
+        below=pad * one,
+        limit=limit * one,
+        turn=np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0)),
+    )
+    _synthesise(out, shape, w, tones, setting, True, band, views)
     return out
 
 
@@ -734,128 +679,30 @@ def _synthesise(
     setting: Setting,
     fresh: bool,
     band: Band,
-    views: np.ndarray,
-    turns: np.ndarray,
+    views: _View,
 ) -> bool:
     """Run the kernel over all elements; False, and nothing done, where no path can be heard and
-    there is no band.
-
-    Parameters
-    ----------
-    views : (M P, 5) what of a chirp is wanted: cycles per sample taken off every frequency; samples
-        from the middle one to the origin; samples of the chirp to one of the grid's; frequencies
-        below zero that are kept; first frequency left out
-    turns : (M P,) complex, factors of the chirps' paths
-    """
+    there is no band."""
     b = _blocks(w, t)
     if b.path.size == 0 and band.turn.size == 0:
         return False
     num_samples = len(band.window) or w.num_samples
     size, poly, deconvolution = weights(num_samples, setting.oversampling, setting.width)
-    radices, twiddles, rows = plan(size)
-    together = _TOGETHER if b.path.size > _MANY else 1
-    buffers = (
-        aligned(together * (size + _MARGIN) * ROW),
-        aligned(80),
-        aligned(_STEP * setting.width),
-        aligned(512),
+    g = _Grid(
+        float(w.num_samples // 2),
+        mean_square(num_samples),
+        (0,) * setting.width,
+        setting.wideband,
+        setting.wideband and setting.cubic,
+        poly.ravel(),
+        deconvolution,
+        *plan(size),
+        _TOGETHER if b.path.size > _MANY else 1,
     )
-    chirps, centre = np.arange(w.num_groups * w.num_chirps), mean_square(num_samples)
+    grids = aligned(g.together * (size + _MARGIN) * ROW)
+    room = _Room(grids, aligned(80), aligned(_STEP * setting.width), aligned(512))
+    flat = out.reshape(-1).view(np.float32)
     for first in range(0, shape[1], LANES):
         steer = _steering(w, t.rx_delay, b.path, first, setting.wideband)
-        _chirps(
-            out.reshape(-1).view(np.float32),
-            shape,
-            first,
-            chirps,
-            together,
-            numbers(w),
-            views,
-            turns,
-            float(w.num_samples // 2),
-            centre,
-            (0,) * setting.width,
-            setting.wideband,
-            setting.wideband and setting.cubic,
-            poly.ravel(),
-            deconvolution,
-            radices,
-            twiddles,
-            rows,
-            b.table,
-            b.factor,
-            b.life,
-            b.blocks,
-            b.bounds,
-            steer,
-            t.symbol_delay,
-            t.send,
-            t.antenna,
-            fresh,
-            band,
-            *buffers,
-        )
+        _chirps(flat, shape, first, numbers(w), views, g, b, steer, t, band, room, fresh)
     return True
-
-
-def add_plain(
-    samples: np.ndarray,
-    waveform: Waveform,
-    tones: Tones,
-    setting: Setting = DEFAULT,
-) -> None:
-    """What `add_gridded` does, path by path in numpy float64: its oracle, slow."""
-    w, t, half = waveform, tones, waveform.num_samples // 2
-    size, poly, deconvolution = weights(w.num_samples, setting.oversampling, setting.width)
-    values, centre, steps = (
-        numbers(w),
-        mean_square(w.num_samples),
-        np.arange(setting.width) - setting.width // 2 + 1,
-    )
-    e = t.rx_delay
-    steer = np.exp(
-        2j
-        * np.pi
-        * (((w.carrier_frequency + w.slope * w.fast_time[half]) * e - w.slope * e**2 / 2) % 1)
-    )
-    theta = 2 * np.pi * w.slope * w.sample_interval * half * e
-    for m, p in np.ndindex(w.num_groups, w.num_chirps):
-        grid = np.zeros((size, samples.shape[1]), complex)
-        time = values[6] + p * values[4] + m * values[5]
-        for k, offset in zip(*sources(w, t), strict=True):
-            q, source = t.link[k], m - offset
-            if not (0 <= source < w.num_groups and t.begin[k] <= time < t.end[k]):
-                continue
-            tau = (
-                t.symbol_delay[q, source, p]
-                + t.delay[k]
-                + (t.rate[k] + t.accel[k] * time / 2) * time
-                - offset * w.group_spacing
-            )
-            gain = filter_gain(w, np.array(w.slope * tau))
-            sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
-            phase, frequency, bend = chirp_terms(
-                values, sent, t.rate[k] + t.accel[k] * time, t.accel[k]
-            )
-            z = (
-                gain
-                * t.factor[k]
-                * t.send[q, source, p]
-                * np.exp(2j * np.pi * (phase + bend * half**2 * centre))
-            )
-            turn, lag = 2 * np.pi * bend * half**2, tau / (w.sample_interval * half)
-            cell, r = divmod(frequency % 1 * size, 1)
-            one, x, square, cube = (np.polyval(poly[i], r - 0.5) for i in range(4))
-            slant = theta[k] if setting.wideband else np.zeros_like(theta[k])
-            third = slant if setting.cubic else np.zeros_like(slant)
-            strengths = np.outer(one, 1 - centre * slant**2 / 2) + np.outer(
-                x, slant * (1 - third**2 / 10 + 4j / 15 * turn)
-            )
-            strengths += np.outer(cube, third * (1j * turn - third**2 / 6))
-            strengths += np.outer(square, 1j * turn - slant**2 / 2)
-            strengths = strengths * steer[k] * np.exp(-1j * lag * slant)
-            np.add.at(grid, (int(cell) + steps) % size, z * strengths)
-        modes = (np.arange(w.num_samples) - half) % size
-        samples[m, :, p] += (
-            np.fft.ifft(grid, axis=0, norm="forward")[modes] * deconvolution[:, None]
-        ).T

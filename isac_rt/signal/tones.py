@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,9 @@ Links = Sequence[tuple[Transmission, PathSet]]
 _CHUNK = 1024  # paths whose element delays stay in the second-level cache
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tones:
-    """K paths of Q links as plain arrays. Times are seconds since the middle of the frame.
+class Tones(NamedTuple):
+    """K paths of Q links as arrays, which compiled code takes as they are. Times are seconds since
+    the middle of the frame.
 
     Attributes
     ----------
@@ -53,13 +53,17 @@ class Tones:
     send: np.ndarray
     antenna: np.ndarray
 
-    def __len__(self) -> int:
+    @property
+    def count(self) -> int:
+        """K."""
         return self.delay.shape[0]
 
     def select(self, which: np.ndarray) -> Tones:
         """The paths that a mask or an index array chooses."""
         shared = ("cross", "symbol_delay", "send", "antenna")
-        return Tones(**{k: v if k in shared else v[which] for k, v in vars(self).items()})
+        return self._replace(
+            **{name: v[which] for name, v in self._asdict().items() if name not in shared}
+        )
 
     def speed(self, duration: float) -> np.ndarray:
         """c/2 times the largest rate of each delay in a frame of this `duration` (K,) [m/s]."""
@@ -76,7 +80,7 @@ def tones_of(
     num_tx = max((t.antennas.num_tx for t, _ in links), default=1)
     none, grid = np.zeros(0), (w.num_groups, w.num_chirps)
     parts = [
-        dict.fromkeys(Tones.__dataclass_fields__, none)
+        dict.fromkeys(Tones._fields, none)
         | {"link": none.astype(np.int64), "cross_row": none.astype(np.int64)}
         | {"sight": none.astype(bool), "factor": none.astype(complex)}
         | {"tx_delay": np.zeros((0, num_tx)), "rx_delay": np.zeros((0, len(rx)))}
