@@ -192,14 +192,14 @@ class _Air:
         return self.n.start + (self.frame + 0.5) * self.n.waveform.frame_duration
 
     def sender(
-        self, name: str, block: int, *, data: bool = False, **change: object
+        self, name: str, block: int, *, data: bool = False, active: np.ndarray | None = None
     ) -> Transmission:
-        """A transmission of a terminal on its own grid: held, and unmodulated unless it has
-        joined."""
+        """A transmission of a terminal on its own grid: held, and unmodulated unless it has joined;
+        `active` chirps of it only."""
         w, n = self.n.waveform, self.n
         rng = generator(n.seed, "access", "payload", name, self.frame)
         payload = random_payload(w, n.schedule, n.dpsk_order, rng) if data else unmodulated(w)
-        made = Transmission(
+        return Transmission(
             name=name,
             pose=n.scene(self.time, [])[0][name],
             antennas=n.antennas,
@@ -208,8 +208,8 @@ class _Air:
             amplitude=n.amplitude,
             first_block=block,
             clock_offset=0.0 if data else n.hold,
+            active=active,
         )
-        return replace(made, **change)  # type: ignore[arg-type]
 
     def hear(self, name: str, first_block: int, sent: Sequence[Transmission] = ()) -> IFCube:
         """Samples of a terminal with its references in M blocks from `first_block` of its own grid,
@@ -316,18 +316,19 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     pts = list(n.listeners[at])
     said = Message(n.names.index(at), block)
     heard = _announce(air, said, pts)
-    rounds: dict[str, list[Round | None]] = {pt: [] for pt in pts}
+    first: dict[str, Round | None] = {}
+    second: dict[str, Round | None] = {}
     understood = {pt: got[0] for pt, got in heard.items() if got is not None}
     if not n.external_clock:
-        _first_round(air, at, block, understood, rounds)
-        understood = {pt: b for pt, b in understood.items() if rounds[pt][0] is not None}
-        _second_round(air, at, block, pts, understood, rounds)
+        first = _first_round(air, at, block, understood)
+        understood = {pt: b for pt, b in understood.items() if first[pt] is not None}
+        second = _second_round(air, at, block, pts, understood)
     read_back = _acknowledge(air, at, block, pts, understood)
     out = {}
     for pt in pts:
         got = heard[pt]
         message = None if got is None else got[1]
-        both = [r for r in rounds[pt] if r is not None]
+        both = [r for r in (first.get(pt), second.get(pt)) if r is not None]
         clock = EXTERNAL if n.external_clock else estimate_clock(both) if len(both) == 2 else None
         out[Link(at, pt)] = LinkState(
             heard_block=None if got is None else got[0],
@@ -380,25 +381,17 @@ def _sight(air: _Air, cube: IFCube) -> Detections:
 
 
 def _first_round(
-    air: _Air,
-    at: str,
-    block: int,
-    understood: Mapping[str, int],
-    rounds: dict[str, list[Round | None]],
-) -> None:
+    air: _Air, at: str, block: int, understood: Mapping[str, int]
+) -> dict[str, Round | None]:
     """The active terminal's unmodulated frame at every passive one that knows where to listen."""
-    sent = air.sender(at, block)
+    sent, w, out = air.sender(at, block), air.n.waveform, {}
     for pt, first in understood.items():
         found = _sight(air, air.hear(pt, first, [sent]))
-        whole = (
-            first - block
-        ) * air.n.waveform.group_spacing  # blocks by which the two grids differ
-        rounds[pt].append(
-            round_of(
-                found, air.time, True, cell=air.n.waveform.range_cell(1), held=air.n.hold - whole
-            )
-        )
+        whole = (first - block) * w.group_spacing  # blocks by which the two grids differ
+        held = air.n.hold - whole
+        out[pt] = round_of(found, air.time, True, cell=w.range_cell(1), held=held)
     air.frame += 1
+    return out
 
 
 def _turns(pts: Sequence[str], width: int) -> list[list[tuple[int, str]]]:
@@ -424,27 +417,20 @@ def _answers(
 
 
 def _second_round(
-    air: _Air,
-    at: str,
-    block: int,
-    pts: Sequence[str],
-    understood: Mapping[str, int],
-    rounds: dict[str, list[Round | None]],
-) -> None:
+    air: _Air, at: str, block: int, pts: Sequence[str], understood: Mapping[str, int]
+) -> dict[str, Round | None]:
     """The passive terminals' unmodulated answers at the active one."""
-    w = air.n.waveform
+    w, out = air.n.waveform, {}
     for turn in _turns(pts, w.num_groups):
         cube = air.hear(at, block, _answers(air, turn, understood, {}))
         for group, pt in turn:
             if pt in understood:
                 found = _sight(air, cube.of_groups([group]))
-                # it answers on its own grid, `whole` blocks late by the other one's: both ends know
-                # this
-                whole = (understood[pt] - block) * w.group_spacing
-                rounds[pt].append(
-                    round_of(found, air.time, False, cell=w.range_cell(1), held=air.n.hold + whole)
-                )
+                # it answers on its own grid, whole blocks late by the other one's, as both know
+                held = air.n.hold + (understood[pt] - block) * w.group_spacing
+                out[pt] = round_of(found, air.time, False, cell=w.range_cell(1), held=held)
         air.frame += 1
+    return out
 
 
 def _acknowledge(

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 PILOT_FRAMES = 5
 PILOT_INTERVALS = 3
 POWER_MARGIN = 10.0
-"""Of estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
+"""Estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
 PHASE_MARGIN = 2.0
 MOST_COMPARED = 150
 """Paths of a frame whose synthesis is compared with the direct one."""

@@ -53,7 +53,7 @@ beyond, `Auto`."""
 
 
 REACH_MARGIN_M = 1.0
-"""Of the mesh, for accelerations within a frame."""
+"""What the mesh reaches farther, for accelerations within a frame."""
 
 
 @dataclass(frozen=True)

@@ -156,6 +156,13 @@ def run(
     Returns
     -------
     Results; the same for one scenario and set of versions whatever the number of threads
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> results = irt.run(irt.load("scenes/paper_swarm_consistent.yaml", frames=4))
+    >>> results.summary["terminals"]["PT1"]["ser_delay"]
+    0.0
     """
     run = _Run.begin(scenario, setup, snapshots, terminal)
     run.fly(progress, threads, resume)
@@ -328,7 +335,7 @@ class _Run:
         return self.kept
 
     def summary(self) -> dict[str, Any]:
-        """Of the frames so far."""
+        """`summary.json` of the frames so far."""
         s = self.setup
         figures = Figures(
             scores={link: o.scorer.score for link, o in self.observers.items()},

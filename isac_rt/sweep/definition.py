@@ -310,6 +310,13 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
     ------
     ScenarioError
         One line per problem, with the place in the file.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> plan = irt.load_sweep("scenes/sweeps/paper_ser.yaml")
+    >>> plan.sweep.num_points, list(plan.sweep.axes)
+    (108, ['snr_db', 'order'])
     """
     path = Path(path)
     document = Document(path, "a sweep needs a scenario and axes")

@@ -35,7 +35,7 @@ class Outcomes:
     folder: Path
 
     def file(self, key: str) -> Path:
-        """Of a point; 256 folders keep each of them short."""
+        """A point's file; 256 folders keep each of them short."""
         return self.folder / "points" / key[:2] / f"{key}.json"
 
     def read(self, key: str) -> dict[str, Any] | None:
@@ -114,19 +114,8 @@ def status(folder: Path | str) -> Status:
     return Status(plan.sweep.num_points, done, failed, errors)
 
 
-class _Table:
-    """Arrays that grow by name as the points come in; a missing value is NaN."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
-        self.links: list[str] = []
-        self.values: dict[str, dict[str, np.ndarray]] = {}
-
-    def put(self, name: str, column: str, index: tuple[int, ...], value: float) -> None:
-        columns = self.values.setdefault(name, {})
-        if column not in columns:
-            columns[column] = np.full(self.shape, np.nan)
-        columns[column][index] = value
+Columns = dict[str, np.ndarray]
+"""Arrays over the points of a sweep, by link or kind."""
 
 
 def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
@@ -141,75 +130,82 @@ def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
         ``paths`` by ``kind``. Coordinates are the axes' values. Nothing in it depends on who
         computed what when.
     """
-    sweep = plan.sweep
-    table, paths = _Table(sweep.shape), _Table(sweep.shape)
-    counts: dict[str, dict[str, np.ndarray]] = {}
-    state = np.zeros(sweep.shape, np.int8)
+    shape = plan.sweep.shape
+    state = np.zeros(shape, np.int8)
+    values: dict[str, Columns] = {}
+    counts: dict[str, Columns] = {}
+    paths: Columns = {}
+
+    def column(columns: Columns, name: str, shape: tuple[int, ...], missing: float) -> np.ndarray:
+        if name not in columns:
+            columns[name] = np.full(shape, missing)
+        return columns[name]
+
     for point in plan.points():
-        outcome = outcomes.read(point.key)
+        outcome, at = outcomes.read(point.key), point.index
         if outcome is None:
             continue
-        state[point.index] = 1 if outcome["status"] == "done" else -1
+        state[at] = 1 if outcome["status"] == "done" else -1
         for link, block in outcome.get("links", {}).items():
             for name, value in flat_numbers(block):
-                table.put(name, link, point.index, value)
+                column(values.setdefault(name, {}), link, shape, np.nan)[at] = value
             for name, pair in block["counts"].items():
-                columns = counts.setdefault(name, {})
-                total = columns.setdefault(link, np.zeros((*sweep.shape[:-1], 2), np.int64))
-                total[point.index[:-1]] += pair
+                column(counts.setdefault(name, {}), link, (*shape[:-1], 2), 0)[at[:-1]] += pair
         for kind, number in outcome.get("paths", {}).items():
-            paths.put("paths", kind, point.index, number)
-    return _dataset(plan, table, paths, counts, state)
+            column(paths, kind, shape, np.nan)[at] = number
+
+    dims, links = [*plan.sweep.axes, "repetition"], list(dict.fromkeys(_names(values)))
+    out = {"state": xr.Variable(dims, state, {"long_name": "1 done, 0 not yet, -1 failed"})}
+    for name, columns in values.items():
+        missing = np.full(shape, np.nan)
+        stacked = np.stack([columns.get(link, missing) for link in links], axis=-1)
+        out[name] = xr.Variable([*dims, "link"], stacked)
+    for name, columns in counts.items():
+        out |= _rates(name, columns, links, dims[:-1])
+    if paths:
+        kinds = sorted(paths)
+        stacked = np.stack([paths[kind] for kind in kinds], axis=-1)
+        out["paths"] = xr.Variable([*dims, "kind"], stacked)
+        out["kind"] = xr.Variable(["kind"], np.array(kinds, object))
+    return _dataset(plan, out, links)
 
 
-def _dataset(
-    plan: Plan,
-    table: _Table,
-    paths: _Table,
-    counts: dict[str, dict[str, np.ndarray]],
-    state: np.ndarray,
-) -> xr.Dataset:
-    sweep, dims = plan.sweep, [*plan.sweep.axes, "repetition"]
-    links = list(dict.fromkeys(link for columns in table.values.values() for link in columns))
-    out: dict[str, xr.Variable] = {
-        "state": xr.Variable(dims, state, {"long_name": "1 done, 0 not yet, -1 failed"})
+def _names(values: dict[str, Columns]) -> Iterator[str]:
+    return (link for columns in values.values() for link in columns)
+
+
+def _rates(
+    name: str, columns: Columns, links: list[str], dims: list[str]
+) -> dict[str, xr.Variable]:
+    """One rate pooled over all repetitions, and its bounds, from errors and trials (..., 2)."""
+    missing = np.zeros_like(next(iter(columns.values())))
+    pairs = np.stack([columns.get(link, missing) for link in links], axis=-1)
+    errors, trials = pairs[..., 0, :], pairs[..., 1, :]
+    bounds = np.array(
+        [
+            binomial_interval(int(e), int(n), CONFIDENCE) if n else (np.nan, np.nan)
+            for e, n in zip(errors.ravel(), trials.ravel(), strict=True)
+        ]
+    ).reshape(*errors.shape, 2)
+    with np.errstate(invalid="ignore"):
+        pooled = errors / np.where(trials, trials, np.nan)
+    meanings = {
+        f"{name}_pooled": (pooled, f"{name} over all repetitions"),
+        f"{name}_low": (bounds[..., 0], f"low bound of {name}_pooled"),
+        f"{name}_high": (bounds[..., 1], f"high bound of {name}_pooled"),
+    }
+    return {
+        key: xr.Variable([*dims, "link"], values, {"long_name": meaning, "confidence": CONFIDENCE})
+        for key, (values, meaning) in meanings.items()
     }
 
-    def stacked(
-        columns: dict[str, np.ndarray], names: list[str], missing: np.ndarray
-    ) -> np.ndarray:
-        return np.stack([columns.get(name, missing) for name in names], axis=-1)
 
-    for name, columns in table.values.items():
-        out[name] = xr.Variable(
-            [*dims, "link"], stacked(columns, links, np.full(table.shape, np.nan))
-        )
-    for name, columns in counts.items():
-        pair = stacked(columns, links, np.zeros((*sweep.shape[:-1], 2), np.int64))  # ..., 2, link
-        errors, trials = pair[..., 0, :], pair[..., 1, :]
-        bounds = np.array(
-            [
-                binomial_interval(int(e), int(n), CONFIDENCE) if n else (np.nan, np.nan)
-                for e, n in zip(errors.ravel(), trials.ravel(), strict=True)
-            ]
-        ).reshape(*errors.shape, 2)
-        about = {"long_name": f"{name} over all repetitions", "confidence": CONFIDENCE}
-        with np.errstate(invalid="ignore"):
-            out[f"{name}_pooled"] = xr.Variable(
-                [*dims[:-1], "link"], errors / np.where(trials, trials, np.nan), about
-            )
-        for i, end in enumerate(("low", "high")):
-            meaning = {**about, "long_name": f"{end} bound of {name}_pooled"}
-            out[f"{name}_{end}"] = xr.Variable([*dims[:-1], "link"], bounds[..., i], meaning)
-    if "paths" in paths.values:
-        kinds = sorted(paths.values["paths"])
-        out["paths"] = xr.Variable(
-            [*dims, "kind"], stacked(paths.values["paths"], kinds, np.full(table.shape, np.nan))
-        )
-        out["kind"] = xr.Variable(["kind"], np.array(kinds, object))
+def _dataset(plan: Plan, variables: dict[str, xr.Variable], links: list[str]) -> xr.Dataset:
+    """What is kept of the variables, with the coordinates along the axes."""
+    sweep = plan.sweep
     kept = {
         name: v
-        for name, v in out.items()
+        for name, v in variables.items()
         if name in ("state", "kind") or any(fnmatch.fnmatch(name, p) for p in sweep.keep)
     }
     coordinates: dict[str, Any] = {
