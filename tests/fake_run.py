@@ -132,7 +132,7 @@ def _reception(w, rng, truth, maps, decoded, detections):
 def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord]:
     """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3,
     and U1 is hidden in frame 4."""
-    w, swarm, out = waveform_of(scenario), swarm_of(scenario), []
+    w, swarm, out = waveform_of(scenario.radio, scenario.array), swarm_of(scenario), []
     for f in range(scenario.frames):
         rng = np.random.default_rng([5, f])
         poses, snapshot, data = swarm.poses(f * 0.043 + 0.004), f == 2, f > 0
@@ -204,17 +204,17 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
 
 
 def fake_recorder(scenario: Scenario) -> Recorder:
-    w = waveform_of(scenario)
+    w = waveform_of(scenario.radio, scenario.array)
     schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
     return Recorder(timetable_of(scenario, w, schedule), STATES)
 
 
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
-    w = waveform_of(scenario)
+    w = waveform_of(scenario.radio, scenario.array)
     recorder = fake_recorder(scenario)
     scores = {
-        ("AT", name): SensingScore(resolutions(w, antennas_of(scenario, w), passes))
+        ("AT", name): SensingScore(resolutions(w, antennas_of(scenario.array, w), passes))
         for name, passes in (("AT", 2), ("PT1", 1))
     }
     for record in fake_records(scenario, detections=detections):

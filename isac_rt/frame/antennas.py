@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.radio import Array
 
 PatternModel = Literal["isotropic", "sector", "cosine"]
 
@@ -116,9 +116,8 @@ class Antennas:
         return self.gain * np.where(forward > 0, forward**exponent, 0.0)
 
 
-def antennas_of(scenario: Scenario, waveform: Waveform) -> Antennas:
+def antennas_of(a: Array, waveform: Waveform) -> Antennas:
     """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
-    a = scenario.array
     return Antennas(
         tx_x=a.tx_x,
         tx_z=a.tx_z,

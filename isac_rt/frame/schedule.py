@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.scenario.tree import Scenario
 
 Schedule = np.ndarray
 """(num_groups, num_chirps) int: the transmit antenna that each group uses in each slot."""
@@ -38,10 +37,10 @@ def is_latin(schedule: Schedule, num_tx: int) -> bool:
     return all(len(set(column)) == len(column) for column in schedule.T) and schedule.max() < num_tx
 
 
-def schedule_of(scenario: Scenario, waveform: Waveform, rng: np.random.Generator) -> Schedule:
-    """The antenna schedule that a scenario states."""
+def schedule_of(kind: str, waveform: Waveform, rng: np.random.Generator) -> Schedule:
+    """The antenna schedule of a kind (``array.schedule``)."""
     w = waveform
-    if scenario.array.schedule == "conventional":
+    if kind == "conventional":
         return conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
     return pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
 

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from isac_rt.scenario.radio import ChirpTimes, chirp_times, num_resource_blocks
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.radio import Array, ChirpTimes, Radio, chirp_times, num_resource_blocks
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
@@ -253,9 +252,8 @@ class Waveform:
         return (self.slope * tau + delay_rate * self.carrier(tau)) * self.sampled_duration
 
 
-def waveform_of(scenario: Scenario) -> Waveform:
-    """The waveform that a scenario states."""
-    r, a = scenario.radio, scenario.array
+def waveform_of(r: Radio, a: Array) -> Waveform:
+    """The waveform that a scenario's radio and array state."""
     return Waveform(
         carrier_frequency=r.carrier_hz,
         bandwidth=r.bandwidth_hz,

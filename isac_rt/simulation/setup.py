@@ -309,10 +309,10 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     dtype('complex64')
     """
     begin = time.perf_counter()
-    waveform = waveform_of(scenario)
-    antennas = antennas_of(scenario, waveform)
+    waveform = waveform_of(scenario.radio, scenario.array)
+    antennas = antennas_of(scenario.array, waveform)
     swarm = swarm_of(scenario)
-    schedule = schedule_of(scenario, waveform, generator(scenario.seed, "schedule"))
+    schedule = schedule_of(scenario.array.schedule, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
     check_memory(antennas, timetable)
     check_flights(swarm, timetable)
@@ -457,8 +457,8 @@ def propagation_in(
     city: CityMesh, scenario: Scenario, instants: Sequence[float] = ()
 ) -> Propagation:
     """The scenario's propagation model in a city, which need not be the scenario's own."""
-    waveform, swarm = waveform_of(scenario), swarm_of(scenario)
-    antennas = antennas_of(scenario, waveform)
+    waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
+    antennas = antennas_of(scenario.array, waveform)
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     return make_propagation(
         scenario.propagation, scenario.clutter, swarm, free, city, waveform, instants

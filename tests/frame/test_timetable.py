@@ -31,7 +31,7 @@ def scenario_of(**changes) -> Scenario:
 def timetable(**changes) -> Timetable:
     """The frames of such a scenario."""
     scenario = scenario_of(**changes)
-    w = waveform_of(scenario)
+    w = waveform_of(scenario.radio, scenario.array)
     return timetable_of(
         scenario,
         w,

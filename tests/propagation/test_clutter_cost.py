@@ -40,11 +40,11 @@ def tracer(city, **clutter):
             "clutter": clutter,
         }
     )
-    w = waveform_of(s)
+    w = waveform_of(s.radio, s.array)
     return (
         propagation_in(city, s),
         swarm_of(s),
-        antennas_of(s, w),
+        antennas_of(s.array, w),
     )
 
 

@@ -415,8 +415,8 @@ def expectation(city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
         "clutter": {"model": "field"},
     }
     s = scenario.Scenario.model_validate(tree)
-    w = waveform_of(s)
-    swarm, antennas = swarm_of(s), antennas_of(s, w)
+    w = waveform_of(s.radio, s.array)
+    swarm, antennas = swarm_of(s), antennas_of(s.array, w)
     copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
     return copy, swarm.poses(0.0)["A"]
 

@@ -259,19 +259,19 @@ def test_two_bodies_at_one_point_are_refused_before_the_run():
     with pytest.raises(ScenarioError, match=r"swarm\.U: .* from A at 2\.\d* s \(frame (19|20)\)"):
         prepare(meeting)
     passing = flight(A=((0, 0, 9), (0, 0, 0)), U=((0.3, 20, 9), (0, -10.0, 0)))
-    w = waveform_of(passing)
+    w = waveform_of(passing.radio, passing.array)
     check_flights(swarm_of(passing), timetable_of(passing, w, np.zeros((3, 120), int)))
 
 
 def aliases(s):
     """What is said of a scenario's velocities."""
-    w = waveform_of(s)
+    w = waveform_of(s.radio, s.array)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         warn_of_aliases(
             swarm_of(s),
             timetable_of(s, w, np.zeros((3, 120), int)),
-            antennas_of(s, w),
+            antennas_of(s.array, w),
             s.receivers.velocity_method,
             s.array.schedule,
         )
@@ -289,7 +289,7 @@ def test_velocities_that_alias_are_warned_of_before_the_run():
         (14.0, 1, []),
     ):
         s = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, way * 20, 9), (0, way * v, 0)))
-        w, said = waveform_of(s), aliases(s)
+        w, said = waveform_of(s.radio, s.array), aliases(s)
         assert [text.split(" moves")[0] for text in said] == expected
         if expected:
             shown = (v + w.max_velocity(2)) % (2 * w.max_velocity(2)) - w.max_velocity(2)

@@ -360,7 +360,7 @@ def test_empty_scene_is_free_space():
     poses = swarm_of((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     model, s = tracer(empty_city("none", np.array([3.0, 4.0, 5.0])))
     closed = (
-        FreeSpace(s.swarm, antennas_of(s, waveform_of(s)), LAMBDA, s.seed)
+        FreeSpace(s.swarm, antennas_of(s.array, waveform_of(s.radio, s.array)), LAMBDA, s.seed)
         .trace(poses, 0.25, LINKS)
         .paths
     )
@@ -534,7 +534,7 @@ def test_leakage():
     (k,) = np.flatnonzero(own.kind == PathKind.LEAKAGE)
     assert own.power[k] == pytest.approx(10**-5.73, rel=1e-12)
     assert (own.delay[k], own.delay_rate[k]) == (1.3e-9, 0.0)
-    arrays = antennas_of(s, waveform_of(s))
+    arrays = antennas_of(s.array, waveform_of(s.radio, s.array))
     assert np.abs(poses["A"].to_body(own.arrival[k]) @ arrays.rx_positions.T).max() < 1e-15
     assert np.abs(poses["A"].to_body(own.departure[k]) @ arrays.tx_positions.T).max() < 1e-15
     assert found["A", "P"].counts()["leakage"] == 0

@@ -545,8 +545,11 @@ def test_what_a_terminal_expects_of_mirrors():
         "clutter": {"model": "field", "cell_area_per_metre_m": 0.02, "mirrors": 2},
     }
     s = scenario.Scenario.model_validate(tree)
-    w = waveform_of(s)
-    antennas, city = antennas_of(s, w), joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
+    w = waveform_of(s.radio, s.array)
+    antennas, city = (
+        antennas_of(s.array, w),
+        joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL)),
+    )
     model = propagation_in(city, s)
     swarm = swarm_of(s)
     copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)

@@ -56,7 +56,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         exclude={"city": {"file"}}
     )
     assert scenario.frame_duration_s == pytest.approx(
-        waveform_of(scenario).frame_duration, rel=1e-12
+        waveform_of(scenario.radio, scenario.array).frame_duration, rel=1e-12
     )  # rounding
 
 

@@ -34,9 +34,9 @@ K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [r
 
 def plan_of(scene: str = "paper_swarm_consistent.yaml", *overrides: str) -> Plan:
     s = load(SCENES / scene, overrides)
-    w = waveform_of(s)
-    timetable = timetable_of(s, w, schedule_of(s, w, generator(s.seed, "schedule")))
-    return plan_of_scenario(s, antennas_of(s, w), timetable, swarm_of(s))
+    w = waveform_of(s.radio, s.array)
+    timetable = timetable_of(s, w, schedule_of(s.array.schedule, w, generator(s.seed, "schedule")))
+    return plan_of_scenario(s, antennas_of(s.array, w), timetable, swarm_of(s))
 
 
 def some_paths(count: int, seed: int, **changes) -> PathSet:

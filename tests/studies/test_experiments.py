@@ -223,7 +223,7 @@ def test_the_papers_grids_have_uniform_errors_and_the_filter_lowers_them():
     cell/sqrt(12) (uniform over many cells; 20 % for 100 frames), and an EKF that knows that must do
     better. Planted bug: the detections left unrounded."""
     scene = flight.scenario("consistent")
-    w, swarm = waveform_of(scene), swarm_of(scene)
+    w, swarm = waveform_of(scene.radio, scene.array), swarm_of(scene)
     frames, every = 100, 5
     truth = []
     for k in range(frames):

@@ -32,8 +32,8 @@ def scenario(variant: str, seed: int | None = None, overrides: tuple[str, ...] =
 def views(scene: Scenario) -> dict[tuple[str, str], np.ndarray]:
     """Whether each UAV has each other in its own field of view, frame by frame, from the poses
     alone: {(who, whom): (frames,)}."""
-    w = waveform_of(scene)
-    antennas, swarm = antennas_of(scene, w), swarm_of(scene)
+    w = waveform_of(scene.radio, scene.array)
+    antennas, swarm = antennas_of(scene.array, w), swarm_of(scene)
     poses = [swarm.poses((k + 0.5) * w.frame_duration) for k in range(scene.frames)]
     pairs = [(a, b) for a in UAVS for b in UAVS if a != b]
     return {(a, b): np.array([sees(antennas, p[a], p[b]) for p in poses]) for a, b in pairs}
@@ -56,7 +56,7 @@ def span(seen: np.ndarray) -> str:
 
 def closing_speed(scene: Scenario, who: str, whom: str) -> tuple[float, float]:
     """Smallest and largest |radial velocity| between two UAVs over the frames [m/s]."""
-    w, swarm = waveform_of(scene), swarm_of(scene)
+    w, swarm = waveform_of(scene.radio, scene.array), swarm_of(scene)
     rates = []
     for k in range(scene.frames):
         p = swarm.poses((k + 0.5) * w.frame_duration)
@@ -74,7 +74,8 @@ def fly(
     The other passive terminal is only a target, so that its own receiver costs nothing; the AT
     processes each frame for itself, or none.
     """
-    interval = every * waveform_of(scenario(variant)).frame_duration
+    scene = scenario(variant)
+    interval = every * waveform_of(scene.radio, scene.array).frame_duration
     own = observer == "AT"
     changes = [
         f"frame_interval_s={interval!r}",

@@ -229,13 +229,13 @@ def _of_terminal(
 ) -> pd.DataFrame:
     """Explained tracks of one terminal and what its test said of them; a passive one's reference,
     which it does not doubt, is left out."""
-    w, passive = waveform_of(s), s.swarm[name].role == "passive"
+    w, passive = waveform_of(s.radio, s.array), s.swarm[name].role == "passive"
     passes = 1 if passive else 2
     observer = dataset.observer.values.tolist().index(name)
     rows = explained_tracks(
         dataset,
         observer,
-        resolutions(w, antennas_of(s, w), passes),
+        resolutions(w, antennas_of(s.array, w), passes),
         2 * w.max_velocity(passes),
         passive,
     )

@@ -30,7 +30,8 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         joint = every["AT", "PT2"] & every["PT1", "PT2"]
         rows.append((variant, "AT and PT1", "PT2", int(joint.sum()), span(joint)))
     speed = {variant: closing_speed(scene, "AT", "PT2") for variant, scene in scenes.items()}
-    limit = waveform_of(scenes["printed"]).max_velocity(2)
+    printed = scenes["printed"]
+    limit = waveform_of(printed.radio, printed.array).max_velocity(2)
     settings = {
         "quick": quick,
         "seed": seed,

@@ -63,7 +63,11 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
     their raw errors are a hundredth.
     """
     scene = scenario("consistent")
-    w, swarm, passes = waveform_of(scene), swarm_of(scene), 2 if observer == "AT" else 1
+    w, swarm, passes = (
+        waveform_of(scene.radio, scene.array),
+        swarm_of(scene),
+        2 if observer == "AT" else 1,
+    )
     step = np.array([w.range_cell(passes), w.velocity_cell(passes), np.deg2rad(ANGLE_STEP_DEG)])
     std = np.append(step, step[2]) / np.sqrt(12)
     out: dict[str, tuple[list[float], list[float]]] = {quantity: ([], []) for quantity in UNITS}
