@@ -161,11 +161,7 @@ def _lines(
     ]
     drawn = sorted(every, key=lambda row: -row[0])[:MOST_LINES]
     gap = np.full((1, 3), np.nan)
-    parts = [
-        part
-        for _, p, k in drawn
-        for part in (polyline(p, k, poses[p.tx].position, poses[p.rx].position, poses), gap)
-    ]
+    parts = [part for _, p, k in drawn for part in (polyline(p, k, poses), gap)]
     return (np.vstack(parts) if parts else np.zeros((0, 3))), len(every)
 
 

@@ -56,6 +56,13 @@ class View:
         """World points (..., 3) as (right, up, depth) [m]; depth grows away from the viewer."""
         return (points - self.centre) @ self.axes.T
 
+    def pixels(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """World points (..., 3) as (column, row, depth) of a picture, row 0 at the bottom."""
+        p = self.project(points)
+        p[..., 0] = (p[..., 0] / self.half[0] + 1) * width / 2
+        p[..., 1] = (p[..., 1] / self.half[1] + 1) * height / 2
+        return p
+
 
 def view_from(
     azimuth: float, elevation: float, centre: np.ndarray, half: tuple[float, float]
@@ -118,9 +125,7 @@ def depth_buffer(
     ----------
     corners : (F, 3, 3) triangles in world coordinates [m]
     """
-    pixels = view.project(corners)
-    pixels[..., 0] = (pixels[..., 0] / view.half[0] + 1) * width / 2
-    pixels[..., 1] = (pixels[..., 1] / view.half[1] + 1) * height / 2
+    pixels = view.pixels(corners, width, height)
     depth, face = np.full((height, width), np.inf), np.full((height, width), -1, np.int32)
     _rasterise(pixels, depth, face)
     return depth, face
@@ -130,9 +135,9 @@ def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 
     """Whether world points (..., 3) lie more than `slack` [m] behind what the depth buffer shows
     there."""
     height, width = depth.shape
-    p = view.project(points)
-    column = np.clip(((p[..., 0] / view.half[0] + 1) * width / 2).astype(int), 0, width - 1)
-    row = np.clip(((p[..., 1] / view.half[1] + 1) * height / 2).astype(int), 0, height - 1)
+    p = view.pixels(points, width, height)
+    column = np.clip(p[..., 0].astype(int), 0, width - 1)
+    row = np.clip(p[..., 1].astype(int), 0, height - 1)
     return p[..., 2] > depth[row, column] + slack
 
 
@@ -198,144 +203,85 @@ def best_view(city: CityMesh, tracks: np.ndarray, aspect: float) -> View:
     )
 
 
-def _line(
-    ax: Axes,
-    corners: np.ndarray,
-    view: View,
-    depth: np.ndarray,
-    colour: str,
-    width: float,
-    alpha: float = 1.0,
-) -> None:
-    """A polyline (n, 3), faint where it is hidden."""
-    s = np.linspace(0, len(corners) - 1, _PIECES * (len(corners) - 1) + 1)
-    points = np.stack(
-        [np.interp(s, np.arange(len(corners)), corners[:, i]) for i in range(3)], axis=1
-    )
-    flat = view.project(points)[:, :2]
-    hidden = is_hidden((points[1:] + points[:-1]) / 2, view, depth)
-    pieces = np.stack([flat[:-1], flat[1:]], axis=1)
-    ax.add_collection(
-        LineCollection(
-            list(pieces),
-            colors=colour,
-            linewidths=width,
-            alpha=np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha,
-        )
-    )
+@dataclass(frozen=True)
+class _Picture:
+    """Axes over a shaded city, whose depth buffer says what is hidden."""
+
+    ax: Axes
+    view: View
+    depth: np.ndarray
+
+    def line(self, corners: np.ndarray, colour: str, width: float, alpha: float = 1.0) -> None:
+        """A polyline (n, 3), faint where it is hidden."""
+        s = np.linspace(0, len(corners) - 1, _PIECES * (len(corners) - 1) + 1)
+        columns = [np.interp(s, np.arange(len(corners)), c) for c in corners.T]
+        points = np.stack(columns, axis=1)
+        flat = self.view.project(points)[:, :2]
+        hidden = is_hidden((points[1:] + points[:-1]) / 2, self.view, self.depth)
+        pieces = list(np.stack([flat[:-1], flat[1:]], axis=1))
+        shown = np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha
+        self.ax.add_collection(LineCollection(pieces, colors=colour, linewidths=width, alpha=shown))
+
+    def paths(self, paths: Mapping[Link, PathSet], poses: Mapping[str, Pose]) -> list[Line2D]:
+        """Every kind in its colour: the scattering points of diffuse paths, the strongest of the
+        others as lines. Returns the legend."""
+        count = dict.fromkeys(PathKind, 0)
+        for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
+            colour = KIND_COLOURS[kind.name.lower()]
+            for p in paths.values():
+                which = np.flatnonzero(p.kind == kind)
+                count[kind] += which.size
+                if kind == PathKind.DIFFUSE and which.size:
+                    points = p.points[which].reshape(-1, 3)
+                    points = points[np.isfinite(points).all(axis=1)]
+                    points = points[~is_hidden(points, self.view, self.depth)]
+                    x, y = self.view.project(points)[:, :2].T
+                    self.ax.plot(x, y, ".", color=colour, ms=2.6, alpha=0.8, mew=0)
+                elif kind != PathKind.LEAKAGE:
+                    width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
+                    for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
+                        self.line(polyline(p, k, poses), colour, width, 0.85)
+        return [
+            Line2D([], [], color=KIND_COLOURS[name], label=f"{words(name)} ({count[kind]})")
+            for kind in PathKind
+            if count[kind] and kind != PathKind.LEAKAGE
+            for name in [kind.name.lower()]
+        ]
+
+    def swarm(self, swarm: Swarm, times: np.ndarray, time: float, ground: float) -> list[Line2D]:
+        """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`.
+        Returns the legend."""
+        poses, legend = swarm.poses(time), []
+        for u, (name, uav) in enumerate(swarm.uavs.items()):
+            colour, marker, here = colour_of(u), ROLE_MARKERS[uav.role], poses[name].position
+            track = swarm.trajectories[name]
+            self.line(np.array([track.pose(t).position for t in times]), colour, 2.2)
+            foot = self.view.project(np.stack([here, [here[0], here[1], ground]]))
+            self.ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
+            style = {"ms": 15 if uav.role == "active" else 8, "mec": "white", "mew": 1.1}
+            self.ax.plot(foot[0, 0], foot[0, 1], marker, color=colour, zorder=8, **style)
+            self.ax.annotate(
+                name,
+                (foot[0, 0], foot[0, 1]),
+                xytext=(8, 7),
+                textcoords="offset points",
+                color=colour,
+                fontweight="bold",
+                fontsize=10,
+                zorder=9,
+                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+            )
+            label = f"{name}, {uav.role}"
+            legend.append(Line2D([], [], color=colour, marker=marker, ls="none", label=label))
+        return legend
 
 
-def _draw_paths(
-    ax: Axes,
-    paths: Mapping[Link, PathSet],
-    poses: Mapping[str, Pose],
-    view: View,
-    depth: np.ndarray,
-) -> list[Line2D]:
-    """Every kind in its colour: the scattering points of diffuse paths, the strongest of the others
-    as lines."""
-    count = dict.fromkeys(PathKind, 0)
-    for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
-        colour = KIND_COLOURS[kind.name.lower()]
-        for (tx, rx), p in paths.items():
-            which = np.flatnonzero(p.kind == kind)
-            count[kind] += which.size
-            if kind == PathKind.DIFFUSE and which.size:
-                points = p.points[which].reshape(-1, 3)
-                points = points[np.isfinite(points).all(axis=1)]
-                points = points[~is_hidden(points, view, depth)]
-                flat = view.project(points)
-                ax.plot(flat[:, 0], flat[:, 1], ".", color=colour, ms=2.6, alpha=0.8, mew=0)
-            elif kind != PathKind.LEAKAGE:
-                width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
-                for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
-                    _line(
-                        ax,
-                        polyline(p, k, poses[tx].position, poses[rx].position, poses),
-                        view,
-                        depth,
-                        colour,
-                        width,
-                        0.85,
-                    )
-    drawn = [k for k in PathKind if count[k] and k != PathKind.LEAKAGE]
-    return [
-        Line2D(
-            [],
-            [],
-            color=KIND_COLOURS[k.name.lower()],
-            label=f"{words(k.name.lower())} ({count[k]})",
-        )
-        for k in drawn
-    ]
-
-
-def polyline(
-    p: PathSet, k: int, start: np.ndarray, end: np.ndarray, poses: Mapping[str, Pose]
-) -> np.ndarray:
+def polyline(p: PathSet, k: int, poses: Mapping[str, Pose]) -> np.ndarray:
     """Corners of a path from transmitter to receiver, its UAV included."""
     inner = p.points[k][np.isfinite(p.points[k]).all(axis=1)]
     if not inner.size and p.target[k] >= 0:
         inner = poses[p.target_names[p.target[k]]].position[None]
-    return np.vstack([start, inner, end])
-
-
-def _draw_swarm(
-    ax: Axes,
-    swarm: Swarm,
-    times: np.ndarray,
-    time: float,
-    view: View,
-    depth: np.ndarray,
-    ground: float,
-) -> list[Line2D]:
-    """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`."""
-    poses, legend = swarm.poses(time), []
-    for u, (name, uav) in enumerate(swarm.uavs.items()):
-        colour, here = colour_of(u), poses[name].position
-        _line(
-            ax,
-            np.array([swarm.trajectories[name].pose(t).position for t in times]),
-            view,
-            depth,
-            colour,
-            2.2,
-        )
-        foot = view.project(np.stack([here, [here[0], here[1], ground]]))
-        ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
-        big = 15 if uav.role == "active" else 8
-        ax.plot(
-            foot[0, 0],
-            foot[0, 1],
-            ROLE_MARKERS[uav.role],
-            color=colour,
-            ms=big,
-            mec="white",
-            mew=1.1,
-            zorder=8,
-        )
-        ax.annotate(
-            name,
-            (foot[0, 0], foot[0, 1]),
-            xytext=(8, 7),
-            textcoords="offset points",
-            color=colour,
-            fontweight="bold",
-            fontsize=10,
-            zorder=9,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-        )
-        legend.append(
-            Line2D(
-                [],
-                [],
-                color=colour,
-                marker=ROLE_MARKERS[uav.role],
-                ls="none",
-                label=f"{name}, {uav.role}",
-            )
-        )
-    return legend
+    return np.vstack([poses[p.tx].position, inner, poses[p.rx].position])
 
 
 def view_scene(
@@ -357,13 +303,14 @@ def view_scene(
     ax = figure.add_axes((0, 0, 1, 1))
     extent = (-view.half[0], view.half[0], -view.half[1], view.half[1])
     ax.imshow(np.clip(picture, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
-    legend = _draw_paths(ax, paths, swarm.poses(time), view, depth)
+    drawn = _Picture(ax, view, depth)
+    legend = drawn.paths(paths, swarm.poses(time))
     ground = (
         float((city.corners + city.origin)[..., 2].min())
         if city.num_faces
         else float(tracks[..., 2].min() - 10)
     )
-    legend = _draw_swarm(ax, swarm, times, time, view, depth, ground) + legend
+    legend = drawn.swarm(swarm, times, time, ground) + legend
     ax.legend(
         handles=legend,
         loc="upper left",
