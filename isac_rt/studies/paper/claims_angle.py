@@ -98,7 +98,7 @@ def angle_hits(scheme: str, targets: int, seed: int) -> tuple[int, int]:
 
 
 def spatial_slips(order: int, pairs: int, seed: int) -> int:
-    """Of DPSK transitions that run from slot to slot, those that the way from one antenna to the
+    """DPSK transitions from slot to slot, out of `pairs`, that the way from one antenna to the
     other would turn by half a symbol."""
     w, rng = Waveform(), generator(seed, "claims", "slips", order)
     places, wrong = onepath.antennas(w, 8).tx_positions, 0

@@ -26,7 +26,7 @@ from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proporti
 from isac_rt.studies.waves import prediction
 
 SPACING = 0.5774
-"""Of the paper's receive elements [carrier wavelengths]."""
+"""Spacing of the paper's receive elements [carrier wavelengths]."""
 
 say = Sentences("""
 model: The approximations that make the IF a product of range, Doppler and angle are negligible

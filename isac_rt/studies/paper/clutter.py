@@ -242,7 +242,7 @@ def earlier(paths: PathSet, seconds: float) -> PathSet:
 
 
 def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.ndarray]:
-    """Of `TARGETS` targets of unit amplitude, those that the CFAR finds within a cell at each SNR,
+    """Those of `TARGETS` targets of unit amplitude that the CFAR finds within a cell at each SNR,
     without a filter and after the zero-Doppler notch, for the clutter at the paper's level and as
     it is: {(physical, filter): (SNR, 3) hits, false alarms and cells in which there could have been
     one}."""

@@ -19,17 +19,18 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import radar_amplitude
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.simulation.setup import Setup, prepare
+from isac_rt.studies.waves import waves
 from isac_rt.world.swarm import Pose, attitude
 
 SPEED = 10.0
-"""Of a terminal in flight [m/s], along its boresight over ground."""
+"""Speed of a terminal in flight [m/s], along its boresight over ground."""
 LEFT_OUT_DB = 20.0
 """Scatterers this far below the noise of one range-Doppler cell are left out: 1 % of the clutter's
 power at 27 m, 7 % at 60 m."""
@@ -138,7 +139,7 @@ class Scenes:
         self.epoch = self.setup.waveform.frame_duration / 2
 
     def pose(self, place: str, speed: float) -> Pose:
-        """Of a terminal that flies over ground along its boresight."""
+        """Pose of a terminal that flies over ground along its boresight."""
         p = PLACES[place]
         ahead = np.array([p.boresight[0], p.boresight[1], 0.0])
         return Pose(
@@ -249,26 +250,19 @@ class Targets:
     def paths(self, scenes: Scenes, place: str, speed: float) -> PathSet:
         """Their echoes, by the radar equation."""
         pose, antennas = scenes.pose(place, speed), scenes.setup.antennas
-        amplitude = radar_amplitude(
-            scenes.setup.waveform.wavelength, SMALL_UAV_M2, self.range, self.range
-        )
-        phase = generator(scenes.setup.scenario.seed, "echo", place).uniform(
-            0, 2 * np.pi, len(self)
-        )
-        return make_paths(
-            gain=amplitude
-            * antennas.element_gain(pose.to_body(self.direction))
-            * np.exp(1j * phase),
-            delay=2 * self.range / SPEED_OF_LIGHT,
-            delay_rate=2 * self.velocity / SPEED_OF_LIGHT,
-            departure=self.direction,
-            arrival=self.direction,
-            tx_radius=self.range,
-            rx_radius=self.range,
-            kind=int(PathKind.TARGET),
-            epoch=scenes.epoch,
-            tx=place,
-            rx=place,
+        wavelength, seed = scenes.setup.waveform.wavelength, scenes.setup.scenario.seed
+        amplitude = radar_amplitude(wavelength, SMALL_UAV_M2, self.range, self.range)
+        phase = generator(seed, "echo", place).uniform(0, 2 * np.pi, len(self))
+        pattern = antennas.element_gain(pose.to_body(self.direction))
+        return waves(
+            scenes.epoch,
+            2 * self.range / SPEED_OF_LIGHT,
+            2 * self.velocity / SPEED_OF_LIGHT,
+            gain=amplitude * pattern * np.exp(1j * phase),
+            ends=(self.direction, self.direction),
+            kind=PathKind.TARGET,
+            radius=self.range,
+            link=Link(place, place),
         )
 
 

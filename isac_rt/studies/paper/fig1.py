@@ -25,7 +25,7 @@ from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
 
 RANGE, VELOCITY = 61.7, 4.3
-"""Of the target, as the AT sees it [m, m/s]."""
+"""The target as the AT sees it [m, m/s]."""
 ORDER = 8
 SHOWN = range(3, 6)
 """Slots drawn: the second chirp of each antenna, the first with a phase."""

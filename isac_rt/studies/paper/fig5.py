@@ -32,7 +32,7 @@ NAMES = {
     "d": "pseudo-random, 3 groups",
 }
 RANGE, VELOCITY_SHARE = 23.7, 0.23
-"""Of the target: range [m], and radial velocity as a share of the unambiguous one."""
+"""The target's range [m], and its radial velocity as a share of the unambiguous one."""
 _EQUAL_DB = 1.0
 """A second peak this close to the first is a second answer."""
 _SLOTS = 9

@@ -108,8 +108,8 @@ def hits(case: Curves, seed: int, index: int) -> Counts:
 
 
 def _count(spectra: np.ndarray, bins: np.ndarray) -> int:
-    """Of (V, channels, bins) spectra in FFT order: how many have their strongest summed power
-    within a bin of the truth."""
+    """How many of (V, channels, bins) spectra in FFT order have their strongest summed power within
+    a bin of the truth."""
     size = spectra.shape[-1]
     best = np.fft.fftfreq(size, 1 / size)[(np.abs(spectra) ** 2).sum(axis=1).argmax(axis=1)]
     # bins of 40 and of 120 slots are equally wide; an estimate that folds is wrong

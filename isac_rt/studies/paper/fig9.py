@@ -16,7 +16,7 @@ FRAMES, EVERY = 25, 20
 """The paper's interval of the AT: frames 0, 20, ... 480."""
 RUNS, QUICK_RUNS = 12, 2
 PRINTED_FRAMES, PRINTED_EVERY = 5, 100
-"""Of the run as printed: PT2 is never in view."""
+"""The run as printed: PT2 is never in view."""
 WARM_UP = 3
 """Processed frames until a new track must be confirmed."""
 

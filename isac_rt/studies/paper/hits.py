@@ -22,13 +22,13 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.antennas import Antennas, unit_vector
-from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
-from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.randomness import generator
 from isac_rt.receive import Prediction
 from isac_rt.receive.cfar import CfarRule
@@ -50,7 +50,7 @@ from isac_rt.studies.baselines.loradar import Compensation, loradar_delay, lorad
 from isac_rt.studies.baselines.tdm import doppler_maps, estimate_tdm
 from isac_rt.studies.paper.montecarlo import Counts
 from isac_rt.studies.paper.symbols import PLACE, RANGE_ERROR_CELLS, VELOCITY_ERROR, paper_antennas
-from isac_rt.world.swarm import Pose
+from isac_rt.studies.waves import STILL, prediction, sender, waves
 
 NEAREST, FARTHEST, WIDEST = 5.0, 100.0, 50.0
 """Ranges (of a PT: path lengths) [m] and azimuths and elevations [deg] that targets are drawn from,
@@ -101,7 +101,7 @@ class Setting:
 
     @property
     def passes(self) -> int:
-        """Of the range: 1 for a PT, 2 for echoes."""
+        """1 for the way to a PT, 2 for that of echoes."""
         return 1 if self.kind == "PT" else 2
 
     @property
@@ -148,25 +148,21 @@ def make_cube(case: Setting, target: Target, schedule: np.ndarray, payload: Payl
     """Noise-free samples of a target of unit amplitude, and clutter from the same direction."""
     w, antennas = case.waveform, paper_antennas(case.waveform)
     (distance, velocity), u = target.truth[:2], unit_vector(target.truth[2:])
-    lengths, count = case.passes * np.append(distance, target.ranges), 1 + target.ranges.size
-    still = np.arange(count) > 0
-    paths = make_paths(
+    lengths = case.passes * np.append(distance, target.ranges)
+    still = np.arange(lengths.size) > 0
+    away = u if case.passes == 2 else unit_vector(target.departure)
+    paths = waves(
+        w.frame_duration / 2,
+        lengths / SPEED_OF_LIGHT,
+        np.where(still, 0.0, case.passes * velocity / SPEED_OF_LIGHT),
         gain=np.append(target.phase, target.amplitudes),
-        delay=lengths / SPEED_OF_LIGHT,
-        delay_rate=np.where(still, 0.0, case.passes * velocity / SPEED_OF_LIGHT),
-        arrival=np.tile(u, (count, 1)),
-        departure=np.tile(u if case.passes == 2 else unit_vector(target.departure), (count, 1)),
-        tx_radius=lengths / case.passes,
-        rx_radius=lengths / case.passes,
+        ends=(away, u),
         kind=np.where(still, PathKind.DIFFUSE, PathKind.TARGET),
-        epoch=w.frame_duration / 2,
-        tx="AT",
-        rx="AT" if case.passes == 2 else "PT",
+        radius=lengths / case.passes,
     )
-    pose = Pose.at_rest()
-    sent = Transmission(name="AT", pose=pose, antennas=antennas, schedule=schedule, payload=payload)
+    sent = sender(antennas, schedule, payload)
     method = Auto(max_direct=1) if case.clutter else Direct()
-    return if_signal(w, [(sent, paths)], ReceiveArray(pose, antennas), Reference(0.0), method)
+    return if_signal(w, [(sent, paths)], ReceiveArray(STILL, antennas), Reference(0.0), method)
 
 
 def make_noise(case: Setting, seed: int, index: int) -> np.ndarray:
@@ -261,8 +257,7 @@ def _fmcw(
         case,
         target,
         both,
-        schedule[0],
-        times,
+        (schedule[0], times),
         lambda cell, bin_: to_delay(cell, bin_, w),
         first,
         "hits",
@@ -286,8 +281,7 @@ def _loradar(
             case,
             target,
             both,
-            sent.schedule,
-            times,
+            (sent.schedule, times),
             partial(loradar_delay, system),
             first_row(case, system.range_cell),
             kind,
@@ -299,14 +293,14 @@ def _tdm(
     case: Setting,
     target: Target,
     both: list[np.ndarray],
-    schedule: np.ndarray,
-    times: np.ndarray,
+    pulses: tuple[np.ndarray, np.ndarray],
     convert: Callable[[float, float], tuple[float, float]],
     first: int,
     name: str,
     note: Note,
 ) -> None:
-    """The baselines' receiver on spectra of signal and noise."""
+    """The baselines' receiver on spectra of signal and noise; `pulses`: antennas and times."""
+    schedule, times = pulses
     w, antennas = case.waveform, paper_antennas(case.waveform)
     signal, noise = (doppler_maps(s, schedule, times, w.frame_duration, w.num_tx) for s in both)
     for level in levels(case):
@@ -471,7 +465,7 @@ def correlations(
 
 @jit
 def _add_strongest(total, found):  # pragma: no cover - compiled
-    """Of every vector of (L_rx, rows, P) the strongest power onto its place in `total`."""
+    """Add the strongest power of every vector of (L_rx, rows, P) to its place in `total`."""
     for one in found:
         for row in range(one.shape[0]):
             best, largest = 0, np.float32(-1)
@@ -535,21 +529,11 @@ def _read(
 def _predict(case: Setting, target: Target, rng: np.random.Generator) -> Prediction:
     """The line of sight with the errors of figures 11 and 12, and the clutter where its profile is
     known."""
-    error, rate = (
-        RANGE_ERROR_CELLS * case.waveform.range_cell(1) * rng.standard_normal(),
-        rng.uniform(-1, 1) * VELOCITY_ERROR,
-    )
+    error = RANGE_ERROR_CELLS * case.waveform.range_cell(1) * rng.standard_normal()
+    rate = rng.uniform(-1, 1) * VELOCITY_ERROR
     ranges, weights = target.truth[:1] + error, np.ones(1)
-    velocity = target.truth[1] + rate
     if case.profile:
         ranges = np.append(ranges, target.ranges + error)
         weights = np.append(weights, np.abs(target.amplitudes) ** 2)
-    still = np.zeros(ranges.size)
-    return Prediction(
-        range=ranges,
-        velocity=np.where(np.arange(ranges.size) > 0, rate, velocity),
-        direction=np.zeros((ranges.size, 2)),
-        range_std=still,
-        velocity_std=still,
-        weight=weights,
-    )
+    velocity = np.where(np.arange(ranges.size) > 0, rate, target.truth[1] + rate)
+    return prediction(ranges, velocity, weights, std=(0.0, 0.0))

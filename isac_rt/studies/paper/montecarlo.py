@@ -34,8 +34,8 @@ from isac_rt.results.provenance import program_fingerprint
 from isac_rt.studies.paper.outcome import Progress
 
 Counts = Mapping[str, tuple[np.ndarray, int]]
-"""Of one frame: for every rate its events (SNR points,) and how many there could have been at each
-point."""
+"""Counts of one frame: for every rate its events (SNR points,) and how many there could have been
+at each point."""
 BATCH = 4
 FEWEST = 8
 """Frames that are always run: fewer say little of how they differ."""

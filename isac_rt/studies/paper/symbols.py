@@ -17,12 +17,12 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.payload import Payload, running_phases
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
@@ -31,13 +31,14 @@ from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.paper.montecarlo import Counts, Curve, Precision, sample
 from isac_rt.studies.paper.outcome import Progress
+from isac_rt.studies.waves import sender, waves
 from isac_rt.world.swarm import Pose
 
 PLACE = np.array([-8.0, 8.0, 0.0])
 """PT1 from the AT in the first frame of Table II [m]."""
 RANGE_ERROR_CELLS = 0.1
 VELOCITY_ERROR = 0.25
-"""Of the prediction: standard deviation in range cells, and largest error [m/s], uniform."""
+"""Errors of the prediction: standard deviation in range cells; largest, uniform [m/s]."""
 
 
 PREDICTION_ERROR = f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s"
@@ -109,68 +110,34 @@ def draw_frame(link: Setting, seed: int, index: int) -> LinkFrame:
     shape = (1, w.num_tx, w.num_chirps // w.num_tx - 1)
     transitions = {order: rng.integers(0, order, shape) for order in link.orders}
     symbols = rng.integers(0, w.num_delay_symbols, (1, w.num_chirps))
-    length = float(np.linalg.norm(PLACE)) + (
-        w.range_cell(1) * rng.uniform(-0.5, 0.5) if link.random_fraction else 0.0
-    )
+    length = float(np.linalg.norm(PLACE))
+    if link.random_fraction:
+        length += w.range_cell(1) * rng.uniform(-0.5, 0.5)
     direction = PLACE / np.linalg.norm(PLACE)
-    paths = _path(
-        np.array([length]), np.ones(1), direction, PathKind.LINE_OF_SIGHT, w, np.array([length])
-    )
+    epoch, ends = w.frame_duration / 2, (direction, -direction)
+    paths = waves(epoch, length / SPEED_OF_LIGHT, ends=ends, radius=length)
     lengths, weights = np.array([length]), np.ones(1)
     if link.clutter:
         ranges, amplitudes = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(1), length, rng)
-        paths = merge(
-            [
-                paths,
-                _path(
-                    ranges, amplitudes, direction, PathKind.DIFFUSE, w, np.full(ranges.size, np.inf)
-                ),
-            ]
-        )
+        delay = ranges / SPEED_OF_LIGHT
+        others = waves(epoch, delay, gain=amplitudes, ends=ends, kind=PathKind.DIFFUSE)
+        paths = merge([paths, others])
         if link.profile:
-            lengths, weights = (
-                np.append(lengths, ranges),
-                np.append(weights, np.abs(amplitudes) ** 2),
-            )
+            lengths = np.append(lengths, ranges)
+            weights = np.append(weights, np.abs(amplitudes) ** 2)
     payload = Payload(
         np.zeros(0, np.uint8), symbols, np.zeros(shape, int), np.ones((1, w.num_chirps), complex)
     )
     tx = Pose.at_rest()
     rx = Pose.at_rest(length * direction, (0, -1, 0))
-    sent = Transmission(name="AT", pose=tx, antennas=antennas, schedule=schedule, payload=payload)
+    sent = sender(antennas, schedule, payload, tx)
     method = Auto(max_direct=1) if link.clutter else Direct()
     cube = if_signal(w, [(sent, paths)], ReceiveArray(rx, antennas), Reference(0.0), method)
-    errors = (
-        (0.0, 0.0)
-        if link.exact_prediction
-        else (RANGE_ERROR_CELLS * rng.standard_normal(), rng.uniform(-1, 1) * VELOCITY_ERROR)
-    )
+    errors = 0.0, 0.0
+    if not link.exact_prediction:
+        errors = RANGE_ERROR_CELLS * rng.standard_normal(), rng.uniform(-1, 1) * VELOCITY_ERROR
     predicted = lengths + errors[0] * w.range_cell(1)
     return LinkFrame(cube.samples[0], schedule, symbols, transitions, predicted, errors[1], weights)
-
-
-def _path(
-    lengths: np.ndarray,
-    amplitudes: np.ndarray,
-    direction: np.ndarray,
-    kind: PathKind,
-    w: Waveform,
-    radius: np.ndarray,
-) -> PathSet:
-    """Resting paths along one direction."""
-    along = np.tile(direction, (lengths.size, 1))
-    return make_paths(
-        gain=amplitudes,
-        delay=lengths / SPEED_OF_LIGHT,
-        departure=along,
-        arrival=-along,
-        kind=kind,
-        epoch=w.frame_duration / 2,
-        tx="AT",
-        rx="PT1",
-        tx_radius=radius,
-        rx_radius=radius,
-    )
 
 
 def cell_noise(link: Setting, seed: int, index: int, num_rx: int = 15) -> np.ndarray:
@@ -282,14 +249,10 @@ def count_errors(link: Setting, snr_db: np.ndarray, seed: int, index: int) -> Co
                 note(f"dpsk {order}{name}", _dpsk_errors(picked, frame, order, sent, w))
     if link.literal:
         _by_the_letter(link, frame, noise, beats[0], snr_db, note)
-    totals = {
-        name: (
-            frame.delay_symbols
-            if "delay" in name.split()[:1]
-            else next(iter(frame.transitions.values()))
-        ).size
-        for name in wrong
-    }
+    sizes = {"delay": frame.delay_symbols.size}
+    if frame.transitions:
+        sizes["dpsk"] = next(iter(frame.transitions.values())).size
+    totals = {name: sizes[name.split()[0]] for name in wrong}
     return {name: (np.array(counts), totals[name]) for name, counts in wrong.items()}
 
 
@@ -343,17 +306,12 @@ def difference(later: Curve, earlier: Curve, level: float) -> tuple[float, float
     thresholds."""
     a, b = later.threshold(level), earlier.threshold(level)
     middle = a[0] - b[0]
-    return (
-        middle,
-        middle - float(np.hypot(a[0] - a[1], b[2] - b[0])),
-        middle + float(np.hypot(a[2] - a[0], b[0] - b[1])),
-    )
+    below, above = np.hypot(a[0] - a[1], b[2] - b[0]), np.hypot(a[2] - a[0], b[0] - b[1])
+    return middle, middle - float(below), middle + float(above)
 
 
 def decibels(found: tuple[float, float, float]) -> str:
     """A threshold or difference and its 95 % interval as text."""
-    return (
-        f"{found[0]:.2f} dB [{found[1]:.2f}, {found[2]:.2f}]"
-        if np.isfinite(found[0])
-        else "not reached"
-    )
+    if not np.isfinite(found[0]):
+        return "not reached"
+    return f"{found[0]:.2f} dB [{found[1]:.2f}, {found[2]:.2f}]"

@@ -20,7 +20,7 @@ from isac_rt.terminal.filter import birth, measure, measurement_covariance, pred
 Pairs = dict[str, tuple[np.ndarray, np.ndarray]]
 """Absolute errors before and after the filter, by quantity."""
 ANGLE_STEP_DEG = 0.25
-"""Of the paper's redundant angle dictionary, whose size it does not give."""
+"""Step of the paper's redundant angle dictionary, whose size it does not give."""
 SETTLED = 3
 """Detections after which the errors of the filter on the grid are counted."""
 UNITS = {"range": "m", "velocity": "m/s", "azimuth": "deg"}

@@ -24,7 +24,7 @@ from isac_rt.world.swarm import Pose
 
 CELL = 0.25
 SHARE = 0.4
-"""Of the power that metal scatters here: its coefficient S."""
+"""Scattering coefficient S of metal here."""
 CROSSING = {
     "source": "blocks",
     "street_width_m": 18.3,

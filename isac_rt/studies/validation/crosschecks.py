@@ -10,6 +10,7 @@ import numpy as np
 
 from isac_rt import scenario as tree
 from isac_rt.frame.cube import Transmission
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation import PathKind, make_paths
@@ -21,7 +22,7 @@ from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.world.city import load_city
 
 PLACES = ((-11.37, 2.13, 14.21), (17.93, -3.31, 9.67), (4.41, 1.73, 20.3))
-"""Of the three bodies in Sionna's street canyon."""
+"""Places of the three bodies in Sionna's street canyon."""
 
 
 @traced(
@@ -44,7 +45,7 @@ def paths_of_a_canyon_against_sionna() -> float:
         (0.31, -0.17, 0.9),
     )
     poses = stage.swarm(*PLACES, moving=False)
-    ours = stage.tracer(city, 2).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
     ours = ours.select(ours.target < 0)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(
@@ -83,7 +84,7 @@ def echoes_against_sionna() -> float:
         tree.City(source="builtin", name="floor_wall"), ".", truths.CARRIER, (0.31, -0.17, 0.9)
     )
     poses = stage.swarm((1.13, -0.41, 2.71), (1.71, 0.33, 0.31), (1.31, 0.43, 1.63))
-    ours = stage.tracer(city, 2).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
     ours = ours.select(ours.target == 2)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(

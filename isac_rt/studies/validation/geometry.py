@@ -10,6 +10,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from isac_rt import scenario as tree
+from isac_rt.frame.link import Link
 from isac_rt.propagation import FreeSpace, PathKind
 from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
 from isac_rt.studies.validation import stage, truths
@@ -56,13 +57,13 @@ def _free_space(poses: dict[str, Pose], tx: str, rx: str):
     s = stage.scenario(traced=False)
     return (
         FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed)
-        .trace(poses, 0.0, [(tx, rx)])
-        .paths[tx, rx]
+        .trace(poses, 0.0, [Link(tx, rx)])
+        .paths[Link(tx, rx)]
     )
 
 
 def _doppler_error(found: float, length) -> float:
-    """Of a Doppler [Hz] against the derivative of a length in long double."""
+    """Error of a Doppler [Hz] against the derivative of a length in long double."""
     return abs(-truths.CARRIER * found - -truths.CARRIER / C * derivatives(length)[0])
 
 
@@ -329,7 +330,7 @@ def every_path_of_a_box() -> float:
             lattice.append(np.linalg.norm(p - np.array(image)))
     paths = (
         stage.tracer(city, 2)
-        .trace(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [("A", "P")])
+        .trace(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [Link("A", "P")])
         .paths["A", "P"]
     )
     found = np.sort(C * paths.delay[paths.target < 0])
@@ -355,7 +356,7 @@ def a_wall_10_km_off_reflects_once() -> float:
         far + np.array([1.7, 17.4, 8.1]),
         far + np.array([-3.3, -2.2, 7.9]),
     )
-    paths = stage.tracer(city, 1).trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
+    paths = stage.tracer(city, 1).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
     return abs(paths.counts()["specular"] - 1)
 
 

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from isac_rt.frame.cube import Transmission
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import demodulate_bits, modulate, running_phases, unmodulated
 from isac_rt.frame.schedule import is_latin, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation import PathKind, make_paths
+from isac_rt.propagation import PathKind
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.gridded import GRIDDED_ERROR
@@ -20,6 +21,7 @@ from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow, traced
 from isac_rt.studies.validation.truths import WAVELENGTH, flown, if_samples, wide
+from isac_rt.studies.waves import waves
 
 START = 3.217
 ORIGIN = np.zeros((1, 3))
@@ -132,20 +134,9 @@ def _one_path(moving: bool, method: Method, data: bool = True) -> float:
     rate = float(u @ motion)
     accel = float((motion @ motion - rate**2) / length + u @ rx.acceleration)
     gain = 0.3 - 0.7j
-    paths = make_paths(
-        gain=np.array([gain]),
-        delay=np.array([length]) / SPEED_OF_LIGHT,
-        delay_rate=rate / SPEED_OF_LIGHT,
-        delay_accel=accel / SPEED_OF_LIGHT,
-        departure=u[None],
-        arrival=-u[None],
-        tx_radius=length,
-        rx_radius=length,
-        kind=PathKind.LINE_OF_SIGHT,
-        epoch=START + w.frame_duration / 2,
-        tx="A",
-        rx="P",
-    )
+    delay, epoch = length / SPEED_OF_LIGHT, START + w.frame_duration / 2
+    paths = waves(epoch, delay, rate / SPEED_OF_LIGHT, gain=gain, ends=(u, -u), radius=length)
+    paths = replace(paths, delay_accel=np.array([accel / SPEED_OF_LIGHT]))
     antennas = stage.arrays(w)
     found = stage.synthesise(w, [(sender, paths)], rx, method, START, antennas)
 
@@ -254,7 +245,7 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
     mesh = stage.rectangle((-150, -150, 0), (300, 0, 0), (0, 300, 0), concrete)
     model = stage.tracer(mesh, 1, propagation={"max_bounces": 1 if ground else 0, "ghosts": False})
     epoch = START + w.frame_duration / 2
-    paths = model.trace(flight, epoch, [("A", "P")]).paths["A", "P"]
+    paths = model.trace(flight, epoch, [Link("A", "P")]).paths["A", "P"]
     paths = paths.select(paths.target == 2 if target else paths.target < 0)
     rng = np.random.default_rng(4)
     point = stage.arrays(w, tx_x=2, tx_z=2, spacing=1e-9)
@@ -344,17 +335,8 @@ def _spectrum_peak(length: float, rate: float) -> tuple[float, float]:
         payload=unmodulated(w),
     )
     along = stage.pose((0, 0, 0)).rotation[:, 1][None]
-    paths = make_paths(
-        gain=np.ones(1),
-        delay=np.array([length]) / SPEED_OF_LIGHT,
-        delay_rate=rate / SPEED_OF_LIGHT,
-        departure=along,
-        arrival=along,
-        kind=PathKind.TARGET,
-        epoch=START + w.frame_duration / 2,
-        tx="A",
-        rx="A",
-    )
+    delay, epoch = length / SPEED_OF_LIGHT, START + w.frame_duration / 2
+    paths = waves(epoch, delay, rate / SPEED_OF_LIGHT, ends=(along, along), kind=PathKind.TARGET)
     s = stage.synthesise(w, [(sender, paths)], stage.pose((0, 0, 0)), Direct(), START, antennas)[
         0, 0
     ]
@@ -406,16 +388,8 @@ def filter_skirts() -> Errors:
         (-stage.SKIRT / 2, 0.5),
         (20e6 + stage.SKIRT * 1.01, 0.0),
     ):
-        paths = make_paths(
-            gain=np.ones(1),
-            delay=np.array([beat / w.slope]),
-            departure=along,
-            arrival=along,
-            kind=PathKind.TARGET,
-            epoch=START + w.frame_duration / 2,
-            tx="A",
-            rx="A",
-        )
+        epoch, kind = START + w.frame_duration / 2, PathKind.TARGET
+        paths = waves(epoch, beat / w.slope, ends=(along, along), kind=kind)
         for method in (Exact(), Direct()):
             found = stage.synthesise(
                 w, [(sender, paths)], stage.pose((0, 0, 0)), method, START, antennas
@@ -441,34 +415,17 @@ def spherical_waves() -> float:
         payload=unmodulated(w),
     )
     u = here.to_world(np.array([[0.41, 0.85, 0.0]]) / np.hypot(0.41, 0.85))
-    paths = make_paths(
-        gain=np.ones(1),
-        delay=np.array([1.0]) / SPEED_OF_LIGHT,
-        departure=u,
-        arrival=u,
-        tx_radius=0.5,
-        rx_radius=0.5,
-        kind=PathKind.TARGET,
-        epoch=START + w.frame_duration / 2,
-        tx="A",
-        rx="A",
-    )
+    delay, epoch = 1.0 / SPEED_OF_LIGHT, START + w.frame_duration / 2
+    paths = waves(epoch, delay, ends=(u, u), kind=PathKind.TARGET, radius=0.5)
     s = stage.synthesise(w, [(sender, paths)], here, Direct(), START, antennas)[0, :, 0, 32]
     elements = here.to_world(antennas.rx_positions)
     extra = np.linalg.norm(0.5 * u - elements, axis=1) - 0.5
     frequency = 77e9 + w.slope * (
         w.chirp_duration - w.sampled_duration + 32 / w.sampling_rate - 1.0 / 299_792_458.0
     )
-    return float(
-        np.abs(
-            np.angle(
-                s
-                * np.exp(-2j * np.pi * frequency * extra / 299_792_458.0)
-                / s[0]
-                * np.exp(2j * np.pi * frequency * extra[0] / 299_792_458.0)
-            )
-        ).max()
-    )
+    turn = np.exp(-2j * np.pi * frequency * extra / 299_792_458.0)
+    back = np.exp(2j * np.pi * frequency * extra[0] / 299_792_458.0)
+    return float(np.abs(np.angle(s * turn / s[0] * back)).max())
 
 
 @case(
