@@ -99,7 +99,7 @@ def two_rays_across_the_breakpoint() -> Errors:
     model = stage.tracer(_ground(sigma, eps), 1)
     for distance in (7.3, 23.9, 61.7, 97.1, 203.0, 411.0):
         poses = stage.swarm((0, 0, low), (distance, 0, high), (3.0, 40.0, 11.0), moving=False)
-        paths = model.trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
+        paths = model.trace(poses, 0.0, [Link("A", "P")]).paths[Link("A", "P")]
         paths = paths.select(paths.target < 0)
         turn = (truths.CARRIER * (paths.delay - paths.delay[0])) % 1.0
         field = (paths.gain * np.exp(-2j * np.pi * turn)).sum() / np.abs(paths.gain[0])
@@ -119,7 +119,7 @@ def conducting_plate() -> float:
         (31.7, -20, -20), (0, 40, 0), (0, 0, 40), stage.material(conductivity=stage.METAL)
     )
     poses = stage.swarm((0.3, 0.0, 0.0), (5.1, 9.0, 3.3), (2.2, -9.0, 4.4))
-    paths = stage.tracer(plate).trace(poses, 0.0, [Link("A", "A")]).paths["A", "A"]
+    paths = stage.tracer(plate).trace(poses, 0.0, [Link("A", "A")]).paths[Link("A", "A")]
     paths = paths.select(paths.kind == PathKind.SPECULAR)
     if len(paths) != 1:
         return np.inf
@@ -152,15 +152,8 @@ def conducting_corner() -> float:
     )
     away = np.array([9.3, 13.1, 0.0])
     radar = corner + away + np.array([0, 0, 1.7])
-    paths = (
-        stage.tracer(mesh, 2)
-        .trace(
-            stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7])),
-            0.0,
-            [Link("A", "A")],
-        )
-        .paths["A", "A"]
-    )
+    poses = stage.swarm(radar, radar + 3.1, radar + np.array([2.0, -3.1, 1.7]))
+    paths = stage.tracer(mesh, 2).trace(poses, 0.0, [Link("A", "A")]).paths[Link("A", "A")]
     paths = paths.select((paths.kind == PathKind.SPECULAR) & (paths.bounces == 2))
     if len(paths) != 1:
         return np.inf
@@ -188,7 +181,7 @@ def reflection_of_a_slab() -> Errors:
         model = stage.tracer(mesh, 1)
         for h in (0.9, 7.3, 31.0):
             poses = stage.swarm((-9.7, 3.1, h), (13.9, -4.3, 0.7 * h), (0.5, 40.0, 11.0))
-            paths = model.trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
+            paths = model.trace(poses, 0.0, [Link("A", "P")]).paths[Link("A", "P")]
             paths = paths.select(paths.kind == PathKind.SPECULAR)
             length = np.sqrt(23.6**2 + 7.4**2 + (1.7 * h) ** 2)
             truth = slab_reflection(eps, sigma, thickness, 1.7 * h / length)[1]
@@ -210,7 +203,7 @@ def ghosts_over_a_conducting_wall() -> float:
     paths = (
         stage.tracer(wall, 2)
         .trace(stage.swarm(a, (-30.0, -20.0, 3.0), u), 0.0, [Link("A", "A")])
-        .paths["A", "A"]
+        .paths[Link("A", "A")]
     )
     paths = paths.select(paths.target == 2)
     image = np.array([u[0], 50 - u[1], u[2]])

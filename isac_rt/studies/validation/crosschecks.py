@@ -45,7 +45,7 @@ def paths_of_a_canyon_against_sionna() -> float:
         (0.31, -0.17, 0.9),
     )
     poses = stage.swarm(*PLACES, moving=False)
-    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths[Link("A", "P")]
     ours = ours.select(ours.target < 0)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(
@@ -84,7 +84,7 @@ def echoes_against_sionna() -> float:
         tree.City(source="builtin", name="floor_wall"), ".", truths.CARRIER, (0.31, -0.17, 0.9)
     )
     poses = stage.swarm((1.13, -0.41, 2.71), (1.71, 0.33, 0.31), (1.31, 0.43, 1.63))
-    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
+    ours = stage.tracer(city, 2).trace(poses, 0.0, [Link("A", "P")]).paths[Link("A", "P")]
     ours = ours.select(ours.target == 2)
     scene = build_scene(city, truths.CARRIER).scene
     scene.tx_array = scene.rx_array = rt.PlanarArray(

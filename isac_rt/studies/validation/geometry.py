@@ -331,7 +331,7 @@ def every_path_of_a_box() -> float:
     paths = (
         stage.tracer(city, 2)
         .trace(stage.swarm(a, p, (0.71, 1.37, 2.03)), 0.0, [Link("A", "P")])
-        .paths["A", "P"]
+        .paths[Link("A", "P")]
     )
     found = np.sort(C * paths.delay[paths.target < 0])
     return float(np.abs(found - np.sort(lattice)).max()) if found.size == len(lattice) else np.inf
@@ -356,7 +356,7 @@ def a_wall_10_km_off_reflects_once() -> float:
         far + np.array([1.7, 17.4, 8.1]),
         far + np.array([-3.3, -2.2, 7.9]),
     )
-    paths = stage.tracer(city, 1).trace(poses, 0.0, [Link("A", "P")]).paths["A", "P"]
+    paths = stage.tracer(city, 1).trace(poses, 0.0, [Link("A", "P")]).paths[Link("A", "P")]
     return abs(paths.counts()["specular"] - 1)
 
 

@@ -245,7 +245,7 @@ def _city_link(moving: bool, ground: bool, target: bool) -> float:
     mesh = stage.rectangle((-150, -150, 0), (300, 0, 0), (0, 300, 0), concrete)
     model = stage.tracer(mesh, 1, propagation={"max_bounces": 1 if ground else 0, "ghosts": False})
     epoch = START + w.frame_duration / 2
-    paths = model.trace(flight, epoch, [Link("A", "P")]).paths["A", "P"]
+    paths = model.trace(flight, epoch, [Link("A", "P")]).paths[Link("A", "P")]
     paths = paths.select(paths.target == 2 if target else paths.target < 0)
     rng = np.random.default_rng(4)
     point = stage.arrays(w, tx_x=2, tx_z=2, spacing=1e-9)
