@@ -11,6 +11,8 @@ for an N that is no product of 8 and twos, threes and fives.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.fft
 
@@ -51,17 +53,33 @@ def transform(
     place = order[-np.arange(size) % size] * ROW  # the lane transform turns the other way
     turns = np.zeros((0, 1), np.complex64) if turn is None else turn
     wanted = np.zeros((0, size), np.float32) if power is None else power
-    work = [aligned(rows * ROW) for rows in (size, size, len(turns), len(wanted) and size // 2)]
-    _transform(  # type: ignore[call-arg]
-        *(np.ascontiguousarray(a, np.complex64).view(np.float32) for a in (samples, factor, turns)),
+    sizes = size, size, len(turns), len(wanted) and size // 2
+    _transform(
+        _floats(samples),
+        _floats(factor),
+        _floats(turns),
         wanted,
         out.view(np.float32),
         radices,
         twiddles,
         place,
         place[np.asarray(cells) % size],
-        *work,
+        _Tables(*(aligned(rows * ROW) for rows in sizes)),
     )
+
+
+class _Tables(NamedTuple):
+    """Work space: sixteen chirps, their factors h, their factors g, and their power."""
+
+    table: np.ndarray
+    factors: np.ndarray
+    turns: np.ndarray
+    added: np.ndarray
+
+
+def _floats(values: np.ndarray) -> np.ndarray:
+    """Complex values as float32 with real and imaginary parts in turn."""
+    return np.ascontiguousarray(values, np.complex64).view(np.float32)
 
 
 def transform_plain(
@@ -85,10 +103,10 @@ def transform_plain(
 
 @jit
 def _transform(
-    samples, factor, turn, power, out, radices, twiddles, place, at, table, factors, turns, added
-):  # pragma: no cover
-    """`transform`; complex arrays as float32 with real and imaginary parts in turn. The last four
-    are work space."""
+    samples, factor, turn, power, out, radices, twiddles, place, at, work
+):  # pragma: no cover - compiled
+    """`transform`; complex arrays as `_floats`."""
+    table, factors, turns, added = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
