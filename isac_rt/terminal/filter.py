@@ -14,21 +14,13 @@ STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
 """Smallest measurement standard deviations that are believed [m, m/s, 1, 1]. At high SNR the errors
 are not noise but the interpolation between cells, alike in successive frames: about 0.002 cell in
 range, 0.02 in velocity, 0.002 in angle."""
-
-
 BIRTH_SPEED_STD = 10.0
 """Per axis [m/s]: before its first detection a body is taken to stand still in the world, give or
 take this."""
-
-
 BIRTH_POSITION_STD_LIMIT = 100.0
 """A single detection that fixes the position worse than this [m] starts no track (near the line
 through both terminals a bistatic length says nothing about where the reflector is)."""
-
-
 _ITERATIONS = 10
-
-
 _POSITION = np.array([0, 2, 3])
 
 

@@ -21,6 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
+from isac_rt.terminal.filter import measure
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
@@ -168,9 +169,9 @@ def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, n
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
-    direct, out = _leg(body, own), []
+    direct, out = measure(body, own), []
     for face, image in _images(body, here, walls):
-        mirrored = _leg(image, own)
+        mirrored = measure(image, own)
         middle = (direct + mirrored) / 2
         out += [
             (face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)
@@ -193,7 +194,7 @@ def reflections(
     body = state + here
     back = [(-1, body), *_images(body, here, walls)]
     if sender is None:
-        return [(face, 1, _leg(image, own)) for face, image in back[1:]]
+        return [(face, 1, measure(image, own)) for face, image in back[1:]]
     start, out = sender + here, []
     for first, image in [(-1, body), *_images(body, start, walls)]:
         distance, rate = _apart(image, start)
@@ -204,7 +205,7 @@ def reflections(
                     (
                         first if first >= 0 else last,
                         order,
-                        _leg(seen, own) + np.array([distance, rate, 0.0, 0.0]),
+                        measure(seen, own) + np.array([distance, rate, 0.0, 0.0]),
                     )
                 )
     return out
@@ -230,13 +231,6 @@ def _apart(body: np.ndarray, end: np.ndarray) -> tuple[float, float]:
     offset, moved = body[:3] - end[:3], body[3:] - end[3:]
     distance = float(np.linalg.norm(offset))
     return distance, float(offset @ moved) / distance
-
-
-def _leg(body: np.ndarray, own: Pose) -> np.ndarray:
-    """(4,) distance of a body (6,), its rate, u_x and u_z."""
-    distance, rate = _apart(body, np.concatenate([own.position, own.velocity]))
-    towards = own.to_body((body[:3] - own.position) / distance)
-    return np.array([distance, rate, towards[0], towards[2]])
 
 
 def _hidden_by(

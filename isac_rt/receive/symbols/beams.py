@@ -26,6 +26,7 @@ from isac_rt.receive.symbols.powers import (
     ByPowers,
     Symbols,
     known_cycles,
+    nearest_symbols,
     symbol_cells,
 )
 from isac_rt.receive.types import Prediction
@@ -104,14 +105,12 @@ def demodulate_beams(
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     product, length = _transitions(picked, cube, raw)
     far = (FARTHEST_STDS * p.velocity_std + FARTHEST_BINS * w.velocity_cell(1)) / SPEED_OF_LIGHT
-    summed, spread = np.zeros(product.shape[1:], np.complex128), 0.0
+    summed = np.zeros(product.shape[1:], np.complex128)
     for k in range(len(rows)):
         rate = _rate_error(product[k], length, far[k], dpsk_order, w)
         product[k] *= np.exp(-2j * np.pi * rate * w.effective_carrier * length)
         summed += product[k] * (2 * snr[k] / (noise[k] * (1 + 2 * snr[k])))
-    steps = np.angle(summed) / (2 * np.pi / dpsk_order)
-    transitions = np.round(steps).astype(np.int64) % dpsk_order
-    spread = float(np.sqrt(np.mean((steps - np.round(steps)) ** 2)) * 2 * np.pi / dpsk_order)
+    transitions, spread = nearest_symbols(summed, dpsk_order)
     own = likelihood[..., EXTRA_CELLS:-EXTRA_CELLS]
     soft_delay, right = soft_delay_bits(own)
     chains = by_antenna(right, cube.schedule, w.num_tx)

@@ -200,11 +200,16 @@ def decide_transitions(
     chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
     product = chains[..., 1:] * chains[..., :-1].conj()
     summed = product.sum(axis=2)
-    steps = np.angle(summed) / (2 * np.pi / order)
-    symbols = np.round(steps).astype(np.int64) % order
-    spread = float(np.sqrt(np.mean((steps - np.round(steps)) ** 2)) * 2 * np.pi / order)
+    symbols, spread = nearest_symbols(summed, order)
     share = np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
     return symbols, share, spread
+
+
+def nearest_symbols(summed: np.ndarray, order: int) -> tuple[np.ndarray, float]:
+    """DPSK symbols of products of chirps, and their `phase_spread`."""
+    steps = np.angle(summed) / (2 * np.pi / order)
+    spread = np.sqrt(np.mean((steps - np.round(steps)) ** 2)) * 2 * np.pi / order
+    return np.round(steps).astype(np.int64) % order, float(spread)
 
 
 def moves_as_predicted(symbols: Symbols, order: int) -> bool:

@@ -231,7 +231,7 @@ def _known(scenes: Scenes, payload: Payload) -> Known:
     return Known(s.waveform, s.schedule, payload.delay_symbols, payload.phases, s.antennas, 2)
 
 
-class Surroundings(ClutterDetector):
+class CfarStatistic(ClutterDetector):
     """The CFAR as a statistic over its threshold."""
 
     def judge(
@@ -271,7 +271,7 @@ def score(
     expected = NOTHING if quiet else _expected(scenes, case.place, case.speed, detector.mistakes)
     # the first one corrects the terminal, and what is in the air must not hinder that
     frames = [*frames[2:], *frames[:2]]
-    kind = CHAINED.get(settings.clutter_detector, Surroundings)
+    kind = CHAINED.get(settings.clutter_detector, CfarStatistic)
     judged = kind(settings, fitted=detector.fitted).judge(frames, known, expected)
     rows = slice(*(round(r / known.waveform.range_cell(2)) for r in SPAN_M))
     tally.tuning.append(judged[-2].ratio[rows].ravel())
