@@ -49,7 +49,7 @@ class FreeSpace:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the UAVs."""
+        """Names of the UAVs."""
         return tuple(self.uavs)
 
     @cached_property

@@ -1,5 +1,4 @@
-"""The paths of one link in one frame: what propagation hands to the signal model and to the
-ledger."""
+"""The paths of one link in one frame."""
 
 from __future__ import annotations
 
@@ -14,7 +13,13 @@ from isac_rt.frame.link import Link
 
 
 class PathKind(IntEnum):
-    """What a path is; its label from the mesh to the detection it causes."""
+    """What a path is; its label from the mesh to the detection it causes.
+
+    Examples
+    --------
+    >>> PathKind(4).name, int(PathKind.GHOST)
+    ('DIFFUSE', 2)
+    """
 
     LINE_OF_SIGHT = 0
     TARGET = 1  # one echo of a UAV, straight there and straight on
@@ -50,6 +55,23 @@ class PathSet:
     points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own
         position, and shadow edges round which a path bends, included)
     faces : (K, B) int32 face of the city mesh at each point, -1 where there is none
+
+    Examples
+    --------
+    >>> paths = make_paths(
+    ...     tx="AT",
+    ...     rx="PT1",
+    ...     epoch=0.0,
+    ...     gain=[1e-6, 2e-7j],
+    ...     delay=[1e-7, 3e-7],
+    ...     departure=[[0, 1, 0], [1, 0, 0]],
+    ...     arrival=[[0, -1, 0], [1, 0, 0]],
+    ...     kind=[PathKind.LINE_OF_SIGHT, PathKind.SPECULAR],
+    ... )
+    >>> paths
+    <PathSet AT -> PT1 at 0.0000 s: 1 line of sight, 1 specular, 100.0 to 300.0 ns>
+    >>> paths.select(paths.kind == PathKind.SPECULAR).delay.tolist()
+    [3e-07]
     """
 
     gain: np.ndarray

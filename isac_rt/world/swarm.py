@@ -21,6 +21,12 @@ class Pose:
     position, velocity, acceleration : (3,) float64 [m, m/s, m/s^2]
     rotation : (3, 3) float64; columns are the body's X (right), Y (boresight) and Z (up) in world
         axes, so world = rotation @ body and body = rotation.T @ world
+
+    Examples
+    --------
+    >>> pose = Pose.at_rest((0, 0, 30), boresight=(1, 0, 0))
+    >>> pose.to_body(np.array([2.0, 0.0, 0.0])).tolist()
+    [0.0, 2.0, 0.0]
     """
 
     position: np.ndarray
@@ -111,6 +117,13 @@ class Swarm:
     uavs : in the scenario's order
     duration : of the flights [s]
     successors : UAVs that become active later on
+
+    Examples
+    --------
+    >>> uav = Uav(role="active", position_m=(0, 0, 30), velocity_mps=(0, 5, 0))
+    >>> swarm = Swarm({"AT": uav}, duration=2.0)
+    >>> swarm.poses(1.5)["AT"].position.tolist(), swarm.middle.tolist()
+    ([0.0, 7.5, 30.0], [0.0, 5.0, 30.0])
     """
 
     uavs: dict[str, Uav]
@@ -119,7 +132,7 @@ class Swarm:
 
     @cached_property
     def trajectories(self) -> dict[str, Trajectory]:
-        """Of every UAV."""
+        """The flight of every UAV."""
         return {name: Trajectory(uav) for name, uav in self.uavs.items()}
 
     def poses(self, time: float) -> dict[str, Pose]:

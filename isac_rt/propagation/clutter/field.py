@@ -102,7 +102,7 @@ class Seen(Ways):
 
     @property
     def nbytes(self) -> int:
-        """Of the arrays, each counted once."""
+        """Memory of the arrays, each counted once."""
         return sum({id(a): a.nbytes for a in vars(self).values()}.values())
 
 
@@ -169,7 +169,7 @@ class ClutterField:
 
     @property
     def nbytes(self) -> int:
-        """Of the scatterers and of what is remembered of their sight."""
+        """Memory of the scatterers and of what is remembered of their sight."""
         return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
 
     def seen(self, state: LinkState, bodies: Bodies | None = None) -> Seen:
@@ -309,8 +309,9 @@ def _advance(surfaces, points, face, area, share, scale, start, end, own, rows):
 
 @jit(inline=True)
 def scattered_power(surfaces, face, area, into, back, between, part):
-    """Of the power density at a cell, what it scatters into a direction, per steradian: the
-    effective-roughness integrand without its distances.
+    """Power that a cell scatters into a direction, per steradian and unit of power density.
+
+    The effective-roughness integrand without its distances.
 
     `into` and `back` are the facet's normal along the ways in and out, `between` is the cosine of
     the angle between them, `part` the share of the field that is TE.

@@ -137,8 +137,7 @@ def shown(
     points: np.ndarray,
     normals: np.ndarray,
 ) -> list[np.ndarray]:
-    """Of points (N, 3) on surfaces with unit normals (N, 3), the indices of those that `place` sees
-    in each mirror.
+    """Indices of those points (N, 3) on surfaces with normals (N, 3) that each mirror shows.
 
     The wave must meet the mirror on one of its faces, and both legs must be free.
     """

@@ -107,7 +107,7 @@ class Sight:
 
     @property
     def nbytes(self) -> int:
-        """Of the tests and crossings kept."""
+        """Memory of the tests and crossings kept."""
         kept = [vars(c).values() for c in (*self._crossed.values(), *self._nearby.values())]
         return sum(bits.nbytes for bits in self._seen.values()) + sum(
             a.nbytes for c in kept for a in c if isinstance(a, np.ndarray)

@@ -128,8 +128,8 @@ class ShadowEdges:
 
 @jit
 def _near(start, span, wings, source, sink, reach):
-    """Of silhouette edges: detours [m] (of at most `reach`, shortest first), points on the edges,
-    directions away from what they bound."""
+    """Silhouette edges near a path: detours [m] (at most `reach`, shortest first), points on the
+    edges, directions away from what they bound."""
     ahead = sink - source
     length = np.sqrt((ahead**2).sum())
     ahead = ahead / length
