@@ -106,9 +106,8 @@ class FreeSpace:
 
     def _legs(self, end: Pose, names: Sequence[str], poses: dict[str, Pose]) -> Legs:
         """Straight legs from an end to UAVs."""
-        bodies = [poses[name] for name in names]
-        motion = [[b.position, b.velocity, b.acceleration] for b in bodies]
-        return straight(end, *np.array(motion).reshape(-1, 3, 3).swapaxes(0, 1))
+        motion = np.array([poses[name].motion() for name in names]).reshape(-1, 3, 3)
+        return straight(end, *motion.swapaxes(0, 1))
 
     def _echo(self, name: str, poses: dict[str, Pose], there: Legs, back: Legs) -> float:
         """Amplitude of one UAV's echo by the radar equation, without the elements."""

@@ -143,9 +143,8 @@ class Between:
         if self._interval[0] != after:
             self._interval = after, _chains(first, second)
             self.changes[after - 1] = _changes(self._interval[1])
-            self.num_chains[after - 1] = (
-                sum(c.in_first.sum() + c.in_second.sum() for c in self._interval[1]) / 2
-            )
+            found_at_both = (c.in_first.sum() + c.in_second.sum() for c in self._interval[1])
+            self.num_chains[after - 1] = sum(found_at_both) / 2
         nearest_first = time - self._instants[after - 1] <= self._instants[after] - time
         found = [
             self._unfolded(chains, local, list(first), nearest_first)
@@ -288,11 +287,8 @@ def _changes(chains: list[_Chains]) -> tuple[int, int]:
 
 def _stacked(poses: list[Pose], which: np.ndarray) -> Pose:
     """One row of position, velocity and acceleration per chain."""
-    names = ("position", "velocity", "acceleration")
-    position, velocity, acceleration = (
-        np.array([getattr(p, name) for p in poses])[which] for name in names
-    )
-    return Pose(position, velocity, acceleration, np.eye(3))
+    motion = np.array([pose.motion() for pose in poses])[which]
+    return Pose(*motion.swapaxes(0, 1), np.eye(3))
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

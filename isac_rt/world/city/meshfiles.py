@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +35,20 @@ def check_size(path: Path) -> None:
         raise CityError(
             f"{path.name}: a file of {size / 1e9:.3g} GB takes about "
             f"{READING_FACTOR * size / 1e9:.3g} GB of memory to read, "
-            f"{free / 1e9:.3g} GB are free; simplify it, or cut out the swarm's surroundings"
+            f"{free / 1e9:.3g} GB are free; simplify it, or cut out what is near the swarm"
         )
+
+
+def _loaded(path: Path, load: Callable[..., Any]) -> Any:
+    """What trimesh makes of a file, or a CityError that says why it cannot."""
+    check_size(path)
+    try:
+        return load(path, process=False)
+    except Exception as error:  # trimesh raises whatever its parsers raise
+        raise CityError(
+            f"{path.name}: not readable as a mesh ({type(error).__name__}: {error}); export it "
+            "again"
+        ) from None
 
 
 def read_triangles(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -42,14 +56,7 @@ def read_triangles(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     larger faces."""
     import trimesh
 
-    check_size(path)
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise CityError(
-            f"{path.name}: not readable as a mesh ({type(error).__name__}: {error}); export it "
-            "again"
-        ) from None
+    mesh = _loaded(path, trimesh.load_mesh)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 
@@ -89,14 +96,7 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
             f"{path.name}: {path.suffix!r} is not a mesh format known here; use one of "
             f"{', '.join(SUFFIXES)}"
         )
-    check_size(path)
-    try:
-        scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise CityError(
-            f"{path.name}: not readable as a mesh ({type(error).__name__}: {error}); export it "
-            "again"
-        ) from None
+    scene = _loaded(path, trimesh.load_scene)
     surfaces, seen, notes = [], set(), []
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
