@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from isac_rt.signal.methods import Exact as Exact
     from isac_rt.signal.methods import Gridded as Gridded
     from isac_rt.signal.methods import Separable as Separable
+    from isac_rt.simulation.setup import Frame as Frame
+    from isac_rt.simulation.setup import Setup as Setup
     from isac_rt.simulation.setup import city_of as city_of
     from isac_rt.simulation.setup import prepare as prepare
     from isac_rt.simulation.setup import trace as trace
@@ -74,7 +76,7 @@ _NAMES = {
     "scenario.tree": "Scenario",
     "signal.if_signal": "add_noise if_signal range_profiles",
     "signal.methods": "Auto Direct Exact Gridded Separable",
-    "simulation.setup": "city_of prepare trace",
+    "simulation.setup": "Frame Setup city_of prepare trace",
     "simulation.simulate": "run standard_terminal",
     "sweep": "load_sweep open_sweep run_sweep",
     "terminal.terminal": "ActiveTerminal PassiveTerminal",

@@ -100,7 +100,7 @@ class Auto:
 
         Parameters
         ----------
-        power, speed, sight : (K,) of each path: received power [W], c |delay rate| / 2 [m/s],
+        power, speed, sight : (K,) of each path: received power [W], c ``|delay rate|`` / 2 [m/s],
             whether it is a line of sight
         """
         model = self.costs or read(SHIPPED)

@@ -18,6 +18,7 @@ import xarray as xr
 
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.level import transmit_amplitude
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.randomness import generator
@@ -100,16 +101,16 @@ def watch(scenario: Scenario) -> tuple[xr.Dataset, dict[str, list[tuple[TrackSet
     s = setup.scenario
     watched: dict[str, WatchedActive | WatchedPassive] = {}
 
-    def terminal(_setup: Setup, link: tuple[str, str]) -> WatchedActive | WatchedPassive:
+    def terminal(_setup: Setup, link: Link) -> WatchedActive | WatchedPassive:
         common = setup.waveform, setup.antennas, s.receivers, s.tracking
-        if link[0] == link[1]:
-            watched[link[1]] = WatchedActive(*common).watch(setup, 2)
+        if link.own:
+            watched[link.rx] = WatchedActive(*common).watch(setup, 2)
         else:
             groups = setup.timetable.groups(link)
             passive = WatchedPassive(
                 *common, s.modulation.dpsk_order, transmit_amplitude(s.noise), groups=groups
             )
-            watched[link[1]] = passive.watch(setup, 1)
+            watched[link.rx] = passive.watch(setup, 1)
         return watched[link[1]]
 
     dataset = simulate.run(scenario, setup=setup, terminal=terminal, snapshots=0).dataset
