@@ -27,18 +27,7 @@ NEWEST_LLVM = 22
 VARIANTS = {"cuda": "cuda_ad_mono_polarized", "llvm": "llvm_ad_mono_polarized"}
 MEMORY_NEEDED = 6e9
 """What the largest scenario of `scenes/` is held to. [bytes]"""
-PACKAGES = (
-    "numpy",
-    "scipy",
-    "numba",
-    "drjit",
-    "mitsuba",
-    "sionna-rt",
-    "xarray",
-    "h5netcdf",
-    "h5py",
-    "pydantic",
-)
+PACKAGES = "numpy scipy numba drjit mitsuba sionna-rt xarray h5netcdf h5py pydantic".split()
 SYSTEM_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",

@@ -259,12 +259,8 @@ class RayTracer:
         amplitude = (real + 1j * imag).reshape(shape)
         valid = np.asarray(found.valid).reshape(shape)
         if not shape[2]:
-            return (
-                amplitude,
-                valid,
-                np.zeros((*shape, depth), np.int64),
-                np.zeros((*shape, depth, 3)),
-            )
+            empty = np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
+            return amplitude, valid, *empty
         faces = self._handle.face_index(np.asarray(found.objects), np.asarray(found.primitives))
         hit = np.asarray(found.interactions) != 0
         faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)

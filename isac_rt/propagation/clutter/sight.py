@@ -148,15 +148,8 @@ class Sight:
         ]:
             del self._seen[key]
         if not parts:
-            nothing = np.zeros(0)
-            return _Nearby(
-                knot,
-                nothing.astype(np.int32),
-                nothing.astype(np.int32),
-                nothing,
-                nothing,
-                nothing.astype(bool),
-            )
+            types = np.int32, np.int32, float, float, bool
+            return _Nearby(knot, *(np.zeros(0, dtype) for dtype in types))
         index, row = np.unique(np.concatenate([c.index for c in parts]), return_inverse=True)
         where = np.concatenate(
             [number + c.where.astype(float) for number, c in zip(spans, parts, strict=True)]

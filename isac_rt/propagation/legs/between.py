@@ -288,7 +288,7 @@ def _changes(chains: list[_Chains]) -> tuple[int, int]:
 def _stacked(poses: list[Pose], which: np.ndarray) -> Pose:
     """One row of position, velocity and acceleration per chain."""
     motion = np.array([pose.motion() for pose in poses])[which]
-    return Pose(*motion.swapaxes(0, 1), np.eye(3))
+    return Pose(motion[:, 0], motion[:, 1], motion[:, 2], np.eye(3))
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

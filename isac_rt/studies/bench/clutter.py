@@ -116,7 +116,7 @@ def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[st
         seconds["traced anew by Sionna RT"].append(time.process_time() - begin)
         powers.append([power, float((amplitude**2).sum())])
     total = np.sum(powers, axis=0)
-    common: dict[str, Any] = {
+    row: dict[str, Any] = {
         "kind": "clutter",
         "size": scatterers,
         "unit": "scatterers",
@@ -131,7 +131,7 @@ def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[st
         cpu = median(of[1:])
         out.append(
             {
-                **common,
+                **row,
                 "method": method,
                 "error": error,
                 "cost": cpu / floor,

@@ -60,7 +60,7 @@ def _of(
             gain_error(found[link], truth[link]) for link in found if truth[link].power.any()
         ]
     repeats = 3 if quick else 7
-    common: dict[str, Any] = {
+    row: dict[str, Any] = {
         "kind": "tracing",
         "size": size,
         "unit": unit,
@@ -75,7 +75,7 @@ def _of(
         seconds = _seconds(setup, tracer, repeats)
         out.append(
             {
-                **common,
+                **row,
                 "method": method,
                 "error": error,
                 "cost": seconds / floor,

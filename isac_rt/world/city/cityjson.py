@@ -18,14 +18,7 @@ from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 
 _GROUND_TYPES = (
-    "TINRelief",
-    "LandUse",
-    "Road",
-    "Railway",
-    "WaterBody",
-    "PlantCover",
-    "TransportSquare",
-    "Waterway",
+    "TINRelief LandUse Road Railway WaterBody PlantCover TransportSquare Waterway".split()
 )
 _DEPTH = {
     "MultiSurface": 0,
