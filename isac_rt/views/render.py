@@ -258,11 +258,12 @@ class _Picture:
             self.line(np.array([track.pose(t).position for t in times]), colour, 2.2)
             foot = self.view.project(np.stack([here, [here[0], here[1], ground]]))
             self.ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
-            style = {"ms": 15 if uav.role == "active" else 8, "mec": "white", "mew": 1.1}
-            self.ax.plot(foot[0, 0], foot[0, 1], marker, color=colour, zorder=8, **style)
+            big, edge = 15 if uav.role == "active" else 8, "white"
+            x, y = foot[0, :2]
+            self.ax.plot(x, y, marker, color=colour, ms=big, mec=edge, mew=1.1, zorder=8)
             self.ax.annotate(
                 name,
-                (foot[0, 0], foot[0, 1]),
+                (x, y),
                 xytext=(8, 7),
                 textcoords="offset points",
                 color=colour,
