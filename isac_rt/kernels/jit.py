@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numba
 from numba.core import caching
@@ -44,7 +44,7 @@ def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = 
     """
     if function is None:
         return partial(jit, fast=fast, inline=inline)
-    made = numba.njit(
+    made: Any = numba.njit(
         nogil=True,
         error_model="numpy",
         fastmath=set(FAST) if fast else False,
@@ -113,8 +113,8 @@ class _Locator(caching._CacheLocator):
 
 
 class _Implementation(caching.CompileResultCacheImpl):
-    _locator_classes: ClassVar = [_Locator]
+    _locator_classes: Any = (_Locator,)
 
 
 class _Cache(caching.Cache):
-    _impl_class = _Implementation
+    _impl_class: Any = _Implementation

@@ -41,7 +41,7 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
     """
     w, t = waveform, tones
     out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
-    for k in range(t.count):
+    for k in range(t.size):
         q = t.link[k]
         for m in range(w.num_groups):
             time = w.chirp_time[m][:, None] - w.frame_duration / 2 + w.fast_time

@@ -47,7 +47,7 @@ class Direct:
 
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return _made(waveform, tones, DEFAULT, np.ones(tones.count, bool))
+        return _made(waveform, tones, DEFAULT, np.ones(tones.size, bool))
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Gridded:
 
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return _made(waveform, tones, self.setting, np.zeros(tones.count, bool))
+        return _made(waveform, tones, self.setting, np.zeros(tones.size, bool))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
         np.arange(w.num_chirps) * w.slot_duration,
     )
     out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
-    for k in range(t.count):
+    for k in range(t.size):
         q = t.link[k]
         for m in range(w.num_groups):
             whole = start[k] + t.symbol_delay[q, m]

@@ -54,7 +54,7 @@ class Tones(NamedTuple):
     antenna: np.ndarray
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """K."""
         return self.delay.shape[0]
 

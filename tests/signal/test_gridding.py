@@ -152,12 +152,12 @@ def gridded(w, tones, setting):
 def narrowband(w, tones):
     """The exact model with receive elements that only turn the phase, by its value at the middle of
     the window."""
-    one = tones._replace(rx_delay=np.zeros((tones.count, 1)), cross=tones.cross[:, :, :1] * 0)
+    one = tones._replace(rx_delay=np.zeros((tones.size, 1)), cross=tones.cross[:, :, :1] * 0)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
     turn = np.exp(2j * np.pi * (middle * tones.rx_delay - w.slope * tones.rx_delay**2 / 2))
     return sum(
         exact(w, one.select(np.array([k]))) * turn[k][None, :, None, None]
-        for k in range(tones.count)
+        for k in range(tones.size)
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from isac_rt.cli.cli import main
 from isac_rt.signal.gridded import ACCURATE_ERROR, GRIDDED_ERROR
-from isac_rt.studies.bench import REQUIRED, hermes, reception, synthesis
+from isac_rt.studies.bench import REQUIRED, hermes, nufft, reception, synthesis
 
 
 def test_errors_of_the_synthesis_are_as_stated():
@@ -20,6 +20,7 @@ def test_errors_of_the_synthesis_are_as_stated():
         "direct",
         synthesis.BOTH,
         *(name for name, _ in synthesis.GRIDS + synthesis.DIRECTLY),
+        *([] if nufft.missing() else [nufft.NAME]),
     }
     assert found["direct"] < 1e-6
     assert max(found.values()) < 3e-4
@@ -54,6 +55,14 @@ def test_hermespy_is_left_out_where_it_is_not_installed(tmp_path, monkeypatch, c
     assert main(["bench", "hermespy", "--quick", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.count("hermespy left out: ISAC_RT_HERMESPY=") == 1
     assert json.loads((tmp_path / "out" / "bench.json").read_text())["rows"] == []
+
+
+def test_finufft_is_left_out_where_it_is_not_installed(monkeypatch):
+    """With the remedy. Planted bug: `left_out` empty."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert "pip install isac_rt[bench]" in synthesis.left_out()["finufft"]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    assert synthesis.left_out() == {}
 
 
 def _pretender(folder, lines: str):

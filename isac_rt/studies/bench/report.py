@@ -59,6 +59,7 @@ def measure(
         reason = module.missing() if hasattr(module, "missing") else None
         if reason is None:
             rows += module.rows(quick)
+            left_out |= module.left_out() if hasattr(module, "left_out") else {}
         else:
             left_out[name] = reason
         if progress:

@@ -29,6 +29,8 @@ from isac_rt.signal.gridded import ACCURATE, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import if_signal, range_profiles
 from isac_rt.signal.methods import Direct, Exact, Gridded, Method
 from isac_rt.signal.noise import add_white_noise
+from isac_rt.signal.tones import tones_of
+from isac_rt.studies.bench import nufft
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.world.swarm import Pose
 
@@ -126,6 +128,11 @@ class Job:
             setting=setting,
         ).spectra
 
+    def by_finufft(self, links: list) -> np.ndarray:
+        """The samples by a library's transform, narrowband."""
+        w = self.waveform
+        return nufft.by_finufft(w, tones_of(w, links, self.receiver, w.frame_duration / 2, 0))
+
     def narrowband(self, links: list) -> np.ndarray:
         """The exact model path by path with one element in the middle of the array, times the
         elements' phases at mid-window."""
@@ -160,10 +167,18 @@ def errors() -> dict[str, float]:
         found[name] = relative(
             job.samples(links, Gridded(setting)), full if setting.wideband else narrow
         )
+    if nufft.missing() is None:
+        found[nufft.NAME] = relative(job.by_finufft(links), narrow)
     whole = job.transformed(links, Exact())
     found[BOTH] = relative(job.transformed(links, Gridded()), whole)
     found |= {name: relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
     return found
+
+
+def left_out() -> dict[str, str]:
+    """The methods that cannot be measured here, and why."""
+    reason = nufft.missing()
+    return {} if reason is None else {"finufft": reason}
 
 
 def rows(quick: bool) -> list[dict[str, Any]]:
@@ -225,6 +240,9 @@ def rows(quick: bool) -> list[dict[str, Any]]:
         for name, setting in GRIDS:
             seconds = cpu_seconds(partial(job.samples, links, Gridded(setting)), times)
             add(name, size, "paths", seconds, error[name])
+        if size in PROFILE_SIZES and nufft.NAME in error:
+            seconds = cpu_seconds(partial(job.by_finufft, links), times)
+            add(nufft.NAME, size, "paths", seconds, error[nufft.NAME])
         if size in PROFILE_SIZES:
             add(
                 BOTH,
