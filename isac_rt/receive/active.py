@@ -42,14 +42,15 @@ class ActiveReceiver:
     ) -> Reception:
         """See `receive_active`."""
         known = Known.of(cube, payload, self.antennas, 2)
-        ready = isinstance(cube, RangeProfiles)
-        spectra = cube.spectra if ready else clean_spectrum(cube, known)
+        if isinstance(cube, IFCube):
+            spectra = clean_spectrum(cube, known)
+        else:
+            spectra = cube.spectra if self.clutter_filter is None else cube.spectra.copy()
         if self.clutter_filter is not None:
-            spectra = spectra.copy() if ready else spectra
             self.clutter_filter.clean(spectra, cube.schedule)
         found = self.detector.sense(spectra, known, clutter)
         detections = found.detections
-        if self.refiner is not None and not ready:
+        if self.refiner is not None and isinstance(cube, IFCube):
             detections = self.refiner(cube.samples, known, detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
         return Reception.undecoded(cube.waveform, detections, picture, found.sparse)

@@ -105,8 +105,8 @@ class ClutterDetector:
         found, towards = [], judged.cosines[rows, bins]
         for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
             if np.isfinite(cosines).all():
-                local = BeamSpectra(spectra, known, row, beam_weights(known, cosines))
-                found.append(self.estimator.at(local, ratio, row, column))
+                beam = BeamSpectra(spectra, known, row, beam_weights(known, cosines))
+                found.append(self.estimator.at(beam, ratio, row, column))
             else:
                 local = LocalSpectra(spectra, known, row)
                 found.append(self.estimator.at(local, power, row, column))
