@@ -22,7 +22,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.studies.paper import onepath
-from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, blank, style
 
 RANGE, VELOCITY = 61.7, 4.3
 """The target as the AT sees it [m, m/s]."""
@@ -108,13 +108,9 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "noise": "none",
         "delay_symbols": payload.delay_symbols[0, list(SHOWN)].tolist(),
     }
+    tables = {"fig1": table}
     return Outcome(
-        "fig1",
-        "The chirp with delay and phase symbols",
-        {"fig1": table},
-        figure,
-        verdicts,
-        settings,
+        "fig1", "The chirp with delay and phase symbols", tables, figure, verdicts, settings
     )
 
 
@@ -173,6 +169,21 @@ def coherent_share(
     return peaks[0] / peaks[1]
 
 
+say = Sentences("""
+linear: After modulation the chirp is still a linear frequency modulation of constant modulus
+  over {chirps} chirps the frequency departs from a line of slope alpha by {slope:.2g} Hz at most,
+  of {band:.0f} MHz, the modulus by {modulus:.1g}
+
+IF: The IF is that of FMCW with the data delay added to the path's
+  the mixed chirps and the program's signal differ by {difference:.1g} RMS; beats lie within
+  {beat:.2f} cells of symbol plus path and Doppler (searched in steps of 1/16)
+
+compatible: It is compatible with the existing estimation algorithms for FMCW
+  only once all data phases are removed: the strongest cell of the range-Doppler map then has
+  {kept:.3f} of its power without data, else {lost:.2g}
+""")
+
+
 def _verdicts(w: Waveform, payload: Payload, schedule: np.ndarray, cube) -> tuple[Verdict, ...]:
     samples = cube.samples[0, 0].astype(np.complex128)
     model = np.stack([mixed(w, payload, p, w.fast_time) for p in range(w.num_chirps)])
@@ -180,29 +191,12 @@ def _verdicts(w: Waveform, payload: Payload, schedule: np.ndarray, cube) -> tupl
     slope, modulus = slope_error(w, payload)
     beat = beat_error(w, payload, samples)
     kept, lost = (coherent_share(w, payload, schedule, cube, removed=r) for r in (True, False))
+    far = {"chirps": w.num_chirps, "slope": slope, "modulus": modulus, "band": w.bandwidth / 1e6}
+    alike = difference < 1e-3 and beat < 0.1
     return (
-        Verdict(
-            "After modulation the chirp is still a linear frequency modulation of constant modulus",
-            "holds" if slope < 1e3 and modulus < 1e-12 else "does not hold",
-            f"over {w.num_chirps} chirps the frequency departs from a line of slope alpha by "
-            f"{slope:.2g} Hz at most, of {w.bandwidth / 1e6:.0f} MHz, the modulus by {modulus:.1g}",
-        ),
-        Verdict(
-            "The IF is that of FMCW with the data delay added to the path's",
-            "holds" if difference < 1e-3 and beat < 0.1 else "does not hold",
-            f"the mixed chirps and the program's signal differ by {difference:.1g} RMS; beats lie "
-            f"within {beat:.2f} cells of symbol plus path and Doppler (searched in steps of 1/16)",
-        ),
-        Verdict(
-            "It is compatible with the existing estimation algorithms for FMCW",
-            "holds under a condition"
-            if kept > 0.9 > 10 * lost
-            else "holds"
-            if lost > 0.9
-            else "does not hold",
-            "only once all data phases are removed: the strongest cell of the range-Doppler map "
-            f"then has {kept:.3f} of its power without data, else {lost:.2g}",
-        ),
+        say("linear", slope < 1e3 and modulus < 1e-12, **far),
+        say("IF", alike, difference=difference, beat=beat),
+        say("compatible", lost > 0.9, kept > 0.9 > 10 * lost, kept=kept, lost=lost),
     )
 
 

@@ -23,7 +23,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, doppler_bins
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.studies.paper import onepath
-from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, blank, style
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, blank, style, table
 
 NAMES = {
     "a": "conventional TDM-MIMO",
@@ -127,38 +127,24 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     for i, (scheme, schedule) in enumerate(chosen.items()):
         found += spectra(scheme, schedule)
         progress(i + 1, len(chosen))
-    summary = pd.DataFrame(
-        [
-            {
-                "scheme": s.scheme,
-                "groups_united": s.united,
-                "unambiguous_velocity_mps": s.unambiguous,
-                "highest_sidelobe_db": s.sidelobe_db,
-            }
-            for s in found
-        ]
-    )
+    rows = [(s.scheme, s.united, s.unambiguous, s.sidelobe_db) for s in found]
+    summary = table("scheme groups_united unambiguous_velocity_mps highest_sidelobe_db", rows)
+    columns = "scheme groups_united velocity_mps power_db"
     curves = pd.concat(
         [
-            pd.DataFrame(
-                {
-                    "scheme": s.scheme,
-                    "groups_united": s.united,
-                    "velocity_mps": s.velocity,
-                    "power_db": s.power_db,
-                }
+            table(
+                columns,
+                ((s.scheme, s.united, *p) for p in zip(s.velocity, s.power_db, strict=True)),
             )
             for s in found
         ]
     )
-    slots = pd.DataFrame(
-        [
-            {"scheme": k, "group": m, "slot": p, "antenna": int(v[m, p])}
-            for k, v in chosen.items()
-            for m in range(len(v))
-            for p in range(v.shape[1])
-        ]
-    )
+    chirps = [
+        (scheme, m, p, int(schedule[m, p]))
+        for scheme, schedule in chosen.items()
+        for m, p in np.ndindex(*schedule.shape)
+    ]
+    slots = table("scheme group slot antenna", chirps)
     true_velocity = VELOCITY_SHARE * Waveform().max_velocity(2)
     settings = {
         "quick": quick,
@@ -169,17 +155,27 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         "window": "Hann",
     }
     tables = {"summary": summary, "spectra": curves, "schedules": slots}
-    return Outcome(
-        "fig5", "Antenna schedules", tables, _figure(chosen, found), _verdicts(found), settings
-    )
+    figure, verdicts = _figure(chosen, found), _verdicts(found)
+    return Outcome("fig5", "Antenna schedules", tables, figure, verdicts, settings)
+
+
+say = Sentences("""
+reduces: Conventional TDM-MIMO reduces the unambiguous velocity
+  {a}
+
+larger: Pseudo-random TDM-MIMO makes it L_tx times larger
+  {a}; {b}; {d}
+
+needed: With 3 groups the pseudo-random order is needed for it
+  only when each group is processed alone: {c}; {united_c}; {united_d}; by the Latin property the
+  groups together sample every antenna in every slot, whatever the order
+""")
 
 
 def _verdicts(found: list[Spectrum]) -> tuple[Verdict, ...]:
     by = {(s.scheme, s.united): s for s in found}
-    a, b, c, d, united_c, united_d = (
-        by[k]
-        for k in (("a", False), ("b", False), ("c", False), ("d", False), ("c", True), ("d", True))
-    )
+    a, b, c, d = (by[scheme, False] for scheme in "abcd")
+    united_c, united_d = by["c", True], by["d", True]
 
     def text(s: Spectrum) -> str:
         level = round(s.sidelobe_db, 1) + 0.0  # no "-0.0"
@@ -191,26 +187,12 @@ def _verdicts(found: list[Spectrum]) -> tuple[Verdict, ...]:
     # the spacing of the ambiguities is a whole number of bins, so that the ratio is exact
     gain = all(abs(s.unambiguous / a.unambiguous - 3) < 1e-9 for s in (b, d))
     reduced = a.sidelobe_db > -_EQUAL_DB and a.unambiguous < b.unambiguous
+    union = united_c.sidelobe_db < -20 and c.sidelobe_db > -_EQUAL_DB
+    texts = {"c": text(c), "united_c": text(united_c), "united_d": text(united_d)}
     return (
-        Verdict(
-            "Conventional TDM-MIMO reduces the unambiguous velocity",
-            "holds" if reduced else "does not hold",
-            text(a),
-        ),
-        Verdict(
-            "Pseudo-random TDM-MIMO makes it L_tx times larger",
-            "holds" if gain else "does not hold",
-            f"{text(a)}; {text(b)}; {text(d)}",
-        ),
-        Verdict(
-            "With 3 groups the pseudo-random order is needed for it",
-            "holds under a condition"
-            if united_c.sidelobe_db < -20 and c.sidelobe_db > -_EQUAL_DB
-            else "holds",
-            f"only when each group is processed alone: {text(c)}; {text(united_c)}; "
-            f"{text(united_d)}; by the Latin property the "
-            "groups together sample every antenna in every slot, whatever the order",
-        ),
+        say("reduces", reduced, a=text(a)),
+        say("larger", gain, a=text(a), b=text(b), d=text(d)),
+        say("needed", not union, True, **texts),
     )
 
 

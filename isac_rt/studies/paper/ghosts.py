@@ -28,7 +28,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.studies import scene_file
-from isac_rt.studies.paper.outcome import Outcome, Progress, Verdict, proportion
+from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, proportion
 from isac_rt.terminal.ghosts import Suspicion, Walls, suspicion
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.terminal.tracker import TrackSet
@@ -215,14 +215,9 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     every = pd.concat(parts, ignore_index=True)
     tracks = whole_tracks(every)
     settings = {"quick": quick, "seed": seed, "flights": flights, "frames": frames, "share": SHARE}
-    return Outcome(
-        "ghosts",
-        "Ghost tracks and a geometric test",
-        {"tracks": tracks, "frames": every},
-        None,
-        verdicts(tracks),
-        settings,
-    )
+    tables = {"tracks": tracks, "frames": every}
+    title = "Ghost tracks and a geometric test"
+    return Outcome("ghosts", title, tables, None, verdicts(tracks), settings)
 
 
 def _of_terminal(
@@ -249,6 +244,17 @@ def _of_terminal(
     return rows.merge(told, on=["frame", "id"]).assign(terminal="passive" if passive else "active")
 
 
+say = Sentences("""
+explained: Every ghost track of the {terminal} terminal is explained by its wall and order
+  {ghosts} ghost tracks, {first} of order 1, {second} of order 2; {other} confirmed tracks are
+  neither ghosts nor UAVs
+
+removed: A geometric test removes ghost tracks of the {terminal} terminal
+  share of ghosts among confirmed tracks: without it {without}, with it {with_it}; tracks of UAVs
+  that it takes away: {lost}
+""")
+
+
 def verdicts(tracks: pd.DataFrame) -> tuple[Verdict, ...]:
     """The rates with and without the test, and what it costs, of each kind of terminal."""
     out: list[Verdict] = []
@@ -270,18 +276,10 @@ def _verdicts(terminal: str, tracks: pd.DataFrame) -> tuple[Verdict, ...]:
     explained = bool((ghosts.order > 0).all() and (ghosts.face >= 0).all())
     lost = proportion(int(uavs.suspect.sum()), len(uavs)) if len(uavs) else "no track"
     fewer = (kept.what == "ghost").sum() < len(ghosts)
+    told = {"terminal": terminal, "ghosts": len(ghosts), "other": (tracks.what == "other").sum()}
+    orders = {"first": (ghosts.order == 1).sum(), "second": (ghosts.order == 2).sum()}
+    rates = {"without": rate(tracks), "with_it": rate(kept), "lost": lost}
     return (
-        Verdict(
-            f"Every ghost track of the {terminal} terminal is explained by its wall and order",
-            "holds" if explained else "does not hold",
-            f"{len(ghosts)} ghost tracks, {(ghosts.order == 1).sum()} of order 1, "
-            f"{(ghosts.order == 2).sum()} of order 2; "
-            f"{(tracks.what == 'other').sum()} confirmed tracks are neither ghosts nor UAVs",
-        ),
-        Verdict(
-            f"A geometric test removes ghost tracks of the {terminal} terminal",
-            "holds" if fewer else "does not hold",
-            f"share of ghosts among confirmed tracks: without it {rate(tracks)}, with it "
-            f"{rate(kept)}; tracks of UAVs that it takes away: {lost}",
-        ),
+        say("explained", explained, **told, **orders),
+        say("removed", bool(fewer), terminal=terminal, **rates),
     )

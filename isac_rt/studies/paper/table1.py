@@ -27,30 +27,18 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     progress(1, 1)
     settings = {"quick": quick, "seed": seed, "spacing_wavelengths": SPACING_WAVELENGTHS}
     verdicts = tuple(_verdict(row) for row in rows)
-    return Outcome(
-        "table1",
-        "Table I",
-        {"table1": pd.DataFrame(rows)},
-        _figure(rows, verdicts),
-        verdicts,
-        settings,
-    )
+    tables, figure = {"table1": pd.DataFrame(rows)}, _figure(rows, verdicts)
+    return Outcome("table1", "Table I", tables, figure, verdicts, settings)
 
 
 def _figure(rows: list[dict], verdicts: tuple[Verdict, ...]) -> Figure:
     """The table with both columns of values, coloured by verdict."""
     colours = {"holds": "#DDF2E9", "holds under a condition": "#FFF3D6", "does not hold": "#F9DCD3"}
     cells = [
-        [
-            r["terminal"],
-            r["quantity"],
-            f"{r['paper']:.6g}",
-            f"{r['ours']:.6g}",
-            r["unit"],
-            v.verdict,
-        ]
-        for r, v in zip(rows, verdicts, strict=True)
+        [r["terminal"], r["quantity"], *(f"{r[x]:.6g}" for x in ("paper", "ours")), r["unit"]]
+        for r in rows
     ]
+    cells = [[*cell, v.verdict] for cell, v in zip(cells, verdicts, strict=True)]
     with style():
         figure, axes = blank(size=(8.2, 5.0))
         axes[0, 0].axis("off")
