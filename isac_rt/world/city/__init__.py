@@ -3,6 +3,6 @@
 
 from isac_rt.world.city.materials import CityError, Material
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.city.sources import load_city
+from isac_rt.world.city.sources import city_files, load_city
 
-__all__ = ["CityError", "CityMesh", "Material", "load_city"]
+__all__ = ["CityError", "CityMesh", "Material", "city_files", "load_city"]

@@ -6,28 +6,85 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from pydantic import Field
 
 from isac_rt import scenario
-from isac_rt.world.city.extrude import triangulate
+from isac_rt.world.city.extrude import check_corners, triangulate
+from isac_rt.world.city.files import Items, Part
 from isac_rt.world.city.materials import CityError, MaterialUse
-from isac_rt.world.city.mesh import Surface
+from isac_rt.world.city.mesh import Surface, check_coordinates
 
 _GROUND_TYPES = (
     "TINRelief LandUse Road Railway WaterBody PlantCover TransportSquare Waterway".split()
 )
-_DEPTH = {
-    "MultiSurface": 0,
-    "CompositeSurface": 0,
-    "Solid": 1,
-    "MultiSolid": 2,
-    "CompositeSolid": 2,
-}
-"""How many lists lie around the list of surfaces."""
+_Triple = tuple[float, float, float]
+_Boundary = Items[Items[Annotated[int, Field(ge=0, lt=2**31)]]]
+
+
+class _Kind(Part):
+    type: str | None = None
+
+
+class _Semantics(Part):
+    surfaces: tuple[_Kind, ...] = ()
+    values: list[Any] | None = None
+
+
+class _Geometry(Part):
+    lod: Annotated[float, Field(strict=False)] = 0.0
+    semantics: _Semantics | None = None
+
+
+class _Surfaces(_Geometry):
+    type: Literal["MultiSurface", "CompositeSurface"]
+    boundaries: Items[_Boundary]
+    depth: ClassVar[int] = 0
+    """How many lists lie around the list of surfaces."""
+
+
+class _Solid(_Geometry):
+    type: Literal["Solid"]
+    boundaries: Items[Items[_Boundary]]
+    depth: ClassVar[int] = 1
+
+
+class _Solids(_Geometry):
+    type: Literal["MultiSolid", "CompositeSolid"]
+    boundaries: Items[Items[Items[_Boundary]]]
+    depth: ClassVar[int] = 2
+
+
+class _NoSurface(_Geometry):
+    type: Literal["MultiPoint", "MultiLineString", "GeometryInstance"]
+
+
+_Surfaced = _Surfaces | _Solid | _Solids
+
+
+class _Object(Part):
+    type: str | None = None
+    attributes: dict[str, Any] | None = None
+    children: tuple[str, ...] = ()
+    geometry: tuple[Annotated[_Surfaced | _NoSurface, Field(discriminator="type")], ...] = ()
+
+
+class _Transform(Part):
+    scale: _Triple
+    translate: _Triple
+
+
+class CityJson(Part):
+    """What is read of a CityJSON file."""
+
+    type: Literal["CityJSON"]
+    transform: _Transform | None = None
+    vertices: Items[_Triple]
+    CityObjects: dict[str, _Object] = Field({})
 
 
 @dataclass
@@ -61,38 +118,14 @@ def parse_height(value: Any, what: str) -> float | None:
     """
     if value is None or (isinstance(value, str) and not value.strip()):
         return None
-    number = value
-    if isinstance(value, str):
-        try:
-            number = float(value.strip().removesuffix("m").strip())
-        except ValueError:
-            raise CityError(
-                f"{what}: height {value!r} is not a number of metres; correct it"
-            ) from None
-    if (
-        isinstance(number, bool)
-        or not isinstance(number, int | float)
-        or not math.isfinite(number)
-        or number <= 0
-    ):
-        raise CityError(f"{what}: height {value!r} is not a positive number of metres; correct it")
-    return float(number)
-
-
-def _vertices(document: dict[str, Any], name: str) -> NDArray[np.float64]:
+    text = value.strip().removesuffix("m") if isinstance(value, str) else value
     try:
-        vertices = np.array(document["vertices"], dtype=np.float64).reshape(-1, 3)
-        transform = document.get("transform")
-        if transform is not None:
-            vertices = vertices * np.array(transform["scale"], dtype=np.float64) + np.array(
-                transform["translate"], dtype=np.float64
-            )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CityError(
-            f"{name}: `vertices` or `transform` cannot be read ({error}); check the file with a "
-            "CityJSON validator"
-        ) from None
-    return vertices
+        number = math.nan if isinstance(text, bool) else float(text)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise CityError(f"{what}: height {value!r} is not a positive number of metres; correct it")
+    return number
 
 
 def _flat(boundaries: list, values: Any, depth: int) -> Iterator[tuple[list, int | None]]:
@@ -143,54 +176,59 @@ def _material(city: scenario.City, semantic: str | None, object_type: str) -> st
     )
 
 
+def _corners(
+    rings: _Boundary, vertices: NDArray[np.float64], what: str
+) -> list[NDArray[np.float64]]:
+    """The rings' corners; the outer ring first, or nothing if it has no area."""
+    check_corners(sum(len(ring) for ring in rings), what)
+    highest = max((max(ring, default=0) for ring in rings), default=0)
+    if highest >= len(vertices):
+        raise CityError(
+            f"{what}: a boundary names vertex {highest} of {len(vertices)}; check the file with a "
+            "CityJSON validator"
+        )
+    return [vertices[ring] for ring in rings if len(ring) >= 3]
+
+
 def _surfaces(
-    geometry: dict[str, Any],
+    geometry: _Surfaced,
     vertices: NDArray[np.float64],
     city: scenario.City,
     object_type: str,
     what: str,
-) -> list[Surface]:
-    semantics = geometry.get("semantics") or {}
-    kinds = [s.get("type") for s in semantics.get("surfaces", [])]
-    found = []
-    for rings, value in _flat(
-        geometry["boundaries"], semantics.get("values"), _DEPTH[geometry["type"]]
-    ):
-        corners = [vertices[np.array(ring, dtype=np.int64)] for ring in rings if len(ring) >= 3]
-        if not corners:
-            continue
-        if not all(np.isfinite(c).all() for c in corners):
-            raise CityError(f"{what}: a coordinate is NaN or infinite; correct it")
-        semantic = kinds[value] if value is not None and 0 <= value < len(kinds) else None
-        use = MaterialUse(_material(city, semantic, object_type))
-        found.append(Surface(np.concatenate(corners), triangulate_planar(corners), use))
-    return found
+) -> Iterator[Surface]:
+    semantics = geometry.semantics or _Semantics()
+    kinds = [surface.type for surface in semantics.surfaces]
+    for rings, value in _flat(geometry.boundaries, semantics.values, geometry.depth):
+        corners = _corners(rings, vertices, what)
+        if corners:
+            semantic = kinds[value] if value is not None and 0 <= value < len(kinds) else None
+            use = MaterialUse(_material(city, semantic, object_type))
+            yield Surface(np.concatenate(corners), triangulate_planar(corners), use)
 
 
 def _footprint(
-    geometry: dict[str, Any], vertices: NDArray[np.float64]
-) -> tuple[shapely.Geometry, float]:
-    polygons, lowest = [], np.inf
-    for rings, _ in _flat(geometry["boundaries"], None, 0):
-        corners = [vertices[np.array(ring, dtype=np.int64)] for ring in rings]
-        lowest = min(lowest, *(float(c[:, 2].min()) for c in corners))
-        polygons.append(shapely.Polygon(corners[0][:, :2], [c[:, :2] for c in corners[1:]]))
-    return shapely.MultiPolygon(polygons), lowest
-
-
-def _level(geometry: dict[str, Any]) -> float:
-    return float(geometry.get("lod", 0))
+    geometry: _Surfaced, vertices: NDArray[np.float64], what: str
+) -> tuple[shapely.Geometry, float] | None:
+    """The plan and the lowest height of surfaces, if they have any."""
+    found = [
+        _corners(r, vertices, what) for r, _ in _flat(geometry.boundaries, None, geometry.depth)
+    ]
+    rings = [corners for corners in found if corners]
+    if not rings:
+        return None
+    polygons = [shapely.Polygon(r[0][:, :2], [c[:, :2] for c in r[1:]]) for r in rings]
+    return shapely.MultiPolygon(polygons), min(float(c[:, 2].min()) for r in rings for c in r)
 
 
 def read_cityjson(
-    document: dict[str, Any], city: scenario.City, name: str, notes: list[str]
+    document: CityJson, city: scenario.City, name: str, notes: list[str]
 ) -> CityModel:
     """The surfaces and footprints of a CityJSON file.
 
     Parameters
     ----------
-    document : dict
-        The parsed file.
+    document : CityJson
     city : scenario.City
         Materials, and the attribute with heights; `measuredHeight` is looked for besides it.
     name : str
@@ -198,37 +236,31 @@ def read_cityjson(
     notes : list of str
         Grows.
     """
-    vertices, model, skipped = _vertices(document, name), CityModel(), 0
-    objects = document.get("CityObjects", {})
-    detailed = {
-        key
-        for key, item in objects.items()
-        if any(_level(g) >= 1 for g in item.get("geometry", []))
-    }
+    vertices = np.array(document.vertices, dtype=np.float64).reshape(-1, 3)
+    if document.transform is not None:
+        vertices = vertices * document.transform.scale + document.transform.translate
+    check_coordinates(vertices, f"{name}: vertices")
+    model, skipped, objects = CityModel(), 0, document.CityObjects
+    detailed = {key for key, item in objects.items() if any(g.lod >= 1 for g in item.geometry)}
     for key, item in objects.items():
-        what, kind = f"{name}: object {key}", str(item.get("type"))
-        usable = [g for g in item.get("geometry", []) if g.get("type") in _DEPTH]
-        skipped += len(item.get("geometry", [])) - len(usable)
+        what, kind = f"{name}: object {key}", str(item.type)
+        usable = [g for g in item.geometry if not isinstance(g, _NoSurface)]
+        skipped += len(item.geometry) - len(usable)
         if not usable:
             continue
-        best = max(usable, key=_level)
-        try:
-            if _level(best) >= 1 or kind in _GROUND_TYPES:
-                model.surfaces += _surfaces(best, vertices, city, kind, what)
-                model.terrain |= kind == "TINRelief"
-            elif not detailed.intersection(item.get("children", [])):
-                attributes = item.get("attributes") or {}
-                height = parse_height(
-                    attributes.get(city.height_property, attributes.get("measuredHeight")), what
-                )
-                shape, base = _footprint(best, vertices)
-                model.outlines.append((shape, height, what))
-                model.bases.append(base)
-        except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise CityError(
-                f"{what}: its geometry cannot be read ({error}); check the file with a CityJSON "
-                "validator"
-            ) from None
+        best = max(usable, key=lambda geometry: geometry.lod)
+        if best.lod >= 1 or kind in _GROUND_TYPES:
+            model.surfaces += _surfaces(best, vertices, city, kind, what)
+            model.terrain |= kind == "TINRelief"
+        elif not detailed.intersection(item.children):
+            attributes = item.attributes or {}
+            height = parse_height(
+                attributes.get(city.height_property, attributes.get("measuredHeight")), what
+            )
+            plan = _footprint(best, vertices, what)
+            if plan is not None:
+                model.outlines.append((plan[0], height, what))
+                model.bases.append(plan[1])
     if skipped:
         notes.append(f"{skipped} CityJSON geometries that are no surfaces left out")
     return model

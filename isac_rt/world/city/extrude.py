@@ -12,6 +12,39 @@ from numpy.typing import NDArray
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 
+MAX_CORNERS = 10_000
+"""Of one polygon: triangulation takes a time that grows with their square, 1 s here."""
+MAX_CROSSINGS = 100
+"""Of one polygon with itself; GEOS repairs some 2000 in a second."""
+
+
+def check_corners(count: int, what: str) -> None:
+    """Refuse a polygon of too many corners.
+
+    Raises
+    ------
+    CityError
+    """
+    if count > MAX_CORNERS:
+        raise CityError(
+            f"{what}: a polygon of {count} corners, more than {MAX_CORNERS}; simplify or split it"
+        )
+
+
+def _crosses_often(geometry: shapely.Geometry) -> bool:
+    """Whether the rings meet themselves or others more often than can be repaired."""
+    rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(geometry)))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    ends = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]
+    segments = shapely.linestrings(ends)
+    tree, found = shapely.STRtree(segments), 0
+    for start in range(0, len(segments), 100):
+        block = segments[start : start + 100]
+        found += tree.query(block, predicate="intersects").shape[1] - 3 * len(block)
+        if found > 2 * MAX_CROSSINGS:  # each is found from both segments
+            return True
+    return False
+
 
 def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
     """The valid polygons of a geometry, with repair where that keeps an area.
@@ -20,7 +53,13 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
     ------
     CityError  If no area can be recovered.
     """
+    check_corners(shapely.get_num_coordinates(geometry), what)
     if not shapely.is_valid(geometry):
+        if _crosses_often(geometry):
+            raise CityError(
+                f"{what}: the polygon meets itself more than {MAX_CROSSINGS} times; redraw or "
+                "remove it"
+            )
         why = shapely.is_valid_reason(geometry)
         geometry = shapely.make_valid(geometry)
         if not geometry.area > 0:

@@ -3,24 +3,24 @@ latitude."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from pydantic import Field, RootModel
 
 from isac_rt import scenario
-from isac_rt.world.city.cityjson import parse_height, read_cityjson
+from isac_rt.world.city.cityjson import CityJson, CityModel, parse_height, read_cityjson
 from isac_rt.world.city.extrude import building, ground, polygons_of
+from isac_rt.world.city.files import JSON_FACTOR, Items, Part, parsed, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse
-from isac_rt.world.city.mesh import Surface
+from isac_rt.world.city.mesh import Surface, check_coordinates
 
 LONLAT_FOOTPRINT = 0.05
 """No building is this many degrees across (5 km), and hardly any is this few metres."""
-_POLYGONAL = ("Polygon", "MultiPolygon", "GeometryCollection")
 
 
 def is_lonlat(boxes: NDArray[np.float64]) -> bool:
@@ -78,66 +78,96 @@ def _placed(
     return projection(float(lon), float(lat))
 
 
+_Position = Annotated[Items[float], Field(min_length=2)]
+_Rings = Items[Annotated[Items[_Position], Field(min_length=3)]]
+
+
+def _polygon(rings: _Rings) -> shapely.Polygon:
+    plan = [[position[:2] for position in ring] for ring in rings]
+    return shapely.Polygon(plan[0], plan[1:]) if plan else shapely.Polygon()
+
+
+class _Polygon(Part):
+    type: Literal["Polygon"]
+    coordinates: _Rings
+
+    def shape(self) -> shapely.Geometry:
+        return _polygon(self.coordinates)
+
+
+class _MultiPolygon(Part):
+    type: Literal["MultiPolygon"]
+    coordinates: Items[_Rings]
+
+    def shape(self) -> shapely.Geometry:
+        return shapely.MultiPolygon([_polygon(rings) for rings in self.coordinates])
+
+
+class _Other(Part):
+    type: Literal["Point", "MultiPoint", "LineString", "MultiLineString"]
+
+    def shape(self) -> shapely.Geometry:
+        return shapely.Polygon()
+
+
+class _Collection(Part):
+    type: Literal["GeometryCollection"]
+    geometries: Items[_Geometry]
+
+    def shape(self) -> shapely.Geometry:
+        return shapely.GeometryCollection([part.shape() for part in self.geometries])
+
+
+_Geometry = Annotated[_Polygon | _MultiPolygon | _Other | _Collection, Field(discriminator="type")]
+
+
+class _Feature(Part):
+    type: Literal["Feature"]
+    geometry: _Geometry | None = None
+    properties: dict[str, Any] | None = None
+
+    def shape(self) -> shapely.Geometry:
+        return shapely.Polygon() if self.geometry is None else self.geometry.shape()
+
+
+_Item = Annotated[
+    _Feature | _Polygon | _MultiPolygon | _Other | _Collection, Field(discriminator="type")
+]
+
+
+class _FeatureCollection(Part):
+    type: Literal["FeatureCollection"]
+    features: Items[_Item]
+
+
+class _Map(RootModel):
+    """GeoJSON or CityJSON."""
+
+    root: Annotated[
+        _FeatureCollection | _Feature | _Polygon | _MultiPolygon | _Collection | CityJson,
+        Field(discriminator="type"),
+    ]
+
+
 def _geojson(
-    document: dict[str, Any], key: str, name: str, notes: list[str]
+    features: Sequence[_Item], key: str, name: str, notes: list[str]
 ) -> list[tuple[shapely.Geometry, float | None, str]]:
     """Geometry, height and label of each polygonal feature."""
-    kind = document.get("type")
-    features = document.get("features") if kind == "FeatureCollection" else [document]
-    if kind not in ("FeatureCollection", "Feature", *_POLYGONAL) or not isinstance(features, list):
-        raise CityError(
-            f"{name}: type {kind!r} is neither GeoJSON with polygons nor CityJSON; give a "
-            "FeatureCollection of polygons"
-        )
     found: list[tuple[shapely.Geometry, float | None, str]] = []
-    skipped = 0
     for i, feature in enumerate(features):
         what = f"{name}: feature {i}"
-        if not isinstance(feature, dict):
-            raise CityError(f"{what}: is {str(feature)[:40]}, not a GeoJSON feature; remove it")
-        geometry = feature.get("geometry") if feature.get("type") == "Feature" else feature
-        if not isinstance(geometry, dict) or geometry.get("type") not in _POLYGONAL:
-            skipped += 1
-            continue
         try:
-            shape = shapely.force_2d(shapely.geometry.shape(geometry))
-        except (
-            LookupError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            shapely.errors.ShapelyError,
-        ) as error:
+            shape = feature.shape()
+        except (ValueError, shapely.errors.ShapelyError) as error:
             raise CityError(
                 f"{what}: its coordinates cannot be read ({error}); rings are lists of [x, y]"
             ) from None
-        if shape.is_empty:
-            skipped += 1
-            continue
-        if not np.isfinite(shapely.get_coordinates(shape)).all():
-            raise CityError(f"{what}: a coordinate is NaN or infinite; correct it")
-        properties = feature.get("properties")
-        height = properties.get(key) if isinstance(properties, dict) else None
-        found.append((shape, parse_height(height, what), what))
-    if skipped:
-        notes.append(f"{skipped} features without a polygon left out")
+        if not shape.is_empty:
+            properties = feature.properties if isinstance(feature, _Feature) else None
+            found.append((shape, parse_height((properties or {}).get(key), what), what))
+    if len(found) < len(features):
+        notes.append(f"{len(features) - len(found)} features without a polygon left out")
     return found
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file, or a CityError that says where it is broken."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CityError(
-            f"{path.name}: not readable as JSON ({error}); give GeoJSON or CityJSON"
-        ) from None
-    if not isinstance(document, dict):
-        raise CityError(
-            f"{path.name}: holds a {type(document).__name__}, not an object; give GeoJSON or "
-            "CityJSON"
-        )
-    return document
 
 
 def _extruded(
@@ -181,20 +211,16 @@ def footprints(city: scenario.City, path: Path) -> tuple[list[Surface], list[str
     ------
     CityError
     """
-    document, notes = read_json(path), list[str]()
-    solids: list[Surface] = []
-    terrain = False
-    if document.get("type") == "CityJSON":
+    data, notes = read_bytes(path, JSON_FACTOR), list[str]()
+    document = parsed(data, _Map, path.name, "give GeoJSON with polygons, or CityJSON").root
+    model = CityModel()
+    if isinstance(document, CityJson):
         model = read_cityjson(document, city, path.name, notes)
-        outlines, bases, solids, terrain = (
-            model.outlines,
-            model.bases,
-            model.surfaces,
-            model.terrain,
-        )
     else:
-        outlines = _geojson(document, city.height_property, path.name, notes)
-        bases = [0.0] * len(outlines)
+        features = document.features if isinstance(document, _FeatureCollection) else [document]
+        model.outlines = _geojson(features, city.height_property, path.name, notes)
+        model.bases = [0.0] * len(model.outlines)
+    outlines, bases, solids = model.outlines, model.bases, model.surfaces
     if not outlines and not solids:
         raise CityError(f"{path.name}: there is no polygon in it; give building footprints")
     points = [shapely.bounds(shape) for shape, _, _ in outlines]
@@ -215,10 +241,12 @@ def footprints(city: scenario.City, path: Path) -> tuple[list[Surface], list[str
             )
             for s in solids
         ]
+    for shape, _, what in outlines:
+        check_coordinates(shapely.get_coordinates(shape), what)
     lowest = min([*bases, *(float(s.vertices[:, 2].min()) for s in solids)])
     surfaces = solids + _extruded(city, outlines, lowest, bases, notes)
     plan = np.concatenate([s.vertices[:, :2] for s in surfaces])
-    if not terrain:
+    if not model.terrain:
         floor = MaterialUse(city.ground_material)
         surfaces.append(
             ground(plan.min(axis=0), plan.max(axis=0), city.ground_margin_m, lowest, floor)

@@ -43,11 +43,17 @@ from isac_rt.scenario.environment import MaterialOverride
 Pattern = Literal["lambertian", "directive", "backscattering"]
 VACUUM_PERMITTIVITY = 8.8541878128e-12
 """[F/m]"""
+MAX_MATERIALS = 1000
+"""In a city."""
 
 
 class CityError(UserError):
     """The city cannot be built from what the scenario says; the text says what, where and what to
-    do."""
+    do, in one line: names in a file may be long and hold anything."""
+
+    def __init__(self, text: str) -> None:
+        line = "".join(c if c.isprintable() else " " for c in text)
+        super().__init__(line if len(line) < 900 else f"{line[:600]} ... {line[-250:]}")
 
 
 @dataclass(frozen=True)
@@ -425,6 +431,10 @@ def resolve_materials(
             else:
                 if any(other.name == material.name for other in materials):
                     material = replace(material, name=f"{material.name} {material.thickness:g} m")
+                if len(materials) == MAX_MATERIALS:
+                    raise CityError(
+                        f"material {key.name!r} is one of more than {MAX_MATERIALS}; join like ones"
+                    )
                 found[key] = len(materials)
                 materials.append(material)
         index.append(found[key])

@@ -3,7 +3,7 @@ areas."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +15,9 @@ from isac_rt.world.city.materials import CityError, Material, MaterialUse
 
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
+MAX_FACES = 10_000_000
+MAX_COORDINATE = 1e8
+"""Farther out float64 places no corner to a wavelength's phase, and no map has it. [m]"""
 
 
 @dataclass(frozen=True)
@@ -241,13 +244,44 @@ def distance_to_triangles(
     return np.linalg.norm(nearest - point, axis=1)
 
 
+def gathered(surfaces: Iterable[Surface], name: str) -> list[Surface]:
+    """The surfaces of a source, held to `MAX_FACES` as they come: a small file may show one mesh a
+    million times."""
+    found, count = list[Surface](), 0
+    for surface in surfaces:
+        count += max(len(surface.faces), len(surface.vertices) // 3)
+        if count > MAX_FACES:
+            raise CityError(
+                f"{name}: more than {MAX_FACES:,} faces; simplify it, or cut out what is near "
+                "the swarm"
+            )
+        found.append(surface)
+    return found
+
+
+def check_coordinates(coordinates: NDArray[np.float64], what: str) -> None:
+    """Refuse coordinates (..., D) that are no place on Earth. [m]
+
+    Raises
+    ------
+    CityError
+    """
+    if not np.isfinite(coordinates).all():
+        bad = int((~np.isfinite(coordinates)).any(axis=-1).sum())
+        raise CityError(
+            f"{what}: {bad} of {len(coordinates)} vertices are NaN or infinite; repair the file"
+        )
+    farthest = np.abs(coordinates).max(initial=0.0)
+    if farthest > MAX_COORDINATE:
+        raise CityError(
+            f"{what}: a coordinate is {farthest:.3g} m from the origin, and no place is beyond "
+            f"{MAX_COORDINATE:g} m; correct it, or its scale"
+        )
+
+
 def _merged(surfaces: Sequence[Surface], name: str) -> tuple[NDArray, NDArray, NDArray]:
     vertices = np.concatenate([s.vertices for s in surfaces])
-    if not np.isfinite(vertices).all():
-        bad = int((~np.isfinite(vertices)).any(axis=1).sum())
-        raise CityError(
-            f"{name}: {bad} of {len(vertices)} vertices are NaN or infinite; repair the file"
-        )
+    check_coordinates(vertices, name)
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
     for s in surfaces:
         if len(s.faces) and (s.faces.min() < 0 or s.faces.max() >= len(s.vertices)):

@@ -1,81 +1,269 @@
-"""PLY, OBJ, STL and GLB files, through trimesh."""
+"""PLY, OBJ, STL, glTF and GLB files. What colours and textures need is not read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import base64
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import from_json
 
 from isac_rt import scenario
-from isac_rt.runtime import available_memory
+from isac_rt.world.city.files import beside, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name
-from isac_rt.world.city.mesh import Surface
+from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
 
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf")
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
-READING_FACTOR = 6
-"""Memory that reading a mesh takes, over the size of its file: text, arrays and their copies;
-measured 3 to 5."""
+@dataclass(frozen=True)
+class Piece:
+    """A part of a mesh: vertices (V, 3), triangles (F, 3), and the names by which it may be called,
+    the material's last."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    labels: tuple[str, ...]
 
 
-def check_size(path: Path) -> None:
-    """Refuse a file that is too large to be read.
-
-    Raises
-    ------
-    CityError  With the estimate and what is free.
-    """
-    size, free = path.stat().st_size, available_memory()
-    if free is not None and READING_FACTOR * size > free:
+def _used(
+    vertices: NDArray, faces: NDArray[np.int64], labels: tuple[str | None, ...], name: str
+) -> Piece:
+    """The piece with the vertices that its faces use."""
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise CityError(
-            f"{path.name}: a file of {size / 1e9:.3g} GB takes about "
-            f"{READING_FACTOR * size / 1e9:.3g} GB of memory to read, "
-            f"{free / 1e9:.3g} GB are free; simplify it, or cut out what is near the swarm"
+            f"{name}: a face names vertex {faces.max()} of {len(vertices)}; repair the file"
         )
+    used, faces = np.unique(faces, return_inverse=True)
+    corners = vertices[used].astype(np.float64).reshape(-1, 3)
+    return Piece(corners, faces.reshape(-1, 3), tuple(str(label) for label in labels if label))
 
 
-def _loaded(path: Path, load: Callable[..., Any]) -> Any:
-    """What trimesh makes of a file, or a CityError that says why it cannot."""
-    check_size(path)
+def _scanned(path: Path) -> Iterator[Piece]:
+    """PLY and STL, with the numbers alone taken from trimesh."""
+    from trimesh.exchange import ply, stl
+    from trimesh.geometry import triangulate_quads
+
+    file = BytesIO(read_bytes(path))
+    is_ply = path.suffix.lower() == ".ply"
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "string or file could not be read to its end")
+        found = ply.load_ply(file, skip_materials=True) if is_ply else stl.load_stl(file)
+    for kind, element in found["metadata"].get("_ply_raw", {}).items() if is_ply else ():
+        data = element.get("data", ())
+        rows = len(next(iter(data.values()), ()) if isinstance(data, dict) else data)
+        if rows != element["length"]:
+            raise ValueError(f"{rows} of {element['length']} rows of {kind}")
+    for label, part in found.get("geometry", {path.name: found}).items():
+        vertices = np.asarray(part["vertices"], dtype=np.float64).reshape(-1, 3)
+        faces = triangulate_quads(part.get("faces", ())).astype(np.int64).reshape(-1, 3)
+        yield Piece(vertices, faces, (label,))
+
+
+def _wavefront(path: Path) -> Iterator[Piece]:
+    """OBJ: one piece for each material, or for each object where there is none."""
+    text = read_bytes(path).decode(errors="replace").replace("\\\n", " ")
+    vertices: list[list[float]] = []
+    groups: dict[str, list[list[int]]] = {}
+    thing, material = path.name, ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        kind, _, rest = line.strip().replace("\t", " ").partition(" ")
+        if kind == "usemtl":
+            material = rest.strip()
+        elif kind in ("o", "g"):
+            thing = rest.strip()
+        elif kind in ("v", "f"):
+            try:
+                if kind == "v":
+                    x, y, z = rest.split()[:3]
+                    vertices.append([float(x), float(y), float(z)])
+                    continue
+                corners = [int(word.partition("/")[0]) for word in rest.split()]
+            except ValueError as error:
+                raise CityError(f"{path.name}: line {number}: {error}; export it again") from None
+            corners = [n - 1 if n > 0 else len(vertices) + n for n in corners]
+            triangles = groups.setdefault(material or thing, [])
+            triangles += [corners[:3]] if len(corners) > 2 else []
+            triangles += [
+                [corners[i], corners[i + 1], corners[0]] for i in range(2, len(corners) - 1)
+            ]
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    for name, triangles in reversed(groups.items()):
+        labels = (name,) if len(groups) > 1 else (thing, name)
+        yield _used(points, np.array(triangles, dtype=np.int64).reshape(-1, 3), labels, path.name)
+
+
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+def _gltf(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The description and the binary chunk of a glTF or GLB file."""
+    data = read_bytes(path)
+    chunks, at = [data], 12
+    if data.startswith(b"glTF"):
+        chunks = []
+        while at + 8 <= len(data) and len(chunks) < 2:
+            end = at + 8 + int.from_bytes(data[at : at + 4], "little")
+            chunks.append(data[at + 8 : end])
+            at = end
+    text, binary, *_ = *chunks, b"", b""
+    return from_json(text, allow_inf_nan=False), binary
+
+
+def _buffer_file(path: Path, buffer: dict[str, Any]) -> Path | None:
+    """Where a buffer lies, if in a file of its own."""
+    uri = buffer.get("uri", "data:")
+    return None if uri.startswith("data:") else beside(path, uri, "a buffer")
+
+
+class _Numbers:
+    """The numbers of a glTF file's accessors; each file is read once."""
+
+    def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
+        self._path, self._tree = path, tree
+        self._read: dict[Path | str | None, bytes] = {None: binary}
+
+    def _bytes(self, buffer: dict[str, Any]) -> bytes:
+        file = _buffer_file(self._path, buffer)
+        key = file or buffer.get("uri")
+        if key not in self._read:
+            encoded = buffer["uri"].partition("base64,")[2]
+            self._read[key] = base64.b64decode(encoded) if file is None else read_bytes(file)
+        return self._read[key]
+
+    def rows(self, index: int, kind: str) -> NDArray:
+        """(count, 1 or 3) numbers of an accessor of kind SCALAR or VEC3."""
+        accessor, width = self._tree["accessors"][index], {"SCALAR": 1, "VEC3": 3}[kind]
+        count, start = accessor["count"], accessor.get("byteOffset", 0)
+        if "bufferView" not in accessor or accessor["type"] != kind or accessor.get("normalized"):
+            raise ValueError(f"accessor {index} is compressed, sparse, normalized or no {kind}")
+        view = self._tree["bufferViews"][accessor["bufferView"]]
+        data = memoryview(self._bytes(self._tree["buffers"][view["buffer"]]))
+        data = data[view.get("byteOffset", 0) :][: view["byteLength"]][start:]
+        dtype = np.dtype(_DTYPES[accessor["componentType"]])
+        stride = view.get("byteStride", width * dtype.itemsize)
+        last = (count - 1) * stride + width * dtype.itemsize
+        if not (0 <= count <= 3 * MAX_FACES and 0 < stride and (not count or last <= len(data))):
+            raise ValueError(f"accessor {index} with {count} rows ends behind its data")
+        return np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
+
+
+def _triangles(corners: NDArray, mode: int) -> NDArray[np.int64]:
+    """(F, 3) triangles of a primitive's corners; none of points and lines."""
+    corners = corners.astype(np.int64).reshape(-1)
+    if mode == _TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    i = np.arange(max(len(corners) - 2, 0))
+    if mode == _STRIP:
+        return corners[np.column_stack([i, i + 1 + i % 2, i + 2 - i % 2])]
+    return corners[np.column_stack([0 * i, i + 1, i + 2])] if mode == _FAN else corners[:0, None]
+
+
+def _to_parent(node: dict[str, Any]) -> NDArray[np.float64]:
+    """(4, 4) from a node to its parent."""
+    from trimesh.transformations import quaternion_matrix, translation_matrix
+
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    turned = translation_matrix(node.get("translation", (0, 0, 0))) @ quaternion_matrix(
+        [w, x, y, z]
+    )
+    return turned @ np.diag([*node.get("scale", (1.0, 1.0, 1.0)), 1.0])
+
+
+def _scene(path: Path) -> Iterator[Piece]:
+    """glTF and GLB: every primitive of every node, in world coordinates."""
+    tree, binary = _gltf(path)
+    numbers = _Numbers(path, tree, binary)
+    roots = tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+    left, seen = [(np.eye(4), root) for root in roots], set[int]()
+    while left:
+        above, number = left.pop()
+        if number in seen:
+            raise ValueError(f"node {number} hangs from two nodes")
+        seen.add(number)
+        node = tree["nodes"][number]
+        place = above @ _to_parent(node)
+        left += [(place, child) for child in node.get("children", [])]
+        mesh = tree["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
+        for primitive in mesh["primitives"]:
+            points = numbers.rows(primitive["attributes"]["POSITION"], "VEC3")
+            indexed = "indices" in primitive
+            corners = (
+                numbers.rows(primitive["indices"], "SCALAR") if indexed else np.arange(len(points))
+            )
+            of = tree["materials"][primitive["material"]] if "material" in primitive else {}
+            labels = (node.get("name", str(number)), mesh.get("name"), of.get("name"))
+            faces = _triangles(corners, primitive.get("mode", _TRIANGLES))
+            piece = _used(points, faces, labels, path.name)
+            yield replace(piece, vertices=piece.vertices @ place[:3, :3].T + place[:3, 3])
+
+
+_READERS: dict[str, Callable[[Path], Iterator[Piece]]] = {
+    ".ply": _scanned,
+    ".obj": _wavefront,
+    ".stl": _scanned,
+    ".glb": _scene,
+    ".gltf": _scene,
+}
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Whatever a parser raises becomes one message."""
     try:
-        return load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
+        yield
+    except CityError:
+        raise
+    except Exception as error:
         raise CityError(
             f"{path.name}: not readable as a mesh ({type(error).__name__}: {error}); export it "
             "again"
         ) from None
 
 
-def read_triangles(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and triangles of a file that holds one mesh, untouched but for the triangulation of
-    larger faces."""
-    import trimesh
+def pieces(path: Path, formats: tuple[str, ...] = tuple(_READERS)) -> Iterator[Piece]:
+    """The pieces of a mesh file; larger faces become triangles.
 
-    mesh = _loaded(path, trimesh.load_mesh)
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    Raises
+    ------
+    CityError
+    """
+    if path.suffix.lower() not in formats:
+        raise CityError(
+            f"{path.name}: {path.suffix!r} is not a mesh format known here; use one of "
+            f"{', '.join(formats)}"
+        )
+    with _readable(path):
+        yield from _READERS[path.suffix.lower()](path)
 
 
-def _labels(node: str, geometry: str, mesh: object) -> list[str]:
-    """The names by which a piece may be called: node, geometry, material."""
-    material = getattr(getattr(mesh, "visual", None), "material", None)
-    names = [node, geometry, getattr(material, "name", None)]
-    return [str(name) for name in names if name]
+def mesh_files(path: Path) -> list[Path]:
+    """A mesh file and those that it is read from."""
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return [path]
+    with _readable(path):
+        named = [_buffer_file(path, buffer) for buffer in _gltf(path)[0].get("buffers", [])]
+    return list(dict.fromkeys([path, *(file for file in named if file is not None)]))
 
 
-def _use(labels: list[str], city: scenario.City) -> MaterialUse:
+def _use(labels: tuple[str, ...], city: scenario.City) -> MaterialUse:
     for label in labels:
         if label in city.material_map:
             return MaterialUse(city.material_map[label])
-    for label in reversed(labels):
-        known = canonical_name(label)
-        if known is not None:
-            return MaterialUse(known)
-    return MaterialUse(city.material)
+    known = (canonical_name(label) for label in reversed(labels))
+    return MaterialUse(next((name for name in known if name is not None), city.material))
 
 
 def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
@@ -89,33 +277,21 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
     ------
     CityError
     """
-    import trimesh
+    seen, notes = set[str](), list[str]()
 
-    if path.suffix.lower() not in SUFFIXES:
-        raise CityError(
-            f"{path.name}: {path.suffix!r} is not a mesh format known here; use one of "
-            f"{', '.join(SUFFIXES)}"
-        )
-    scene = _loaded(path, trimesh.load_scene)
-    surfaces, seen, notes = [], set(), []
-    for node in scene.graph.nodes_geometry:
-        transform, geometry = scene.graph[node]
-        mesh = scene.geometry[geometry]
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            notes.append(f"{geometry}: no triangles, left out")
-            continue
-        vertices = (
-            np.asarray(mesh.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
-        )
-        vertices = vertices * city.scale
-        if city.up_axis == "y":
-            vertices = vertices @ _Y_UP_TO_Z_UP.T
-        labels = _labels(str(node), str(geometry), mesh)
-        seen.update(labels)
-        surfaces.append(
-            Surface(vertices, np.asarray(mesh.faces, dtype=np.int64), _use(labels, city))
-        )
-    if not surfaces:
+    def surfaces() -> Iterator[Surface]:
+        for piece in pieces(path):
+            if not len(piece.faces):
+                notes.append(f"{piece.labels[0]}: no triangles, left out")
+                continue
+            vertices = piece.vertices * city.scale
+            if city.up_axis == "y":
+                vertices = vertices @ _Y_UP_TO_Z_UP.T
+            seen.update(piece.labels)
+            yield Surface(vertices, piece.faces, _use(piece.labels, city))
+
+    found = gathered(surfaces(), path.name)
+    if not found:
         raise CityError(f"{path.name}: there is no triangle in it; export a mesh")
     unused = sorted(set(city.material_map) - seen)
     if unused:
@@ -125,4 +301,4 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
         )
     if path.suffix.lower() in (".glb", ".gltf") and city.up_axis == "z":
         notes.append("glTF is y-up by its standard, and city.up_axis is z")
-    return surfaces, notes
+    return found, notes

@@ -6,13 +6,18 @@ from __future__ import annotations
 import importlib.util
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from isac_rt import scenario
+from isac_rt.scenario.environment import MaterialOverride
+from isac_rt.world.city.files import beside, read_bytes
 from isac_rt.world.city.materials import (
     DEFAULT_EXPONENT,
     DEFAULT_THICKNESS,
@@ -21,28 +26,52 @@ from isac_rt.world.city.materials import (
     MaterialUse,
     canonical_name,
 )
-from isac_rt.world.city.mesh import Surface
-from isac_rt.world.city.meshfiles import read_triangles
+from isac_rt.world.city.mesh import Surface, gathered
+from isac_rt.world.city.meshfiles import pieces
 
-_RECTANGLE = (
-    np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
-    np.array([[0, 1, 2], [0, 2, 3]]),
-)
-_CUBE = (
-    np.array([[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)]),
-    np.array(
-        "0 2 3 0 3 1 4 5 7 4 7 6 0 1 5 0 5 4 2 6 7 2 7 3 0 4 6 0 6 2 1 3 7 1 7 5".split(), int
-    ).reshape(-1, 3),
-)
+_MESHES = ("ply", "obj", "stl")
+_LONGEST = 1000
+"""Characters of an attribute, before and after its defaults are put in."""
+_SHAPES = {
+    "rectangle": (
+        np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    ),
+    "cube": (
+        np.array([[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)]),
+        np.array(
+            [list(t) for t in "023 031 457 476 015 054 267 273 046 062 137 175".split()], dtype=int
+        ),
+    ),
+}
 
 
-@dataclass
+class _Tree(ET.TreeBuilder):
+    """Builds the tree of a file without a document type, whose entities might grow without end."""
+
+    def doctype(self, *_: str | None) -> None:
+        raise ValueError("a <!DOCTYPE> is not read here")
+
+
+@dataclass(frozen=True)
 class _Reader:
-    """One file: where it is, its defaults, and its materials by id."""
+    """One file: where it is, what it holds, and its defaults."""
 
     path: Path
-    city: scenario.City
+    root: ET.Element
     defaults: dict[str, str]
+
+    @classmethod
+    def of(cls, path: Path) -> _Reader:
+        parser = ET.XMLParser(target=_Tree())
+        try:
+            root = ET.fromstring(read_bytes(path), parser)
+        except (ET.ParseError, LookupError, ValueError) as error:
+            raise CityError(
+                f"{path.name}: not readable as XML ({error}); export it again"
+            ) from None
+        defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
+        return cls(path, root, defaults)
 
     def text(self, element: ET.Element, key: str, otherwise: str | None = None) -> str | None:
         """An attribute with `$name` replaced."""
@@ -54,32 +83,45 @@ class _Reader:
             name = match.group(1) or match.group(2)
             if name not in self.defaults:
                 raise CityError(f"{self.path.name}: ${name} has no <default>; give it one")
-            return self.defaults[name]
+            return self.defaults[name][:_LONGEST]
 
+        if len(value) > _LONGEST:
+            raise CityError(
+                f"{self.path.name}: <{element.tag} {key}> has {len(value)} characters, more than "
+                f"{_LONGEST}; shorten it"
+            )
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", known, value)
 
     def numbers(
-        self, element: ET.Element, key: str = "value", otherwise: str | None = None
+        self,
+        element: ET.Element,
+        counts: tuple[int, ...],
+        key: str = "value",
+        otherwise: str | None = None,
     ) -> NDArray[np.float64]:
+        """The finite numbers of an attribute, as many as one of `counts`."""
         value = self.text(element, key, otherwise)
         try:
-            return np.array([float(v) for v in re.split(r"[\s,]+", (value or "").strip())])
+            numbers = np.array([float(v) for v in re.split(r"[\s,]+", (value or "").strip())])
         except ValueError:
+            numbers = np.full(1, np.nan)
+        if len(numbers) not in counts or not np.isfinite(numbers).all():
             raise CityError(
-                f"{self.path.name}: <{element.tag} {key}={value!r}> is not a list of numbers; "
-                "correct it"
-            ) from None
+                f"{self.path.name}: <{element.tag} {key}={value!r}> is not a list of "
+                f"{' or '.join(map(str, counts))} numbers; correct it"
+            )
+        return numbers
 
     def scalar(self, element: ET.Element, name: str) -> float | None:
         found = element.find(f"float[@name='{name}']")
-        return None if found is None else float(self.numbers(found)[0])
+        return None if found is None else float(self.numbers(found, (1,))[0])
 
 
 def _vector(reader: _Reader, element: ET.Element, missing: float) -> NDArray[np.float64]:
     if element.get("value") is not None:
-        value = reader.numbers(element)
+        value = reader.numbers(element, (1, 3))
         return np.full(3, value[0]) if value.size == 1 else value
-    return np.array([reader.numbers(element, axis, str(missing))[0] for axis in "xyz"])
+    return np.array([reader.numbers(element, (1,), axis, str(missing))[0] for axis in "xyz"])
 
 
 def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
@@ -100,10 +142,10 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
         elif part.tag == "scale":
             step[:3, :3] = np.diag(_vector(reader, part, 1.0))
         elif part.tag == "rotate":
-            angle = np.deg2rad(reader.numbers(part, "angle", "0")[0])
+            angle = np.deg2rad(reader.numbers(part, (1,), "angle", "0")[0])
             step[:3, :3] = _rotation(_vector(reader, part, 0.0), angle)
         elif part.tag == "matrix":
-            values = reader.numbers(part)
+            values = reader.numbers(part, (9, 16))
             size = round(values.size**0.5)
             step[:size, :size] = values.reshape(size, size)
         else:
@@ -115,76 +157,73 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
     return total
 
 
-def _material(reader: _Reader, bsdf: ET.Element) -> MaterialUse:
+def _material(reader: _Reader, city: scenario.City, bsdf: ET.Element) -> MaterialUse:
     name = reader.text(bsdf, "id") or ""
-    if name in reader.city.material_map:
-        return MaterialUse(reader.city.material_map[name])
-    thickness = reader.scalar(bsdf, "thickness")
-    if bsdf.get("type") == "radio-material":
-        eps, sigma = (
-            reader.scalar(bsdf, "relative_permittivity"),
-            reader.scalar(bsdf, "conductivity"),
+    if name in city.material_map:
+        return MaterialUse(city.material_map[name])
+    given = {
+        key: reader.scalar(bsdf, key.removesuffix("_s_per_m").removesuffix("_m"))
+        for key in (
+            "relative_permittivity",
+            "conductivity_s_per_m",
+            "scattering_coefficient",
+            "thickness_m",
         )
-        scattering = reader.scalar(bsdf, "scattering_coefficient")
+    }
+    try:
+        numbers = MaterialOverride.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CityError(
+            f"{reader.path.name}: <bsdf id={name!r}>: {first['loc'][0]}: {first['msg']}; correct it"
+        ) from None
+    thickness = numbers.thickness_m
+    if bsdf.get("type") == "radio-material":
         defined = Material(
             name,
-            1.0 if eps is None else eps,
-            sigma or 0.0,
-            scattering or 0.0,
+            numbers.relative_permittivity or 1.0,
+            numbers.conductivity_s_per_m or 0.0,
+            numbers.scattering_coefficient or 0.0,
             "lambertian",
             DEFAULT_EXPONENT,
-            DEFAULT_THICKNESS if thickness is None else thickness,
+            thickness or DEFAULT_THICKNESS,
             f"numbers in {reader.path.name}",
         )
         return MaterialUse(name, defined=defined)
     kind = bsdf.find("string[@name='type']")
     wanted = name if kind is None else reader.text(kind, "value") or name
     short = name.removeprefix("mat-")
-    if canonical_name(wanted) is None and short in reader.city.materials:
+    if canonical_name(wanted) is None and short in city.materials:
         wanted = short
     return MaterialUse(canonical_name(wanted) or wanted, thickness)
 
 
-def _bsdf_of(reader: _Reader, shape: ET.Element, by_id: dict[str, ET.Element]) -> MaterialUse:
-    own = shape.find("bsdf")
-    if own is not None:
-        return _material(reader, own)
-    for ref in shape.findall("ref"):
-        key = reader.text(ref, "id")
-        if key in by_id:
-            return _material(reader, by_id[key])
-    return MaterialUse(reader.city.material)
+def _mesh_path(reader: _Reader, shape: ET.Element) -> Path:
+    """The mesh file that a shape names."""
+    what = f"shape {shape.get('id')!r}"
+    node = shape.find("string[@name='filename']")
+    if node is None:
+        raise CityError(f"{reader.path.name}: {what} has no filename; give it one")
+    return beside(reader.path, reader.text(node, "value") or "", what)
 
 
-def _geometry(reader: _Reader, shape: ET.Element) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    kind = shape.get("type")
-    if kind in ("ply", "obj", "stl"):
-        node = shape.find("string[@name='filename']")
-        if node is None:
-            raise CityError(
-                f"{reader.path.name}: shape {shape.get('id')!r} has no filename; give it one"
-            )
-        folder = reader.path.parent.resolve()
-        file = (folder / (reader.text(node, "value") or "")).resolve()
-        if not file.is_relative_to(folder):
-            name = reader.text(node, "value")
-            raise CityError(
-                f"{reader.path.name}: shape {shape.get('id')!r} wants {name}, outside the scene's "
-                "folder; copy it there"
-            )
-        if not file.is_file():
-            raise CityError(
-                f"{reader.path.name}: shape {shape.get('id')!r} wants "
-                f"{reader.text(node, 'value')}, which is missing"
-            )
-        return read_triangles(file)
-    if kind == "rectangle":
-        return _RECTANGLE
-    if kind == "cube":
-        return _CUBE
-    raise CityError(
-        f"{reader.path.name}: shape {shape.get('id')!r} is of type {kind!r}; ply, obj, stl, "
-        "rectangle and cube are read here"
+def mitsuba_files(path: Path) -> list[Path]:
+    """A Mitsuba scene file and the meshes that it is read from."""
+    reader = _Reader.of(path)
+    shapes = (s for s in reader.root.iter("shape") if s.get("type") in _MESHES)
+    return list(dict.fromkeys([path, *(_mesh_path(reader, shape) for shape in shapes)]))
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and triangles of a mesh file."""
+    parts = list(pieces(path, tuple(f".{name}" for name in _MESHES)))
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return (
+        np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
+        np.concatenate(
+            [np.zeros((0, 3), dtype=np.int64)]
+            + [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
+        ),
     )
 
 
@@ -199,24 +238,42 @@ def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[s
     ------
     CityError
     """
-    try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
-        raise CityError(f"{path.name}: not readable as XML ({error}); export it again") from None
-    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
-    reader = _Reader(path, city, defaults)
-    by_id = {str(b.get("id")): b for b in root.findall("bsdf")}
-    surfaces = []
-    for shape in root.iter("shape"):
-        if shape.get("type") == "merge":
-            continue  # its members come along by themselves
-        vertices, faces = _geometry(reader, shape)
-        transform = transform_of(reader, shape)
-        vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
-        surfaces.append(Surface(vertices, faces, _bsdf_of(reader, shape, by_id)))
-    if not surfaces:
+    reader = _Reader.of(path)
+    by_id = {str(b.get("id")): b for b in reader.root.findall("bsdf")}
+    read, known = cache(_read), cache(lambda key: _material(reader, city, by_id[key]))
+
+    def use(shape: ET.Element) -> MaterialUse:
+        own = shape.find("bsdf")
+        if own is not None:
+            return _material(reader, city, own)
+        keys = (reader.text(ref, "id") for ref in shape.findall("ref"))
+        key = next((key for key in keys if key in by_id), None)
+        return MaterialUse(city.material) if key is None else known(key)
+
+    def geometry(shape: ET.Element) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        kind = shape.get("type")
+        if kind in _MESHES:
+            return read(_mesh_path(reader, shape))
+        if kind not in _SHAPES:
+            raise CityError(
+                f"{path.name}: shape {shape.get('id')!r} is of type {kind!r}; "
+                f"{', '.join((*_MESHES, *_SHAPES))} are read here"
+            )
+        return _SHAPES[kind]
+
+    def surfaces() -> Iterator[Surface]:
+        for shape in reader.root.iter("shape"):
+            if shape.get("type") == "merge":
+                continue  # its members come along by themselves
+            vertices, faces = geometry(shape)
+            transform = transform_of(reader, shape)
+            vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+            yield Surface(vertices, faces, use(shape))
+
+    found = gathered(surfaces(), path.name)
+    if not found:
         raise CityError(f"{path.name}: there is no shape in it; export the scene with its meshes")
-    return surfaces, []
+    return found, []
 
 
 def builtin_path(name: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -12,39 +13,54 @@ from isac_rt import scenario
 from isac_rt.world.city.footprints import footprints
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
-from isac_rt.world.city.meshfiles import mesh_file
-from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file
+from isac_rt.world.city.meshfiles import mesh_file, mesh_files
+from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
 from isac_rt.world.city.parametric import blocks, canyon
 
 
-def _file(city: scenario.City, folder: Path) -> Path:
-    if not city.file:
-        raise CityError(
-            f"city.source {city.source} needs city.file: a path, relative to the scenario's folder"
-        )
-    path = folder / city.file
-    if not path.is_file():
-        raise CityError(
-            f"city.file {city.file!r} does not exist in {folder}; paths are relative to the "
-            "scenario's folder"
-        )
-    return path
-
-
-def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], list[str]]:
+def _path(city: scenario.City, folder: Path) -> Path:
     if city.source == "builtin":
         if not city.name:
             raise CityError(
                 "city.source builtin needs city.name, such as munich or simple_street_canyon"
             )
-        return city.name, *mitsuba_file(city, builtin_path(city.name))
+        return builtin_path(city.name)
+    if not city.file:
+        raise CityError(
+            f"city.source {city.source} needs city.file: a path, relative to the scenario's folder"
+        )
+    path = folder / city.file
+    if not os.path.isfile(path):
+        raise CityError(
+            f"city.file {city.file!r} does not exist in {folder}, or is no file; paths are "
+            "relative to the scenario's folder"
+        )
+    return path
+
+
+def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
+    """Every file that a city is read from, in an order of their own.
+
+    Raises
+    ------
+    CityError  If one is missing.
+    """
+    if city is None or city.source in ("canyon", "blocks"):
+        return []
+    path = _path(city, folder)
+    if city.source == "footprints":
+        return [path]
+    return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
+
+
+def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], list[str]]:
     if city.source == "canyon":
         return city.name or "canyon", canyon(city), []
     if city.source == "blocks":
         return city.name or "blocks", blocks(city), []
-    path = _file(city, folder)
-    read = {"mitsuba": mitsuba_file, "mesh": mesh_file, "footprints": footprints}[city.source]
-    return path.name, *read(city, path)
+    path = _path(city, folder)
+    read = {"mesh": mesh_file, "footprints": footprints}.get(city.source, mitsuba_file)
+    return city.name or path.name, *read(city, path)
 
 
 def load_city(
@@ -78,7 +94,8 @@ def load_city(
         raise CityError(f"the centre {origin} is not finite; check the positions of the swarm")
     if city is None:
         return empty_city("free space", origin)
-    name, surfaces, notes = _surfaces(city, Path(folder))
+    with np.errstate(all="ignore"):  # what overflows is refused by `clean`
+        name, surfaces, notes = _surfaces(city, Path(folder))
     uses, materials = resolve_materials(
         [s.material for s in surfaces], carrier_frequency, city.materials
     )

@@ -1,0 +1,102 @@
+"""How a file of a city is read: whole, of a size that memory holds, from where it may lie, and
+checked against a schema."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Annotated, TypeVar
+from urllib.parse import unquote
+
+from pydantic import BaseModel, ConfigDict, FailFast, ValidationError
+
+from isac_rt.runtime import available_memory
+from isac_rt.world.city.materials import CityError
+
+MAX_BYTES = 1_000_000_000
+"""No file of a city may be larger than this."""
+READING_FACTOR = 6
+"""Memory that reading a mesh takes, over the size of its file: text, arrays and their copies;
+measured 3 to 5."""
+JSON_FACTOR = 20
+"""The same for JSON, whose numbers become objects; measured 11 to 18."""
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+
+class Part(BaseModel):
+    """A part of a JSON file: of the types that its format says, with finite numbers, and with keys
+    that are not looked at."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+
+
+Document = TypeVar("Document", bound=BaseModel)
+Item = TypeVar("Item")
+Items = Annotated[list[Item], FailFast()]
+"""A list that is left at its first wrong item: a file may have a million of them."""
+
+
+def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
+    """The content of a regular file.
+
+    Raises
+    ------
+    CityError  If there is none, it is a device or a pipe, or reading it takes `factor` times its
+        size of memory and more than there is.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise CityError(f"{path.name}: is no regular file; give a file")
+        size, free = status.st_size, available_memory()
+        if free is not None and factor * size > free:
+            raise CityError(
+                f"{path.name}: a file of {size / 1e9:.3g} GB takes about "
+                f"{factor * size / 1e9:.3g} GB of memory to read, "
+                f"{free / 1e9:.3g} GB are free; simplify it, or cut out what is near the swarm"
+            )
+        if size > MAX_BYTES:
+            raise CityError(
+                f"{path.name}: a file of {size / 1e9:.3g} GB, more than the "
+                f"{MAX_BYTES / 1e9:g} GB that are read; cut out what is near the swarm"
+            )
+        with path.open("rb") as opened:
+            return opened.read(size)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise CityError(f"{path.name}: cannot be read ({error}); give a file") from None
+
+
+def beside(path: Path, name: str, what: str) -> Path:
+    """The file that `what` in the file `path` names: in its folder or below, and nowhere else.
+
+    Raises
+    ------
+    CityError
+    """
+    folder = Path(os.path.realpath(path.parent))
+    file = folder / unquote(name)
+    try:
+        inside = Path(os.path.realpath(file)).is_relative_to(folder)
+    except (OSError, ValueError):
+        inside = False
+    if not inside:
+        raise CityError(f"{path.name}: {what} wants {name}, outside its folder; copy it there")
+    if not os.path.isfile(file):
+        raise CityError(f"{path.name}: {what} wants {name}, which is missing or no file")
+    return file
+
+
+def parsed(data: bytes, model: type[Document], name: str, remedy: str) -> Document:
+    """A JSON file as its format's model.
+
+    Raises
+    ------
+    CityError  With the first place that is not as it should be.
+    """
+    try:
+        return model.model_validate_json(data.removeprefix(_BYTE_ORDER_MARK))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place = " ".join(str(part) for part in first["loc"])
+        raise CityError(f"{name}: {place}: {first['msg']}; {remedy}") from None
