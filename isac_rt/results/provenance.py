@@ -103,7 +103,7 @@ def path_content(tree: Mapping[str, Any], city: str) -> str:
     Parameters
     ----------
     tree : the scenario as plain values
-    city : digest of the city's file
+    city : digest of the city's files
     """
     seen = {key: value for key, value in tree.items() if key not in UNSEEN_BY_PATHS}
     return json.dumps([seen, city, program_fingerprint()], sort_keys=True)

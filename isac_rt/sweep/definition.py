@@ -22,10 +22,12 @@ from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
 from isac_rt.results.provenance import path_content, program_fingerprint
 from isac_rt.scenario.document import Document, ScenarioError
+from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import load, plain_tree
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
-from isac_rt.world.area import file_digest
+from isac_rt.world.area import city_digest, file_digest
+from isac_rt.world.city import CityError
 
 MAX_POINTS = 100_000
 """More points than this are taken for a slip unless asked for."""
@@ -226,23 +228,22 @@ class Plan:
 
     def key_of(self, tree: dict[str, Any]) -> str:
         """Under which a point is kept."""
-        files = (
-            self._named_file(tree, "city", "file"),
-            self._named_file(tree, "accuracy", "cost_model"),
-        )
+        costs = (tree.get("accuracy") or {}).get("cost_model")
+        files = self._city(tree), "" if costs is None else _file_digest(self.base.folder / costs)
         return _digest([tree, *files, program_fingerprint()])
 
     def paths_key(self, tree: dict[str, Any]) -> str | None:
         """Under which a point's paths are kept; None where they are not traced."""
         if (tree.get("propagation") or {}).get("model") != "ray_traced":
             return None
-        return _digest(path_content(tree, self._named_file(tree, "city", "file")))
+        return _digest(path_content(tree, self._city(tree)))
 
-    def _named_file(self, tree: dict[str, Any], part: str, key: str) -> str:
-        """Digest of the file that a key names, "" without one."""
-        node = tree.get(part)
-        file = node.get(key) if isinstance(node, dict) else None
-        return "" if file is None else _file_digest(self.base.folder / str(file))
+    def _city(self, tree: dict[str, Any]) -> str:
+        """Digest of the files of a point's city."""
+        city = {
+            k: v for k, v in (tree.get("city") or {}).items() if k in ("source", "name", "file")
+        }
+        return _city_digest(self.base.folder, json.dumps(city)) if city else ""
 
 
 def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
@@ -287,6 +288,15 @@ def put(tree: dict[str, Any], key: str, value: Any) -> None:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+
+
+@lru_cache(maxsize=64)
+def _city_digest(folder: Path, named: str) -> str:
+    city = City.model_construct(**json.loads(named))
+    try:
+        return city_digest(city, folder)
+    except (CityError, OSError):
+        return ""  # the point's own check says what is missing
 
 
 @lru_cache(maxsize=64)

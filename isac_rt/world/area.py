@@ -12,7 +12,7 @@ import numpy as np
 
 from isac_rt.scenario import environment
 from isac_rt.scenario.file import plain_tree
-from isac_rt.world.city import CityMesh, load_city
+from isac_rt.world.city import CityMesh, city_files, load_city
 
 
 def city_about(
@@ -49,8 +49,14 @@ def _loaded_city(
 
 
 def city_digest(city: environment.City | None, folder: Path) -> str:
-    """SHA-256 of the city's file, "" without one."""
-    return "" if city is None or city.file is None else file_digest(folder / city.file)
+    """SHA-256 of every file that the city is read from, "" without one.
+
+    Raises
+    ------
+    CityError  If one is missing.
+    """
+    digests = [file_digest(file) for file in city_files(city, folder)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 
 
 def file_digest(file: Path) -> str:

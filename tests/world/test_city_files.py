@@ -12,6 +12,7 @@ import json
 import os
 import random
 import struct
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -21,8 +22,11 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
-from isac_rt.world.area import city_digest
-from isac_rt.world.city import CityError, load_city
+from isac_rt.results.provenance import path_content, run_content
+from isac_rt.scenario.file import load
+from isac_rt.sweep import load_sweep
+from isac_rt.world.area import city_about, city_digest
+from isac_rt.world.city import CityError, city_files, load_city
 from isac_rt.world.city.materials import MAX_MATERIALS
 
 SECONDS = 8.0
@@ -468,3 +472,94 @@ def test_twenty_thousand_materials_in_a_mesh(tmp_path):
 def test_a_byte_order_mark_is_no_harm(tmp_path):
     (tmp_path / "f.geojson").write_bytes(b"\xef\xbb\xbf" + collection(feature([SQUARE])))
     assert complaint(tmp_path, "footprints", "f.geojson", coordinates="metres") is None
+
+
+# ---- what a city depends on
+
+
+SCENARIO = """
+name: s
+city: {{source: {source}, file: {file}}}
+propagation: {{model: ray_traced}}
+swarm:
+  A: {{role: active, position_m: [0, 0, 60]}}
+  U: {{role: target, position_m: [1, 30, 60]}}
+"""
+SWEEP = """
+scenario: s.yaml
+name: w
+axes: {snr: {key: noise.snr_db, values: [1, 2]}}
+"""
+
+
+def keys(folder: Path) -> dict[str, str]:
+    """All keys that hold the city of the scenario in a folder."""
+    from isac_rt.sweep.definition import _city_digest
+
+    _city_digest.cache_clear()
+    read = load(folder / "s.yaml")
+    point = next(load_sweep(folder / "w.yaml").points())
+    return {
+        "city": city_digest(read.city, folder),
+        "paths": path_content(read.model_dump(mode="json"), city_digest(read.city, folder)),
+        "run": run_content(read, 0),
+        "point": point.key,
+        "paths of a point": str(point.paths_key),
+    }
+
+
+def opened(folder: Path, source: str, file: str) -> set[str]:
+    """Names of the files in a folder that reading a city opens."""
+    names, watched = set[str](), True
+
+    def watch(event: str, arguments: tuple) -> None:
+        if watched and event == "open" and str(arguments[0]).startswith(str(folder)):
+            names.add(Path(arguments[0]).name)
+
+    sys.addaudithook(watch)
+    city(folder, source, file)
+    watched = False
+    return names
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_keys_hold_every_file_that_is_read_and_no_other(kind, tmp_path):
+    """Each file changed once. Seen failing for the meshes of a Mitsuba scene and the buffers of a
+    glTF file. An OBJ's colours are not read: its materials go by their names in `usemtl`."""
+    source, name, files = WHOLE[kind]
+    folder = write(tmp_path, files | {"beside.txt": b"x", "unused.ply": b"x"})
+    (folder / "s.yaml").write_text(SCENARIO.format(source=source, file=name))
+    (folder / "w.yaml").write_text(SWEEP)
+    before = keys(folder)
+    used = {file.name for file in city_files(scenario.City(source=source, file=name), folder)}
+    assert used == opened(folder, source, name)
+    assert used == set(files) - {"box.mtl"}
+    for changed in [*files, "beside.txt", "unused.ply"]:
+        whole = (folder / changed).read_bytes()
+        (folder / changed).write_bytes(whole + b"\n")
+        after = keys(folder)
+        assert {k for k in before if before[k] != after[k]} == (
+            set(before) if changed in used else set()
+        )
+        (folder / changed).write_bytes(whole)
+    assert keys(folder) == before
+
+
+def test_a_city_that_changes_behind_its_file_is_read_anew(tmp_path):
+    """Seen failing: the city in memory was handed out again."""
+    source, name, files = WHOLE["mitsuba"]
+    write(tmp_path, files)
+    node, place = scenario.City(source=source, file=name), np.zeros(3)
+    assert city_about(place, node, tmp_path, 77e9) is city_about(place, node, tmp_path, 77e9)
+    first = city_about(place, node, tmp_path, 77e9).bounds()
+    (tmp_path / "box.ply").write_bytes(
+        trimesh.creation.box(extents=(99.0, 7.0, 5.0)).export(file_type="ply")
+    )
+    assert not np.array_equal(city_about(place, node, tmp_path, 77e9).bounds(), first)
+
+
+def test_built_in_cities_are_held_by_their_files():
+    munich, box = (scenario.City(source="builtin", name=name) for name in ("munich", "box"))
+    assert len(city_files(munich, Path())) > 100
+    assert city_digest(munich, Path()) != city_digest(box, Path()) != ""
+    assert city_digest(scenario.City(source="canyon"), Path()) == city_digest(None, Path()) == ""
