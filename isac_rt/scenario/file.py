@@ -60,10 +60,10 @@ def load(
     folder = document.path.parent
     scenario = document.check(Scenario).in_folder(folder)
     city, costs = scenario.city, scenario.cost_model_path()
-    if city is not None and city.file is not None and not scenario.city_path().is_file():
+    if city is not None and city.file is not None and not os.path.isfile(scenario.city_path()):
         said = f"no such file in {folder}; the path is relative to the scenario's folder"
         raise ScenarioError(document.complaint(Problem((("city", "file"),), said)))
-    if costs is not None and not costs.is_file():
+    if costs is not None and not os.path.isfile(costs):
         said = f"no such file in {folder}; make one with isac-rt bench --fit {costs}"
         raise ScenarioError(document.complaint(Problem((("accuracy", "cost_model"),), said)))
     for doubt in doubts(scenario):

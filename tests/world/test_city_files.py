@@ -22,6 +22,7 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
+from isac_rt.cli.cli import main
 from isac_rt.results.provenance import path_content, run_content
 from isac_rt.scenario.file import load
 from isac_rt.sweep import load_sweep
@@ -563,3 +564,25 @@ def test_built_in_cities_are_held_by_their_files():
     assert len(city_files(munich, Path())) > 100
     assert city_digest(munich, Path()) != city_digest(box, Path()) != ""
     assert city_digest(scenario.City(source="canyon"), Path()) == city_digest(None, Path()) == ""
+
+
+@pytest.mark.parametrize(
+    ("source", "file"),
+    [
+        ("mitsuba", "scene.xml"),
+        ("footprints", "deep.geojson"),
+        ("mesh", "remote.gltf"),
+        ("mesh", "pipe.ply"),
+        ("mesh", "x" * 5000),
+        ("mesh", '"a\\0b"'),
+    ],
+)
+def test_a_run_in_a_hostile_city_ends_with_2_and_one_line(source, file, traps, capsys):
+    (traps / "scene.xml").write_text(XML["pipe"])
+    (traps / "deep.geojson").write_bytes(JSON["deep"])
+    (traps / "remote.gltf").write_bytes(MESH["remote.gltf"])
+    (traps / "s.yaml").write_text(SCENARIO.format(source=source, file=file))
+    assert main(["run", str(traps / "s.yaml"), "--out", str(traps / "o")]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said and "Traceback" not in said and len(said.splitlines()) == 1
+    assert not list(traps.glob("o/*"))
