@@ -19,12 +19,7 @@ MAX_CROSSINGS = 100
 
 
 def check_corners(count: int, what: str) -> None:
-    """Refuse a polygon of too many corners.
-
-    Raises
-    ------
-    CityError
-    """
+    """Refuse a polygon of too many corners."""
     if count > MAX_CORNERS:
         raise CityError(
             f"{what}: a polygon of {count} corners, more than {MAX_CORNERS}; simplify or split it"

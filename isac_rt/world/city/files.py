@@ -69,12 +69,7 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
 
 
 def beside(path: Path, name: str, what: str) -> Path:
-    """The file that `what` in the file `path` names: in its folder or below, and nowhere else.
-
-    Raises
-    ------
-    CityError
-    """
+    """The file that `what` in the file `path` names: in its folder or below, and nowhere else."""
     folder = Path(os.path.realpath(path.parent))
     file = folder / unquote(name)
     try:

@@ -260,12 +260,7 @@ def gathered(surfaces: Iterable[Surface], name: str) -> list[Surface]:
 
 
 def check_coordinates(coordinates: NDArray[np.float64], what: str) -> None:
-    """Refuse coordinates (..., D) that are no place on Earth. [m]
-
-    Raises
-    ------
-    CityError
-    """
+    """Refuse coordinates (..., D) that are no place on Earth. [m]"""
     if not np.isfinite(coordinates).all():
         bad = int((~np.isfinite(coordinates)).any(axis=-1).sum())
         raise CityError(

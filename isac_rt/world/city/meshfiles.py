@@ -234,12 +234,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def pieces(path: Path, formats: tuple[str, ...] = tuple(_READERS)) -> Iterator[Piece]:
-    """The pieces of a mesh file; larger faces become triangles.
-
-    Raises
-    ------
-    CityError
-    """
+    """The pieces of a mesh file; larger faces become triangles."""
     if path.suffix.lower() not in formats:
         raise CityError(
             f"{path.name}: {path.suffix!r} is not a mesh format known here; use one of "
@@ -271,12 +266,7 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
     turned z-up.
 
     A piece's material is what `material_map` says of its node, geometry or material name, else a
-    known material of that name, else `material`.
-
-    Raises
-    ------
-    CityError
-    """
+    known material of that name, else `material`."""
     seen, notes = set[str](), list[str]()
 
     def surfaces() -> Iterator[Surface]:

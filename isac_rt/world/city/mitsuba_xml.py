@@ -27,21 +27,23 @@ from isac_rt.world.city.materials import (
     canonical_name,
 )
 from isac_rt.world.city.mesh import Surface, gathered
-from isac_rt.world.city.meshfiles import pieces
+from isac_rt.world.city.meshfiles import Piece, pieces
 
-_MESHES = ("ply", "obj", "stl")
+_MESHES = (".ply", ".obj", ".stl")
 _LONGEST = 1000
 """Characters of an attribute, before and after its defaults are put in."""
+
+
+def _shape(corners: list[list[float]], faces: str) -> list[Piece]:
+    triangles = np.array([list(triangle) for triangle in faces.split()], dtype=np.int64)
+    return [Piece(np.array(corners), triangles, ())]
+
+
 _SHAPES = {
-    "rectangle": (
-        np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
-        np.array([[0, 1, 2], [0, 2, 3]]),
-    ),
-    "cube": (
-        np.array([[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)]),
-        np.array(
-            [list(t) for t in "023 031 457 476 015 054 267 273 046 062 137 175".split()], dtype=int
-        ),
+    "rectangle": _shape([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], "012 023"),
+    "cube": _shape(
+        [[x, y, z] for z in (-1.0, 1) for y in (-1.0, 1) for x in (-1.0, 1)],
+        "023 031 457 476 015 054 267 273 046 062 137 175",
     ),
 }
 
@@ -162,13 +164,9 @@ def _material(reader: _Reader, city: scenario.City, bsdf: ET.Element) -> Materia
     if name in city.material_map:
         return MaterialUse(city.material_map[name])
     given = {
-        key: reader.scalar(bsdf, key.removesuffix("_s_per_m").removesuffix("_m"))
-        for key in (
-            "relative_permittivity",
-            "conductivity_s_per_m",
-            "scattering_coefficient",
-            "thickness_m",
-        )
+        key: reader.scalar(bsdf, re.sub("_s_per_m$|_m$", "", key))
+        for key in MaterialOverride.model_fields
+        if key not in ("scattering_pattern", "pattern_exponent")
     }
     try:
         numbers = MaterialOverride.model_validate(given)
@@ -210,21 +208,8 @@ def _mesh_path(reader: _Reader, shape: ET.Element) -> Path:
 def mitsuba_files(path: Path) -> list[Path]:
     """A Mitsuba scene file and the meshes that it is read from."""
     reader = _Reader.of(path)
-    shapes = (s for s in reader.root.iter("shape") if s.get("type") in _MESHES)
+    shapes = (s for s in reader.root.iter("shape") if f".{s.get('type')}" in _MESHES)
     return list(dict.fromkeys([path, *(_mesh_path(reader, shape) for shape in shapes)]))
-
-
-def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and triangles of a mesh file."""
-    parts = list(pieces(path, tuple(f".{name}" for name in _MESHES)))
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    return (
-        np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
-        np.concatenate(
-            [np.zeros((0, 3), dtype=np.int64)]
-            + [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
-        ),
-    )
 
 
 def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
@@ -240,7 +225,8 @@ def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[s
     """
     reader = _Reader.of(path)
     by_id = {str(b.get("id")): b for b in reader.root.findall("bsdf")}
-    read, known = cache(_read), cache(lambda key: _material(reader, city, by_id[key]))
+    read = cache(lambda file: list(pieces(file, _MESHES)))
+    known = cache(lambda key: _material(reader, city, by_id[key]))
 
     def use(shape: ET.Element) -> MaterialUse:
         own = shape.find("bsdf")
@@ -250,25 +236,20 @@ def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[s
         key = next((key for key in keys if key in by_id), None)
         return MaterialUse(city.material) if key is None else known(key)
 
-    def geometry(shape: ET.Element) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        kind = shape.get("type")
-        if kind in _MESHES:
-            return read(_mesh_path(reader, shape))
-        if kind not in _SHAPES:
-            raise CityError(
-                f"{path.name}: shape {shape.get('id')!r} is of type {kind!r}; "
-                f"{', '.join((*_MESHES, *_SHAPES))} are read here"
-            )
-        return _SHAPES[kind]
-
     def surfaces() -> Iterator[Surface]:
         for shape in reader.root.iter("shape"):
-            if shape.get("type") == "merge":
+            kind = shape.get("type", "")
+            if kind == "merge":
                 continue  # its members come along by themselves
-            vertices, faces = geometry(shape)
-            transform = transform_of(reader, shape)
-            vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
-            yield Surface(vertices, faces, use(shape))
+            if kind not in _SHAPES and f".{kind}" not in _MESHES:
+                raise CityError(
+                    f"{path.name}: shape {shape.get('id')!r} is of type {kind!r}; "
+                    f"{', '.join(_SHAPES)} and meshes ({', '.join(_MESHES)}) are read here"
+                )
+            transform, material = transform_of(reader, shape), use(shape)
+            for piece in _SHAPES.get(kind) or read(_mesh_path(reader, shape)):
+                vertices = piece.vertices @ transform[:3, :3].T + transform[:3, 3]
+                yield Surface(vertices, piece.faces, material)
 
     found = gathered(surfaces(), path.name)
     if not found:
