@@ -367,6 +367,21 @@ MESH = {
     "link.gltf": json.dumps(gltf(buffers=[{"uri": "link"}])).encode(),
     "nul.gltf": json.dumps(gltf(buffers=[{"uri": "a\0b"}])).encode(),
     "long.gltf": json.dumps(gltf(buffers=[{"uri": "x" * 5000}])).encode(),
+    "points.gltf": json.dumps(
+        gltf(
+            scenes=[{"nodes": list(range(2000))}],
+            nodes=[{"mesh": 0}] * 2000,
+            meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 0}]}],
+            accessors=[{**gltf()["accessors"][0], "count": 500_000}],
+            bufferViews=[{"buffer": 0, "byteLength": 6_000_000}],
+            buffers=[{"uri": "data:;base64," + "A" * 8_000_000}],
+        )
+    ).encode(),
+    "properties.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    + b"".join(b"property list uchar float x%d\n" % i for i in range(5000))
+    + b"end_header\n"
+    + bytes(5000),
+    "unequal.stl": b"solid a\nvertex 0 0 0\nvertex 9 0 0\nendsolid\n",
     "zip.zip": b"PK",
 }
 XML = {
@@ -468,6 +483,14 @@ def test_twenty_thousand_materials_in_a_mesh(tmp_path):
     faces = "".join(f"usemtl m{i}\nf {i} {i + 1} {i + 2}\n" for i in range(1, 20_000))
     (tmp_path / "m.obj").write_text(corners + faces)
     complaint(tmp_path, "mesh", "m.obj")
+
+
+def test_twenty_thousand_solids_in_an_stl(tmp_path):
+    """Seen failing: trimesh looks for a free name among all those before."""
+    facet = "outer loop\nvertex 0 0 0\nvertex {} 0 0\nvertex 0 9 0\nendloop\n"
+    solids = "".join(f"solid a\n{facet.format(i + 1)}endsolid a\n" for i in range(20_000))
+    (tmp_path / "m.stl").write_text(solids)
+    assert complaint(tmp_path, "mesh", "m.stl", material_map={"a": "metal"}) is None
 
 
 def test_a_byte_order_mark_is_no_harm(tmp_path):

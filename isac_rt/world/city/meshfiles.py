@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import logging
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,10 @@ from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name
 from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks
+_MAX_PROPERTIES = 200
+"""Of a PLY file: trimesh takes a time that grows with their square."""
+_SOLID = re.compile(r"^[ \t]*solid\b", re.MULTILINE | re.IGNORECASE)
+_VERTEX = re.compile(r"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
@@ -48,25 +53,41 @@ def _used(
     return Piece(corners, faces.reshape(-1, 3), tuple(str(label) for label in labels if label))
 
 
-def _scanned(path: Path) -> Iterator[Piece]:
-    """PLY and STL, with the numbers alone taken from trimesh."""
-    from trimesh.exchange import ply, stl
+def _polygons(path: Path) -> Iterator[Piece]:
+    """PLY, with the numbers alone taken from trimesh."""
+    from trimesh.exchange.ply import load_ply
     from trimesh.geometry import triangulate_quads
 
-    file = BytesIO(read_bytes(path))
-    is_ply = path.suffix.lower() == ".ply"
+    data = read_bytes(path)
+    if data.count(b"property", 0, data.find(b"end_header")) > _MAX_PROPERTIES:
+        raise ValueError(f"more than {_MAX_PROPERTIES} properties")
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read to its end")
-        found = ply.load_ply(file, skip_materials=True) if is_ply else stl.load_stl(file)
-    for kind, element in found["metadata"].get("_ply_raw", {}).items() if is_ply else ():
+        found = load_ply(BytesIO(data), skip_materials=True)
+    for kind, element in found["metadata"]["_ply_raw"].items():
         data = element.get("data", ())
         rows = len(next(iter(data.values()), ()) if isinstance(data, dict) else data)
         if rows != element["length"]:
             raise ValueError(f"{rows} of {element['length']} rows of {kind}")
-    for label, part in found.get("geometry", {path.name: found}).items():
-        vertices = np.asarray(part["vertices"], dtype=np.float64).reshape(-1, 3)
-        faces = triangulate_quads(part.get("faces", ())).astype(np.int64).reshape(-1, 3)
-        yield Piece(vertices, faces, (label,))
+    vertices = np.asarray(found.get("vertices", ()), dtype=np.float64).reshape(-1, 3)
+    faces = triangulate_quads(found.get("faces", ())).astype(np.int64).reshape(-1, 3)
+    yield Piece(vertices, faces, (path.name,))
+
+
+def _solids(path: Path) -> Iterator[Piece]:
+    """STL: binary, or text with a piece for each solid."""
+    data = read_bytes(path)
+    if len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        facets = np.frombuffer(
+            data, np.dtype([("", "<f4", 3), ("corners", "<f4", (3, 3)), ("", "<u2")]), offset=84
+        )
+        solids = [(path.name, facets["corners"])]
+    else:
+        named = (block.partition("\n") for block in _SOLID.split(data.decode(errors="replace"))[1:])
+        solids = [(name.strip(), _VERTEX.findall(facets)) for name, _, facets in named]
+    for name, corners in solids:
+        vertices = np.array(corners, dtype=np.float64).reshape(-1, 3)
+        yield Piece(vertices, np.arange(len(vertices)).reshape(-1, 3), (name or path.name,))
 
 
 def _wavefront(path: Path) -> Iterator[Piece]:
@@ -159,14 +180,14 @@ class _Numbers:
 
 
 def _triangles(corners: NDArray, mode: int) -> NDArray[np.int64]:
-    """(F, 3) triangles of a primitive's corners; none of points and lines."""
+    """(F, 3) triangles of a primitive's corners."""
     corners = corners.astype(np.int64).reshape(-1)
     if mode == _TRIANGLES:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     i = np.arange(max(len(corners) - 2, 0))
     if mode == _STRIP:
         return corners[np.column_stack([i, i + 1 + i % 2, i + 2 - i % 2])]
-    return corners[np.column_stack([0 * i, i + 1, i + 2])] if mode == _FAN else corners[:0, None]
+    return corners[np.column_stack([0 * i, i + 1, i + 2])]
 
 
 def _to_parent(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -198,6 +219,9 @@ def _scene(path: Path) -> Iterator[Piece]:
         left += [(place, child) for child in node.get("children", [])]
         mesh = tree["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
         for primitive in mesh["primitives"]:
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode not in (_TRIANGLES, _STRIP, _FAN):
+                continue  # points and lines
             points = numbers.rows(primitive["attributes"]["POSITION"], "VEC3")
             indexed = "indices" in primitive
             corners = (
@@ -205,15 +229,15 @@ def _scene(path: Path) -> Iterator[Piece]:
             )
             of = tree["materials"][primitive["material"]] if "material" in primitive else {}
             labels = (node.get("name", str(number)), mesh.get("name"), of.get("name"))
-            faces = _triangles(corners, primitive.get("mode", _TRIANGLES))
+            faces = _triangles(corners, mode)
             piece = _used(points, faces, labels, path.name)
             yield replace(piece, vertices=piece.vertices @ place[:3, :3].T + place[:3, 3])
 
 
 _READERS: dict[str, Callable[[Path], Iterator[Piece]]] = {
-    ".ply": _scanned,
+    ".ply": _polygons,
     ".obj": _wavefront,
-    ".stl": _scanned,
+    ".stl": _solids,
     ".glb": _scene,
     ".gltf": _scene,
 }
