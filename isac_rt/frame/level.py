@@ -8,8 +8,8 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import BOLTZMANN, Waveform
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.radio import Noise
-from isac_rt.scenario.tree import Clutter
 
 
 def thermal_noise_power(noise: Noise, waveform: Waveform) -> float:

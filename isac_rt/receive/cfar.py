@@ -230,7 +230,7 @@ def peaks(
 
 
 @jit
-def _largest(power, rows, bins, along, across):  # pragma: no cover - compiled
+def _largest(power, rows, bins, along, across):
     """Whether nothing within reach is larger, of each cell."""
     num_rows, num_bins = power.shape
     out = np.ones(rows.size, np.bool_)

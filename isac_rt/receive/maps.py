@@ -138,7 +138,7 @@ class Conventional(LatinUnion):
 
 
 @jit
-def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
+def _unite_parts(flat, places, num_chirps, out):
     """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]."""
     for i in range(out.shape[1]):
         first = np.uint64(i * num_chirps)
@@ -150,7 +150,7 @@ def _unite_parts(flat, places, num_chirps, out):  # pragma: no cover - compiled
 # no fused products: which of two is fused the compiler may decide anew, and bits would differ
 # between processes
 @jit
-def _add_both_bins(made, power):  # pragma: no cover - compiled
+def _add_both_bins(made, power):
     """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
     num_chirps = power.shape[1]
     for i in range(power.shape[0]):
@@ -163,7 +163,7 @@ def _add_both_bins(made, power):  # pragma: no cover - compiled
 
 
 @jit
-def _unite(flat, places, num_chirps, out):  # pragma: no cover - compiled
+def _unite(flat, places, num_chirps, out):
     """out[i, s] = flat[i P + places[s]]; unsigned, so that no index is checked for its sign."""
     for i in range(out.shape[0]):
         first = np.uint64(i * num_chirps)
@@ -196,7 +196,7 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
 
 
 @jit
-def add_power(power, values):  # pragma: no cover - compiled
+def add_power(power, values):
     """power += |values|^2 of two matrices, float32 and complex64."""
     for i in range(power.shape[0]):
         for j in range(power.shape[1]):

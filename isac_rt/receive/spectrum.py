@@ -42,7 +42,7 @@ def _factors(
 
 
 @jit
-def _fill_factors(symbols, starts, length, places, roots, out):  # pragma: no cover - compiled
+def _fill_factors(symbols, starts, length, places, roots, out):
     """Sines of sums made of few sines: `places` are those of the window, `roots` those of the
     transform."""
     for p in range(out.shape[0]):
@@ -69,7 +69,7 @@ def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
 
 
 @jit
-def _fill_tones(start, step, out):  # pragma: no cover - compiled
+def _fill_tones(start, step, out):
     for p in range(out.shape[0]):
         for n in range(out.shape[1]):
             out[p, n] = start[p, n // 32] * step[p, n % 32]

@@ -104,7 +104,7 @@ def transform_plain(
 @jit
 def _transform(
     samples, factor, turn, power, out, radices, twiddles, place, at, work
-):  # pragma: no cover - compiled
+):
     """`transform`; complex arrays as `_floats`."""
     table, factors, turns, added = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
@@ -133,7 +133,7 @@ def _transform(
 
 
 @jit
-def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
+def _fill(lines, offset, first, count, table):
     """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
     chirps are turned over at a time."""
     lanes = lines.shape[1]
@@ -147,7 +147,7 @@ def _fill(lines, offset, first, count, table):  # pragma: no cover - compiled
 
 
 @jit
-def _multiply(table, factors):  # pragma: no cover - compiled
+def _multiply(table, factors):
     for i in range(0, table.size, ROW):
         a, b, c, d = (
             load(table, i),
@@ -160,14 +160,14 @@ def _multiply(table, factors):  # pragma: no cover - compiled
 
 
 @jit
-def _add_power(table, place, added):  # pragma: no cover - compiled
+def _add_power(table, place, added):
     for k in range(place.size):
         a, b = load(table, place[k]), load(table, place[k] + LANES)
         store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
 
 
 @jit
-def _write(table, at, turns, first, count, out):  # pragma: no cover - compiled
+def _write(table, at, turns, first, count, out):
     """out[i, first + l] = the cells, times g where there is one."""
     flat, width, spare = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
     for i in range(at.size):

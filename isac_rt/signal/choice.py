@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.signal.gridded import ACCURATE, DEFAULT, LANES, Setting
+from isac_rt.kernels.vector import LANES
+from isac_rt.signal.gridded import ACCURATE, DEFAULT, Setting
 
 FORMAT = "isac_rt cost model 1"
 DIRECT = "direct"

@@ -31,7 +31,7 @@ from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
-from isac_rt.scenario.file import ScenarioError
+from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs

@@ -8,4 +8,4 @@ from pathlib import Path
 
 def scene_file(name: str) -> Path:
     """A scene that studies run: a link to `scenes/` in a checkout, a copy in an installed wheel."""
-    return Path(str(files("isac_rt"))) / "scenes" / name
+    return Path(str(files("isac_rt.studies"))) / "scenes" / name

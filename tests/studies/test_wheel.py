@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_links_to_scenes_lead_to_the_scenes():
     """Planted bug: a link to a scene that was renamed."""
-    links = list((ROOT / "isac_rt" / "scenes").iterdir())
+    links = list((ROOT / "isac_rt" / "studies" / "scenes").iterdir())
     assert links and scene_file(links[0].name).parent == links[0].parent
     for link in links:
         assert link.read_text() == (ROOT / "scenes" / link.name).read_text()

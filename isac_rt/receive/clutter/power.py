@@ -205,7 +205,7 @@ def expected_power(
 
 
 @jit
-def _accumulate(grid, line, column, power, steer):  # pragma: no cover - compiled
+def _accumulate(grid, line, column, power, steer):
     """grid[line, column] += power * (lower triangle of a a^H, row by row)."""
     size = steer.shape[1]
     for s in range(line.size):

@@ -36,8 +36,8 @@ from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
 from isac_rt.receive.symbols.profile import correlate, learn_profile
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.receivers import Receivers
-from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.studies.paper import clutter_statistics as numbers

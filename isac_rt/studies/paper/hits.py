@@ -40,8 +40,8 @@ from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
 from isac_rt.receive.sense import describe
 from isac_rt.receive.spectrum import clean_spectrum, tones
 from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.receivers import Receivers
-from isac_rt.scenario.tree import Clutter
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.baselines import Echoes, LoRadar, fmcw_frame, loradar_frame, resolution
@@ -464,7 +464,7 @@ def correlations(
 
 
 @jit
-def _add_strongest(total, found):  # pragma: no cover - compiled
+def _add_strongest(total, found):
     """Add the strongest power of every vector of (L_rx, rows, P) to its place in `total`."""
     for one in found:
         for row in range(one.shape[0]):

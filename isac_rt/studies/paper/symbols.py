@@ -26,7 +26,7 @@ from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
-from isac_rt.scenario.tree import Clutter
+from isac_rt.scenario.environment import Clutter
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.paper.montecarlo import Counts, Curve, Precision, sample

@@ -15,9 +15,9 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation import FreeSpace, PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.propagation.ways import LinkState
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.swarm import Rcs
-from isac_rt.scenario.tree import Clutter
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced

@@ -25,9 +25,9 @@ from isac_rt.receive.omp import omp
 from isac_rt.receive.sense import Cfar
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.receivers import Receivers
-from isac_rt.scenario.tree import Clutter
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.case import Errors, case, slow
 from isac_rt.studies.validation.stage import FEW, FULL
