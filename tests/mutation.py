@@ -184,7 +184,7 @@ class _Finder(ast.NodeVisitor):
         )
 
     def _add(self, node: ast.AST, kind: str, start: int, old: str, new: str) -> None:
-        self.found.append(Mutant(self.file, node.lineno, kind, start, old, new))  # type: ignore[attr-defined]
+        self.found.append(Mutant(self.file, node.lineno, kind, start, old, new))  # type: ignore[attr-defined]  # a node with a place
 
     def visit_Raise(self, node: ast.Raise) -> None:
         """Messages are no physics."""

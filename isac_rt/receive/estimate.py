@@ -132,9 +132,7 @@ class LocalSpectra:
 
 
 @jit
-def _match(
-    data, weight, tx, time, first, numbers, delay, delay_rate, out, energy
-):
+def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energy):
     """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the
     template: beat, phase and `hann_response` in one loop, which a test holds against them.
 

@@ -102,9 +102,7 @@ def transform_plain(
 
 
 @jit
-def _transform(
-    samples, factor, turn, power, out, radices, twiddles, place, at, work
-):
+def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, work):
     """`transform`; complex arrays as `_floats`."""
     table, factors, turns, added = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size

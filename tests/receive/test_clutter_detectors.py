@@ -435,12 +435,9 @@ def test_receiver_finds_what_clutter_hides():
     target = Path(2 * 17.3, -2 * 9.3 * 0.74, 1.1, (-0.5, -0.3), (-0.5, -0.3))
     received = cube(w, schedule, payload, [*truth, target], antennas, 20.0, 1)
     count = {}
-    for detector in ("cfar", "angle_doppler"):
+    for detector, more in (("cfar", {}), ("angle_doppler", {"clutter_channels": "joint"})):
         settings = Receivers(
-            clutter_detector=detector,
-            clutter_channels="joint",
-            false_alarm_rate=1e-5,
-            cluster_cells=(2, 2),
+            clutter_detector=detector, false_alarm_rate=1e-5, cluster_cells=(2, 2), **more
         )
         d = receive_active(received, payload, antennas, settings, clutter=guess).detections
         near = (np.abs(d.range - 17.3) < w.range_cell(2)) & (

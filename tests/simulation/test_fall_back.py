@@ -105,7 +105,10 @@ def test_one_dense_advice_is_enough_and_the_last_word_counts(run):
     """Planted bug: the first advice of a link is kept."""
     usual = pseudo_random_schedule(1, 120, 3, np.random.default_rng(1))
     s, other = Schedules(usual, 3), conventional_schedule(1, 120, 3)
-    said = lambda sparse: replace(empty(), sparse=sparse)  # noqa: E731
+
+    def said(sparse):
+        return replace(empty(), sparse=sparse)
+
     assert s.of("A") is usual
     s.take_advice({("A", "A"): said(True), ("A", "P"): said(False), ("B", "B"): said(True)})
     assert np.array_equal(s.of("A"), other) and s.of("B") is usual

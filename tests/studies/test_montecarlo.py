@@ -125,7 +125,10 @@ def test_interval_of_like_frames_is_binomial_and_of_unlike_ones_wider():
 
 def test_crossing_is_linear_in_the_logit():
     snr = np.array([-3.0, -1.0, 1.0])
-    logit = lambda p: np.log(p / (1 - p))  # noqa: E731
+
+    def logit(p):
+        return np.log(p / (1 - p))
+
     p = 1 / (1 + np.exp(0.7 * snr + 0.2))
     assert crossing(snr, p * 1e9, 10**9, 0.31) == pytest.approx(
         (-logit(0.31) - 0.2) / 0.7, rel=1e-9

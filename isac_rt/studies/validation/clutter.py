@@ -72,7 +72,7 @@ class Flight:
         }
         s = Scenario.model_validate(tree)
         self.city = _crossing()
-        self.field = propagation_in(self.city, s).field  # type: ignore[attr-defined]
+        self.field = propagation_in(self.city, s).field  # type: ignore[attr-defined]  # a ray tracer
         self.way = swarm_of(s).trajectories["A"]
 
     def pose(self, time: float) -> Pose:
@@ -334,7 +334,7 @@ def mean_power_of_a_street() -> float:
     city = load_city(
         s.city, ".", truths.CARRIER, (np.array(way["A"][0]) + np.array(way["P"][0])) / 2
     )
-    field = propagation_in(city, s).field  # type: ignore[attr-defined]
+    field = propagation_in(city, s).field  # type: ignore[attr-defined]  # a ray tracer
     cells, totals = [], []
     for time in (0.02, 400 * FRAME - 0.02):
         poses = {

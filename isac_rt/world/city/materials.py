@@ -358,7 +358,8 @@ def _override(material: Material, change: MaterialOverride) -> Material:
     given = {key: value for key, value in fields.items() if value is not None}
     if not given:
         return material
-    return replace(material, **given, source=f"{material.source}; scenario: {', '.join(given)}")  # type: ignore[arg-type]
+    source = f"{material.source}; scenario: {', '.join(given)}"
+    return replace(material, **given, source=source)  # type: ignore[arg-type]  # checked by the scenario
 
 
 def _base(use: MaterialUse, carrier_frequency: float, change: MaterialOverride | None) -> Material:
