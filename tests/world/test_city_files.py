@@ -394,6 +394,8 @@ XML = {
     "above": scene(SHAPE.format("obj", "../secret.obj", "")),
     "link": scene(SHAPE.format("obj", "link", "")),
     "long file": scene(SHAPE.format("obj", "x" * 999, "")),
+    "linked folder": scene(SHAPE.format("obj", "out/secret.obj", "")),
+    "there and back": scene(SHAPE.format("obj", "out/../../secret.obj", "")),
     "folder": scene(SHAPE.format("obj", ".", "")),
     "remote": scene(SHAPE.format("obj", "http://127.0.0.1/m.obj", "")),
     "two scales": wall('<scale value="1 2"/>'),
@@ -425,6 +427,7 @@ def traps(tmp_path: Path) -> Path:
     (tmp_path / "secret.obj").write_bytes(WHOLE["obj"][2]["box.obj"])
     os.mkfifo(inside / "pipe.ply")
     (inside / "link").symlink_to(tmp_path / "secret.obj")
+    (inside / "out").symlink_to(tmp_path)
     with zipfile.ZipFile(inside / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("m.obj", WHOLE["obj"][2]["box.obj"] + b"# " + bytes(10**7))
     grid = "".join(f"v {i} {i * i % 97} {i % 7}\n" for i in range(3000))

@@ -70,12 +70,11 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
 
 def beside(path: Path, name: str, what: str) -> Path:
     """The file that `what` in the file `path` names: in its folder or below, and nowhere else."""
-    folder = Path(os.path.realpath(path.parent))
-    file = folder / unquote(name)
-    try:
-        inside = Path(os.path.realpath(file)).is_relative_to(folder)
-    except (OSError, ValueError):
-        inside = False
+    relative = os.path.relpath(path.parent / unquote(name), path.parent)
+    file, steps = path.parent / relative, relative.split(os.sep)
+    inside = steps[0] != os.pardir
+    if inside and any(os.path.islink(place) for place in (file, *file.parents[: len(steps) - 1])):
+        inside = Path(os.path.realpath(file)).is_relative_to(os.path.realpath(path.parent))
     if not inside:
         raise CityError(f"{path.name}: {what} wants {name}, outside its folder; copy it there")
     if not os.path.isfile(file):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic_core import from_json
 
 from isac_rt import scenario
@@ -81,7 +81,7 @@ def _solids(path: Path) -> Iterator[Piece]:
         facets = np.frombuffer(
             data, np.dtype([("", "<f4", 3), ("corners", "<f4", (3, 3)), ("", "<u2")]), offset=84
         )
-        solids = [(path.name, facets["corners"])]
+        solids: list[tuple[str, ArrayLike]] = [(path.name, facets["corners"])]
     else:
         named = (block.partition("\n") for block in _SOLID.split(data.decode(errors="replace"))[1:])
         solids = [(name.strip(), _VERTEX.findall(facets)) for name, _, facets in named]
@@ -108,7 +108,8 @@ def _wavefront(path: Path) -> Iterator[Piece]:
                     x, y, z = rest.split()[:3]
                     vertices.append([float(x), float(y), float(z)])
                     continue
-                corners = [int(word.partition("/")[0]) for word in rest.split()]
+                words = rest.partition("#")[0].split()
+                corners = [int(word.partition("/")[0]) for word in words]
             except ValueError as error:
                 raise CityError(f"{path.name}: line {number}: {error}; export it again") from None
             corners = [n - 1 if n > 0 else len(vertices) + n for n in corners]
