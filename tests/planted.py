@@ -414,15 +414,25 @@ OF_CASES = {
         "(2 * (length - baseline @ direction))",
         "(2 * (length + baseline @ direction))",
     ),
+    "covariance of an unknown acceleration": Bug(
+        "terminal/filter.py",
+        "density = 2 * acceleration_std**2",
+        "density = acceleration_std**2",
+    ),
     "consistency of states": Bug(
         "terminal/filter.py",
-        "acceleration_std**2 * G @ G.T",
-        "0.01 * acceleration_std**2 * G @ G.T",
+        "density = 2 * acceleration_std**2",
+        "density = 0.02 * acceleration_std**2",
     ),
     "consistency of innovations": Bug(
         "terminal/filter.py",
         "return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))",
         "return Gaussian(x, _symmetric(A @ P @ A.T) / 4)",
+    ),
+    "consistency in manoeuvres": Bug(
+        "terminal/filter.py",
+        "density * interval**5 *",
+        "density * interval**6 *",
     ),
     "gospa metric": Bug(
         "results/metrics.py", "(len(x) - pairs) * cutoff**2 / 2", "(len(x) - pairs) * cutoff**2"

@@ -113,10 +113,10 @@ class Receivers(Node):
 class Tracking(Node):
     """The Kalman filters, and when a track begins and ends."""
 
-    acceleration_std_mps2: Positive = 1.0
-    """Standard deviation of the acceleration that the filter expects of a UAV [m/s^2]. A higher
-    value follows turns more quickly and smooths less; the default suits straight and gently curved
-    flight."""
+    acceleration_std_mps2: Positive = 3.0
+    """Standard deviation of a UAV's acceleration along each axis, held for about a second (Singer's
+    model) [m/s^2]. A higher value follows turns more quickly and smooths less; the default is the
+    limit that PX4 sets for multicopters and covers severe gusts."""
     gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
     """Probability that a detection of a tracked UAV falls within the gate about its prediction. A
     higher value loses fewer detections and lets more false ones in; the default loses one in a

@@ -3,9 +3,11 @@ and birth."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.world.swarm import Pose
@@ -20,12 +22,16 @@ take this."""
 BIRTH_POSITION_STD_LIMIT = 100.0
 """A single detection that fixes the position worse than this [m] starts no track (near the line
 through both terminals a bistatic length says nothing about where the reflector is)."""
+MANOEUVRE_TIME = 1.0
+"""Correlation time of a body's acceleration [s]. Turns, braking and gusts hold theirs for half a
+second to some seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one needs 0.75 s."""
 _ITERATIONS = 10
 _POSITION = np.array([0, 2, 3])
 
 
 class Gaussian(NamedTuple):
-    """Mean (6,) [m, m/s] of world position and velocity, and covariance (6, 6)."""
+    """Mean and covariance of world position, velocity and, in a track, acceleration: (9,) [m, m/s,
+    m/s^2] and (9, 9)."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -48,21 +54,21 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
 
     Parameters
     ----------
-    state : (..., 6) world position and velocity of the body [m, m/s]
+    state : (..., 6 or 9) world position, velocity, acceleration of the body [m, m/s, m/s^2]
     own : pose of the receiver
-    transmitter : (6,) state of the transmitter; None for the one-way form
+    transmitter : (6 or 9,) state of the transmitter; None for the one-way form
 
     Returns
     -------
     (..., 4) : range [m], range rate [m/s, positive receding], u_x, u_z
     """
     distance, e = _unit(state[..., :3] - own.position)
-    rate = np.sum(e * (state[..., 3:] - own.velocity), axis=-1)
+    rate = np.sum(e * (state[..., 3:6] - own.velocity), axis=-1)
     u = own.to_body(e)
     if transmitter is not None:
         outward, e_t = _unit(state[..., :3] - transmitter[:3])
         distance = distance + outward
-        rate = rate + np.sum(e_t * (state[..., 3:] - transmitter[3:]), axis=-1)
+        rate = rate + np.sum(e_t * (state[..., 3:6] - transmitter[3:6]), axis=-1)
     return np.stack([distance, rate, u[..., 0], u[..., 2]], axis=-1)
 
 
@@ -75,20 +81,20 @@ def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray,
 
 
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    """Derivative of `measure` with respect to the body's state (6,): (4, 6)."""
-    leg, turn = _leg_jacobian(state[:3] - own.position, state[3:] - own.velocity)
-    out = np.zeros((4, 6))
-    out[:2] = leg
+    """Derivative of `measure` with respect to the body's state (S,): (4, S)."""
+    leg, turn = _leg_jacobian(state[:3] - own.position, state[3:6] - own.velocity)
+    out = np.zeros((4, len(state)))
+    out[:2, :6] = leg
     out[2:, :3] = (own.rotation.T @ turn)[[0, 2]]
     if transmitter is not None:
-        out[:2] += _leg_jacobian(state[:3] - transmitter[:3], state[3:] - transmitter[3:])[0]
+        out[:2, :6] += _leg_jacobian(state[:3] - transmitter[:3], state[3:6] - transmitter[3:6])[0]
     return out
 
 
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """Derivative of the bistatic `measure` with respect to the transmitter's state: (4, 6)."""
-    out = np.zeros((4, 6))
-    out[:2] = -_leg_jacobian(state[:3] - transmitter[:3], state[3:] - transmitter[3:])[0]
+    """Derivative of the bistatic `measure` with respect to the transmitter's state (S,): (4, S)."""
+    out = np.zeros((4, len(transmitter)))
+    out[:2, :6] = -_leg_jacobian(state[:3] - transmitter[:3], state[3:6] - transmitter[3:6])[0]
     return out
 
 
@@ -96,7 +102,7 @@ def measurement_covariance(
     std: np.ndarray, mean: np.ndarray, transmitter: Gaussian | None = None
 ) -> np.ndarray:
     """R (4, 4) of a detection: its own deviations (4,), not below `STD_FLOOR`, and for a bistatic
-    one the uncertainty of the transmitter's track, seen from the body's state `mean` (6,).
+    one the uncertainty of the transmitter's track, seen from the body's state `mean`.
 
     The transmitter's error is the same in successive frames, but is treated here as if it were
     drawn anew: a reflector's covariance is too small by what they share.
@@ -108,16 +114,41 @@ def measurement_covariance(
     return R
 
 
-def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
-    r"""Constant velocity with an acceleration that is white from step to step and constant in each.
+@lru_cache(maxsize=64)
+def singer(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.ndarray]:
+    r"""Transition F (9, 9) and covariance Q (9, 9) of Singer's model over an interval [s].
 
-    :math:`x' = F x + G a,\ a \sim N(0, \sigma^2 I)`, :math:`G = [\Delta^2/2,\ \Delta]^T \otimes I`.
-    [interval s, m/s^2]
+    The acceleration of each axis is a stationary Gauss-Markov process of standard deviation
+    :math:`\sigma` [m/s^2] and correlation time :math:`\tau` = `MANOEUVRE_TIME`,
+    :math:`\dot a = -a/\tau + w` with the density :math:`2\sigma^2/\tau` of w. As a process in
+    continuous time it does not know how an interval is cut into frames:
+    :math:`Q(2T) = F(T) Q(T) F(T)^T + Q(T)`, by which intervals beyond :math:`\tau` are halved.
+
+    References
+    ----------
+    .. [1] R. A. Singer, "Estimating optimal tracking filter performance for manned maneuvering
+       targets", IEEE Trans. AES-6(4), 1970, doi:10.1109/TAES.1970.310128
+    .. [2] C. F. Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans.
+       AC-23(3), 1978, doi:10.1109/TAC.1978.1101743
     """
-    F = np.eye(6)
-    F[:3, 3:] = interval * np.eye(3)
-    G = np.concatenate([interval**2 / 2 * np.eye(3), interval * np.eye(3)])
-    return Gaussian(F @ g.mean, _symmetric(F @ g.covariance @ F.T + acceleration_std**2 * G @ G.T))
+    if interval > MANOEUVRE_TIME:
+        F, Q = singer(interval / 2, acceleration_std)
+        return F @ F, F @ Q @ F.T + Q
+    A = np.diag([1.0, 1.0], 1)  # of position, T velocity, T^2 acceleration over T: of order one
+    A[2, 2] = -interval / MANOEUVRE_TIME
+    M = np.zeros((6, 6))
+    M[:3, :3], M[2, 5], M[3:, 3:] = -A, 1.0, A.T
+    E, scale = expm(M), interval ** -np.arange(3.0)
+    F = E[3:, 3:].T
+    density = 2 * acceleration_std**2 / MANOEUVRE_TIME
+    Q = density * interval**5 * np.outer(scale, scale) * (F @ E[:3, 3:])
+    return np.kron(F * np.outer(scale, 1 / scale), np.eye(3)), np.kron(Q, np.eye(3))
+
+
+def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
+    """A track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
+    F, Q = singer(interval, acceleration_std)
+    return Gaussian(F @ g.mean, _symmetric(F @ g.covariance @ F.T + Q))
 
 
 def update(
@@ -149,30 +180,30 @@ def update(
         x = new
         if settled:
             break
-    A = np.eye(6) - K @ H
+    A = np.eye(len(x)) - K @ H
     return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))
 
 
 def expected(
     mean: np.ndarray, covariance: np.ndarray, own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (..., 4) and covariance (..., 4, 4) of what will be measured of states (..., 6),
+    """Mean (..., 4) and covariance (..., 4, 4) of what will be measured of states (..., 9),
     measurement noise excluded.
 
-    Unscented (12 points, equal weights): with a transversal velocity still unknown by 10 m/s and
-    0.15 s between frames the range rate bends by more than its own deviation, and a linearised gate
-    would lose the target.
+    Unscented (12 points of position and velocity, equal weights): with a transversal velocity still
+    unknown by 10 m/s and 0.15 s between frames the range rate bends by more than its own deviation,
+    and a linearised gate would lose the target.
     """
-    root = np.sqrt(6.0) * np.swapaxes(np.linalg.cholesky(covariance), -1, -2)
-    points = mean[..., None, :] + np.concatenate([root, -root], axis=-2)
+    root = np.sqrt(6.0) * np.swapaxes(np.linalg.cholesky(covariance[..., :6, :6]), -1, -2)
+    points = mean[..., None, :6] + np.concatenate([root, -root], axis=-2)
     z = measure(points, own, None if transmitter is None else transmitter.mean)
     z_mean = z.mean(axis=-2)
     dz = z - z_mean[..., None, :]
     S = np.swapaxes(dz, -1, -2) @ dz / z.shape[-2]
     if transmitter is not None:
         J = np.stack(
-            [transmitter_jacobian(x, transmitter.mean) for x in mean.reshape(-1, 6)]
-        ).reshape(*mean.shape[:-1], 4, 6)
+            [transmitter_jacobian(x, transmitter.mean) for x in mean.reshape(-1, mean.shape[-1])]
+        ).reshape(*mean.shape[:-1], 4, -1)
         S = S + J @ transmitter.covariance @ np.swapaxes(J, -1, -2)
     return z_mean, S
 
@@ -198,7 +229,12 @@ def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray
 
 
 def birth(
-    measurement: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None = None
+    measurement: np.ndarray,
+    std: np.ndarray,
+    own: Pose,
+    transmitter: Gaussian | None = None,
+    *,
+    acceleration_std: float,
 ) -> Gaussian | None:
     """State after a first detection (4,) with deviations (4,); None where it does not fix a
     position.
@@ -206,7 +242,7 @@ def birth(
     The position from range and direction (front half-space), its covariance through the inverse
     Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
     measured rate: the component along the line of sight (or the bisector) is then known, the others
-    are not.
+    are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
     """
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
@@ -217,18 +253,19 @@ def birth(
         rho = bistatic_distance(rho, transmitter.mean[:3] - own.position, e)
     if rho <= 0:
         return None
-    mean = np.concatenate([own.position + rho * e, np.zeros(3)])
+    mean = np.concatenate([own.position + rho * e, np.zeros(6)])
     t = None if transmitter is None else transmitter.mean
     J = jacobian(mean, own, t)[_POSITION, :3]
     if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
         return None
     R = measurement_covariance(std, mean, transmitter)
     back = np.linalg.inv(J)
-    P = np.zeros((6, 6))
+    P = np.zeros((9, 9))
     P[:3, :3] = back @ R[np.ix_(_POSITION, _POSITION)] @ back.T
     if np.trace(P) > BIRTH_POSITION_STD_LIMIT**2:
         return None
-    P[3:, 3:] = BIRTH_SPEED_STD**2 * np.eye(3)
+    P[3:6, 3:6] = BIRTH_SPEED_STD**2 * np.eye(3)
+    P[6:, 6:] = acceleration_std**2 * np.eye(3)
     rate_only = np.array([np.nan, measurement[1], np.nan, np.nan])
     return update(Gaussian(mean, _symmetric(P)), rate_only, R, own, t)
 

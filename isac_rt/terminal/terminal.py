@@ -259,7 +259,7 @@ class PassiveTerminal:
 
     def _restart(self, z: np.ndarray, std: np.ndarray, snr: float, own: Pose) -> None:
         """A reference track from one detection; the other tracks rested on the old one."""
-        state = birth(z, std, own)
+        state = birth(z, std, own, acceleration_std=self._acceleration)
         if state is not None:
             self.reference = Track(self.tracker.new_id(), state, snr, confirmed=True)
             self.tracker.clear()

@@ -1,8 +1,8 @@
 """Extended Kalman filter, association and the life of tracks.
 
-A track is the world position and velocity of one body. The terminal that keeps it knows its own
-pose, so what is reported is relative to it. Names outside, symbols inside: x, P mean and
-covariance; F, Q, H, R the model.
+A track is the world position, velocity and acceleration of one body. The terminal that keeps it
+knows its own pose, so what is reported is relative to it, and leaves the acceleration out. Names
+outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
     bistatic."""
     everyone = ([] if reference is None else [reference]) + list(tracks)
     count = len(everyone)
-    mean = np.array([t.state.mean for t in everyone]).reshape(count, 6)
-    covariance = np.array([t.state.covariance for t in everyone]).reshape(count, 6, 6)
+    mean = np.array([t.state.mean[:6] for t in everyone]).reshape(count, 6)
+    covariance = np.array([t.state.covariance[:6, :6] for t in everyone]).reshape(count, 6, 6)
     is_reference = np.arange(count) < (reference is not None)
     z, std = np.zeros((count, 4)), np.zeros((count, 4))
     for k, track in enumerate(everyone):
@@ -222,7 +222,13 @@ class Tracker:
                 track.snr = float(detections.snr[q])
         self.tracks = [t for t in self.tracks if not self._dead(t)]
         for q in free:
-            state = birth(z[q], detections.std[q], own, transmitter)
+            state = birth(
+                z[q],
+                detections.std[q],
+                own,
+                transmitter,
+                acceleration_std=self.settings.acceleration_std_mps2,
+            )
             if state is not None:
                 track = Track(self.new_id(), state, float(detections.snr[q]))
                 track.confirmed = self.settings.confirm_hits == 1

@@ -63,6 +63,7 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
     their raw errors are a hundredth.
     """
     scene = scenario("consistent")
+    acceleration_std = scene.tracking.acceleration_std_mps2
     w, swarm, passes = (
         waveform_of(scene.radio, scene.array),
         swarm_of(scene),
@@ -83,9 +84,9 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                 raw = np.round(found / step) * step
                 z = np.array([raw[0], raw[1], np.sin(raw[2]), 0.0])
                 if state is None:
-                    state = birth(z, std, own)
+                    state = birth(z, std, own, acceleration_std=acceleration_std)
                 else:
-                    state = predict(state, time - last, scene.tracking.acceleration_std_mps2)
+                    state = predict(state, time - last, acceleration_std)
                     state = update(
                         state,
                         z,
