@@ -95,6 +95,7 @@ class Detections:
 
 
 def no_detections() -> Detections:
+    """Nothing found."""
     return Detections(
         range=np.zeros(0),
         velocity=np.zeros(0),

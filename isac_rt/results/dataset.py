@@ -32,8 +32,10 @@ MEASURES = {
 
 
 def errors_of(dataset: xr.Dataset, group: str, name: str) -> np.ndarray:
-    """ "detected" or "tracked" value less the truth (frame, observer, uav), NaN where none; angles
-    [rad] wrapped to (-pi, pi]."""
+    """Value of "detected" or "tracked" less the truth (frame, observer, uav), NaN where none.
+
+    Angles are wrapped to (-pi, pi] [rad].
+    """
     e = (dataset[f"{group}_{name}"] - dataset[f"truth_{name}"]).values
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 

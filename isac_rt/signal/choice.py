@@ -1,4 +1,4 @@
-"""What a synthesis costs and how far off it may be, from which `isac_rt.signal.methods.Auto`
+r"""What a synthesis costs and how far off it may be, from which `isac_rt.signal.methods.Auto`
 chooses.
 
 Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K paths, fitted by
@@ -6,8 +6,8 @@ Cost [CPU s] of a cube of C chirps, L receive elements and N samples with K path
 
 .. math::
 
-    C L \\frac{N}{1024} (a_d + K b_d) \\text{ (direct)}, \\qquad C \\lceil L/16 \\rceil \\left(a_s
-    \\frac{N}{1024} + K b_s\\right) \\text{ (gridded, each setting)}
+    C L \frac{N}{1024} (a_d + K b_d) \text{ (direct)}, \qquad C \lceil L/16 \rceil \left(a_s
+    \frac{N}{1024} + K b_s\right) \text{ (gridded, each setting)}
 
 Data do not enter: the delay symbols move paths over the grid. The coefficients that ship with the
 program stand in `cost_model.json`, with the machine they were measured on. Others are read only

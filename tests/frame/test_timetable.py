@@ -128,7 +128,7 @@ def test_payloads_differ_between_terminals_and_frames_and_repeat():
     assert not np.array_equal(t.payload("A", 7).bits, t.payload("A", 8).bits)
 
 
-@pytest.mark.parametrize("groups, order", [(1, 2), (2, 8), (3, 16)])
+@pytest.mark.parametrize(("groups", "order"), [(1, 2), (2, 8), (3, 16)])
 def test_all_groups_hold_all_bits(groups, order):
     w = Waveform(num_groups=groups)
     schedule = pseudo_random_schedule(groups, w.num_chirps, w.num_tx, np.random.default_rng(1))

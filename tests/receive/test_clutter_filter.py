@@ -108,7 +108,7 @@ def test_all_cells_can_be_filtered():
 
 
 @pytest.mark.parametrize(
-    "speed, clutter_filter, allowed",
+    ("speed", "clutter_filter", "allowed"),
     [
         (5.3, "none", (0, 1, 2)),
         (5.3, "runs", (3,)),
@@ -143,7 +143,7 @@ def test_the_filter_at_the_active_terminal(speed, clutter_filter, allowed):
 
 
 @pytest.mark.parametrize(
-    "centre, clutter_filter, low, high",
+    ("centre", "clutter_filter", "low", "high"),
     [(30.0, None, 0.9, 1.0), (33.0, 15, 0.0, 0.05), (16.0, 15, 0.9, 1.0)],
 )
 def test_the_filter_at_a_passive_terminal(centre, clutter_filter, low, high):

@@ -126,7 +126,7 @@ def test_a_sweep_s_name_is_no_path(folder, name):
 
 
 @pytest.mark.parametrize(
-    "axes, said",
+    ("axes", "said"),
     [
         (
             "axes: {snr: {key: noise.snr, values: [1]}}",
@@ -205,7 +205,7 @@ def test_too_many_points_are_counted_and_refused(folder, capsys):
 
 
 @pytest.mark.parametrize(
-    "text, said",
+    ("text", "said"),
     [
         (
             "scenario: no.yaml\naxes: {a: {key: frames, values: [4]}}\n",

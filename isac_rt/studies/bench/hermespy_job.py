@@ -87,6 +87,7 @@ def error(job: dict) -> float:
 
 
 def main(job: dict) -> dict:
+    """Run the job; its seconds, its errors and the versions."""
     seconds = {}
     propagated(job, channel(job, 2))
     for count in job["sizes"]:

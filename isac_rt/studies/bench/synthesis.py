@@ -154,6 +154,7 @@ class Job:
 
 
 def relative(found: np.ndarray, truth: np.ndarray) -> float:
+    """RMS error over the RMS of the truth."""
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 

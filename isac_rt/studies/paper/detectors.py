@@ -347,6 +347,7 @@ def summarise(
 
 
 def rate_text(row: pd.Series) -> str:
+    """False alarms per cell with their interval, for people."""
     return proportion(int(row.false_alarms), int(row.cells))
 
 

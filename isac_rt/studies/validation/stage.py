@@ -33,6 +33,7 @@ def pose(
     acceleration: Triple = (0, 0, 0),
     boresight: Triple = (0.3, 1.0, 0.1),
 ) -> Pose:
+    """A body at a place, in flight, with a boresight."""
     place, speed, change = (np.array(v, float) for v in (position, velocity, acceleration))
     return Pose(place, speed, change, attitude(np.array(boresight, float)))
 
@@ -82,6 +83,7 @@ def material(
     scattering: float = 0.0,
     thickness: float = 0.1,
 ) -> Material:
+    """A slab's material."""
     return Material(
         "slab", permittivity, conductivity, scattering, "lambertian", 1, thickness, "validation"
     )
@@ -114,6 +116,7 @@ SMALL = Waveform(
 
 
 def arrays(w: Waveform, **change: Any) -> Antennas:
+    """Arrays that fit a waveform; `change` of their fields."""
     return Antennas(
         **(
             {

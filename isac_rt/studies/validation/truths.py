@@ -18,10 +18,12 @@ Plane = tuple[Triple, Triple]
 
 
 def norm(v: np.ndarray) -> np.longdouble:
+    """Length of a vector."""
     return np.sqrt((v * v).sum())
 
 
 def wide(v: Triple) -> np.ndarray:
+    """In long double."""
     return np.array(v, np.longdouble)
 
 
