@@ -191,10 +191,8 @@ OF_CASES = {
     ),
     "fluctuation of a cross section": Bug(
         "propagation/rcs.py",
-        """np.sqrt(
-            2 / NUM_WAVES
-        )""",
-        "np.sqrt(1 / NUM_WAVES)",
+        "_WAVE = np.sqrt(2 / NUM_WAVES)",
+        "_WAVE = np.sqrt(1 / NUM_WAVES)",
     ),
     "elements radiate their power": Bug(
         "frame/antennas.py",

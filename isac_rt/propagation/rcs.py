@@ -4,11 +4,14 @@ fluctuation that is smooth in aspect."""
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import i0
 
 from isac_rt.randomness import generator
 from isac_rt.scenario.swarm import Rcs
 
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
+TR38901_STD_DB = {"small": 3.74, "large": 2.50}
+"""Standard deviation of the random component, by the size of the UAV."""
 LARGE_BISTATIC = (6.05, 1.33)  # k_1, k_2 of eq. 7.9.2-3 for the large UAV
 LARGE_LOBES = (
     # azimuth of the lobe (None: around the vertical), its 3 dB width, zenith angle, its width, peak
@@ -24,6 +27,7 @@ LARGE_LOBES = (
 inside its sector."""
 
 NUM_WAVES = 24
+_WAVE = np.sqrt(2 / NUM_WAVES)  # amplitude of each, for a field of unit standard deviation
 ASPECT_SCALE = 6.0
 """Wave number of the aspect field [1/rad]: it decorrelates over about a sixth of a radian."""
 
@@ -32,13 +36,17 @@ class CrossSection:
     """Radar cross-section of one UAV as a function of aspect, the same for all links and frames.
 
     The fluctuation in dB is a sum of plane waves over the bisector of the directions of incidence
-    and observation in the body's frame: a fixed, smooth random field of zero mean and the stated
-    standard deviation, seeded by the UAV's name. It takes the place of TR 38.901's random
-    component, whose independent draws per direction would not be coherent between frames.
+    and observation in the body's frame: a fixed, smooth random field of the stated standard
+    deviation, seeded by the UAV's name. Its mean in dB lies below zero by as much as makes the mean
+    power one (-ln(10)/20 std^2 for a Gaussian field, as in TR 38.901; exact here for the sum of
+    waves), so that it leaves the mean cross-section as it is. It takes the place of TR 38.901's
+    random component, whose independent draws per direction would not be coherent between frames.
     """
 
     def __init__(self, rcs: Rcs, name: str, seed: int) -> None:
         self._rcs = rcs
+        default = TR38901_STD_DB[rcs.size] if rcs.model == "tr38901" else 0.0
+        self._std_db = default if rcs.fluctuation_db is None else rcs.fluctuation_db
         rng = generator(seed, "rcs", name)
         waves = rng.standard_normal((NUM_WAVES, 3))
         self._waves = ASPECT_SCALE * waves / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -56,13 +64,12 @@ class CrossSection:
         norm = np.linalg.norm(total, axis=-1)  # 2 cos(beta/2)
         half_bistatic = np.arccos(np.clip(norm / 2, 0.0, 1.0))
         bisector = total / np.maximum(norm, 1e-9)[..., None]
-        field = np.cos(bisector @ self._waves.T + self._phases).sum(axis=-1) * np.sqrt(
-            2 / NUM_WAVES
-        )
+        field = _WAVE * np.cos(bisector @ self._waves.T + self._phases).sum(axis=-1)
         # towards forward scattering the bisector turns ever faster: the field fades there, or it
         # would not be smooth
-        fluctuation = self._rcs.fluctuation_db * field * norm / 2
-        return 10 ** ((self._mean_db(bisector, half_bistatic) + fluctuation) / 10)
+        std = self._std_db * norm / 2
+        mean_db = self._mean_db(bisector, half_bistatic) - excess_db(std)
+        return 10 ** ((mean_db + std * field) / 10)
 
     def _mean_db(self, bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
         if self._rcs.model != "tr38901":
@@ -70,6 +77,14 @@ class CrossSection:
         if self._rcs.size == "small":
             return SMALL_MEAN_DBSM - 3 * np.sin(half_bistatic)  # eq. 7.9.2-2
         return large_uav_db(bisector, half_bistatic)
+
+
+def excess_db(std_db: np.ndarray) -> np.ndarray:
+    """Mean power of a sum of `NUM_WAVES` waves in dB, of zero mean there and a standard deviation.
+
+    The mean of 10^(a cos(phase)/10) over the phase is I_0(a ln(10)/10), for each wave by itself.
+    """
+    return NUM_WAVES * 10 * np.log10(i0(_WAVE * std_db * np.log(10) / 10))
 
 
 def large_uav_db(bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:

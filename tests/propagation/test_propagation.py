@@ -283,7 +283,7 @@ def test_constant_and_small_cross_sections():
         u, u[::-1]
     )
     assert constant == near(np.full(40, 10**-0.73), 1e-12)
-    small = CrossSection(Rcs(), "U", 1)
+    small = CrossSection(Rcs(fluctuation_db=0), "U", 1)
     assert small.square_metres(u, u) == near(
         np.full(40, 10**-1.281), 1e-6
     )  # arccos near 1 keeps half of the digits
@@ -336,7 +336,9 @@ def test_fluctuation_is_smooth_and_has_its_spread():
     )
     # statistical: 12000 samples of which about 200 * 20 are independent: 1.1 %; 5 sigma
     assert db.std() == near(std, 0.055)
-    assert db.mean() == pytest.approx(0.0, abs=5 * std / np.sqrt(4000))
+    # a Gaussian field of unit mean power (TR 38.901): the sum of 24 waves is 0.006 dB off
+    below = -np.log(10) / 20 * std**2
+    assert db.mean() == pytest.approx(below, abs=0.006 + 5 * std / np.sqrt(4000))
     one = CrossSection(rcs, "U0", 4)
     step = 1e-5
     side = np.cross(u, u[::-1])
@@ -344,6 +346,37 @@ def test_fluctuation_is_smooth_and_has_its_spread():
     slope = np.abs(10 * np.log10(one.square_metres(v, v) / one.square_metres(u, u))) / step
     assert slope.max() < std * np.sqrt(2 / 24) * 24 * 6.0
     assert slope.max() > std  # it does fluctuate
+
+
+@pytest.mark.parametrize("std", [3.74, 6.3])
+def test_fluctuation_keeps_the_mean_cross_section(std):
+    """In power, over bodies and at a generic bistatic angle, whatever its spread. Planted bug: zero
+    mean in decibels, which is 1.6 dB too much at 3.74 dB."""
+    u = directions(30, 5)
+    observed = directions(30, 6)
+    of = [
+        CrossSection(Rcs(model="constant", value_dbsm=-9.1, fluctuation_db=std), f"U{k}", 4)
+        for k in range(3000)
+    ]
+    mean = np.mean([section.square_metres(u, observed) for section in of])
+    scatter = np.sqrt(np.exp((np.log(10) / 10 * std) ** 2) - 1)  # of a log-normal power
+    # statistical: 3000 bodies in some 10 independent aspects; 5 sigma
+    assert mean / 10**-0.91 == pytest.approx(1.0, abs=5 * scatter / np.sqrt(30000))
+
+
+def test_the_reports_uavs_fluctuate_unless_told_otherwise():
+    """3.74 dB for the small UAV and 2.50 dB for the large, seen as spread over bodies."""
+    u = directions(1, 3)
+    for size, std in (("small", 3.74), ("large", 2.50)):
+        db = [
+            10 * np.log10(CrossSection(Rcs(size=size), f"U{k}", 4).square_metres(u, u)[0])
+            for k in range(1000)
+        ]
+        assert np.std(db) == near(std, 0.11)  # statistical: 1000 bodies, 5 sigma
+        still = Rcs(size=size, fluctuation_db=0)
+        assert CrossSection(still, "a", 4).square_metres(u, u) == CrossSection(
+            still, "b", 4
+        ).square_metres(u, u)
 
 
 def test_cross_section_belongs_to_the_body_alone():
@@ -388,7 +421,9 @@ def test_cross_sections_are_sionnas(size):
     expected = 10 * np.log10(
         np.asarray(theirs(in_their_axes(-to_source), in_their_axes(to_observer)), float)
     )
-    ours = 10 * np.log10(CrossSection(Rcs(size=size), "U", 1).square_metres(to_source, to_observer))
+    ours = 10 * np.log10(
+        CrossSection(Rcs(size=size, fluctuation_db=0), "U", 1).square_metres(to_source, to_observer)
+    )
     assert ours.std() > (0.3 if size == "small" else 2)
     assert (
         np.abs(ours - expected).max() < 2e-3
