@@ -27,8 +27,8 @@ class Rcs(Node):
     fluctuation_db: Annotated[float, Field(ge=0, le=20)] | None = None
     """Standard deviation by which the cross-section varies smoothly with the aspect [dB], for
     `tr38901` and `constant`; the same on all links and frames, and without effect on the mean
-    power. The default is the report's for `tr38901` (3.74 for a small UAV, 2.50 for a large one) and
-    none for `constant`."""
+    power. The default is the report's for `tr38901` (3.74 for a small UAV, 2.50 for a large one),
+    and none for `constant`."""
     level_db: Decibels = -20.0
     """Level of the reflected path over the reference path of its link [dB], for `relative`: the
     line of sight at a passive terminal, the strongest other target at an active one. The default
