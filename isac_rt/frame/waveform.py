@@ -35,6 +35,12 @@ class Waveform:
     filter_transition : width of the skirts of the IF filter [Hz], which passes [0, f_s]
     blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A
         receiver that reads some of the groups only sees a waveform of these (`of_groups`)
+
+    Examples
+    --------
+    >>> w = Waveform(num_samples=1024, num_chirps=120)
+    >>> round(w.range_cell(2), 4), round(w.velocity_cell(2), 4), round(w.max_velocity(1), 2)
+    (0.2498, 0.249, 29.89)
     """
 
     carrier_frequency: float = 77e9

@@ -49,6 +49,11 @@ def load(
     -----
     ScenarioWarning
         About values that look as if their unit were another.
+
+    Examples
+    --------
+    >>> load("scenes/street_canyon.yaml", ["noise.tx_power_dbm=3"], frames=4).noise.tx_power_dbm
+    3.0
     """
     document = Document(Path(path), "a scenario needs at least a swarm")
     for override in overrides:

@@ -466,5 +466,13 @@ def propagation_in(
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
-    """The paths of all links of one frame."""
+    """The paths of all links of one frame.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> paths = irt.trace(irt.load("scenes/paper_swarm_consistent.yaml"), 0)
+    >>> float((paths["AT", "PT1"].delay.min() * 299792458).round(2))
+    11.33
+    """
     return dict((setup or prepare(scenario)).frame(frame).paths)

@@ -236,11 +236,22 @@ def save_dataset(dataset: xr.Dataset, folder: Path) -> Path:
 def open_sweep(folder: Path | str) -> xr.Dataset:
     """The outcomes of a sweep so far, finished or not, as one labelled dataset (see `assemble`).
 
+    Points belong to the program that ran them. Where another version of it finished the sweep, the
+    dataset is the one that it wrote; its attribute ``program`` says which.
+
     Raises
     ------
-    ResultsError  If the folder is no sweep's.
+    ResultsError  If the folder is no sweep's, or its dataset cannot be read.
     """
     outcomes = Outcomes(Path(folder))
+    file = outcomes.folder / FILE
+    if file.is_file():
+        try:
+            with xr.open_dataset(file, engine="h5netcdf") as written:
+                if written.attrs.get("program") != program_fingerprint():
+                    return written.load()
+        except (OSError, ValueError) as problem:
+            raise ResultsError(f"{file} cannot be read ({problem}); delete it") from problem
     return assemble(outcomes.definition(), outcomes)
 
 

@@ -157,7 +157,20 @@ def cube_dataset(cube: IFCube) -> xr.Dataset:
 
 
 def save_cube(cube: IFCube, file: str | Path) -> None:
-    """Write an IF cube as NetCDF (see `cube_dataset`); the file appears whole or not at all."""
+    """Write an IF cube as NetCDF (see `cube_dataset`); the file appears whole or not at all.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
+    >>> cube = setup.frame(0).samples(("AT", "PT1"))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     irt.save_cube(cube, f"{folder}/cube.nc")
+    ...     again = irt.load_cube(f"{folder}/cube.nc")
+    >>> bool((again.samples == cube.samples).all())
+    True
+    """
     dataset = cube_dataset(cube)
     write_bytes(Path(file), lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf"))
 

@@ -22,13 +22,14 @@ import isac_rt
 from isac_rt.cli.cli import main
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
+from isac_rt.results.files import ResultsError
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import UNSEEN_BY_PATHS
 from isac_rt.scenario.file import ScenarioError, load, plain_tree
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import summarise
-from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, status
+from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, save_dataset, status
 from isac_rt.sweep.execute import Job, run_job
 
 ROOT = Path(__file__).parents[2]
@@ -241,6 +242,24 @@ def test_the_key_is_of_the_content(folder, monkeypatch):
 
 
 # ---- outcomes
+
+
+def test_a_sweep_that_another_version_finished_is_opened(folder, monkeypatch):
+    """Its own dataset, and not points of today's program, of which there are none. Planted bug:
+    the saved dataset never looked at."""
+    plan, out = plan_of(folder), folder / "out"
+    Outcomes(out).save_definition(plan)
+    run_here(plan, out, list(plan.points())[:2])
+    finished = open_sweep(out)
+    save_dataset(finished, out)
+    for module in ("definition", "outcomes"):
+        monkeypatch.setattr(f"isac_rt.sweep.{module}.program_fingerprint", lambda: "another")
+    found = open_sweep(out)
+    assert found.attrs["program"] == finished.attrs["program"] != "another"
+    assert int(found.state.sum()) == 2 and found.equals(finished)
+    (out / "sweep.nc").write_bytes(b"half")
+    with pytest.raises(ResultsError, match=r"sweep\.nc cannot be read"):
+        open_sweep(out)
 
 
 def test_the_dataset_holds_each_points_summary(folder):
