@@ -83,9 +83,9 @@ def test_import_finder_sees_every_form():
 
 
 def imported_files(path: Path) -> set[Path]:
-    """Files of the package that a file imports when it is imported itself."""
+    """Files of the package that a file imports, at once or when one of its functions is called."""
     found = set()
-    for node in ast.parse(path.read_text()).body:
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("isac_rt"):
             for dotted in (f"{node.module}.{alias.name}" for alias in node.names):
                 for name in (dotted, node.module or ""):

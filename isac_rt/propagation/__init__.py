@@ -1,7 +1,8 @@
 """Propagation: poses in, path sets out."""
 
+from isac_rt.propagation.build import make_propagation
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.model import Census, Propagation, Traced, make_propagation
+from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 
 __all__ = [

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathSet
-from isac_rt.scenario import environment
-from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.swarm import Pose, Swarm
-
-if TYPE_CHECKING:
-    from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.world.swarm import Pose
 
 
 class Traced(NamedTuple):
@@ -52,34 +45,3 @@ class Propagation(Protocol):
     def census(self) -> Census:
         """What the model holds, the same at all instants."""
         ...
-
-
-def make_propagation(
-    propagation: environment.Propagation,
-    clutter: environment.Clutter,
-    swarm: Swarm,
-    free: FreeSpace,
-    city: CityMesh,
-    waveform: Waveform,
-    instants: Sequence[float] = (),
-) -> Propagation:
-    """The model that a scenario asks for. `ray_traced` starts the JIT back end.
-
-    With `instants` (rising, those of the first and the last frame among them) the city is traced
-    then only; between them paths are unfolded anew (`legs.between`).
-    """
-    model: Propagation = free
-    if propagation.model == "ray_traced":
-        from isac_rt import runtime
-
-        runtime.activate()
-        from isac_rt.propagation.raytrace import RayTracer
-
-        model = RayTracer(
-            propagation, clutter, swarm, free, city, waveform.carrier_frequency, instants
-        )
-    if clutter.model == "rayleigh":
-        from isac_rt.propagation.clutter.rayleigh import RayleighClutter
-
-        return RayleighClutter(model, free, clutter, waveform)
-    return model
