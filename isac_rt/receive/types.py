@@ -25,6 +25,16 @@ class Prediction:
     direction : (K, 2) direction cosines (u_x, u_z) in the receiver's body frame
     range_std, velocity_std : (K,) standard deviations of the predictions
     weight : (K,) expected power relative to the strongest, in (0, 1]
+
+    Examples
+    --------
+    >>> one = np.ones(1)
+    >>> expected = Prediction(
+    ...     range=30.2 * one, velocity=-3.1 * one, direction=np.array([[0.1, 0.0]]),
+    ...     range_std=0.02 * one, velocity_std=0.1 * one, weight=one,
+    ... )
+    >>> expected.range.round(1)
+    array([30.2])
     """
 
     range: np.ndarray

@@ -50,7 +50,15 @@ class _Clock:
 
 
 def standard_terminal(setup: Setup, link: Link) -> Terminal:
-    """The receiver of a link as the scenario has it."""
+    """The receiver of a link as the scenario has it.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
+    >>> [type(standard_terminal(setup, link)).__name__ for link in setup.timetable.links(0)]
+    ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
+    """
     s = setup.scenario
     if link.own:
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
