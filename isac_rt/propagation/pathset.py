@@ -212,6 +212,15 @@ def make_paths(
     )
 
 
+def widened(a: np.ndarray, depth: int, fill: float) -> np.ndarray:
+    """An array whose second axis is lengthened to `depth` by `fill`; numpy's own pad is slow."""
+    if a.shape[1] == depth:
+        return a
+    out = np.full((a.shape[0], depth, *a.shape[2:]), fill, a.dtype)
+    out[:, : a.shape[1]] = a
+    return out
+
+
 def merge(parts: list[PathSet]) -> PathSet:
     """All paths of one link in one set, in the order given; interaction lists are padded to the
     longest."""
@@ -223,8 +232,7 @@ def merge(parts: list[PathSet]) -> PathSet:
     def padded(name: str, a: np.ndarray) -> np.ndarray:
         if name not in ("points", "faces"):
             return a
-        width = [(0, 0), (0, depth - a.shape[1])] + [(0, 0)] * (a.ndim - 2)
-        return np.pad(a, width, constant_values=np.nan if name == "points" else -1)
+        return widened(a, depth, np.nan if name == "points" else -1)
 
     columns = [p.arrays() for p in parts]
     joined: dict[str, Any] = {

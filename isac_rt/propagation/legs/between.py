@@ -22,6 +22,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.legs.geometry import EDGE, Legs, unfold
 from isac_rt.propagation.legs.rays import LIFT, Shadows
 from isac_rt.propagation.legs.reflection import mirror_amplitude
+from isac_rt.propagation.pathset import widened
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -78,16 +79,7 @@ def leg_set(parts: list[tuple[np.ndarray, Legs, np.ndarray, np.ndarray]], depth:
 
     def joined(arrays: Iterable[np.ndarray], fill: float) -> np.ndarray:
         """Padded along the second axis to `depth`."""
-        return np.concatenate(
-            [
-                np.pad(
-                    a,
-                    [(0, 0), (0, depth - a.shape[1]), *[(0, 0)] * (a.ndim - 2)],
-                    constant_values=fill,
-                )
-                for a in arrays
-            ]
-        )
+        return np.concatenate([widened(a, depth, fill) for a in arrays])
 
     amplitudes, legs, faces, planes = zip(*parts, strict=True)
     *columns, points = zip(*(vars(part).values() for part in legs), strict=True)
