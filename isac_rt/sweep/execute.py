@@ -177,7 +177,7 @@ def run_sweep(
     retry_failed: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Run what is missing of a sweep.
+    r"""Run what is missing of a sweep.
 
     Parameters
     ----------
@@ -193,6 +193,21 @@ def run_sweep(
     SweepError  If the scheduler cannot be reached.
     SchedulerLost  If it is lost on the way.
     isac_rt.results.files.ResultsError  If the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import isac_rt as irt
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "two.yaml"
+    ...     _ = file.write_text(
+    ...         f"name: two\nscenario: {Path('scenes/paper_swarm_consistent.yaml').resolve()}\n"
+    ...         "set: {frames: 4}\naxes: {snr_db: {key: noise.snr_db, values: [0, 10]}}\n"
+    ...     )
+    ...     irt.run_sweep(irt.load_sweep(file), Path(folder) / "out", workers=1)
+    ...     outcomes = irt.open_sweep(Path(folder) / "out")
+    >>> outcomes.state.values.ravel().tolist()
+    [1, 1]
     """
     outcomes = Outcomes(Path(folder).resolve())
     outcomes.save_definition(plan)

@@ -74,7 +74,24 @@ class TerminalState(IntEnum):
 
 
 class ActiveTerminal:
-    """The AT: senses with its own echoes and tracks what it finds."""
+    """The AT: senses with its own echoes and tracks what it finds.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> scenario = irt.load("scenes/paper_swarm_consistent.yaml")
+    >>> setup = irt.prepare(scenario)
+    >>> frame, link = setup.frame(0), ("AT", "AT")
+    >>> cube, sent = frame.samples(link), frame.sent["AT"]
+    >>> terminal = irt.ActiveTerminal(
+    ...     setup.waveform, setup.antennas, scenario.receivers, scenario.tracking
+    ... )
+    >>> reception, tracks = terminal.step(
+    ...     cube, sent.payload, sent.pose, time=frame.paths[link].epoch
+    ... )
+    >>> len(tracks) == len(reception.detections)
+    True
+    """
 
     def __init__(
         self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking

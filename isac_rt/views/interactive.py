@@ -47,6 +47,17 @@ def scene_3d(
     Raises
     ------
     ModuleNotFoundError  Without the package `plotly`.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
+    >>> frame, when = setup.frame(0), setup.timetable.epoch(0)
+    >>> figure = irt.scene_3d(
+    ...     setup.city, setup.swarm, np.linspace(0, 1, 5), when, frame.paths
+    ... )
+    >>> len(figure.data) > len(setup.swarm.uavs)
+    True
     """
     try:
         import plotly.graph_objects as go
