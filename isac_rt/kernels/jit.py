@@ -1,11 +1,11 @@
 """The decorator of every compiled function, and where their machine code is kept.
 
 Machine code holds that of the functions which are called and the constants which are named, from
-whatever module they come. It is therefore kept in a folder whose name is a digest of the source of
-every module that defines compiled functions, and of those that these import constants from: changed
-source never finds old code. The folder stands in the one that the variable `CACHE` of the
-environment names, else NUMBA_CACHE_DIR, else the user's cache. Where it cannot be written, every
-process compiles for itself.
+whatever module they come. It is therefore kept in a folder for each module, whose name is a digest
+of the source of that module, of the modules with compiled functions that it imports, and of those
+that these import constants from: changed source never finds old code. The folders stand in the one
+that the variable `CACHE` of the environment names, else NUMBA_CACHE_DIR, else the user's cache.
+Where it cannot be written, every process compiles for itself.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from numba.core import caching
 CACHE = "ISAC_RT_CACHE"
 """Variable of the environment: folder of the machine code."""
 KEPT = 8
-"""Digests whose machine code is kept, the last used."""
+"""Sources of a module whose machine code is kept, the last used."""
 FAST = ("contract", "nnan", "ninf", "nsz")
 """Freedoms of the compiler that do not depend on the vector width."""
 _COMPILES = re.compile(rb"^(from|import) (numba|isac_rt\.kernels\.jit)\b", re.MULTILINE)
 _IMPORT = re.compile(rb"^from isac_rt\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CONSTANT = re.compile(rb"\b_?[A-Z][A-Z0-9_]+\b")
+_WORD = re.compile(rb"\w+")
 
 
 def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = False) -> Any:
@@ -50,41 +51,49 @@ def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = 
         fastmath=set(FAST) if fast else False,
         inline="always" if inline else "never",
     )(function)
-    if not inline and cache_folder() is not None:
+    if not inline and cache_folder(function.__module__) is not None:
         made._cache = _Cache(function)
     return made
 
 
-@lru_cache(maxsize=1)
-def digest() -> str:
-    """Of the source of all that the machine code of the package depends on."""
+@lru_cache
+def digest(module: str) -> str:
+    """Of the source of all that a module's machine code depends on; it and what it calls."""
     root = Path(__file__).parents[1]
-    sources = {path: path.read_bytes() for path in root.rglob("*.py")}
-    chosen = [path for path, text in sources.items() if _COMPILES.search(text)]
+    chosen = [root.joinpath(*module.split(".")[1:]).with_suffix(".py")]
+    sources: dict[Path, bytes] = {}
     for path in chosen:  # grows while it is read
-        for module, names in _IMPORT.findall(sources[path]):
-            source = root.joinpath(*module.decode().split(".")).with_suffix(".py")
-            if _CONSTANT.search(names) and source in sources and source not in chosen:
-                chosen.append(source)
+        sources[path] = path.read_bytes()
+        if not _COMPILES.search(sources[path]) and path != chosen[0]:
+            continue  # only its constants count
+        for name, imported in _IMPORT.findall(sources[path]):
+            source = root.joinpath(*name.decode().split("."))
+            inside = [source / f"{word.decode()}.py" for word in _WORD.findall(imported)]
+            for file in (source.with_suffix(".py"), *inside):
+                if file in chosen or not file.exists():
+                    continue
+                if _CONSTANT.search(imported) or _COMPILES.search(file.read_bytes()):
+                    chosen.append(file)
     found = hashlib.sha256()
-    for path in sorted(chosen):
+    for path in sorted(sources):
         found.update(f"{path.relative_to(root)}:{len(sources[path])}:".encode() + sources[path])
     return found.hexdigest()[:16]
 
 
-@lru_cache(maxsize=1)
-def cache_folder() -> Path | None:
-    """Folder of this source's machine code, made if need be; None where none can be written.
+@lru_cache
+def cache_folder(module: str) -> Path | None:
+    """Folder of a module's machine code, made if need be; None where none can be written.
 
-    Those of other sources are removed but for the last used.
+    Those of other sources of the module are removed but for the last used.
     """
     named = os.environ.get(CACHE) or os.environ.get("NUMBA_CACHE_DIR")
+    short = module.removeprefix("isac_rt.")
     try:
         user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "isac_rt"
-        folder = (Path(named) if named else user) / f"kernels-{digest()}"
+        folder = (Path(named) if named else user) / f"{short}-{digest(module)}"
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()  # which also says that it was used today
-        others = sorted(folder.parent.glob("kernels-*"), key=lambda f: f.stat().st_mtime)
+        others = sorted(folder.parent.glob(f"{short}-*"), key=lambda f: f.stat().st_mtime)
     except (OSError, RuntimeError):
         return None
     for old in others[:-KEPT]:
@@ -99,13 +108,13 @@ class _Locator(caching._CacheLocator):
         self._function = function
 
     def get_cache_path(self) -> str:
-        return str(cache_folder())
+        return str(cache_folder(self._function.__module__))
 
     def get_source_stamp(self) -> str:
-        return digest()
+        return digest(self._function.__module__)
 
     def get_disambiguator(self) -> str:
-        return f"{self._function.__module__}-{self._function.__code__.co_firstlineno}"
+        return str(self._function.__code__.co_firstlineno)
 
     @classmethod
     def from_function(cls, py_func: Callable, py_file: str) -> _Locator:

@@ -83,12 +83,24 @@ def test_a_changed_line_runs(copy, file, old, new, answer):
     assert run(copy) == ["21001", "1"]
 
 
-@pytest.mark.parametrize("file", ["signal/noise.py", "kernels/vector.py", "receive/maps.py"])
-def test_every_kernel_counts(copy, file):
-    """A line of any kernel changes the folder; one of a module without kernels does not."""
-    code = "from isac_rt.kernels.jit import cache_folder; print(cache_folder().name)"
+@pytest.mark.parametrize(
+    ("module", "file"),
+    [
+        ("signal.noise", "signal/noise.py"),
+        ("signal.gridded", "kernels/vector.py"),
+        ("receive.transform", "kernels/fourier.py"),
+        ("propagation.clutter.two_bounces", "propagation/clutter/field.py"),
+    ],
+)
+def test_every_kernel_that_is_called_counts(copy, module, file):
+    """A line of any kernel of a module's own changes the folder; one that it does not use does not.
+
+    `receive.transform` imports its kernels as a module.
+    """
+    code = f"from isac_rt.kernels.jit import digest; print(digest('isac_rt.{module}'))"
     first = run(copy, code)
-    (copy / "isac_rt/views/report.py").write_text("")
+    for other in ("views/report.py", "views/render.py"):
+        (copy / "isac_rt" / other).write_text("")
     assert run(copy, code) == first
     with (copy / "isac_rt" / file).open("a") as source:
         source.write("\n")
@@ -101,14 +113,14 @@ def test_where_nothing_can_be_written_every_process_compiles(copy):
 
 
 def test_old_machine_code_goes(copy):
-    """Of twelve sources the eight last used stay."""
+    """Of twelve sources of a module the eight last used stay."""
     for number in range(11):
-        old = copy / f"cache/kernels-{number:02}"
+        old = copy / f"cache/kernels.outer-{number:02}"
         old.mkdir(parents=True)
         os.utime(old, (number, number))
     run(copy)
-    left = sorted(f.name for f in (copy / "cache").iterdir())
-    assert len(left) == 8 and "kernels-03" not in left and "kernels-04" in left
+    left = sorted(f.name for f in (copy / "cache").glob("kernels.outer-*"))
+    assert len(left) == 8 and "kernels.outer-03" not in left and "kernels.outer-04" in left
 
 
 def test_two_processes_compile_at_once(copy):
