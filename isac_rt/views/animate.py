@@ -18,7 +18,7 @@ from isac_rt.views.figures import STYLE, colour_of, range_doppler, scene_map
 from isac_rt.world.city.mesh import CityMesh
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
-_STYLE = STYLE | {"figure.constrained_layout.use": False}
+
 _LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
 
 
@@ -67,7 +67,7 @@ def animate(
             f"{len(shown)} frame(s) have maps of {d.observer.values[observer]}; run again with "
             "--snapshots 20 or more"
         )
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 4.8), dpi=100)
         left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
         scene_map(left, d, city)
@@ -82,7 +82,7 @@ def animate(
                 ax.remove()  # the last map's colour bar
             right.clear()
             right.set_position(_RIGHT)
-            with matplotlib.rc_context(_STYLE):
+            with matplotlib.rc_context(STYLE):
                 range_doppler(right, d, k, observer)
             return []
 

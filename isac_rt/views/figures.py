@@ -3,6 +3,7 @@ all."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -53,7 +54,6 @@ UAV_COLOURS = (
 ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
 STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
-    "figure.constrained_layout.use": True,
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -67,6 +67,10 @@ STYLE: dict[Any, Any] = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.4,
 }
+_MARGINS = (0.75, 0.15, 0.5, 0.35, 0.75, 0.8)
+"""Left, right, bottom, top, between columns and between rows of a figure [inch]."""
+_LEGEND_ROW = 0.17
+"""Height of a row of a legend [inch]."""
 _SHOWN_DB = 60.0
 _TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 """Depth of a map's colour scale [dB]."""
@@ -98,10 +102,21 @@ def _moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
     return frame, int(dataset.frame.values[frame])
 
 
-def _labelled(ax: Axes, x: str, y: str, **legend: Any) -> Axes:
-    """Labels, and a legend if there is something to name."""
+def _labelled(ax: Axes, x: str, y: str, columns: int = 0, **legend: Any) -> Axes:
+    """Labels, and a legend if there is something to name.
+
+    With `columns` it stands in so many above the data, for which the axis grows.
+    """
     ax.set(xlabel=x, ylabel=y)
-    if ax.get_legend_handles_labels()[0]:
+    named = len(ax.get_legend_handles_labels()[0])
+    if named and columns:
+        figure = ax.get_figure(root=True)
+        height = ax.get_position().height * (figure.get_figheight() if figure else 1.0)
+        share = min(0.6, (math.ceil(named / columns) * _LEGEND_ROW + 0.1) / height)
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, low + (high - low) / (1 - share))
+        legend = {"loc": "upper left", "ncols": columns} | legend
+    if named:
         ax.legend(**legend)
     return ax
 
@@ -277,7 +292,7 @@ def _map(
         interpolation="nearest",
         extent=(x[0] - dx, x[-1] + dx, y[0] - dy, y[-1] + dy),
     )
-    ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.05)
+    ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.12, aspect=30)
     ax.grid(False)
 
 
@@ -327,7 +342,7 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         )
         ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
-    return _labelled(ax, "time [s]", f"{name} [{unit}]", ncols=4, loc="best")
+    return _labelled(ax, "time [s]", f"{name} [{unit}]", columns=8)
 
 
 def _processed(dataset: xr.Dataset, observer: int) -> xr.Dataset:
@@ -359,8 +374,9 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
                     color=colour_of(o),
                     label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})",
                 )
-    ax.set(xscale="log", ylim=(0, 1.02))
-    return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", loc="best")
+    ax.set(xscale="log", ylim=(0, 1.02), yticks=np.linspace(0, 1, 6))
+    ax.minorticks_off()  # they take longer to draw than the curves
+    return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", columns=2)
 
 
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
@@ -389,7 +405,7 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
             )
     delay, doppler = "path length [m]", "Doppler shift [kHz] (closing is positive)"
     ax.set_title(_link(dataset, observer))
-    _labelled(ax, delay if against == "delay" else doppler, "path gain [dB]", loc="best", ncols=2)
+    _labelled(ax, delay if against == "delay" else doppler, "path gain [dB]", columns=3)
     legend = ax.get_legend()
     for handle in legend.legend_handles if legend else ():
         assert handle is not None
@@ -450,7 +466,7 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
             color=colour_of(o),
             label=name,
         )
-    return _labelled(ax, "time [s]", "SNR of the reference path [dB]", loc="best")
+    return _labelled(ax, "time [s]", "SNR of the reference path [dB]", columns=8)
 
 
 def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
@@ -471,19 +487,43 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
                 label=f"{words(name)} ({count[:, k].sum()})",
             )
     ax.set_title(f"{_link(dataset, observer)} (paths over all frames)")
-    return _labelled(ax, "time [s]", "path gain of the kind [dB]", ncols=3)
+    return _labelled(ax, "time [s]", "path gain of the kind [dB]", columns=6)
 
 
 def _figure(
     draw: Sequence[Callable[[Axes], Any]], height: float, columns: int = 1, width: float = 8.4
 ) -> Figure:
-    """A figure of one axis for each of `draw`, row by row; outside pyplot, so that none stays
-    open."""
-    figure = Figure(figsize=(width, height))
-    axes = figure.subplots(len(draw) // columns, columns, squeeze=False)
+    """A figure of one axis for each of `draw`, row by row.
+
+    It is outside pyplot, so that none stays open. Margins are fixed in inches: a layout solver
+    would draw everything twice.
+    """
+    figure, rows = Figure(figsize=(width, height)), len(draw) // columns
+    axes = figure.subplots(rows, columns, squeeze=False)
+    left, right, bottom, top, across, down = _MARGINS
+    figure.subplots_adjust(
+        left=left / width,
+        right=1 - right / width,
+        bottom=bottom / height,
+        top=1 - top / height,
+        wspace=across / ((width - left - right - (columns - 1) * across) / columns),
+        hspace=down / ((height - bottom - top - (rows - 1) * down) / rows),
+    )
     for ax, drawn in zip(axes.flat, draw, strict=True):
         drawn(ax)
     return figure
+
+
+def _maps(
+    d: xr.Dataset, snapshot: int, name: str, function: Callable, height: float
+) -> Iterator[tuple[str, Figure]]:
+    """Maps of the terminals that have one; where profiles were made directly the data were never
+    in."""
+    values = d["map_power" if function is range_doppler else "map_equivalent_range"][snapshot]
+    shown = np.flatnonzero(np.isfinite(values.values).any(axis=(1, 2)))
+    draw = [partial(function, dataset=d, snapshot=snapshot, observer=o) for o in shown]
+    if draw:
+        yield f"{name}_{_moment(d, snapshot)[1]:04d}", _figure(draw, height * len(draw))
 
 
 def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[tuple[str, Figure]]:
@@ -491,14 +531,9 @@ def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[tuple[str, Figure]]:
     observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
     yield "scene", _figure([partial(scene_map, dataset=d, city=city)], 6.4)
     for s in sorted({0, kept // 2, kept - 1}) if kept else ():
-        for name, function, values, height in (
-            ("range_doppler", range_doppler, d.map_power, 4.1),
-            ("equivalent_range", equivalent_range, d.map_equivalent_range, 3.2),
-        ):  # the latter is missing where profiles were made directly
-            shown = [o for o in observers if np.isfinite(values.values[s, o]).any()]
-            if shown:
-                draw = [partial(function, dataset=d, snapshot=s, observer=o) for o in shown]
-                yield f"{name}_{_moment(d, s)[1]:04d}", _figure(draw, height * len(shown))
+        yield from _maps(d, s, "range_doppler", range_doppler, 4.1)
+    if kept:  # every frame shows the same
+        yield from _maps(d, kept // 2, "equivalent_range", equivalent_range, 3.2)
     for o in observers:
         of = ("range", "velocity", "azimuth")
         figure = _figure([partial(over_time, dataset=d, observer=o, name=m) for m in of], 7.6)
@@ -507,7 +542,7 @@ def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[tuple[str, Figure]]:
             f"{label}: truth (line), detections (dots), tracks (broad); shaded where hidden"
         )
         yield f"tracks_{label.replace('->', '_to_')}", figure
-    yield "errors", _figure([partial(error_cdf, dataset=d, name=m) for m in MEASURES], 6.0, 2)
+    yield "errors", _figure([partial(error_cdf, dataset=d, name=m) for m in MEASURES], 7.0, 2)
     if d.sizes["path"]:
         draw = [
             partial(path_power, dataset=d, observer=o, against=against)
