@@ -23,7 +23,7 @@ from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import Detections, ExpectedClutter
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import (
     Gaussian,
@@ -182,6 +182,7 @@ class PassiveTerminal:
                 self.reference.state, time - self._time, self._acceleration
             )
             self.reference.age += 1
+            self.reference.detection = -1
         self._time = time
         self.tracker.predict(time)
         reception = self.receive(
@@ -262,7 +263,7 @@ class PassiveTerminal:
         if self.reference is None or (
             not modulated and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)
         ):
-            self._restart(z, std, float(d.snr[q]), own)
+            self._restart(d, q, std, own)
         elif off > 0:
             self.reference.missed += 1
         else:
@@ -271,14 +272,18 @@ class PassiveTerminal:
                 self.reference.state, z, R, own, velocity_period=self._period
             )
             self.reference.snr, self.reference.missed = float(d.snr[q]), 0
+            self.reference.detection = q
         if self.reference is not None:
             self.state = TerminalState.TRACKING
 
-    def _restart(self, z: np.ndarray, std: np.ndarray, snr: float, own: Pose) -> None:
-        """A reference track from one detection; the other tracks rested on the old one."""
+    def _restart(self, d: Detections, q: int, std: np.ndarray, own: Pose) -> None:
+        """A reference track from detection `q`; the other tracks rested on the old one."""
+        z = np.array([d.range[q], d.velocity[q], *d.direction[q]])
         state = birth(z, std, own, acceleration_std=self._acceleration)
         if state is not None:
-            self.reference = Track(self.tracker.new_id(), state, snr, confirmed=True)
+            self.reference = Track(
+                self.tracker.new_id(), state, float(d.snr[q]), confirmed=True, detection=q
+            )
             self.tracker.clear()
             self._ends.clear()
 

@@ -60,6 +60,7 @@ class Track:
         included
     missed : frames since the last detection
     confirmed : M hits in N frames were reached
+    detection : row among the frame's detections that updated it, -1: none
     """
 
     id: int
@@ -69,6 +70,7 @@ class Track:
     recent: list[bool] = field(default_factory=lambda: [True])
     missed: int = 0
     confirmed: bool = False
+    detection: int = -1
 
     def memory(self) -> dict[str, Any]:
         """The track as plain numbers and arrays, for `of_memory`."""
@@ -97,6 +99,7 @@ class TrackSet:
     std : (K, 4) standard deviations of range, velocity, u_x, u_z
     age : (K,) int, frames since the first detection
     confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
+    detection : (K,) int, row among the frame's detections that updated it, -1: none
     """
 
     ids: np.ndarray
@@ -109,6 +112,7 @@ class TrackSet:
     age: np.ndarray
     confirmed: np.ndarray
     is_reference: np.ndarray
+    detection: np.ndarray
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -144,6 +148,7 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
         age=np.array([t.age for t in everyone], np.int64),
         confirmed=np.array([t.confirmed for t in everyone], bool),
         is_reference=is_reference,
+        detection=np.array([t.detection for t in everyone], np.int64),
     )
 
 
@@ -189,6 +194,7 @@ class Tracker:
             track.state = predict(
                 track.state, time - self.time, self.settings.acceleration_std_mps2
             )
+            track.detection = -1
         self.time = time
 
     def update(
@@ -219,7 +225,7 @@ class Tracker:
                 track.state = update(
                     track.state, z[q], R, own, t, velocity_period=self.velocity_period
                 )
-                track.snr = float(detections.snr[q])
+                track.snr, track.detection = float(detections.snr[q]), q
         self.tracks = [t for t in self.tracks if not self._dead(t)]
         for q in free:
             state = birth(
@@ -230,7 +236,7 @@ class Tracker:
                 acceleration_std=self.settings.acceleration_std_mps2,
             )
             if state is not None:
-                track = Track(self.new_id(), state, float(detections.snr[q]))
+                track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
                 track.confirmed = self.settings.confirm_hits == 1
                 self.tracks.append(track)
 

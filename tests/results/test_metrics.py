@@ -209,6 +209,7 @@ def tracks(rows, confirmed) -> TrackSet:
         age=np.zeros(k, int),
         confirmed=np.array(confirmed),
         is_reference=np.zeros(k, bool),
+        detection=np.full(k, -1),
     )
 
 

@@ -75,6 +75,7 @@ def test_acquires_from_pilots_then_decodes():
             reception.bits == payload.bits
         ).mean() > 0.99  # statistical: D = 8 at 5 dB has no errors in 900 symbols but by bad luck
         assert tracks.is_reference[0]
+        assert tracks.detection[0] == np.flatnonzero(reception.detections.is_reference)[0]
         # discretisation: interpolation between cells of the map, a hundredth of a cell at most
         assert tracks.range[0] == pytest.approx(
             LENGTH + RATE * INTERVAL * frame, abs=0.01 * W.range_cell(1)

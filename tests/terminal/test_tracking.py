@@ -439,3 +439,23 @@ def test_ids_are_deterministic():
         )
     assert runs[0] == runs[1]
     assert all(a <= b for ids in runs[0] for a, b in pairwise(ids))
+
+
+def test_a_track_says_which_detection_updated_it():
+    """Rows of the frame's detections, whatever their order; -1 while it coasts. Planted bugs: the
+    row kept while coasting, the row among the detections that no confirmed track took."""
+    tracker = Tracker(Tracking(), PERIOD)
+    far = BODY + np.array([17.0, 9.0, 1.0, 1.0, -2.0, 0.0])
+    expected_rows = ([0, 1], [1, 0], [0, 1], [1, 0], [-1, 0], [-1, -1])
+    for k, rows in enumerate(expected_rows):
+        t = 0.02 * k
+        z = np.zeros((max(rows) + 1, 4))
+        for body, row in zip((BODY, far), rows, strict=True):
+            if row >= 0:
+                place = np.concatenate([body[:3] + t * body[3:], body[3:]])
+                own = OWN.position + t * OWN.velocity
+                z[row] = measure(place, Pose(own, OWN.velocity, np.zeros(3), OWN.rotation))
+        now = Pose(OWN.position + t * OWN.velocity, OWN.velocity, np.zeros(3), OWN.rotation)
+        tracker.predict(t)
+        tracker.update(detections(z), now)
+        assert tracker.snapshot(now).detection.tolist() == rows
