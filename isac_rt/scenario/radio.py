@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from fractions import Fraction as Rational
 from typing import Annotated, Literal, NamedTuple
@@ -39,6 +40,28 @@ def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> 
     the paper's numbers)."""
     ratio = Rational(bandwidth).limit_denominator() / Rational(sampling_rate).limit_denominator()
     return int((ratio - 2) / 2 + 1 + num_tx)
+
+
+GAIN_ROUNDING_DB = 0.01
+"""A gain stated to two digits may stand this far above the largest that is possible."""
+
+
+def beam_solid_angle(half_view: float) -> float:
+    """Solid angle [sr] of the directions in front with |u_x| and |u_z| up to sin(`half_view`).
+
+    By the theorem of Gauss and Bonnet: four arcs of circles u = s, which turn about their axes by
+    2 asin(s / sqrt(1 - s^2)) from corner to corner. Beyond 45 degrees the corners lie behind the
+    horizon, and the half sphere less four half caps is left.
+
+    Parameters
+    ----------
+    half_view : half of the field of view per axis [rad]
+    """
+    s = math.sin(min(half_view, math.pi / 2))
+    if 2 * s * s >= 1:
+        return 2 * math.pi - 4 * math.pi * (1 - s)
+    slope = s / math.sqrt(1 - s * s)
+    return 2 * math.pi - 4 * math.acos(-slope * slope) + 8 * s * math.asin(slope)
 
 
 class Radio(Node):
@@ -80,6 +103,13 @@ class Radio(Node):
                 f"{self.sampling_rate_hz:g} Hz; "
                 "raise the bandwidth or lower the sampling rate",
             )
+        if self.bandwidth_hz > self.carrier_hz:
+            yield Problem(
+                (("bandwidth_hz",), ("carrier_hz",)),
+                f"{self.bandwidth_hz:g} Hz is more than the carrier of {self.carrier_hz:g} Hz: "
+                "no antenna sweeps over an octave at one gain; lower the bandwidth, or give both in "
+                "hertz",
+            )
         if self.samples_per_chirp % 2:
             yield Problem(
                 (("samples_per_chirp",),),
@@ -120,11 +150,33 @@ class Array(Node):
     field of view and none outside; `cosine`, the default, falls off from the boresight as a patch
     antenna does."""
     element_gain_dbi: Decibels = 5.0
-    """Gain of one element on boresight over an isotropic one [dBi]; with `isotropic` it holds in
-    all directions. The default is that of a patch antenna."""
+    """Gain of one element on boresight over an isotropic one [dBi]. At most 0 with `isotropic` and
+    what the field of view leaves with `sector` (4.36 for 120 degrees), or the element would radiate
+    more than its power. The default is that of a patch antenna."""
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0
     """Full angle that the arrays look at, in azimuth as in elevation [degrees]. Targets outside
     count as out of view. The default is what the default spacing tells without ambiguity."""
+
+    @property
+    def largest_gain_dbi(self) -> float:
+        """Gain on boresight at which an element radiates just its power [dBi]: 4 pi over the solid
+        angle of its beam. A `cosine` narrows with its gain and has no limit."""
+        if self.element_pattern == "cosine":
+            return math.inf
+        beam = 4 * math.pi
+        if self.element_pattern == "sector":
+            beam = beam_solid_angle(math.radians(self.field_of_view_deg) / 2)
+        return 10 * math.log10(4 * math.pi / beam)
+
+    def problems(self) -> Iterator[Problem]:
+        excess = self.element_gain_dbi - self.largest_gain_dbi
+        if excess > GAIN_ROUNDING_DB:
+            yield Problem(
+                (("element_gain_dbi",), ("element_pattern",), ("field_of_view_deg",)),
+                f"with {self.element_gain_dbi:g} dBi the {self.element_pattern} element would "
+                f"radiate {10 ** (excess / 10):.3g} times its power; at most {self.largest_gain_dbi:.2f} dBi are possible; lower the "
+                "gain, or take the pattern cosine, whose beam narrows with its gain",
+            )
 
 
 class Modulation(Node):

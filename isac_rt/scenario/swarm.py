@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
 from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
+
+
+MAX_SPEED_MPS = 1e4
+"""Nothing in the air is faster. Doppler shifts are modelled to the first order in v/c, which is
+3e-5 here."""
 
 
 class Rcs(Node):
@@ -103,6 +109,8 @@ class Uav(Node):
                 "role takes over its blocks); remove it"
             )
             yield Problem((("resource_block",), ("role",)), said)
+        if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
+            yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:
             yield Problem((("position_m",),), "missing: a UAV needs either position_m or waypoints")
         if self.waypoints is None:
@@ -130,6 +138,12 @@ class Uav(Node):
                     f"must be later than the waypoint before, at {before.time_s:g} s; put the "
                     "waypoints in the order of their times",
                 )
+                continue
+            way = math.dist(before.position_m, after.position_m)
+            if (speed := way / (after.time_s - before.time_s)) > MAX_SPEED_MPS:
+                yield Problem(
+                    (("waypoints", i, "time_s"), ("waypoints", i, "position_m")), _too_fast(speed)
+                )
 
     def place(self, time: float) -> tuple[float, ...]:
         """Position [m] with straight lines between waypoints: near enough to judge an input, not to
@@ -146,6 +160,14 @@ class Uav(Node):
                     p + share * (q - p) for p, q in zip(a.position_m, b.position_m, strict=True)
                 )
         raise AssertionError("two waypoints at least")
+
+
+def _too_fast(speed: float) -> str:
+    """What is wrong with a speed [m/s]."""
+    return (
+        f"a flight at {speed:.4g} m/s is faster than the {MAX_SPEED_MPS:g} m/s that are modelled; "
+        "fly slower"
+    )
 
 
 class Access(Node):

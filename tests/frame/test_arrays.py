@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy.integrate import dblquad
 
 from isac_rt.frame.antennas import Antennas, l_shape
 from isac_rt.frame.schedule import conventional_schedule, is_latin, pseudo_random_schedule
 from isac_rt.scenario.file import load
+from isac_rt.scenario.radio import Array
 from isac_rt.simulation.setup import prepare
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -53,6 +56,45 @@ def test_cosine_pattern_radiates_its_own_power(gain):
 
     total, _ = dblquad(density, 0, 2 * np.pi, 0, np.pi / 2)
     assert total / (4 * np.pi) == pytest.approx(1.0, abs=1e-6)  # quadrature
+
+
+@pytest.mark.parametrize("view", [23.0, 71.3, 90.0, 117.9, 180.0])
+def test_the_largest_gain_of_a_sector_radiates_its_power(view):
+    """The mean over the sphere at `largest_gain_dbi` is 1, by midpoints of rings about the
+    boresight. Planted bugs: the half sphere less four whole caps; interior for exterior angles."""
+    stated = Array(element_pattern="sector", element_gain_dbi=-3, field_of_view_deg=view)
+    gain = 10 ** (stated.largest_gain_dbi / 10)
+    a = replace(PAPER, gain=gain, pattern="sector", half_view=np.deg2rad(view) / 2)
+    count = 1500
+    cosine = (np.arange(count) + 0.5) / count  # u_y: equal areas
+    turn = (np.arange(4 * count) + 0.37) * np.pi / (2 * count)
+    side = np.sqrt(1 - cosine**2)[:, None]
+    u = np.stack(
+        np.broadcast_arrays(side * np.cos(turn), cosine[:, None], side * np.sin(turn)), axis=-1
+    )
+    # half a cell of the edge on either side
+    assert a.element_gain(u).mean() / 2 == pytest.approx(1.0, abs=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("array", "possible"),
+    [
+        ({"element_pattern": "sector", "element_gain_dbi": 4.37}, True),
+        ({"element_pattern": "sector", "element_gain_dbi": 4.39}, False),
+        ({"element_pattern": "sector", "element_gain_dbi": 12.1, "field_of_view_deg": 50}, True),
+        ({"element_pattern": "sector"}, False),
+        ({"element_pattern": "isotropic", "element_gain_dbi": 0}, True),
+        ({"element_pattern": "isotropic", "element_gain_dbi": 0.7}, False),
+        ({"element_pattern": "cosine", "element_gain_dbi": 17.3}, True),
+    ],
+)
+def test_no_element_radiates_more_than_its_power(array, possible):
+    """Over 120 degrees 4.365 dBi are possible (2 pi - 4 pi (1 - sin 60 deg) = 4.5996 sr)."""
+    if possible:
+        Array(**array)
+    else:
+        with pytest.raises(ValidationError, match="times its power; at most .* dBi are possible"):
+            Array(**array)
 
 
 def test_sector_pattern_ends_at_the_field_of_view():

@@ -447,7 +447,7 @@ def test_what_cannot_run_is_refused_before_it_starts(changes, words, tmp_path, c
 @pytest.mark.parametrize(
     "changes",
     [
-        {"radio": {"carrier_hz": 77e6}},
+        {"radio": {"carrier_hz": 770e6}},
         {"radio": {"carrier_hz": 77e12}},
         {
             "swarm": {

@@ -44,6 +44,9 @@ def swarm() -> dict[str, Uav]:
     return out
 
 
+SMALL_ARRAY = {"rx_x": 2, "rx_z": 2, "element_pattern": "isotropic", "element_gain_dbi": 0}
+
+
 def scenario(**changes) -> Scenario:
     base = {
         "name": "dense",
@@ -51,7 +54,7 @@ def scenario(**changes) -> Scenario:
         "frames": 12,
         "frame_interval_s": 0.02,
         "radio": Radio(samples_per_chirp=256, groups=1),
-        "array": Array(rx_x=2, rx_z=2, element_pattern="isotropic", fall_back=True),
+        "array": Array(**SMALL_ARRAY, fall_back=True),
         "noise": Noise(model="snr", snr_db=-5.0),
         "propagation": Propagation(leakage={"enabled": False}),
         "modulation": Modulation(acquisition_frames=2, pilot_every_frames=None),
@@ -90,9 +93,7 @@ def test_data_are_read_by_either_schedule(run):
 
 
 def test_without_the_key_the_advice_is_recorded_and_nothing_changes(run, tmp_path):
-    still = simulate.run(
-        scenario(frames=3, array=Array(rx_x=2, rx_z=2, element_pattern="isotropic")), snapshots=0
-    )
+    still = simulate.run(scenario(frames=3, array=Array(**SMALL_ARRAY)), snapshots=0)
     assert (
         not still.dataset.fell_back.any() and still.dataset.sparse.sel(observer="A").values[0] == 0
     )
