@@ -107,8 +107,8 @@ class Radio(Node):
             yield Problem(
                 (("bandwidth_hz",), ("carrier_hz",)),
                 f"{self.bandwidth_hz:g} Hz is more than the carrier of {self.carrier_hz:g} Hz: "
-                "no antenna sweeps over an octave at one gain; lower the bandwidth, or give both in "
-                "hertz",
+                "no antenna sweeps over an octave at one gain; lower the bandwidth, or give both "
+                "in hertz",
             )
         if self.samples_per_chirp % 2:
             yield Problem(
@@ -174,8 +174,9 @@ class Array(Node):
             yield Problem(
                 (("element_gain_dbi",), ("element_pattern",), ("field_of_view_deg",)),
                 f"with {self.element_gain_dbi:g} dBi the {self.element_pattern} element would "
-                f"radiate {10 ** (excess / 10):.3g} times its power; at most {self.largest_gain_dbi:.2f} dBi are possible; lower the "
-                "gain, or take the pattern cosine, whose beam narrows with its gain",
+                f"radiate {10 ** (excess / 10):.3g} times its power; at most "
+                f"{self.largest_gain_dbi:.2f} dBi are possible; lower the gain, or take the "
+                "pattern cosine, whose beam narrows with its gain",
             )
 
 

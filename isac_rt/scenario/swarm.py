@@ -11,7 +11,6 @@ from pydantic import Field, field_validator
 
 from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
-
 MAX_SPEED_MPS = 1e4
 """Nothing in the air is faster. Doppler shifts are modelled to the first order in v/c, which is
 3e-5 here."""

@@ -93,7 +93,7 @@ def test_no_element_radiates_more_than_its_power(array, possible):
     if possible:
         Array(**array)
     else:
-        with pytest.raises(ValidationError, match="times its power; at most .* dBi are possible"):
+        with pytest.raises(ValidationError, match=r"times its power; at most .* dBi are possible"):
             Array(**array)
 
 
