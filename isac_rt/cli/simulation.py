@@ -120,10 +120,15 @@ def _say_budget(rows: list[Any]) -> None:
 
 
 def _say_summary(results: Results) -> None:
-    from isac_rt.views.report import number, per_terminal, rmse_table
+    from isac_rt.views.report import number, per_terminal, rmse_table, side_by_side
 
     left_out = ("Role", "Matched", "Matched, tracked")
-    for part in (per_terminal(results.summary), rmse_table(results.summary)):
+    compared = side_by_side(results.summary)
+    for part in (
+        per_terminal(results.summary),
+        rmse_table(results.summary),
+        *([compared] if compared.rows else []),
+    ):
         kept = [i for i, title in enumerate(part.columns) if title not in left_out]
         say_table([part.columns[i] for i in kept], [[row[i] for i in kept] for row in part.rows])
     found = ", ".join(

@@ -92,7 +92,16 @@ def commit() -> str:
         return ""
 
 
-UNSEEN_BY_PATHS = ("name", "access", "modulation", "noise", "receivers", "tracking")
+UNSEEN_BY_PATHS = (
+    "name",
+    "access",
+    "modulation",
+    "noise",
+    "receiver_preset",
+    "receivers",
+    "tracking",
+    "compare",
+)
 """Parts of a scenario on which its paths do not depend: runs that differ in nothing else share
 them. What they say of the links and of the city's reach is in the key of stored paths besides."""
 

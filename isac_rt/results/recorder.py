@@ -65,12 +65,17 @@ class Figures:
     timing : seconds by stage, of `TIMINGS`
     plan : what was modelled: the summary's `fidelity`, but for what was kept of the paths
     access : what became of the stages before the data, None without them
+    compared : `Recorder.blocks` of the sets of receivers that heard the same samples, by name
+    costs : of each set, `OWN` included, the processor seconds of reception and tracking by link;
+        empty without sets to compare
     """
 
     scores: Mapping[Link, SensingScore]
     timing: Mapping[str, float]
     plan: Mapping[str, Any]
     access: Mapping[str, Any] | None = None
+    compared: Mapping[str, Any] = field(default_factory=dict)
+    costs: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass
@@ -105,7 +110,37 @@ class Recorder:
     def summary(self, figures: Figures) -> dict[str, Any]:
         """The keys of `summary.json` but for the scenario's name and seed; null stands for what
         does not apply."""
-        rows, timetable, scores = self.rows, self.timetable, figures.scores
+        rows = self.rows
+        of_kind = sum(
+            (o["path_count"] for row in rows for o in row["observers"].values()),
+            np.zeros(len(KINDS), int),
+        )
+        return {
+            "frames": len(rows),
+            **self.blocks(figures.scores),
+            "compared": dict(figures.compared),
+            "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
+            "timing_s": {key: figures.timing.get(key) for key in TIMINGS}
+            | ({"by_set": dict(figures.costs)} if figures.costs else {}),
+            "fidelity": {
+                **figures.plan,
+                "links": kept_of_paths([row["uses"] for row in rows]),
+                "paths_contradicted": sum(row["dropped"] for row in rows),
+            },
+            "access": figures.access,
+            "sparsity": {
+                str(link): judged
+                for link in self.timetable.all_links
+                if (judged := self._sparsity(link))
+            }
+            or None,
+            "versions": versions(),
+        }
+
+    def blocks(self, scores: Mapping[Link, SensingScore]) -> dict[str, Any]:
+        """The keys `terminals` and `links` of the summary; `scores` are of every link's
+        sensing."""
+        rows, timetable = self.rows, self.timetable
         duration = (
             (rows[-1]["frame"] - rows[0]["frame"]) * timetable.interval
             + timetable.waveform.frame_duration
@@ -130,26 +165,7 @@ class Recorder:
             )
             for link, counted in symbols.items()
         }
-        of_kind = sum(
-            (o["path_count"] for row in rows for o in row["observers"].values()),
-            np.zeros(len(KINDS), int),
-        )
-        return {
-            "frames": len(rows),
-            "terminals": terminals,
-            "links": links,
-            "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
-            "timing_s": {key: figures.timing.get(key) for key in TIMINGS},
-            "fidelity": {
-                **figures.plan,
-                "links": kept_of_paths([row["uses"] for row in rows]),
-                "paths_contradicted": sum(row["dropped"] for row in rows),
-            },
-            "access": figures.access,
-            "sparsity": {str(link): judged for link in symbols if (judged := self._sparsity(link))}
-            or None,
-            "versions": versions(),
-        }
+        return {"terminals": terminals, "links": links}
 
     def _of(self, link: Link) -> list[Row]:
         """The rows of a link's receiver."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -137,3 +137,54 @@ class Tracking(Node):
                 f"{self.confirm_hits} hits cannot be reached within confirm_window = "
                 f"{self.confirm_window}; lower it or widen the window",
             )
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {
+        "receivers": {
+            "velocity_method": "omp",
+            "refinement": "grid",
+            "symbol_decision": "powers",
+            "clutter_filter": "runs",
+            "clutter_detector": "cfar",
+        },
+        "tracking": {},
+    },
+    "plain": {
+        "receivers": {
+            "velocity_method": "auto",
+            "refinement": "local",
+            "symbol_decision": "powers",
+            "clutter_filter": "none",
+            "clutter_detector": "cfar",
+        },
+        "tracking": {},
+    },
+}
+"""What each preset says of `receivers` and `tracking`; of the rest it says nothing."""
+Preset = Literal["paper", "plain"]
+
+
+class ReceiverSet(Node):
+    """Receivers and trackers that hear the same samples as the scenario's own. They listen only:
+    nothing that is sent depends on them."""
+
+    preset: Preset | None = None
+    """Settings by name, which the keys stated beside it override. null, the default: none; what is
+    not stated is as in the scenario's own `receivers` and `tracking`."""
+    receivers: Receivers = Receivers()
+    """How its terminals detect targets and decode data."""
+    tracking: Tracking = Tracking()
+    """Its Kalman filters, and when a track begins and ends."""
+
+
+def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict[str, Any]:
+    """What a file states of a set of receivers, with what the preset `named` says and `own`
+    settings say of the rest. What is malformed stays as it is, for whoever checks it."""
+    said = PRESETS.get(named, {}) if isinstance(named, str) else {}
+    out = dict(stated)
+    for key in ("receivers", "tracking"):
+        parts = [own.get(key), said.get(key), stated.get(key, {})]
+        if isinstance(parts[-1], dict):
+            out[key] = {k: v for p in parts if isinstance(p, dict) for k, v in p.items()}
+    return out

@@ -13,14 +13,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
-from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed
+from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio, chirp_times, num_resource_blocks
-from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
 from isac_rt.scenario.swarm import Access, RoleChange, Uav
 
+OWN = "own"
+"""Name of the scenario's own receivers beside those compared with them."""
 NEAREST_M = 0.05
 """Two bodies nearer than this are one to the ray tracer."""
 
@@ -65,12 +67,33 @@ class Scenario(Node):
     nothing."""
     noise: Noise = Noise()
     """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
+    receiver_preset: Preset | None = None
+    """Settings of `receivers` and `tracking` by name, which the keys stated there override.
+    `paper`: the paper's to the letter. `plain`: better estimates, no knowledge of the city. null,
+    the default: `plain`."""
     receivers: Receivers = Receivers()
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
     """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
+    compare: dict[Name, ReceiverSet] = Field({})
+    """Further sets of receivers by name, which hear the same samples. By default none."""
 
     _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="before")
+    @classmethod
+    def _presets(cls, data: Any) -> Any:
+        """Fill in what presets say, and what the sets to compare take over."""
+        if not isinstance(data, dict):
+            return data
+        out = with_preset(data, data.get("receiver_preset"), {})
+        own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
+        if isinstance(sets := out.get("compare"), dict):
+            out["compare"] = {
+                name: with_preset(one, one.get("preset"), own) if isinstance(one, dict) else one
+                for name, one in sets.items()
+            }
+        return out
 
     @property
     def folder(self) -> Path:
@@ -124,6 +147,7 @@ class Scenario(Node):
         yield from self._role_problems()
         yield from self._block_problems()
         yield from self._model_problems()
+        yield from self._set_problems()
 
     def _timing_problems(self) -> Iterator[Problem]:
         sizes = (("array", "tx_x"), ("array", "tx_z"))
@@ -294,15 +318,45 @@ class Scenario(Node):
                 "from; "
                 "add them or set clutter.model to none",
             )
-        if self.receivers.needs_mesh and (
-            self.propagation.model != "ray_traced" or self.city is None
-        ):
-            yield Problem(
-                (("receivers", "clutter_detector"), ("propagation", "model"), ("city",)),
-                f"{self.receivers.clutter_detector} predicts clutter from a city's mesh: it needs "
-                "propagation.model ray_traced and a city; "
-                "add them or set receivers.clutter_detector to cfar or sample_matrix",
-            )
+        traced = self.propagation.model == "ray_traced" and self.city is not None
+        compared = (
+            (("compare", name, "receivers"), s.receivers) for name, s in self.compare.items()
+        )
+        for key, receivers in [(("receivers",), self.receivers), *compared]:
+            if receivers.needs_mesh and not traced:
+                detector = (*key, "clutter_detector")
+                yield Problem(
+                    (detector, ("propagation", "model"), ("city",)),
+                    f"{receivers.clutter_detector} predicts clutter from a city's mesh: it needs "
+                    "propagation.model ray_traced and a city; "
+                    f"add them or set {dotted(detector)} to cfar or sample_matrix",
+                )
+
+    def _set_problems(self) -> Iterator[Problem]:
+        for name, one in self.compare.items():
+            if name == OWN:
+                said = "is the name of the scenario's own receivers; choose another"
+                yield Problem((("compare", name),), said)
+            for key in ("active_every_frames", "active_input"):
+                own, other = getattr(self.receivers, key), getattr(one.receivers, key)
+                if own != other:
+                    yield Problem(
+                        (("compare", name, "receivers", key), ("receivers", key)),
+                        f"every set hears the same samples, and receivers.{key} is {own}; "
+                        "leave it out",
+                    )
+
+    @property
+    def needs_mesh(self) -> bool:
+        """Whether some terminal predicts clutter from the city's mesh."""
+        return self.receivers.needs_mesh or any(
+            one.receivers.needs_mesh for one in self.compare.values()
+        )
+
+
+def _plain(value: Any) -> Any:
+    """A node as the mapping that states it."""
+    return value.model_dump() if isinstance(value, Node) else value
 
 
 def json_schema() -> dict[str, Any]:

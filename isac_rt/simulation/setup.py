@@ -354,7 +354,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         Connections(),
         plan,
         make_expectation(scenario.clutter, swarm, city, waveform, antennas, scenario.seed)
-        if scenario.receivers.needs_mesh
+        if scenario.needs_mesh
         else None,
     )
     return replace(_connected(setup), seconds=time.perf_counter() - begin)

@@ -5,23 +5,25 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from isac_rt.access import exchange
 from isac_rt.access.fall_back import Schedules
-from isac_rt.frame.cube import IFCube
+from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import TIMINGS, Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord
 from isac_rt.results.scoring import Heard, Scorer
-from isac_rt.scenario.tree import Scenario
+from isac_rt.scenario.receivers import ReceiverSet
+from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
@@ -49,8 +51,8 @@ class _Clock:
         return self.seconds | {"total": self.seconds["total"] + time.perf_counter() - self.begun}
 
 
-def standard_terminal(setup: Setup, link: Link) -> Terminal:
-    """The receiver of a link as the scenario has it.
+def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
+    """The receiver of a link as the scenario has it, or as a set of receivers to compare with.
 
     Examples
     --------
@@ -59,7 +61,7 @@ def standard_terminal(setup: Setup, link: Link) -> Terminal:
     >>> [type(standard_terminal(setup, link)).__name__ for link in setup.timetable.links(0)]
     ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
     """
-    s = setup.scenario
+    s = settings or setup.scenario
     if link.own:
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
     return PassiveTerminal(
@@ -67,7 +69,7 @@ def standard_terminal(setup: Setup, link: Link) -> Terminal:
         setup.antennas,
         s.receivers,
         s.tracking,
-        s.modulation.dpsk_order,
+        setup.scenario.modulation.dpsk_order,
         setup.plan.amplitude,
         groups=setup.timetable.groups(link),
     )
@@ -80,26 +82,29 @@ class _Observer:
         self.link, self.setup, self.terminal = link, setup, terminal
         self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable)
         self.feedback = {"answers": 0, "corrections": 0}
+        self.seconds = 0.0
+        """Processor time of reception and tracking so far."""
 
-    def hear(self, frame: Frame, clock: _Clock, maps: bool) -> Heard:
-        """Samples, reception and tracking of one frame. Runs in a thread of its own; only this
-        observer's state changes."""
+    def hear(self, frame: Frame, cube: IFCube | RangeProfiles, maps: bool) -> Heard:
+        """Reception and tracking of one frame. Runs in a thread of its own; only this observer's
+        state changes."""
+        begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
-        with clock.stage("synthesis"):
-            cube = frame.heard(self.link)
-        with clock.stage("receive"):
-            when = timetable.epoch(frame.number, tx)
-            own = self.setup.swarm.trajectories[rx].pose(when)
-            if isinstance(self.terminal, ActiveTerminal):
-                payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
-                reception, tracks = self.terminal.step(
-                    cube, payload, own, when, clutter=clutter, maps=maps
-                )
-                return Heard(reception, tracks, int(TerminalState.TRACKING))
+        when = timetable.epoch(frame.number, tx)
+        own = self.setup.swarm.trajectories[rx].pose(when)
+        state = int(TerminalState.TRACKING)
+        if isinstance(self.terminal, ActiveTerminal):
+            payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
+            reception, tracks = self.terminal.step(
+                cube, payload, own, when, clutter=clutter, maps=maps
+            )
+        else:
             assert isinstance(cube, IFCube)  # profiles are for active terminals only
             modulated = timetable.modulated(frame.number)
             reception, tracks = self.terminal.step(cube, own, when, modulated, maps=maps)
-            return Heard(reception, tracks, int(self.terminal.state))
+            state = int(self.terminal.state)
+        self.seconds += time.thread_time() - begun
+        return Heard(reception, tracks, state)
 
     def feed_back(self, frame: int, heard: Heard, at_active: Heard) -> None:
         """The passive terminal's feedback after a frame, and the active one's answer to it."""
@@ -122,19 +127,77 @@ class _Observer:
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        score = self.scorer.score.memory()
-        return {"terminal": self.terminal.memory(), "score": score, "feedback": self.feedback}
+        return {
+            "terminal": self.terminal.memory(),
+            "score": self.scorer.score.memory(),
+            "feedback": self.feedback,
+            "seconds": self.seconds,
+        }
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
         self.terminal.restore(memory["terminal"])
         self.scorer.score.restore(memory["score"])
-        self.feedback = memory["feedback"]
+        self.feedback, self.seconds = memory["feedback"], memory["seconds"]
 
     def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
         """The frame held against the truth."""
         paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
         return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
+
+
+@dataclass
+class _Listeners:
+    """One set of receivers: every link's terminal with its score, and what is recorded of them."""
+
+    observers: dict[Link, _Observer]
+    recorder: Recorder
+
+    @classmethod
+    def of(cls, setup: Setup, terminal: Callable[[Link], Terminal]) -> _Listeners:
+        """Before the first frame."""
+        links = setup.timetable.all_links
+        return cls(
+            {link: _Observer(setup, link, terminal(link)) for link in links},
+            Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
+        )
+
+    def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
+        """Hold a frame against the truth."""
+        timetable = self.recorder.timetable
+        self.recorder.add(
+            FrameRecord(
+                frame=frame.number,
+                time=timetable.epoch(frame.number),
+                modulated=timetable.modulated(frame.number),
+                poses=frame.poses,
+                observers={
+                    timetable.labels[link]: self.observers[link].record(frame, h)
+                    for link, h in heard.items()
+                },
+                snapshot=snapshot,
+                uses=frame.uses,
+                dropped=frame.dropped,
+            )
+        )
+
+    def blocks(self) -> dict[str, Any]:
+        """`terminals` and `links` of the summary."""
+        return self.recorder.blocks({link: o.scorer.score for link, o in self.observers.items()})
+
+    def costs(self) -> dict[str, float]:
+        """Processor seconds of reception and tracking by link."""
+        return {str(link): o.seconds for link, o in self.observers.items()}
+
+    def memory(self, first: int) -> dict[str, Any]:
+        """The rows from a frame on, and what every terminal carries over."""
+        observers = {str(link): o.memory() for link, o in self.observers.items()}
+        return {"rows": self.recorder.rows[first:], "observers": observers}
+
+    def restore(self, observers: Mapping[str, Any]) -> None:
+        """Take up what the terminals carried over."""
+        for link, observer in self.observers.items():
+            observer.restore(observers[str(link)])
 
 
 def run(
@@ -207,11 +270,12 @@ def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[
     # the first once more: what is compiled on first use is not a frame's cost
     for link in links[:1] + links:
         clock = _Clock()
+        with clock.stage("synthesis"):
+            cube = frame.heard(link)
         if receive:
-            _Observer(setup, link, standard_terminal(setup, link)).hear(frame, clock, False)
-        else:
-            with clock.stage("synthesis"):
-                frame.heard(link)
+            observer = _Observer(setup, link, standard_terminal(setup, link))
+            with clock.stage("receive"):
+                observer.hear(frame, cube, False)
         stages = ("synthesis", "receive") if receive else ("synthesis",)
         out[link] = {stage: clock.seconds[stage] for stage in stages}
     return out
@@ -222,8 +286,9 @@ class _Run:
     """The frames of a run so far, recorded and scored."""
 
     setup: Setup
-    recorder: Recorder
-    observers: dict[Link, _Observer]
+    own: _Listeners
+    """The scenario's own receivers, the only ones on which anything that is sent depends."""
+    compared: dict[str, _Listeners]
     schedules: Schedules
     snapshots: set[int]
     clock: _Clock
@@ -241,19 +306,28 @@ class _Run:
         """Before the first frame."""
         s, clock = setup or prepare(scenario), _Clock()
         clock.seconds["setup"] = clock.seconds["total"] = s.seconds
+        compared = {
+            name: _Listeners.of(s, partial(standard_terminal, s, settings=one))
+            for name, one in scenario.compare.items()
+        }
         return cls(
             s,
-            Recorder(s.timetable, [state.name.lower() for state in TerminalState]),
-            {link: _Observer(s, link, terminal(s, link)) for link in s.timetable.all_links},
+            _Listeners.of(s, partial(terminal, s)),
+            compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),
             clock,
         )
 
+    @property
+    def recorder(self) -> Recorder:
+        """Of the scenario's own receivers."""
+        return self.own.recorder
+
     def fly(self, progress: Progress | None, threads: int | None, resume: Resume | None) -> None:
         """Frame after frame; while the receivers work on one the next is traced."""
         setup, clock, frames = self.setup, self.clock, self.setup.timetable.frames
-        at_work: tuple[Frame, dict[Link, Future[Heard]]] | None = None
+        at_work: tuple[Frame, dict[Link, Future[list[Heard]]]] | None = None
         with (
             threadpool_limits(limits=1),
             ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
@@ -268,44 +342,44 @@ class _Run:
                 if progress and number:
                     progress(number, frames)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
-                maps = number in self.snapshots
-                jobs = {
-                    link: pool.submit(self.observers[link].hear, frame, clock, maps)
-                    for link in setup.timetable.links(number)
-                }
-                at_work = frame, jobs
+                at_work = (
+                    frame,
+                    {
+                        link: pool.submit(self.hear, frame, link)
+                        for link in setup.timetable.links(number)
+                    },
+                )
             if at_work is not None:
                 self.collect(*at_work)
             if progress:
                 progress(frames, frames)
 
-    def collect(self, frame: Frame, jobs: dict[Link, Future[Heard]]) -> None:
-        """Wait for a frame's receivers, score and record it, take their advice."""
-        heard = {link: job.result() for link, job in jobs.items()}
-        timetable = self.setup.timetable
+    def hear(self, frame: Frame, link: Link) -> list[Heard]:
+        """What a link's receivers make of a frame, those of the scenario first; all are given the
+        same samples."""
+        with self.clock.stage("synthesis"):
+            cube = frame.heard(link)
+        with self.clock.stage("receive"):
+            maps = frame.number in self.snapshots
+            heard = self.own.observers[link].hear(frame, cube, maps)
+        others = self.compared.values()
+        return [heard, *(s.observers[link].hear(frame, cube, False) for s in others)]
+
+    def collect(self, frame: Frame, jobs: dict[Link, Future[list[Heard]]]) -> None:
+        """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
+        results = {link: job.result() for link, job in jobs.items()}
+        heard = {link: by_set[0] for link, by_set in results.items()}
         with self.clock.stage("track"):
             if self.setup.scenario.access.feedback:
                 for tx, rx in heard:
                     if (tx, tx) in heard:
                         at_active = heard[Link(tx, tx)]
-                        self.observers[Link(tx, rx)].feed_back(
+                        self.own.observers[Link(tx, rx)].feed_back(
                             frame.number, heard[Link(tx, rx)], at_active
                         )
-            self.recorder.add(
-                FrameRecord(
-                    frame=frame.number,
-                    time=timetable.epoch(frame.number),
-                    modulated=timetable.modulated(frame.number),
-                    poses=frame.poses,
-                    observers={
-                        timetable.labels[link]: self.observers[link].record(frame, h)
-                        for link, h in heard.items()
-                    },
-                    snapshot=frame.number in self.snapshots,
-                    uses=frame.uses,
-                    dropped=frame.dropped,
-                )
-            )
+            self.own.record(frame, heard, frame.number in self.snapshots)
+            for i, one in enumerate(self.compared.values(), start=1):
+                one.record(frame, {link: by_set[i] for link, by_set in results.items()}, False)
             self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
     def memory(self) -> dict[str, Any]:
@@ -318,8 +392,8 @@ class _Run:
         first, self.kept = self.kept, len(self.recorder.rows)
         return {
             "first": first,
-            "rows": self.recorder.rows[first:],
-            "observers": {str(link): o.memory() for link, o in self.observers.items()},
+            **self.own.memory(first),
+            "compared": {name: one.memory(first) for name, one in self.compared.items()},
             "advice": self.schedules.memory(),
             "seconds": self.clock.so_far(),
         }
@@ -331,11 +405,14 @@ class _Run:
             with resume.reading():
                 if entry["first"] == len(self.recorder.rows):  # not another call's at the same time
                     self.recorder.restore(entry["rows"])
+                    for name, one in self.compared.items():
+                        one.recorder.restore(entry["compared"][name]["rows"])
                     last = entry
         if last is not None:
             with resume.reading():
-                for link, observer in self.observers.items():
-                    observer.restore(last["observers"][str(link)])
+                self.own.restore(last["observers"])
+                for name, one in self.compared.items():
+                    one.restore(last["compared"][name]["observers"])
                 self.schedules.restore(last["advice"])
                 for stage in TIMINGS:
                     self.clock.seconds[stage] += last["seconds"][stage]
@@ -345,8 +422,9 @@ class _Run:
     def summary(self) -> dict[str, Any]:
         """`summary.json` of the frames so far."""
         s = self.setup
+        sets = {OWN: self.own, **self.compared} if self.compared else {}
         figures = Figures(
-            scores={link: o.scorer.score for link, o in self.observers.items()},
+            scores={link: o.scorer.score for link, o in self.own.observers.items()},
             timing=self.clock.so_far(),
             plan={
                 **mechanisms(s.scenario.propagation, s.scenario.clutter),
@@ -354,6 +432,8 @@ class _Run:
                 **extent(s.city, s.propagation.census(), s.scenario.clutter),
             },
             access=self._access(),
+            compared={name: one.blocks() for name, one in self.compared.items()},
+            costs={name: one.costs() for name, one in sets.items()},
         )
         named = {"scenario": s.scenario.name, "seed": s.scenario.seed}
         return named | self.recorder.summary(figures)
@@ -362,5 +442,5 @@ class _Run:
         stages = self.setup.connections.summary(self.setup.timetable.epoch(0))
         if not self.setup.scenario.access.feedback:
             return stages
-        told = {str(link): o.feedback for link, o in self.observers.items() if not link.own}
+        told = {str(link): o.feedback for link, o in self.own.observers.items() if not link.own}
         return (stages or {}) | {"feedback": told}

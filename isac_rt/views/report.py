@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as package_files
 from pathlib import Path
@@ -13,7 +13,8 @@ from typing import Any
 import jinja2
 
 from isac_rt.results.files import write_text
-from isac_rt.results.recorder import Results
+from isac_rt.results.recorder import TIMINGS, Results
+from isac_rt.scenario.tree import OWN
 
 DASH = "\u2013"
 _CAPTIONS = {
@@ -83,30 +84,58 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if abs(value) < 1e4 else f"{value:,.0f}"
 
 
+_RATES = {
+    "SER delay": "ser_delay",
+    "SER DPSK": "ser_dpsk",
+    "BER": "ber",
+    "Undecided": "erased",
+    "Bits": "bits",
+    "Bit rate [kbit/s]": "bit_rate_bps",
+    "Hit rate": "hit_rate",
+    "Matched": "matched",
+    "Matched, tracked": "matched_tracked",
+    "False per frame": "false_per_frame",
+}
+
+
+def _rates(link: Mapping[str, Any], keys: Iterable[str]) -> list[str]:
+    """Figures of a link as text."""
+    values = {key: link[key] for key in keys}
+    if values.get("bit_rate_bps") is not None:
+        values["bit_rate_bps"] /= 1e3
+    return [number(value) for value in values.values()]
+
+
 def per_terminal(summary: Mapping[str, Any]) -> Table:
     """Decoding and detection, one row for each link (and so for each terminal)."""
-    keys = {
-        "SER delay": "ser_delay",
-        "SER DPSK": "ser_dpsk",
-        "BER": "ber",
-        "Undecided": "erased",
-        "Bits": "bits",
-        "Bit rate [kbit/s]": "bit_rate_bps",
-        "Hit rate": "hit_rate",
-        "Matched": "matched",
-        "Matched, tracked": "matched_tracked",
-        "False per frame": "false_per_frame",
-    }
-
-    def shown(link: Mapping[str, Any], key: str) -> str:
-        value = link[key]
-        return number(value / 1e3 if key == "bit_rate_bps" and value is not None else value)
-
     rows = [
-        (_link(name), s["role"], *(shown(s, key) for key in keys.values()))
+        (_link(name), s["role"], *_rates(s, _RATES.values()))
         for name, s in summary["links"].items()
     ]
-    return Table(("Link", "Role", *keys), rows)
+    return Table(("Link", "Role", *_RATES), rows)
+
+
+def side_by_side(summary: Mapping[str, Any]) -> Table:
+    """The scenario's own receivers and those compared with them on the same samples, link by link;
+    no rows where none are compared."""
+    titles = {t: k for t, k in _RATES.items() if k not in ("bits", "bit_rate_bps")}
+    titles["Clutter per frame"] = "clutter_per_frame"
+    costs = summary["timing_s"].get("by_set", {})
+    rows = [
+        (
+            _link(name),
+            set_name,
+            *_rates(links[name], titles.values()),
+            number(costs[set_name][name]),
+        )
+        for name in summary["links"]
+        for set_name, links in {
+            OWN: summary["links"],
+            **{key: one["links"] for key, one in summary.get("compared", {}).items()},
+        }.items()
+        if set_name in costs
+    ]
+    return Table(("Link", "Receivers", *titles, "Processor time [s]"), rows)
 
 
 def _link(name: str) -> str:
@@ -195,6 +224,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
         terminals=per_terminal(s),
         rmse=rmse_table(s),
+        compared=side_by_side(s),
         budget=row_table(json.loads(d.attrs["link_budget"])),
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]
@@ -206,7 +236,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         ),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
-        timing=Table(("Stage", "Seconds"), [(k, number(v)) for k, v in s["timing_s"].items()]),
+        timing=Table(("Stage", "Seconds"), [(k, number(s["timing_s"][k])) for k in TIMINGS]),
         versions=Table(
             ("Package", "Version"),
             [

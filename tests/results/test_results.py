@@ -144,6 +144,7 @@ def test_summary_has_the_fixed_keys(run):
         "seed",
         "frames",
         "terminals",
+        "compared",
         "paths",
         "timing_s",
         "fidelity",

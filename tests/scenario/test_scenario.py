@@ -145,6 +145,23 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
             "only with cfar; leave it out, or change clutter_detector",
         ),
         (
+            BASE + "compare: {a: {receivers: {active_every_frames: 3}}}\n",
+            "s.yaml:4: compare.a.receivers.active_every_frames = 3: every set hears the same "
+            "samples, and receivers.active_every_frames is 1; leave it out",
+        ),
+        (
+            BASE + "compare: {own: {preset: paper}}\n",
+            "compare.own: is the name of the scenario's own receivers; choose another",
+        ),
+        (
+            BASE + "compare: {a: {preset: papper}}\n",
+            "compare.a.preset = papper: must be",
+        ),
+        (
+            BASE + "compare: {a: {receivers: {clutter_detector: map}}}\n",
+            "compare.a.receivers.clutter_detector = map: map predicts clutter",
+        ),
+        (
             BASE + "receivers: {velocity_method: pursuit, refinement: grid}\n",
             "receivers.refinement = grid: has no meaning with velocity_method pursuit",
         ),
@@ -534,3 +551,27 @@ def test_round_trip(tmp_path_factory, tree):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ScenarioWarning)
         assert load(path).model_dump() == scenario.model_dump()
+
+
+def test_presets_fill_in_what_is_not_stated(tmp_path):
+    """What is stated beside a preset holds; of what neither says a set does as the scenario's own.
+    Planted bugs: the preset over what is stated; the own settings over the preset."""
+    file = tmp_path / "s.yaml"
+    file.write_text(
+        BASE
+        + "receiver_preset: paper\n"
+        + "receivers: {refinement: local, max_detections: 7}\n"
+        + "tracking: {confirm_window: 9}\n"
+        + "compare:\n  a: {preset: plain}\n"
+        + "  b: {receivers: {symbol_decision: beams}, tracking: {confirm_hits: 2}}\n"
+    )
+    s = load(file)
+    own, a, b = s.receivers, s.compare["a"], s.compare["b"]
+    assert (own.velocity_method, own.refinement, own.clutter_filter) == ("omp", "local", "runs")
+    assert (a.receivers.velocity_method, a.receivers.clutter_filter) == ("auto", "none")
+    assert b.receivers == own.model_copy(update={"symbol_decision": "beams"})
+    assert a.tracking == s.tracking and b.tracking.confirm_hits == 2
+    assert {o.max_detections for o in (own, a.receivers)} == {7} == {b.receivers.max_detections}
+    assert b.tracking.confirm_window == 9
+    file.write_text(to_yaml(s))
+    assert load(file) == s

@@ -1,0 +1,101 @@
+"""Several sets of receivers on the same samples: each as in a run of its own, and none that
+changes what the scenario's own receivers hear."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_fall_back import scenario as dense_scenario
+from test_resume import SCENES, Stopped, assert_equal_results, stopping_at
+
+from isac_rt.results.provenance import run_content
+from isac_rt.scenario.file import load
+from isac_rt.simulation import simulate
+from isac_rt.simulation.resume import Resume
+from isac_rt.simulation.setup import prepare
+from isac_rt.views.report import side_by_side, write_report
+
+SHORT = ["modulation.acquisition_frames=2", "receivers.active_every_frames=2"]
+SETS = [
+    "compare.paper.preset=paper",
+    "compare.beams={receivers: {symbol_decision: beams}, tracking: {confirm_hits: 2}}",
+]
+
+
+@pytest.fixture(scope="module")
+def compared():
+    return simulate.run(load(SCENES / "paper_swarm_consistent.yaml", SHORT + SETS, frames=5))
+
+
+def test_the_own_receivers_hear_what_they_hear_alone(compared):
+    """Rounding is none: the same bits. Planted bug: a listener's record in place of the own."""
+    alone = simulate.run(load(SCENES / "paper_swarm_consistent.yaml", SHORT, frames=5))
+    for name, variable in alone.dataset.variables.items():
+        kind = variable.dtype.kind == "f"
+        assert np.array_equal(compared.dataset[name].values, variable.values, equal_nan=kind), name
+    for key in ("terminals", "links", "paths"):
+        assert compared.summary[key] == alone.summary[key]
+    assert alone.summary["compared"] == {}
+
+
+def test_each_set_does_as_in_a_run_of_its_own(compared):
+    """`paper` and `beams` by themselves give the same figures, which differ from the own ones.
+    Planted bugs: a set with the own receivers' settings, one with the own trackers'."""
+    scenario = compared.scenario
+    for name, one in scenario.compare.items():
+        own = {"receivers": one.receivers, "tracking": one.tracking, "compare": {}}
+        alone = simulate.run(scenario.model_copy(update=own)).summary
+        found = compared.summary["compared"][name]
+        assert found == {key: alone[key] for key in ("terminals", "links")}
+        assert found["links"] != compared.summary["links"]
+
+
+def test_every_frame_is_synthesised_once_for_all_sets(monkeypatch):
+    scenario = load(SCENES / "paper_swarm_consistent.yaml", SHORT + SETS, frames=3)
+    setup, heard = prepare(scenario), []
+    frames = type(setup.frame(0))
+    make = frames.heard
+    monkeypatch.setattr(
+        frames, "heard", lambda self, link: heard.append((self.number, link)) or make(self, link)
+    )
+    simulate.run(scenario, setup=setup)
+    assert sorted(heard) == sorted((k, link) for k in range(3) for link in setup.timetable.links(k))
+
+
+def test_listeners_give_no_advice():
+    """By pursuit the own receivers judge no scene; those compared find it dense, and still the
+    random schedule is sent. Planted bug: the advice of all sets is taken."""
+    settings = {"receivers": {"velocity_method": "pursuit"}}
+    omp = {"receivers": {"velocity_method": "omp"}}
+    scenario = dense_scenario(frames=4, **settings, compare={"omp": omp})
+    found = simulate.run(scenario)
+    assert not found.dataset.fell_back.any() and (found.dataset.sparse == -1).all()
+    advising = simulate.run(dense_scenario(frames=4, **omp))
+    assert advising.dataset.fell_back.any()
+
+
+def test_a_stopped_comparison_goes_on_to_the_same_bits(tmp_path):
+    """Planted bugs: the listeners' terminals, scores or rows not taken up."""
+    listeners = {"grid": {"receivers": {"refinement": "grid"}}}
+    scenario = dense_scenario(frames=5, compare=listeners)
+    whole = simulate.run(scenario, snapshots=1)
+    content = run_content(scenario, 1)
+    resume = Resume(tmp_path, content, every=0.0)
+    with pytest.raises(Stopped):
+        simulate.run(scenario, snapshots=1, progress=stopping_at(3), resume=resume)
+    again = simulate.run(scenario, snapshots=1, resume=Resume(tmp_path, content, every=0.0))
+    assert_equal_results(again, whole)
+
+
+def test_the_report_shows_the_sets_side_by_side(compared, tmp_path):
+    table = side_by_side(compared.summary)
+    assert [row[:2] for row in table.rows[:4]] == [
+        ("AT to AT", "own"),
+        ("AT to AT", "paper"),
+        ("AT to AT", "beams"),
+        ("AT to PT1", "own"),
+    ]
+    page = write_report(compared, tmp_path, []).read_text()
+    assert "Receivers on the same samples" in page
+    costs = compared.summary["timing_s"]["by_set"]
+    assert all(seconds > 0 for links in costs.values() for seconds in links.values())
