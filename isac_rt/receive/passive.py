@@ -23,6 +23,8 @@ from isac_rt.receive.symbols.powers import (
     confidence_threshold,
     moves_as_predicted,
     symbol_cells,
+    transition_error_rate,
+    velocity_spread,
 )
 from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
 from isac_rt.scenario.receivers import Receivers
@@ -33,6 +35,10 @@ noise."""
 GATE_CELLS, GATE_BINS = 1, 4
 """Range rows and Doppler bins searched on each side of the predicted cell: the fraction of a row is
 known, the whole row is the prediction's."""
+
+MOST_WRONG = 1.0
+"""Transitions of a frame that may be expected wrong where its samples are fitted all the same: a
+chain that turns in its middle looks like several paths."""
 
 
 @dataclass(frozen=True)
@@ -92,20 +98,30 @@ class PassiveReceiver:
             return Reception.undecoded(w, no_detections(), picture)
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         found, detections, reference = self._sense_data(cube, known, prediction)
-        if (
-            self.refiner is not None
-            and reference is not None
-            and np.isfinite(detections.direction[0]).all()
-        ):
-            first = detections  # row 0 is the reference
-            delay, rate = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT
-            path = JointPath(delay, rate, first.direction[0], np.ones(1), np.zeros(4))
-            phases = decide_phases(cube.samples, known, path, self.reader.order)
-            if not np.allclose(phases, known.phases):
-                known = replace(known, phases=phases)
-                found, detections, reference = self._sense_data(cube, known, prediction)
-        reception = self._reception(cube, known, found, detections, reference, maps=maps)
+        phases = None
+        if self.refiner is not None and reference is not None:
+            phases = self._phases(cube, known, detections)
+        if phases is not None:
+            known = replace(known, phases=phases)
+            found, detections, reference = self._sense_data(cube, known, prediction)
+        else:
+            spread = velocity_spread(symbols, self.reader.order, prediction, w)
+            detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
+        chain = self
+        wrong = transition_error_rate(symbols, self.reader.order) * symbols.transitions.size
+        if phases is None and wrong > MOST_WRONG:
+            chain = replace(self, refiner=None)
+        reception = chain._reception(cube, known, found, detections, reference, maps=maps)
         return reception if reference is None else _decoded(reception, symbols)
+
+    def _phases(self, cube: IFCube, known: Known, detections: Detections) -> np.ndarray | None:
+        """The phases as the reference, row 0 of the detections, shows them over the whole frame."""
+        if not np.isfinite(detections.direction[0]).all():
+            return None
+        first = detections
+        delay, rate = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT
+        path = JointPath(delay, rate, first.direction[0], np.ones(1), np.zeros(4))
+        return decide_phases(cube.samples, known, path, self.reader.order)
 
     def _believed(self, symbols: Symbols, waveform: Waveform) -> bool:
         """Whether the decisions look neither like noise nor like a path that moves otherwise."""

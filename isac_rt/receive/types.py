@@ -85,6 +85,10 @@ class Detections:
         """The detections that a mask or an index array chooses."""
         return Detections(**{name: value[which] for name, value in vars(self).items()})
 
+    def widened(self, spread: np.ndarray) -> Detections:
+        """With independent errors of standard deviation `spread` (4,) or (Q, 4) besides."""
+        return replace(self, std=np.hypot(self.std, spread))
+
     @staticmethod
     def joined(parts: Sequence[Detections]) -> Detections:
         """All detections of some sets, in their order."""

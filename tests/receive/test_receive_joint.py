@@ -266,11 +266,12 @@ def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
 def test_wrong_transitions_are_undone_by_the_path_itself():
     """Two transitions decided wrong turn the rest of their chains, and the velocity starts half a
     bin off: the phases come back as sent, all but those that noise alone moves. Per chirp over the
-    receivers 12.6 dB: 8-PSK errs in 1.4 %, of 72 chirps one; four are 3 sigma. Planted bugs: the
-    carrier of one antenna for all; the first phases handed back."""
+    receivers 15 dB: 8-PSK errs in 0.2 %; more than two of 72 chirps in one case of 2,500. In noise
+    alone there is no carrier. Planted bugs: the carrier of one antenna for all; the first phases
+    handed back."""
     w, schedule, payload = frame(waveform=SHORT)
     theta = np.array(LOS)
-    cube = noisy(w, schedule, samples(w, schedule, payload, FEW, theta, 1), 10**-1.32, 3)
+    cube = noisy(w, schedule, samples(w, schedule, payload, FEW, theta, 1), 10**-1.08, 3)
     wrong = payload.phases.copy()
     for group, tx in ((0, 1), (2, 0)):
         later = np.flatnonzero(schedule[group] == tx)[3:]
@@ -281,9 +282,40 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
     sent = known(w, schedule, payload, FEW, 1)
     found = decide_phases(cube.samples, replace(sent, phases=wrong), start, 8)
     apart = np.abs(found - payload.phases) > 0.1
-    assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 4
+    assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 2
     right = decide_phases(cube.samples, sent, start, 8)
-    assert (np.abs(right - payload.phases) > 0.1).sum() <= 4
+    assert (np.abs(right - payload.phases) > 0.1).sum() <= 2
+    empty = noisy(w, schedule, np.zeros(cube.samples.shape), 1.0, 4)
+    assert decide_phases(empty.samples, sent, start, 8) is None
+
+
+@pytest.mark.parametrize("snr_db", [-14.0, -9.0])
+@pytest.mark.parametrize("refinement", ["local", "joint"])
+def test_velocity_errors_are_those_stated_where_decisions_err(snr_db: float, refinement: str):
+    """D = 16: at -14 dB a third of the transitions is wrong and the D-th powers show no carrier, at
+    -9 dB 6 % and they do. Errors over their deviations in frames whose directions, velocities and
+    predictions are drawn (the prediction within its own deviation, a twentieth of a bin): in units
+    of 1 the mean square over 20 frames has a deviation of 0.32; it has to lie under 1 + 4 of them,
+    and none beyond 5. Planted bugs: the carrier believed without asking whether noise makes as much
+    (0.7 bins with 0.006 stated); the walk of the phases not stated."""
+    w, rng = Waveform(num_samples=128, num_chirps=48), np.random.default_rng(21)
+    w, schedule, payload = frame(16, waveform=w)
+    off = []
+    for seed in range(20):
+        theta = np.array([17.3, 41.7, 0.31, -0.22, 0.7, 1.0, -0.17, 0.26])
+        theta += rng.uniform(-1, 1, 8) * [0.5, 10, 0.2, 0.2, 3, 0, 0.2, 0.2]
+        clean = samples(w, schedule, payload, FEW, theta, 1)
+        std = 0.05 * w.velocity_cell(1)
+        first = predicted(theta, w)
+        velocity = theta[1] + std * rng.standard_normal(1)
+        first = replace(first, velocity=velocity, velocity_std=np.full(1, std))
+        cube = noisy(w, schedule, clean, 10 ** (snr_db / 10), seed)
+        r = receive_passive(cube, FEW, Receivers(refinement=refinement), 16, first, True)
+        assert r.line_of_sight
+        q = r.detections.is_reference
+        off.append((r.detections.velocity[q][0] - theta[1]) / r.detections.std[q, 1][0])
+    assert np.mean(np.square(off)) < 1 + 4 * 0.32
+    assert np.abs(off).max() < 5
 
 
 @pytest.mark.slow

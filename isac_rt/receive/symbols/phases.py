@@ -13,23 +13,35 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from isac_rt.receive.joint.fit import JointPath, fit, match_chirps, rate_bin
 from isac_rt.receive.known import Known
 
-OFFSETS = np.arange(-1.5, 1.501, 0.02)
-"""Errors of the first velocity that are tried [bins]; to the power D a chirp's bin is 1/D wide."""
+FARTHEST = 1.5
+"""Error of the first velocity within which it is sought [bins]."""
+STEP = 0.32
+"""Spacing of the offsets tried, in bins of the D-th power: a line between two loses 4 %."""
+UNAMBIGUOUS = 0.45
+"""Share of the D-th power's period in velocity, P/D bins, that is searched on each side."""
+FALSE_RATE = 1e-3
+"""Chance that noise is taken for the carrier."""
 ROUNDS = 2
 
 
-def decide_phases(samples: np.ndarray, known: Known, path: JointPath, order: int) -> np.ndarray:
-    """(M, P) running phases of a modulated frame at a PT.
+def decide_phases(
+    samples: np.ndarray, known: Known, path: JointPath, order: int
+) -> np.ndarray | None:
+    """(M, P) running phases of a modulated frame at a PT; None where it shows no carrier.
+
+    Hard decisions add up nearly in phase whatever the carrier and the velocity: of uniform phases
+    they leave sin(pi/D)/(pi/D) of the sum, 0.994 for D = 16. So it is no evidence that the decided
+    chirps gather. What counts is that the D-th powers do, more than noise makes them.
 
     Parameters
     ----------
     samples : (M, L_rx, P, N)
-    known : with the phases decided so far, which are handed back unless others let the path stand
-        out more
+    known : with the phases decided so far
     path : near estimate of the reference path, within 1.5 Doppler bins
     order : D
 
@@ -38,39 +50,43 @@ def decide_phases(samples: np.ndarray, known: Known, path: JointPath, order: int
     phases : as sent, but for whole steps that an antenna has in common over the frame: those belong
         to its amplitude
     """
+    phases = None
     for _ in range(ROUNDS):
-        tried = fit(samples, known, [path])[0]
-        matched = match_chirps(samples, known, tried)
-        phases, offset = _decide(known, matched * known.phases, order)
-        moved = replace(tried, delay_rate=tried.delay_rate + offset * rate_bin(known.waveform))
-        other = replace(known, phases=phases)
-        if _gathered(other, match_chirps(samples, other, moved)) <= _gathered(known, matched):
+        path = fit(samples, known, [path])[0]
+        matched = match_chirps(samples, known, path)
+        found = _decide(known, matched * known.phases, order)
+        if found is None:
             break
-        known, path = other, moved
-    return known.phases
+        phases, offset = found
+        path = replace(path, delay_rate=path.delay_rate + offset * rate_bin(known.waveform))
+        known = replace(known, phases=phases)
+    return phases
 
 
-def _decide(known: Known, chirps: np.ndarray, order: int) -> tuple[np.ndarray, float]:
-    """Phases of the chirps' sums (M, P), and the velocity's error [bins] that they show."""
-    turns = known.sampled_times / known.waveform.frame_duration
+def _decide(known: Known, chirps: np.ndarray, order: int) -> tuple[np.ndarray, float] | None:
+    """Phases of the chirps' sums (M, P), and the velocity's error [bins] that they show; None where
+    noise alone would show as much."""
+    w = known.waveform
+    far = min(FARTHEST, UNAMBIGUOUS * w.num_chirps / order)
+    offsets = np.linspace(-far, far, 2 * int(np.ceil(far * order / STEP)) + 1)
+    turns = known.sampled_times / w.frame_duration
     powers = (chirps / np.maximum(np.abs(chirps), 1e-300)) ** order
     sums = np.array(
         [
-            np.exp(-2j * np.pi * order * np.outer(OFFSETS, turns[a])) @ powers[a]
+            np.exp(-2j * np.pi * order * np.outer(offsets, turns[a])) @ powers[a]
             for a in known.sent_by
         ]
     )
-    best = int((np.abs(sums) ** 2).sum(axis=0).argmax())
+    counts = np.array([[a.sum()] for a in known.sent_by])
+    line = (np.abs(sums) ** 2 / counts).sum(axis=0)  # in noise a sum of L_tx exponentials
+    best = int(line.argmax())
+    if line[best] < stats.gamma(w.num_tx).isf(FALSE_RATE / offsets.size):
+        return None
     carrier = np.angle(sums[:, best])[known.schedule] / order
     steps = np.round(
-        (np.angle(chirps) - 2 * np.pi * OFFSETS[best] * turns - carrier) * order / (2 * np.pi)
+        (np.angle(chirps) - 2 * np.pi * offsets[best] * turns - carrier) * order / (2 * np.pi)
     )
     for a in known.sent_by:  # as before, in the middle
         apart = np.exp(2j * np.pi * steps[a] / order) @ known.phases[a].conj()
         steps[a] -= np.round(np.angle(apart) * order / (2 * np.pi))
-    return np.exp(2j * np.pi * steps / order), float(OFFSETS[best])
-
-
-def _gathered(known: Known, chirps: np.ndarray) -> float:
-    """Power of the chirps added in phase, antenna by antenna."""
-    return sum(float(np.abs(chirps[sent].sum()) ** 2) for sent in known.sent_by)
+    return np.exp(2j * np.pi * steps / order), float(offsets[best])

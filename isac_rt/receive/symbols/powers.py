@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
@@ -217,10 +217,39 @@ def moves_as_predicted(symbols: Symbols, order: int) -> bool:
 
     The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole
     symbols of its Doppler, so that a reflection always ends up near the predicted cell. But unless
-    it moves as predicted its phases lie anywhere between the symbols: a spread of pi/D/sqrt(3). The
-    spread from noise is sqrt((1 + 1/(2 g)) / (L_rx g)) with g the SNR of a cell.
+    it moves as predicted its phases lie anywhere between the symbols: a spread of pi/D/sqrt(3).
     """
     anywhere = np.pi / order / np.sqrt(3)
-    g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)
-    from_noise = np.sqrt((1 + 1 / (2 * g)) / (symbols.looks * g))
+    from_noise = transition_noise(symbols)
     return bool(from_noise > 0.6 * anywhere or symbols.phase_spread < 0.8 * anywhere)
+
+
+def transition_noise(symbols: Symbols) -> float:
+    """RMS phase that noise gives a transition [rad], by the confidence of the delay symbols: with g
+    the SNR of a cell, sqrt((1 + 1/(2 g)) / (L_rx g))."""
+    g = max(float(np.median(symbols.delay_confidence)) - 1, 1e-3)
+    return float(np.sqrt((1 + 1 / (2 * g)) / (symbols.looks * g)))
+
+
+def transition_error_rate(symbols: Symbols, order: int) -> float:
+    """Share of the transitions that noise is expected to have turned to a neighbouring symbol."""
+    return float(special.erfc(np.pi / order / (np.sqrt(2) * transition_noise(symbols))))
+
+
+def velocity_spread(
+    symbols: Symbols, order: int, prediction: Prediction, waveform: Waveform
+) -> float:
+    """Standard deviation that decided transitions add to all velocities of a frame [m/s].
+
+    Two things are in it. A wrong transition turns the rest of its chain by 2 pi/D: over n chirps
+    with an error rate q the phase walks, and the slope of a walk has the variance 6 q n / (5 D^2)
+    in squared turns per chain, over M L_tx chains. And decisions take up part of what the predicted
+    velocity is off: of a phase error that noise of RMS s hides, rounding to symbols keeps only 1 +
+    2 sum_k (-1)^(k+1) exp(-(k D s)^2 / 2), and loses the rest.
+    """
+    w, k = waveform, np.arange(1, 30)
+    rate = transition_error_rate(symbols, order)
+    walk = 1.2 * rate * w.num_chirps / (w.num_tx * order) ** 2 / len(symbols.raw)
+    kept = np.exp(-((k * order * transition_noise(symbols)) ** 2) / 2)
+    lost = float(1 + 2 * ((-1.0) ** k * kept).sum())
+    return float(np.hypot(np.sqrt(walk) * w.velocity_cell(1), lost * prediction.velocity_std[0]))
