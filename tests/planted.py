@@ -461,8 +461,8 @@ OF_CASES = {
     ),
     "cfar against mmwrt": Bug(
         "receive/cfar.py",
-        "cell = stats.gamma(looks, scale=1 / looks)",
-        "cell = stats.gamma(looks, scale=1.1 / looks)",
+        "x = looks * factor * z",
+        "x = looks * factor * z / 1.1",
     ),
     "gospa against stone soup": Bug(
         "results/metrics.py",

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
@@ -78,7 +78,7 @@ def summarise(
     """
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
     looks = reception.confidence_looks or num_rx
-    level = stats.gamma(looks, scale=1 / looks).isf(CONFIDENT_RATE / searched)
+    level = gammainccinv(looks, CONFIDENT_RATE / searched) / looks
     r = reception
     sure = np.sort(r.raw_delay_symbols[_of_decided(r) > level]) if r.decoded else np.zeros(0, int)
     if sure.size < 2:

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 import scipy.fft
-from scipy import stats
+from scipy.special import bdtrc, betainccinv
 
 T = TypeVar("T", bound=Hashable)
 
@@ -25,8 +25,9 @@ def hot_threshold(num_rx: int, num_cells: int, rate: float = HOT_RATE) -> float:
     """Strongest cell over the mean of the others that noise exceeds in this share of chirps: the
     largest of `num_cells` F-distributed ratios with 2 L_rx and 2 L_rx (num_cells - 1) degrees of
     freedom."""
-    law = stats.f(2 * num_rx, 2 * num_rx * (num_cells - 1))
-    return float(law.isf(-np.expm1(np.log1p(-rate) / num_cells)))
+    a, b = num_rx, num_rx * (num_cells - 1)
+    share = betainccinv(a, b, -np.expm1(np.log1p(-rate) / num_cells))  # a x / (a x + b)
+    return float(share / (1 - share) * b / a)
 
 
 def hot_chirps(samples: np.ndarray) -> np.ndarray:
@@ -47,7 +48,7 @@ def hot_chirps(samples: np.ndarray) -> np.ndarray:
 def needed_chirps(num_chirps: int, false_rate: float) -> int:
     """Hot chirps from which a block counts as taken: noise reaches them with at most
     `false_rate`."""
-    tail = stats.binom.sf(np.arange(-1, num_chirps), num_chirps, HOT_RATE)
+    tail = np.append(1.0, bdtrc(np.arange(num_chirps), num_chirps, HOT_RATE))
     return int(np.flatnonzero(tail <= false_rate)[0])
 
 

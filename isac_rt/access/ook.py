@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from scipy import stats
+from scipy.special import betainccinv
 
 from isac_rt.frame.waveform import Waveform
 
@@ -129,7 +129,8 @@ def threshold(rate: float, looks: int, num_cells: int) -> float:
     """Energy over the mean noise of `num_cells` cells that noise alone exceeds with this rate: both
     are means of `looks` exponentials per cell, their ratio is F distributed with 2 `looks` and 2
     `looks` `num_cells` degrees of freedom."""
-    return float(stats.f(2 * looks, 2 * looks * num_cells).isf(rate))
+    share = betainccinv(looks, looks * num_cells, rate)  # x / (x + num_cells)
+    return float(share / (1 - share) * num_cells)
 
 
 def read(

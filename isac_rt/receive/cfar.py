@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage, optimize, stats
+from scipy import ndimage, optimize, special
 
 from isac_rt.kernels.jit import jit
 from isac_rt.scenario.receivers import Receivers
@@ -170,16 +170,18 @@ def greatest_of_factor(
     before, behind : independent training cells on each side (may be fractions); 0 where a side is
         missing
     """
-    cell = stats.gamma(looks, scale=1 / looks)
-    sides = [stats.gamma(looks * n, scale=1 / (looks * n)) for n in (before, behind) if n > 0]
-    z = np.linspace(
-        min(s.ppf(1e-12) for s in sides), max(s.isf(1e-14) for s in sides), QUADRATURE_POINTS
-    )
-    cumulative = np.prod([s.cdf(z) for s in sides], axis=0)
+    sides = np.array([looks * n for n in (before, behind) if n > 0])  # shapes of Gamma means
+    low = (special.gammaincinv(sides, 1e-12) / sides).min()
+    high = (special.gammainccinv(sides, 1e-14) / sides).max()
+    z = np.linspace(low, high, QUADRATURE_POINTS)
+    cumulative = np.prod([special.gammainc(shape, shape * z) for shape in sides], axis=0)
 
     def excess(factor: float) -> float:
         # by parts: the density of the greater mean against the cell's tail
-        rate = np.trapezoid(factor * cell.pdf(factor * z) * cumulative, z) + cell.sf(factor * z[-1])
+        x = looks * factor * z
+        density = np.exp(special.xlogy(looks - 1, x) - x - special.gammaln(looks))
+        tail = special.gammaincc(looks, x[-1])
+        rate = np.trapezoid(looks * factor * density * cumulative, z) + tail
         return float(np.log(max(rate, 1e-300)) - np.log(false_alarm_rate))
 
     return float(optimize.brentq(excess, 0.5, 1000.0, xtol=1e-6))

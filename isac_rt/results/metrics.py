@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from isac_rt.frame.antennas import Antennas, azimuth_elevation
 from isac_rt.frame.payload import Payload
@@ -427,9 +427,11 @@ def binomial_interval(
     """Clopper-Pearson: the proportions that would not make `successes` or fewer, or as many or
     more, too unlikely."""
     tail = (1 - confidence) / 2
-    low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
+    low = float(betaincinv(successes, trials - successes + 1, tail)) if successes else 0.0
     high = (
-        float(beta.ppf(1 - tail, successes + 1, trials - successes)) if successes < trials else 1.0
+        float(betaincinv(successes + 1, trials - successes, 1 - tail))
+        if successes < trials
+        else 1.0
     )
     return low, high
 

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammainccinv
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
@@ -334,7 +334,7 @@ def _end_symbols(
     raw, last = reception.raw_delay_symbols, waveform.num_delay_symbols - 1
     searched = waveform.num_delay_symbols + 2 * EXTRA_CELLS
     looks = reception.confidence_looks
-    sure = confidence > stats.gamma(looks, scale=1 / looks).isf(SLIP_FALSE_RATE / searched)
+    sure = confidence > gammainccinv(looks, SLIP_FALSE_RATE / searched) / looks
     return raw[sure & ((raw < EXTRA_CELLS) | (raw > last - EXTRA_CELLS))]
 
 

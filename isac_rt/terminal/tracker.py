@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from isac_rt.receive.types import Detections, Prediction
 from isac_rt.scenario.receivers import Tracking
@@ -272,7 +272,8 @@ class Tracker:
         R = np.fmax(std, STD_FLOOR)[:, :, None] ** 2 * np.eye(4)
         residual = wrapped(z[None] - z_mean[:, None], self.velocity_period)
         d2, log_det = mahalanobis(residual, S[:, None] + R[None])
-        gate = chi2.ppf(self.settings.gate_probability, np.isfinite(residual).sum(axis=-1))
+        freedom = np.isfinite(residual).sum(axis=-1)  # of chi squared
+        gate = 2 * gammaincinv(freedom / 2, self.settings.gate_probability)
         return np.where(d2 <= gate, d2 + log_det, np.inf)
 
     def _live(self, track: Track, hit: bool) -> None:

@@ -26,7 +26,6 @@ transmitter's chirps it carries their data, as the paper does not say.
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -67,6 +66,8 @@ def rayleigh_cells(
     mean_power = 10 ** (clutter.level_db / 10) * (
         4 / np.pi if clutter.level_of == "amplitude" else 1.0
     )
+    from scipy.signal import lfilter  # dear to import, and few runs draw such clutter
+
     return ranges, np.sqrt(mean_power) * lfilter([1.0], [1.0, -rho], white)
 
 

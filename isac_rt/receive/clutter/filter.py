@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from scipy import ndimage, stats
+from scipy import ndimage, special
 
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import hann
@@ -46,8 +46,8 @@ class ClutterFilter:
 def occupied_factor(looks: float) -> float:
     """Power over the median of noise, a mean of `looks` exponentials, from which on a cell is
     occupied; at least 3 dB."""
-    noise = stats.gamma(looks, scale=1 / looks)
-    return max(float(noise.isf(FALSE_RATE) / noise.median()), LEAST_FACTOR)
+    rare, median = special.gammainccinv(looks, FALSE_RATE), special.gammaincinv(looks, 0.5)
+    return max(float(rare / median), LEAST_FACTOR)
 
 
 def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import betaincinv
 
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.clutter.adaptive import Beams, Matched, Scan, white_scan
@@ -82,9 +82,8 @@ def sampled(maps: np.ndarray, channels: Channels, beams: Beams, noise: float, gu
 def like_exponential(t: np.ndarray, snapshots: float, size: int) -> np.ndarray:
     """-ln P[T > t] of one beam's matched filter whose covariance comes from so many snapshots of
     `size` channels."""
-    rho = stats.beta(max(snapshots - size + 2, 1), max(size - 1, 1)).ppf(
-        (np.arange(200) + 0.5) / 200
-    )
+    a, b = max(snapshots - size + 2, 1), max(size - 1, 1)
+    rho = betaincinv(a, b, (np.arange(200) + 0.5) / 200)
     return -np.log(
         np.mean((1 + rho[:, None] * np.asarray(t) / snapshots) ** -(snapshots - size + 1), axis=0)
     )

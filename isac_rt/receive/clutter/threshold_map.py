@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammainccinv
 
 from isac_rt.receive.clutter.detectors import ClutterDetector, Judged
 from isac_rt.receive.known import Known
@@ -39,4 +39,4 @@ def map_factor(level: np.ndarray, looks: int, false_alarm_rate: float) -> np.nda
     """
     c = np.asarray(level, float)
     mean, variance = 1 + c, 1 / looks + c**2
-    return stats.gamma.isf(false_alarm_rate, mean**2 / variance, scale=variance / mean)
+    return gammainccinv(mean**2 / variance, false_alarm_rate) * (variance / mean)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.joint.fit import (
@@ -107,7 +107,7 @@ def _hidden(
     grid = grid[(grid**2).sum(axis=1) < 0.98]
     best: tuple[float, int, JointPath] | None = None
     sums = 1 if known.passes == 2 else known.antennas.num_tx
-    level = stats.gamma(sums).isf(FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
+    level = gammainccinv(sums, FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
     for k, (path, channels, counts, noise) in enumerate(
         residual_channels(samples, known, paths, DOPPLER_OFFSETS)
     ):

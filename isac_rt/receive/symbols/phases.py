@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammainccinv
 
 from isac_rt.receive.joint.fit import JointPath, fit, match_chirps, rate_bin
 from isac_rt.receive.known import Known
@@ -80,7 +80,7 @@ def _decide(known: Known, chirps: np.ndarray, order: int) -> tuple[np.ndarray, f
     counts = np.array([[a.sum()] for a in known.sent_by])
     line = (np.abs(sums) ** 2 / counts).sum(axis=0)  # in noise a sum of L_tx exponentials
     best = int(line.argmax())
-    if line[best] < stats.gamma(w.num_tx).isf(FALSE_RATE / offsets.size):
+    if line[best] < gammainccinv(w.num_tx, FALSE_RATE / offsets.size):
         return None
     carrier = np.angle(sums[:, best])[known.schedule] / order
     steps = np.round(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
@@ -68,9 +68,9 @@ def confidence_threshold(num_rx: int, num_cells: int, num_chirps: int) -> float:
     >= num_chirps/2].
     """
     share = np.linspace(0.01, 0.5, 491)
-    tail = stats.binom.sf(num_chirps // 2 - 1, num_chirps, share)
+    tail = special.bdtrc(num_chirps // 2 - 1, num_chirps, share)
     q = float(share[np.flatnonzero(tail < 1e-6)[-1]])
-    return float(stats.gamma(num_rx, scale=1 / num_rx).ppf((1 - q) ** (1 / num_cells)))
+    return float(special.gammaincinv(num_rx, (1 - q) ** (1 / num_cells)) / num_rx)
 
 
 def symbol_cells(waveform: Waveform) -> np.ndarray:

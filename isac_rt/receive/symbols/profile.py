@@ -19,7 +19,7 @@ from functools import partial
 
 import numpy as np
 import scipy.fft
-from scipy import stats
+from scipy.special import ndtri
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
@@ -52,7 +52,7 @@ def learn_profile(cube: IFCube, prediction: Prediction) -> np.ndarray:
             total += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
     looks = cube.samples[..., 0].size
     noise = float(np.median(total))
-    least = float(stats.norm.isf(FALSE_RATE)) / np.sqrt(looks)
+    least = -float(ndtri(FALSE_RATE)) / np.sqrt(looks)
     over = total / noise - 1
     return np.where(over > least, over, 0.0)
 
