@@ -358,8 +358,8 @@ OF_CASES = {
     ),
     "false alarm factor": Bug(
         "receive/cfar.py",
-        "cumulative = np.prod([s.cdf(z) for s in sides], axis=0)",
-        "cumulative = np.mean([s.cdf(z) for s in sides], axis=0)",
+        "cumulative = np.prod([special.gammainc(shape, shape * z) for shape in sides], axis=0)",
+        "cumulative = np.mean([special.gammainc(shape, shape * z) for shape in sides], axis=0)",
     ),
     "false alarms along range": Bug(
         "receive/cfar.py",
@@ -437,8 +437,8 @@ OF_CASES = {
     ),
     "binomial intervals": Bug(
         "results/metrics.py",
-        "beta.ppf(tail, successes, trials - successes + 1)",
-        "beta.ppf(tail, successes + 1, trials - successes + 1)",
+        "betaincinv(successes, trials - successes + 1, tail)",
+        "betaincinv(successes + 1, trials - successes + 1, tail)",
     ),
     "paths of a canyon against sionna": Bug(
         "propagation/raytrace.py",
