@@ -62,9 +62,11 @@ def attitude(boresight: Sequence[float] | np.ndarray) -> np.ndarray:
     A vertical boresight leaves the roll open: then X is east.
     """
     y = np.asarray(boresight, float) / np.linalg.norm(boresight)
-    x = np.cross(y, [0.0, 0.0, 1.0])
-    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+    east, north, up = y
+    size = np.sqrt(north * north + east * east)
+    # written out, for numpy's cross products of single vectors take most of the time of a pose
+    x0, x1 = (north / size, -east / size) if size > 1e-9 else (1.0, 0.0)
+    return np.array([[x0, east, x1 * up], [x1, north, -x0 * up], [0.0, up, x0 * north - x1 * east]])
 
 
 class Trajectory:
@@ -88,6 +90,13 @@ class Trajectory:
             self._spline = CubicSpline(
                 times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural"
             )
+
+    def positions(self, times: np.ndarray) -> np.ndarray:
+        """(K, 3) positions at times (K,) [s]."""
+        if self._spline is None:
+            return self._start + times[:, None] * self._velocity
+        inside = np.clip(times, *self._span)
+        return self._spline(inside) + (times - inside)[:, None] * self._spline(inside, 1)
 
     def pose(self, time: float) -> Pose:
         """Pose at `time` [s]."""

@@ -20,6 +20,7 @@ from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind
+from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.ways import LinkState
@@ -89,6 +90,55 @@ def test_cells_tile_the_faces_and_are_as_fine_as_asked():
     a, b, c = np.moveaxis(city.corners[cells.face], 1, 0)
     for p, q in ((a, b), (b, c), (c, a)):
         assert ((np.cross(q - p, cells.points - p) * n).sum(1) > -1e-9).all()
+
+
+COARSE = Density(0.2, 0.28)
+
+
+def halved(corners: np.ndarray, places: np.ndarray, code: int = 1) -> list[tuple[int, float]]:
+    """(code, area) of the cells of one triangle, by recursion, against every place."""
+    a, b, c = corners
+    area = np.linalg.norm(np.cross(b - a, c - a)) / 2
+    middle = corners.mean(axis=0)
+    reach = np.linalg.norm(corners - middle, axis=1).max()
+    distance = max(np.linalg.norm(places - middle, axis=1).min() - reach, 0.0)
+    if area <= max(COARSE.smallest, COARSE.per_metre * distance):
+        return [(code, area)]
+    edges = [np.linalg.norm(corners[(k + 1) % 3] - corners[k]) for k in range(3)]
+    k = next(k for k in range(3) if edges[k] > max(edges) * (1 - 1e-9))
+    p, q, r = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
+    one = halved(np.array([p, (p + q) / 2, r]), places, 2 * code)
+    return one + halved(np.array([(p + q) / 2, q, r]), places, 2 * code + 1)
+
+
+def test_cells_of_a_long_flight_are_those_of_plain_recursion():
+    """Area and order of all cells of a street beside 133 places of a bent flight, by recursion with
+    no shortcut. Planted bugs: boxes begin one place late; a box's distance with its corners
+    swapped; the second half begins at the other end of the edge."""
+    city = canyon()
+    t = np.linspace(0, 1, 133)[:, None]
+    places = np.hstack([3.1 * np.sin(5 * t), 71 * t - 30, 6 + 9 * t])
+    cells = cut(city, np.ones(city.num_faces, bool), places - city.origin, COARSE, 3)
+    found = 0
+    for face in range(city.num_faces):
+        corners = city.corners[face]
+        corners = corners[np.lexsort(corners.T[::-1])]
+        true = sorted(halved(corners, places - city.origin))
+        mine = cells.area[cells.face == face]
+        assert mine == pytest.approx([area for _, area in true], rel=1e-6, abs=0)  # float32
+        found += len(true)
+    assert found == len(cells) > 1500
+
+
+def test_one_cell_too_many_is_refused(monkeypatch):
+    """As many as allowed are cut, and one more is refused. Planted bug: what waits is counted
+    twice."""
+    count = len(all_cells(canyon()))
+    monkeypatch.setattr(clutter_cells, "MOST_CELLS", count)
+    assert len(all_cells(canyon())) == count
+    monkeypatch.setattr(clutter_cells, "MOST_CELLS", count - 1)
+    with pytest.raises(ValueError, match=f"more than {count - 1} cells"):
+        all_cells(canyon())
 
 
 @pytest.mark.parametrize("seed", [5, 6])
@@ -568,3 +618,18 @@ def test_speckle_of_the_field_is_rayleigh_where_few_share_a_cell():
         )
     assert 1.5 < np.mean(count) < 4
     assert stats.kstest(samples, stats.expon.cdf).pvalue > 1e-4
+
+
+def test_points_ever_seen_are_those_seen_from_any_place():
+    """In one kernel as place by place, points beyond corners and on roofs among them. Planted bugs:
+    the last place is not looked from; a point once in the dark stays there."""
+    city = load_city(scenario.City(source="blocks"), ".", F_C, np.zeros(3))
+    model, _ = flown(city, (2.0, 3.0, 19.0), (9.0, 40.0, 25.0), cell_area_per_metre_m=9.0)
+    shadows, cells = model.field.sight.shadows, all_cells(city)
+    places = np.array([[2.0, 3.0, 19.0], [-31.0, 8.0, 44.0], [77.0, -60.0, 31.0]])
+    normals = city.normals[cells.face]
+    each = np.array([shadows.sees(place, cells.points, normals) for place in places])
+    assert np.array_equal(shadows.ever_sees(places, cells.points, normals), each.any(axis=0))
+    assert (each.any(axis=0) & ~each[0]).sum() > 100
+    assert (each[2] & ~each[0] & ~each[1]).sum() > 100
+    assert (~each.any(axis=0)).sum() > 100

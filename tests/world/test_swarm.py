@@ -59,6 +59,18 @@ def test_beyond_the_waypoints_it_flies_straight_on():
     assert not later.acceleration.any()
 
 
+def test_many_positions_at_once_are_those_of_the_poses():
+    """Bit for bit, beyond the waypoints too. Planted bug: no straight way beyond them."""
+    times = np.linspace(-1.3, 9.7, 57)
+    waypoints = [
+        {"time_s": t, "position_m": p} for t, p in ((0, (1, 2, 3)), (4, (-7, 9, 5)), (8, (3, 1, 8)))
+    ]
+    for way in ({"waypoints": waypoints}, {"position_m": (1, 2, 3), "velocity_mps": (4, -5, 0.7)}):
+        flight = Trajectory(Uav.model_validate({"role": "active", **way}))
+        alone = np.array([flight.pose(t).position for t in times])
+        assert np.array_equal(flight.positions(times), alone)
+
+
 def test_boresight_follows_velocity_or_stays():
     moving = Uav(role="passive", position_m=(0, 0, 0), velocity_mps=(3.0, -1.0, 0.0))
     fixed = moving.model_copy(update={"boresight": (0.0, -1.0, 0.0)})

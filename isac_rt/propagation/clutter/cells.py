@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from isac_rt.kernels.jit import jit
 from isac_rt.randomness import seed_sequence, splitmix64
 from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import CityMesh
@@ -25,6 +25,8 @@ a file lies where rounding could go either way after the city has been recentred
 back."""
 ALIKE = 1e-9
 """Edges whose lengths differ by less than this share are equally long; then the first is halved."""
+BOX = 32
+"""Places along a flight that are looked at only if the box about them is near enough."""
 MOST_CELLS = 8_000_000
 
 
@@ -122,44 +124,17 @@ def cut(
     order = np.lexsort(corners.reshape(-1, 9).T[::-1])
     face, corners = face[order], corners[order]
     state = _face_state(corners + city.origin, seed)
-    tree = cKDTree(places)
-    area = city.areas[face]
-    row, code = np.arange(face.size), np.ones(face.size, np.uint64)
-    leaves: list[tuple[np.ndarray, ...]] = []
-    count = 0
-    while row.size:
-        large = _too_large(corners, area, tree, density)
-        leaves.append((row[~large], code[~large], area[~large], corners[~large]))
-        count += int((~large).sum()) + 2 * int(large.sum())
-        if count > MOST_CELLS:
-            raise ValueError(
-                f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, "
-                "or cell_area_per_metre_m) cuts "
-                f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
-            )
-        corners = _halves(corners[large])
-        row, area = np.repeat(row[large], 2), np.repeat(area[large] / 2, 2)
-        code = np.repeat(code[large], 2) * np.uint64(2)
-        code[1::2] += np.uint64(1)
-        count -= row.size
-    rows, codes, areas, triangles = (np.concatenate(part) for part in zip(*leaves, strict=True))
-    order = np.lexsort([codes, rows])
-    rows, codes, areas, triangles = rows[order], codes[order], areas[order], triangles[order]
+    limits = density.per_metre, density.smallest, MOST_CELLS
+    count, *leaves = _leaves(corners, city.areas[face], places, _boxes(places), *limits)
+    if count > MOST_CELLS:
+        raise ValueError(
+            f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, "
+            "or cell_area_per_metre_m) cuts "
+            f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
+        )
+    rows, codes, areas, triangles = (part[:count] for part in leaves)
     point, amplitude = _draw(splitmix64(state[rows], codes), triangles)
     return Cells(point, areas.astype(np.float32), amplitude, face[rows].astype(np.int32))
-
-
-def _too_large(
-    corners: np.ndarray, area: np.ndarray, tree: cKDTree, density: Density
-) -> np.ndarray:
-    """Whether cells are larger than their distance allows; that of the nearest point that a circle
-    about the centroid can hold."""
-    large = area > density.smallest
-    middle = corners[large].mean(axis=1)
-    reach = np.linalg.norm(corners[large] - middle[:, None], axis=2).max(axis=1)
-    distance = np.maximum(tree.query(middle)[0] - reach, 0.0)
-    large[large] = area[large] > density.per_metre * distance
-    return large
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:
@@ -168,17 +143,88 @@ def _sorted_corners(corners: np.ndarray) -> np.ndarray:
     return np.take_along_axis(corners, rank[..., None], axis=1)
 
 
-def _halves(corners: np.ndarray) -> np.ndarray:
-    """(2n, 3, 3) the two halves of each triangle (n, 3, 3), cut from the middle of its longest
-    edge."""
-    edge = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)
-    first = (edge >= edge.max(axis=1, keepdims=True) * (1 - ALIKE)).argmax(axis=1)
-    turn = (first[:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
-    middle = (a + b) / 2
-    return np.stack(
-        [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)], axis=1
-    ).reshape(-1, 3, 3)
+def _boxes(places: np.ndarray) -> np.ndarray:
+    """(B, 2, 3) lowest and highest coordinates of every `BOX` places (K, 3)."""
+    first = np.arange(0, len(places), BOX)
+    return np.stack([np.minimum.reduceat(places, first), np.maximum.reduceat(places, first)], 1)
+
+
+@jit
+def _leaves(corners, area, places, boxes, per_metre, smallest, most):
+    """Cells of faces (F, 3, 3) that are cut no further: how many, then the row of the face, code,
+    area and corners, in the order of row and code. Ends early where there are more than `most`."""
+    room = max(2 * area.size, 1024)
+    rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
+    areas, cells = np.empty(room), np.empty((room, 3, 3))
+    line_codes, line_areas = np.empty(64, np.uint64), np.empty(64)
+    line = np.empty((64, 3, 3))  # cells of one face that wait, those of few halvings first
+    count = 0
+    for row in range(area.size):
+        line_codes[0], line_areas[0], line[0] = 1, area[row], corners[row]
+        first, last = 0, 1
+        while first < last:
+            if count + last - first > most:
+                return most + 1, rows, codes, areas, cells
+            large = line_areas[first] > smallest
+            if not large or not _near(line[first], line_areas[first] / per_metre, places, boxes):
+                if count == rows.size:
+                    rows, codes = np.append(rows, rows), np.append(codes, codes)
+                    areas, cells = np.append(areas, areas), np.concatenate((cells, cells))
+                rows[count], codes[count] = row, line_codes[first]
+                areas[count], cells[count] = line_areas[first], line[first]
+                count, first = count + 1, first + 1
+                continue
+            if last + 2 > line_areas.size:
+                line_codes = np.append(line_codes[first:last], line_codes)
+                line_areas = np.append(line_areas[first:last], line_areas)
+                line = np.concatenate((line[first:last], line))
+                first, last = 0, last - first
+            _halve(line[first], line[last], line[last + 1])
+            for half in range(2):
+                line_codes[last + half] = line_codes[first] * np.uint64(2) + np.uint64(half)
+                line_areas[last + half] = line_areas[first] / 2
+            first, last = first + 1, last + 2
+    return count, rows, codes, areas, cells
+
+
+@jit
+def _near(corners, limit, places, boxes):
+    """Whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a sphere
+    about its centroid that holds it."""
+    middle = (corners[0] + corners[1] + corners[2]) / 3
+    reach = 0.0
+    for corner in corners:
+        reach = max(reach, _distance(corner, middle))
+    for number, (low, high) in enumerate(boxes):
+        within = np.minimum(np.maximum(middle, low), high)
+        if _distance(within, middle) > (1 + ALIKE) * (limit + reach):
+            continue
+        for place in places[number * BOX : (number + 1) * BOX]:
+            if max(_distance(place, middle) - reach, 0.0) < limit:
+                return True
+    return False
+
+
+@jit(inline=True)
+def _distance(a, b):
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@jit
+def _halve(corners, one, other):
+    """Cut a triangle (3, 3) from the middle of its longest edge into two."""
+    edges = np.empty(3)
+    for k in range(3):
+        edges[k] = _distance(corners[(k + 1) % 3], corners[k])
+    first, least = 0, edges.max() * (1 - ALIKE)
+    while edges[first] < least:
+        first += 1
+    for axis in range(3):
+        a, b = corners[first, axis], corners[(first + 1) % 3, axis]
+        middle = (a + b) / 2
+        one[0, axis], one[1, axis], one[2, axis] = a, middle, corners[(first + 2) % 3, axis]
+        other[0, axis], other[1, axis], other[2, axis] = middle, b, corners[(first + 2) % 3, axis]
 
 
 def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:

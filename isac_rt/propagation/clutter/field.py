@@ -156,9 +156,8 @@ class ClutterField:
         ]
         candidates = cut(city, scatters, places, Density.of(clutter), seed)
         shadows = Shadows(scene)
-        kept = _ever_seen(
-            shadows,
-            [flights[name] for name in swarm.transmitters],
+        kept = shadows.ever_sees(
+            _kept_places([flights[name] for name in swarm.transmitters]),
             candidates.points,
             city.normals[candidates.face],
         )
@@ -223,17 +222,10 @@ class ClutterField:
         )
 
 
-def _ever_seen(
-    shadows: Shadows, flights: Sequence[Flight], points: np.ndarray, normals: np.ndarray
-) -> np.ndarray:
-    """(N,) whether points are seen from a place of the flights."""
+def _kept_places(flights: Sequence[Flight]) -> np.ndarray:
+    """(K, 3) places of the flights from which cells are tested."""
     step = round(KEPT_SPACING / KNOT_SPACING)
-    kept = np.zeros(len(points), bool)
-    for flight in flights:
-        for place in [*flight.knots[::step], flight.knots[-1]]:
-            left = np.flatnonzero(~kept)
-            kept[left] = shadows.sees(place, points[left], normals[left])
-    return kept
+    return np.concatenate([part for f in flights for part in (f.knots[::step], f.knots[-1:])])
 
 
 def surfaces(city: CityMesh, wavelength: float) -> Surfaces:

@@ -47,14 +47,14 @@ class Flight:
     def __init__(self, trajectory: Trajectory, duration: float, origin: np.ndarray) -> None:
         self._trajectory, self._origin = trajectory, origin
         self._times = np.linspace(0.0, duration, 2001)
-        track = np.array([trajectory.pose(t).position for t in self._times])
+        track = trajectory.positions(self._times)
         self._way = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))]
         )
         self.spacing = max(self._way[-1] / max(np.ceil(self._way[-1] / KNOT_SPACING), 1.0), 1e-9)
         count = round(self._way[-1] / self.spacing) + 1
         times = np.interp(self.spacing * np.arange(count), self._way, self._times)
-        self.knots = np.array([trajectory.pose(t).position for t in times]) - origin
+        self.knots = trajectory.positions(times) - origin
         """(K, 3) local [m]"""
 
     def holds(self, pose: Pose, time: float) -> bool:

@@ -22,6 +22,8 @@ measured 3 to 5."""
 JSON_FACTOR = 25
 """The same for JSON, whose numbers and lists become objects: measured 16 with footprints, 23 with
 CityJSON (53 with nothing but empty lists)."""
+ANY_MEMORY = 100_000
+"""Of files up to this size the free memory is not asked: a city may have thousands."""
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
@@ -50,7 +52,8 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise CityError(f"{path.name}: is no regular file; give a file")
-        size, free = status.st_size, available_memory()
+        size = status.st_size
+        free = available_memory() if size > ANY_MEMORY else None
         if free is not None and factor * size > free:
             raise CityError(
                 f"{path.name}: a file of {size / 1e9:.3g} GB takes about "
@@ -70,7 +73,9 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
 
 def beside(path: Path, name: str, what: str) -> Path:
     """The file that `what` in the file `path` names: in its folder or below, and nowhere else."""
-    relative = os.path.relpath(path.parent / unquote(name), path.parent)
+    relative = os.path.normpath(unquote(name))
+    if os.path.isabs(relative) or relative.startswith(os.pardir):
+        relative = os.path.relpath(path.parent / relative, path.parent)
     file, steps = path.parent / relative, relative.split(os.sep)
     inside = steps[0] != os.pardir
     if inside and any(os.path.islink(place) for place in (file, *file.parents[: len(steps) - 1])):

@@ -25,6 +25,14 @@ from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks
 _MAX_PROPERTIES = 200
 """Of a PLY file: trimesh takes a time that grows with their square."""
+_PLAIN_PLY = re.compile(
+    rb"ply\nformat binary_little_endian 1.0\nelement vertex ([1-9]\d{0,8})\n"
+    rb"property float x\nproperty float y\nproperty float z\nelement face ([1-9]\d{0,8})\n"
+    rb"property list uchar int vertex_ind(?:ices|ex)\nend_header\n"
+)
+"""The header of a mesh with nothing but places and faces, as of Sionna's thousands of
+buildings."""
+_PLAIN_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _SOLID = re.compile(r"^[ \t]*solid\b", re.MULTILINE | re.IGNORECASE)
 _VERTEX = re.compile(r"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -53,12 +61,31 @@ def _used(
     return Piece(corners, faces.reshape(-1, 3), tuple(str(label) for label in labels if label))
 
 
+def _plain_triangles(data: bytes) -> tuple[NDArray, NDArray] | None:
+    """Vertices and faces of a binary PLY file that holds triangles and nothing else; None of any
+    other, however near to it."""
+    header = _PLAIN_PLY.match(data)
+    if header is None:
+        return None
+    points, count = int(header[1]), int(header[2])
+    if len(data) != header.end() + 12 * points + _PLAIN_FACE.itemsize * count:
+        return None
+    vertices = np.frombuffer(data, "<f4", 3 * points, header.end()).reshape(-1, 3)
+    faces = np.frombuffer(data, _PLAIN_FACE, count, header.end() + 12 * points)
+    return (vertices, faces["corners"]) if (faces["count"] == 3).all() else None
+
+
 def _polygons(path: Path) -> Iterator[Piece]:
-    """PLY, with the numbers alone taken from trimesh."""
+    """PLY: plain triangles are read here, of all else trimesh takes the numbers."""
     from trimesh.exchange.ply import load_ply
     from trimesh.geometry import triangulate_quads
 
     data = read_bytes(path)
+    plain = _plain_triangles(data)
+    if plain is not None:
+        vertices, faces = plain
+        yield Piece(vertices.astype(np.float64), faces.astype(np.int64), (path.name,))
+        return
     if data.count(b"property", 0, data.find(b"end_header")) > _MAX_PROPERTIES:
         raise ValueError(f"more than {_MAX_PROPERTIES} properties")
     with warnings.catch_warnings():
