@@ -1,5 +1,5 @@
-"""What is looked at before a run begins: whether it fits into memory, and whether its bodies keep
-apart."""
+"""What is looked at before a run begins: whether it fits into memory, whether its bodies keep apart
+and out of the city, and whether they can be seen."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.file import ScenarioWarning
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.tree import NEAREST_M
+from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.passage import TOUCH_M, enclosed, first_passage
 from isac_rt.world.swarm import Pose, Swarm
 
 SAMPLE_BYTES = 8
@@ -94,6 +96,52 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
                 f"{nearest * step}), at least "
                 f"{NEAREST_M} m are needed; change one of their flights"
             )
+
+
+def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
+    """Refuse UAVs that begin inside a building or under the ground, or fly through a surface.
+
+    Parameters
+    ----------
+    city : the whole of it; what a plan cuts away may be the ground under a target
+
+    Raises
+    ------
+    ScenarioError
+    """
+    for name, flight in swarm.trajectories.items():
+        times, places = flight.way(timetable.epoch(0), timetable.epoch(timetable.frames - 1))
+        way = places - city.origin
+        keys = "waypoints" if swarm.uavs[name].waypoints else "position_m or velocity_mps"
+        if enclosed(city, way[0]):
+            raise ScenarioError(
+                f"swarm.{name}: starts inside a building of {city.name} or under its ground, at "
+                f"{_said(places[0])} m; change its {keys}"
+            )
+        found = first_passage(city, _off_the_ends(way))
+        if found is not None:
+            a, b = found.segment, found.segment + 1
+            when = times[a] + found.share * (times[b] - times[a])
+            where = places[a] + found.share * (places[b] - places[a])
+            made_of = city.materials[city.face_material[found.face]].name
+            raise ScenarioError(
+                f"swarm.{name}: flies through a surface of {city.name} ({made_of}) at {when:.3g} s "
+                f"(frame {int(when / timetable.interval)}), at {_said(where)} m; change its {keys}"
+            )
+
+
+def _off_the_ends(way: np.ndarray) -> np.ndarray:
+    """A way (T, 3) that begins and ends `TOUCH_M` later and earlier; what is shorter is a point."""
+    out = way.copy()
+    for end, inner in ((0, 1), (-1, -2)):
+        step = way[inner] - way[end]
+        length = float(np.linalg.norm(step))
+        out[end] += step * min(TOUCH_M / length, 0.5) if length else 0.0
+    return out
+
+
+def _said(place: np.ndarray) -> str:
+    return "[" + ", ".join(f"{value:.1f}" for value in place) + "]"
 
 
 def warn_of_aliases(

@@ -41,6 +41,7 @@ from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
     check_flights,
     check_memory,
+    check_passage,
     check_reference,
     warn_of_aliases,
 )
@@ -316,15 +317,18 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     timetable = timetable_of(scenario, waveform, schedule)
     check_memory(antennas, timetable)
     check_flights(swarm, timetable)
-    warn_of_aliases(
-        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
-    )
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
     plan = plan_of(scenario, antennas, timetable, swarm)
     # the blocks, and with them the reach, are found out in the run where links are established
     radius = np.inf if scenario.access.establish else plan.mesh_radius(swarm.middle)
     carrier = waveform.carrier_frequency
     city = city_about(swarm.middle, scenario.city, scenario.folder, carrier, radius)
+    check_passage(
+        swarm, timetable, city_about(swarm.middle, scenario.city, scenario.folder, carrier)
+    )
+    warn_of_aliases(
+        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
+    )
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     make = partial(
         make_propagation,

@@ -11,6 +11,10 @@ from scipy.interpolate import CubicSpline
 
 from isac_rt.scenario.swarm import Uav
 
+SAG_M = 0.01
+MOST_PLACES = 20_000
+"""A flight that would need more is followed less closely."""
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -115,6 +119,17 @@ class Trajectory:
         if not np.any(boresight):
             boresight = np.array([0.0, 1.0, 0.0])  # a hovering UAV looks north
         return Pose(position, velocity, acceleration, attitude(boresight))
+
+    def way(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (T,) [s] and places (T, 3) [m] of the flight between two times, whose straight
+        connections keep within `SAG_M` of it."""
+        times = np.array([start, end])
+        if self._spline is not None:
+            knots = self._spline.x[(self._spline.x > start) & (self._spline.x < end)]
+            bends = np.linalg.norm(self._spline(np.clip(self._spline.x, start, end), 2), axis=1)
+            count = int((end - start) * np.sqrt(bends.max() / (8 * SAG_M))) + 2
+            times = np.union1d(np.linspace(start, end, min(count, MOST_PLACES)), knots)
+        return times, np.array([self.pose(float(t)).position for t in times])
 
 
 @dataclass(frozen=True)

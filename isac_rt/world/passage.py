@@ -1,0 +1,114 @@
+"""Where flights meet the city: ways through surfaces, places inside buildings or under the ground.
+
+All in float64 and against every face, because Sionna's float32 rays see through what they start on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from isac_rt.world.city.mesh import CityMesh
+
+TOUCH_M = 0.01
+"""A flight may begin and end this near to a surface: UAVs stand on roofs."""
+RING = 12
+LOW_RAD, HIGH_RAD = 0.09, 0.7
+"""Elevations of two rings of rays about a place: out through walls, and out through roofs."""
+
+
+class Passage(NamedTuple):
+    """Where a way goes through a face.
+
+    Attributes
+    ----------
+    segment : of the way, from 0
+    share : of the segment that is flown until then
+    face : of the city
+    """
+
+    segment: int
+    share: float
+    face: int
+
+
+def first_passage(city: CityMesh, way: np.ndarray) -> Passage | None:
+    """The first face that a way goes through; None if it is clear.
+
+    Parameters
+    ----------
+    city : CityMesh
+    way : (T, 3) corners of a polyline, local [m]
+    """
+    return _first(city.corners, np.arange(city.num_faces), way, 0)
+
+
+def _first(corners: np.ndarray, faces: np.ndarray, way: np.ndarray, begin: int) -> Passage | None:
+    """By halves: only faces whose boxes meet that of a part of the way are looked at again."""
+    near = corners[faces]
+    inside = (near.min(axis=1) <= way.max(axis=0)) & (near.max(axis=1) >= way.min(axis=0))
+    faces = faces[inside.all(axis=1)]
+    if not faces.size or len(way) < 2:
+        return None
+    if len(way) == 2:
+        hit, share = hits(corners[faces], way[0], way[1])
+        return (
+            Passage(begin, float(share.min()), int(faces[hit[share.argmin()]]))
+            if hit.size
+            else None
+        )
+    half = len(way) // 2
+    return _first(corners, faces, way[: half + 1], begin) or _first(
+        corners, faces, way[half:], begin + half
+    )
+
+
+def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (F, 3, 3) that the straight line between two places (3,) goes through, and the share of
+    the line up to each; a line within a face's plane goes through none."""
+    box = np.stack([np.minimum(start, end), np.maximum(start, end)])
+    near = np.flatnonzero(
+        ((corners.min(axis=1) <= box[1]) & (corners.max(axis=1) >= box[0])).all(axis=1)
+    )
+    a, line = corners[near, 0], end - start
+    first, second = corners[near, 1] - a, corners[near, 2] - a
+    cross = np.cross(line, second)
+    volume = (first * cross).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = ((start - a) * cross).sum(axis=1) / volume
+        turned = np.cross(start - a, first)
+        v = turned @ line / volume
+        share = (turned * second).sum(axis=1) / volume
+        through = (u >= 0) & (v >= 0) & (u + v <= 1) & (share >= 0) & (share <= 1)
+    return near[through], share[through]
+
+
+def enclosed(city: CityMesh, place: np.ndarray) -> bool:
+    """Whether a place (3,), local, lies inside a building or under the ground.
+
+    Inside a building an odd number of faces lies above, and in most directions about, whether it
+    has a floor or not. Under the ground nothing lies below, and something above in every direction.
+    A place under a bridge or a canopy is neither.
+    """
+    if not city.num_faces:
+        return False
+    low, high = city.bounds()
+    reach = float(np.linalg.norm(high - low)) + float(np.linalg.norm(place - (low + high) / 2))
+
+    def count(elevation: float, azimuth: float) -> int:
+        level = np.cos(elevation)
+        towards = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        return len(hits(city.corners, place, place + reach * np.array(towards))[0])
+
+    # no direction is along an edge of what people build: an edge would count twice
+    above = count(np.pi / 2 - 1e-4, 0.37)
+    if not above:
+        return False
+    turns = 0.123 + np.arange(RING) * 2 * np.pi / RING
+    odd = sum(count(LOW_RAD, turn) % 2 for turn in turns)
+    if above % 2 and 2 * odd > RING:
+        return True
+    if count(-np.pi / 2 + 1e-4, 0.37):
+        return False
+    return all(count(HIGH_RAD, turn) for turn in turns)
