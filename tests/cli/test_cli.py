@@ -204,9 +204,9 @@ def test_titles_keep_their_units_on_the_screen(
 
 def test_warnings_are_said_as_they_stand(scenario_file, simulation, tmp_path, capsys):
     """Planted bug: warnings printed as markup."""
-    changes = ["--set", "radio.carrier_hz=77", "--out", str(tmp_path / "o")]
+    changes = ["--set", "radio.carrier_hz=9e8", "--out", str(tmp_path / "o")]
     assert main(["run", str(scenario_file), *changes]) == 0
-    assert "warning --set radio.carrier_hz=77: 77 is outside" in capsys.readouterr().err
+    assert "warning --set radio.carrier_hz=9e8: 9e+08 is outside" in capsys.readouterr().err
     isac_rt.cli.cli._say_warning("[bold]not[/] markup", ScenarioWarning)
     assert "warning [bold]not[/] markup" in capsys.readouterr().err
 

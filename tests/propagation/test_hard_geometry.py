@@ -300,7 +300,7 @@ def test_velocities_that_alias_are_warned_of_before_the_run():
 
 
 def test_a_flight_beyond_all_bounds_is_refused():
-    lost = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 20, 9), (0, 1e300, 0)))
+    lost = flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 2e13, 9), (0, 7.0, 0)))
     with pytest.raises(ScenarioError, match="beyond all bounds"):
         prepare(lost)
 
