@@ -12,6 +12,7 @@ the standard library.
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib.metadata
 import os
@@ -40,14 +41,45 @@ _INSTALL_LLVM = (
     "install LLVM 19 (Debian 12 and later, Ubuntu 24.04 and later: apt install libllvm19)"
 )
 
+_OF_THE_NAME = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
+"""Numbers of errors that are of the file which was asked for, and not of the machine."""
+_NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
+"""What libraries say that raise no MemoryError."""
+
 
 class UserError(Exception):
     """What the user can mend: the text says what, where, the limit and the remedy. The command
     line prints it alone and exits with 2."""
 
 
-class RuntimeProblem(UserError):
+class MachineProblem(UserError):
+    """The machine will not do as it is: its disk, its memory, a library. The same may succeed at
+    another time or place."""
+
+
+class RuntimeProblem(MachineProblem):
     """The ray tracer cannot run here; the text says why and what to do."""
+
+
+def of_machine(problem: BaseException) -> bool:
+    """Whether the machine is to blame for an error and not what was asked of it, also where
+    another error was made of the machine's.
+
+    Examples
+    --------
+    >>> of_machine(OSError(errno.ENOSPC, "No space left on device")), of_machine(ValueError("x"))
+    (True, False)
+    """
+    seen: BaseException | None = problem
+    while seen is not None:
+        if isinstance(seen, MachineProblem | MemoryError):
+            return True
+        if isinstance(seen, OSError) and seen.errno not in (None, *_OF_THE_NAME):
+            return True
+        if isinstance(seen, RuntimeError) and _NO_MORE.search(str(seen)):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ else.
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import traceback
 import warnings
@@ -22,7 +21,7 @@ import isac_rt
 from isac_rt.cli import setting_up, simulation, studies, sweeps
 from isac_rt.cli.console import err
 from isac_rt.cli.interruption import Terminated, say_interrupted
-from isac_rt.runtime import UserError
+from isac_rt.runtime import UserError, of_machine
 
 DEBUG = "ISAC_RT_DEBUG"
 COMMANDS = (
@@ -88,9 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say_interrupted()
         return 130
-    except Terminated:
+    except Terminated as asked:
         say_interrupted()
-        return 128 + signal.SIGTERM
+        return 128 + asked.args[0]
     except Exception as problem:
         if os.environ.get(DEBUG):
             traceback.print_exc()
@@ -101,6 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return int(problem.exit_code)
         if isinstance(problem, UserError):
             sys.stderr.write(f"{problem}\n")
+            return 2
+        if of_machine(problem):
+            said = str(problem) or "there is no more memory"
+            sys.stderr.write(f"{type(problem).__name__}: {said} (the machine's disk or memory)\n")
             return 2
         sys.stderr.write(
             f"{type(problem).__name__}: {problem} (this is a fault of isac_rt; {DEBUG}=1 shows "

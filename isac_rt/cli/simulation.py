@@ -34,19 +34,24 @@ def run(
             help="Afterwards measure what was left out on sampled frames; into summary.json.",
         ),
     ] = False,
+    restart: Annotated[
+        bool,
+        typer.Option("--restart", help="Let go of frames that a stopped run kept in DIR."),
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Simulate a scenario: results, summary, figures and a report."""
+    """Simulate a scenario: results, summary, figures and a report. After a stop the same command
+    goes on."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or (), frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
     with ending_soon_after_interrupt(folder):
-        _run(loaded, folder, snapshots, check_budget)
+        _run(loaded, folder, snapshots, check_budget, restart)
     say(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/")
 
 
-def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> None:
+def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, restart: bool) -> None:
     from isac_rt.results.files import check_folder, save
 
     check_folder(folder)
@@ -55,16 +60,16 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool) -> 
     from isac_rt.simulation.resume import Resume
     from isac_rt.simulation.setup import link_budgets, prepare
 
+    resume = Resume(folder, run_content(loaded, snapshots))
+    if restart:
+        resume.remove()
+    resume.check()
     with err().status("setting up"):
         setup = prepare(loaded)
         budget = link_budgets(setup)
     _say_budget(budget)
-    resume = Resume(folder, run_content(loaded, snapshots))
     if resume.begun:
         err().print(f"going on after the frames in {resume.file}", soft_wrap=True)
-    elif resume.other:
-        said = f"{resume.other} is of another run or an earlier version: the run begins anew"
-        err().print(said, soft_wrap=True)
     results = with_progress(
         lambda report: simulate.run(
             loaded, setup=setup, progress=report, snapshots=snapshots, resume=resume

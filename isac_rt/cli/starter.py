@@ -8,10 +8,11 @@ import re
 from importlib import resources
 from pathlib import Path
 
-from isac_rt.results.files import ResultsError, write_text
+from isac_rt.results.files import ResultsError
 from isac_rt.scenario.environment import City
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.tree import json_schema
+from isac_rt.storage import write_whole
 from isac_rt.world.city import load_city
 
 SCHEMA = "scenario.schema.json"
@@ -71,7 +72,8 @@ def write_starter(
 
     Raises
     ------
-    ResultsError  If the scenario is there already or cannot be written.
+    ResultsError  If the scenario is there already.
+    isac_rt.storage.StorageError  If it cannot be written.
     isac_rt.world.city.CityError  If the footprints are not what they should be.
     """
     file = Path(file)
@@ -88,8 +90,8 @@ def write_starter(
         named = os.path.relpath(footprints, file.parent)
         centre, height, notes = _above(named, file.parent)
         text = starter_text(file.stem, named, centre, height)
-    write_text(file, text)
-    write_text(file.with_name(SCHEMA), schema_text())
+    write_whole(file, text)
+    write_whole(file.with_name(SCHEMA), schema_text())
     return [file, file.with_name(SCHEMA)], notes
 
 

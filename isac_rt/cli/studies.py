@@ -152,7 +152,8 @@ def bench(
     """Speed against error, method by method, in floors of the same run."""
     if fit is not None:
         return _fit(fit)
-    from isac_rt.results.files import check_folder, write_text
+    from isac_rt.results.files import check_folder
+    from isac_rt.storage import write_whole
     from isac_rt.studies.bench import report
 
     chosen = list(dict.fromkeys(stages or report.stages()))
@@ -164,7 +165,7 @@ def bench(
         )
         files = report.write(found, out)
         if json_file is not None:
-            write_text(json_file, json.dumps(found, indent=1) + "\n")
+            write_whole(json_file, json.dumps(found, indent=1) + "\n")
     rows = [
         (
             f"{row['kind']}: {row['method']}",
@@ -181,12 +182,13 @@ def bench(
 
 def _fit(file: Path) -> None:
     """Measure what the methods of synthesis cost here, for accuracy.cost_model of a scenario."""
-    from isac_rt.results.files import check_folder, write_text
+    from isac_rt.results.files import check_folder
+    from isac_rt.storage import write_whole
     from isac_rt.studies.bench.fit import fit
 
     check_folder(file.parent)
     found = with_progress(lambda moved: fit(progress=moved), "repeats")
-    write_text(file, json.dumps(found, indent=1) + "\n")
+    write_whole(file, json.dumps(found, indent=1) + "\n")
     rows = [
         (
             name,

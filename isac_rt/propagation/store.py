@@ -1,9 +1,10 @@
 """Traced paths on disk, by content: runs that differ only in noise, modulation or receivers share
 them.
 
-A file holds the paths of all links of one instant. Files appear whole (written beside, then
-renamed) and are touched when read; when the folder grows beyond its limit the least recently used
-go. Several processes may share a folder: a file that another one takes away is traced again.
+A file holds the paths of all links of one instant, with its key and a checksum: one that is bent,
+cut off or another's is traced again. Files are touched when read; when the folder grows beyond its
+limit the least recently used go. Several processes may share a folder: a file that another one
+takes away is traced again too.
 """
 
 from __future__ import annotations
@@ -11,23 +12,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import uuid
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathSet
+from isac_rt.storage import BAD_DATA, StorageError, load_data, save_data
 from isac_rt.world.swarm import Pose
 
-SUFFIX = ".paths.npz"
+SUFFIX = ".paths"
 LOW_WATER = 0.8
 """When the limit is passed the folder is brought down to this share of it, so that not every write
 has to look."""
@@ -44,26 +42,19 @@ class PathStore:
         """What was traced for a key, and by what; None where it is not (or no longer) here."""
         file = self._file(key)
         try:
-            with np.load(file) as data:
-                found = _unpack({name: data[name] for name in data.files})
+            data = load_data(file, key)
+            if data is None:
+                return None
             os.utime(file)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return _unpack(data)
+        except (OSError, *BAD_DATA):
             return None
-        return found
 
     def put(self, key: str, traced: Traced, census: Census) -> None:
         """Keep what was traced for a key; nothing, where the folder cannot be written."""
-        file = self._file(key)
-        temporary = file.with_name(f".{uuid.uuid4().hex}.tmp")
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("wb") as out:
-                np.savez(out, **_pack(traced, census))
-            os.replace(temporary, file)
+        with suppress(OSError, StorageError):
+            save_data(self._file(key), key, _pack(traced, census))
             self._make_room()
-        except OSError:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
 
     def _file(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}{SUFFIX}"
@@ -132,23 +123,17 @@ class CachedPropagation:
 
 
 def _pack(traced: Traced, census: Census) -> dict[str, Any]:
-    """Flat arrays of path sets; what is no array goes into a JSON text."""
-    out: dict[str, Any] = {}
-    about = []
-    for i, p in enumerate(traced.paths.values()):
-        about.append({"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names})
-        out |= {f"{i}/{name}": array for name, array in p.arrays().items()}
-    text = json.dumps({"links": about, "dropped": traced.dropped, "census": asdict(census)})
-    return out | {"about": np.array(text)}
+    """Path sets as plain values and arrays."""
+    links = [
+        {"tx": p.tx, "rx": p.rx, "epoch": p.epoch, "target_names": p.target_names, **p.arrays()}
+        for p in traced.paths.values()
+    ]
+    return {"links": links, "dropped": traced.dropped, "census": asdict(census)}
 
 
-def _unpack(data: dict[str, np.ndarray]) -> tuple[Traced, Census]:
-    about = json.loads(str(data["about"]))
+def _unpack(data: dict[str, Any]) -> tuple[Traced, Census]:
     out = {}
-    for i, link in enumerate(about["links"]):
-        arrays = {f.name: data[f"{i}/{f.name}"] for f in fields(PathSet) if f"{i}/{f.name}" in data}
-        names = tuple(link["target_names"])
-        out[Link(link["tx"], link["rx"])] = PathSet(
-            **arrays, tx=link["tx"], rx=link["rx"], epoch=link["epoch"], target_names=names
-        )
-    return Traced(out, about["dropped"]), Census(**about["census"])
+    for link in data["links"]:
+        names = tuple(link.pop("target_names"))
+        out[Link(link["tx"], link["rx"])] = PathSet(**link, target_names=names)
+    return Traced(out, data["dropped"]), Census(**data["census"])

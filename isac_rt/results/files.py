@@ -9,64 +9,44 @@ scenario give bit-identical variables.
 
 from __future__ import annotations
 
+import io
 import json
-import os
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import to_yaml
+from isac_rt.storage import write_whole
 
 FILE = "results.nc"
 
 
 class ResultsError(UserError):
-    """Results cannot be written or read; the text says why and what to do."""
-
-
-def _atomically(file: Path, write: Callable[[Path], object]) -> None:
-    """Have `write` make a file under a temporary name beside `file`, then put it in place whole; or
-    raise and leave nothing."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        os.replace(temporary, file)
-    except OSError as problem:
-        reason = problem.strerror or str(problem)
-        raise ResultsError(
-            f"cannot write {file}: {reason}; choose another place with --out, or make room"
-        ) from problem
-    finally:
-        try:
-            temporary.unlink(missing_ok=True)
-        except OSError:  # its folder is no folder: there is nothing to take away
-            pass
-
-
-def write_text(file: Path, text: str) -> None:
-    """A text file that appears whole or not at all."""
-    _atomically(Path(file), lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
-def write_bytes(file: Path, write: Callable[[Path], object]) -> None:
-    """A file made by `write(temporary path)` that appears whole or not at all."""
-    _atomically(Path(file), write)
+    """Results cannot be read; the text says why and what to do."""
 
 
 def write_dataset(dataset: xr.Dataset, file: Path) -> None:
-    """A NetCDF file, compressed, that appears whole or not at all."""
+    """A NetCDF file, compressed and with checksums, that appears whole or not at all.
+
+    It is made in memory: on a full disk the library that makes it may end the process.
+    """
     encoding = {
-        name: {"zlib": True, "complevel": 4, "shuffle": True}
+        name: {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
         for name, v in dataset.variables.items()
         if v.dtype != object and v.ndim and v.size
     }
-    _atomically(
-        file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
-    )
+    write_whole(file, bytes(dataset.to_netcdf(engine="h5netcdf", encoding=encoding)))
+
+
+def write_figure(file: Path, figure: Any, **options: Any) -> None:
+    """A matplotlib figure as a PNG file that appears whole or not at all; options as for its
+    `savefig`."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", metadata={"Software": None}, **options)
+    write_whole(file, drawn.getvalue())
 
 
 def save(results: Results, folder: str | Path) -> None:
@@ -75,12 +55,12 @@ def save(results: Results, folder: str | Path) -> None:
 
     Raises
     ------
-    ResultsError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written.
     """
     folder = Path(folder)
     write_dataset(results.dataset, folder / FILE)
-    write_text(folder / "scenario.yaml", to_yaml(results.scenario, folder))
-    write_text(
+    write_whole(folder / "scenario.yaml", to_yaml(results.scenario, folder))
+    write_whole(
         folder / "summary.json", json.dumps(results.summary, indent=1, allow_nan=False) + "\n"
     )
 
@@ -88,7 +68,7 @@ def save(results: Results, folder: str | Path) -> None:
 def check_folder(folder: str | Path) -> None:
     """Refuse a folder that cannot be made or written, before a long run rather than after it."""
     probe = Path(folder) / ".writable"
-    write_text(probe, "")
+    write_whole(probe, "")
     probe.unlink(missing_ok=True)
 
 

@@ -115,7 +115,7 @@ def path_content(tree: Mapping[str, Any], city: str) -> str:
     city : digest of the city's files
     """
     seen = {key: value for key, value in tree.items() if key not in UNSEEN_BY_PATHS}
-    return json.dumps([seen, city, program_fingerprint()], sort_keys=True)
+    return json.dumps([seen, city, program_fingerprint(), versions()], sort_keys=True)
 
 
 def run_content(scenario: Scenario, snapshots: int) -> str:

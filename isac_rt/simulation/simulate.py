@@ -337,8 +337,8 @@ class _Run:
                     frame = setup.frame(number)
                 if at_work is not None:
                     self.collect(*at_work)
-                    if resume and resume.due():
-                        resume.append(self.memory())
+                    if resume and resume.due() and resume.append(self.memory()):
+                        self.kept = len(self.recorder.rows)
                 if progress and number:
                     progress(number, frames)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
@@ -383,17 +383,16 @@ class _Run:
             self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
     def memory(self) -> dict[str, Any]:
-        """What a later call needs to go on after the frames so far: those since the last call, and
-        all that receivers carry over.
+        """What a later call needs to go on after the frames so far: those since the last entry,
+        and all that receivers carry over.
 
         Only while no receiver is at work. Paths and samples are functions of the frame alone and
         are made anew.
         """
-        first, self.kept = self.kept, len(self.recorder.rows)
         return {
-            "first": first,
-            **self.own.memory(first),
-            "compared": {name: one.memory(first) for name, one in self.compared.items()},
+            "first": self.kept,
+            **self.own.memory(self.kept),
+            "compared": {name: one.memory(self.kept) for name, one in self.compared.items()},
             "advice": self.schedules.memory(),
             "seconds": self.clock.so_far(),
         }

@@ -9,9 +9,9 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
-from isac_rt.results.provenance import path_content, program_fingerprint
+from isac_rt.results.provenance import path_content, program_fingerprint, versions
 from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import load, plain_tree
@@ -192,13 +192,15 @@ class Point:
     ----------
     index : along every axis and the repetitions
     tree : its scenario as plain values, without the name
-    key : digest of the tree, the city's file and the program; under it the outcome is kept
+    ground : what its outcome depends on beside its scenario, by name (see `ground_of`)
+    key : digest of the tree and the ground; under it the outcome is kept
     paths_key : digest of what its paths depend on, None where they are not traced: points with the
         same one share them
     """
 
     index: tuple[int, ...]
     tree: dict[str, Any]
+    ground: dict[str, str]
     key: str
     paths_key: str | None
 
@@ -214,36 +216,53 @@ class Plan:
         """All points in order, made one by one: a million of them need no memory."""
         tree = plain_tree(self.base)
         tree.pop("name")
+        files = lru_cache(maxsize=64)(partial(_files_digest, self.base.folder))
         for index in itertools.product(*(range(n) for n in self.sweep.shape)):
             here = copy.deepcopy(tree)
             for axis, i in zip(self.sweep.axes.values(), index[:-1], strict=True):
                 for key, value in axis.entry(i).items():
                     put(here, key, value)
             here["seed"] = self.seed(index[-1])
-            yield Point(index, here, self.key_of(here), self.paths_key(here))
+            ground = _ground(here, files)
+            yield Point(index, here, ground, point_key(here, ground), paths_key(here, ground))
 
     def seed(self, repetition: int) -> int:
         """The scenario's seed in a repetition."""
         return int(seed_sequence(self.sweep.seed, "repetition", repetition).generate_state(1)[0])
 
-    def key_of(self, tree: dict[str, Any]) -> str:
-        """Under which a point is kept."""
-        costs = (tree.get("accuracy") or {}).get("cost_model")
-        files = self._city(tree), "" if costs is None else _file_digest(self.base.folder / costs)
-        return _digest([tree, *files, program_fingerprint()])
 
-    def paths_key(self, tree: dict[str, Any]) -> str | None:
-        """Under which a point's paths are kept; None where they are not traced."""
-        if (tree.get("propagation") or {}).get("model") != "ray_traced":
-            return None
-        return _digest(path_content(tree, self._city(tree)))
+def ground_of(tree: dict[str, Any], folder: Path) -> dict[str, str]:
+    """What a point's outcome depends on beside its scenario: the program, the versions under it,
+    and digests of the files that the scenario names.
 
-    def _city(self, tree: dict[str, Any]) -> str:
-        """Digest of the files of a point's city."""
-        city = {
-            k: v for k, v in (tree.get("city") or {}).items() if k in ("source", "name", "file")
-        }
-        return _city_digest(self.base.folder, json.dumps(city)) if city else ""
+    Parameters
+    ----------
+    tree : the scenario as plain values
+    folder : to which its files are relative
+    """
+    return _ground(tree, partial(_files_digest, folder))
+
+
+def _ground(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> dict[str, str]:
+    city = {k: v for k, v in (tree.get("city") or {}).items() if k in ("source", "name", "file")}
+    return {
+        "program": program_fingerprint(),
+        "versions": json.dumps(versions()),
+        "city": files(json.dumps(city), None) if city else "",
+        "cost model": files("", (tree.get("accuracy") or {}).get("cost_model")),
+    }
+
+
+def point_key(tree: dict[str, Any], ground: dict[str, str]) -> str:
+    """Under which a point's outcome is kept."""
+    return _digest([tree, ground])
+
+
+def paths_key(tree: dict[str, Any], ground: dict[str, str]) -> str | None:
+    """Under which a point's paths are kept; None where they are not traced."""
+    if (tree.get("propagation") or {}).get("model") != "ray_traced":
+        return None
+    return _digest(path_content(tree, ground["city"]))
 
 
 def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
@@ -290,21 +309,15 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-@lru_cache(maxsize=64)
-def _city_digest(folder: Path, named: str) -> str:
-    city = City.model_construct(**json.loads(named))
+def _files_digest(folder: Path, city: str, costs: str | None) -> str:
+    """Digest of the files of a city, as JSON, or of a cost model; "" where one is missing: the
+    point's own check says so."""
     try:
-        return city_digest(city, folder)
+        if city:
+            return city_digest(City.model_construct(**json.loads(city)), folder)
+        return "" if costs is None else file_digest(folder / costs)
     except (CityError, OSError):
-        return ""  # the point's own check says what is missing
-
-
-@lru_cache(maxsize=64)
-def _file_digest(file: Path) -> str:
-    try:
-        return file_digest(file)
-    except OSError:
-        return ""  # the point's own check says that it is missing
+        return ""
 
 
 def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:

@@ -7,8 +7,11 @@ killed takes nothing with it that was finished.
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import platform
+import shutil
 import time
 import traceback
 from collections import deque
@@ -17,10 +20,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from isac_rt.runtime import UserError, available_memory
-from isac_rt.sweep.definition import Plan, Point
+from isac_rt.runtime import MachineProblem, UserError, available_memory, of_machine
+from isac_rt.sweep.definition import Plan, Point, ground_of
 from isac_rt.sweep.outcomes import Outcomes, pending
 
 WINDOW = 4
@@ -29,8 +32,13 @@ WORKER_BYTES = 1.5e9
 """Memory that a worker is reckoned with when their number is chosen: a ray-traced city, three
 receivers at work."""
 LOST_AFTER = 5
-"""Workers that a point may take with it before it counts as failed: one that is killed from outside
-must not condemn its points."""
+"""Workers that a point may take with it before it is left to do."""
+PASSES = 2
+"""Times that a point is tried which the machine did not let end."""
+PATIENCE = 2
+"""Windows of points in a row that the machine did not let end: then the sweep stops."""
+ROOM = 1_000_000
+"""Free disk without which no point is begun. [bytes]"""
 CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
 
@@ -42,53 +50,113 @@ class SweepError(UserError):
     """The sweep cannot start. The text says what to do."""
 
 
+class PointsLeft(MachineProblem):
+    """The machine did not let some points end; what was finished is kept. The text says why."""
+
+
 class SchedulerLost(Exception):
     """The sweep cannot go on; what was finished is kept."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One point as a worker gets it: plain values only."""
+    """One point as a worker gets it: plain values only.
+
+    Attributes
+    ----------
+    ground : what the client found that the outcome depends on (see `ground_of`)
+    """
 
     key: str
     tree: dict[str, Any]
+    ground: dict[str, str]
     scenario_folder: str
     folder: str
     threads: int
     retry_failed: bool = False
 
 
-def run_job(job: Job) -> tuple[str, bool]:
-    """Simulate a point and write its outcome; in a worker. Returns its key and whether it
-    succeeded.
+class Ended(NamedTuple):
+    """What came of a point at a worker: its outcome's status, or "left" and why."""
 
-    An outcome that cannot be written (a full disk) raises: then nothing is recorded, and the point
-    is run again next time. Dask repeats a task whose worker dies before its word reached the
-    client; a point whose outcome is there is not repeated.
+    status: str
+    why: str = ""
+    worker: str = ""
+
+
+def run_job(job: Job) -> Ended:
+    """Simulate a point and write its outcome; in a worker.
+
+    Only an error that the point's own content causes is an outcome. Where the machine is to blame
+    (its disk, its memory, a folder that it does not see) nothing is recorded, and the point is left
+    to do. Dask repeats a task whose worker dies before its word reached the client; a point whose
+    outcome is there is not repeated.
     """
     outcomes = Outcomes(Path(job.folder))
-    if outcomes.done(job.key, job.retry_failed):
-        return job.key, (outcomes.read(job.key) or {}).get("status") == "done"
+    try:
+        outcome = outcomes.read(job.key)
+        if outcome is None or (job.retry_failed and outcome["status"] == "failed"):
+            _check_machine(job, outcomes)
+            outcome = _outcome(job)
+            outcomes.write(job.key, outcome)
+    except Exception as problem:
+        if not of_machine(problem):
+            raise
+        return Ended("left", f"{platform.node()}: {_words(problem)}", _address())
+    return Ended(outcome["status"])
+
+
+def _check_machine(job: Job, outcomes: Outcomes) -> None:
+    """Refuse to begin a point whose outcome could not be written, or would not be the one that its
+    key says.
+
+    Raises
+    ------
+    MachineProblem
+    """
+    if not outcomes.points.is_dir():
+        raise MachineProblem(
+            f"does not see {outcomes.points}; every worker must reach it under this path"
+        )
+    if shutil.disk_usage(outcomes.points).free < ROOM:
+        raise MachineProblem(f"no room is left in {outcomes.folder}; make room")
+    found = ground_of(job.tree, Path(job.scenario_folder))
+    if other := [name for name, value in job.ground.items() if found[name] != value]:
+        raise MachineProblem(
+            f"{' and '.join(other)} are not those of the client, so that the outcome would be of "
+            f"another point; let every worker see the same files under {job.scenario_folder}, and "
+            "start it anew after an upgrade"
+        )
+
+
+def _outcome(job: Job) -> dict[str, Any]:
     begin = time.perf_counter()
+    about: dict[str, Any] = {"scenario": job.tree}
     try:
         summary = _simulate(job)
+        kept = ("links", "terminals", "paths", "fidelity", "timing_s", "versions")
+        about |= {"status": "done", **{name: summary[name] for name in kept}}
+        json.dumps(about, allow_nan=False)
     except Exception as problem:
-        where = traceback.format_exception(problem)[-3:]
-        text = f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
-        outcome = {"status": "failed", "error": text, "where": "".join(where)}
-    else:
-        outcome = {
-            "status": "done",
-            **{
-                key: summary[key]
-                for key in ("links", "terminals", "paths", "fidelity", "timing_s", "versions")
-            },
-        }
-    outcomes.write(
-        job.key,
-        {"key": job.key, "scenario": job.tree, "seconds": time.perf_counter() - begin, **outcome},
-    )
-    return job.key, outcome["status"] == "done"
+        if of_machine(problem):
+            raise
+        where = "".join(traceback.format_exception(problem)[-3:])
+        about = {"scenario": job.tree, "status": "failed", "error": _words(problem), "where": where}
+    return about | {"seconds": time.perf_counter() - begin}
+
+
+def _words(problem: BaseException) -> str:
+    return f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
+
+
+def _address() -> str:
+    """Of this worker; "" outside of a cluster."""
+    from distributed import get_worker
+
+    try:
+        return get_worker().address
+    except ValueError:
+        return ""
 
 
 def _simulate(job: Job) -> dict[str, Any]:
@@ -191,8 +259,9 @@ def run_sweep(
     Raises
     ------
     SweepError  If the scheduler cannot be reached.
+    PointsLeft  If the machine did not let points end.
     SchedulerLost  If it is lost on the way.
-    isac_rt.results.files.ResultsError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written.
 
     Examples
     --------
@@ -218,16 +287,15 @@ def run_sweep(
     if not todo:
         return
     with _client(workers, scheduler) as client:
-        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run(
-            pending(plan, outcomes, retry_failed)
-        )
+        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run()
 
 
 class _Runner:
     """Feeds the scheduler from a window and counts what comes back.
 
     Of the points that share their paths one goes first; the others follow when its paths are on the
-    disk.
+    disk. Points that the machine did not let end are tried again when the others are done, rather
+    at workers that had no such trouble.
     """
 
     def __init__(
@@ -250,9 +318,32 @@ class _Runner:
         self._traced: set[str] = set()
         self._waiting = 0
         self._active: dict[str, Point] = {}
+        self._left: dict[str, tuple[Point, str]] = {}
+        self._in_a_row = 0
+        self._troubled: set[str] = set()
 
-    def run(self, points: Iterator[Point]) -> None:
-        """Until every point is done or failed."""
+    def run(self) -> None:
+        """Until every point is done, failed or left."""
+        points = pending(self._plan, self._outcomes, self._retry_failed)
+        for _ in range(PASSES):
+            self._pass(points)
+            points = iter([point for point, _ in self._left.values()])
+            if not self._left or self._stuck:
+                break
+            self._left, self._in_a_row = {}, 0
+        if self._left:
+            (point, why), *_ = self._left.values()
+            raise PointsLeft(
+                f"the machine did not let {len(self._left)} of {self._plan.sweep.num_points} "
+                f"points end, {self._done} are done and kept; at {list(point.index)}: {why}; mend "
+                "it and start the same command again"
+            )
+
+    @property
+    def _stuck(self) -> bool:
+        return self._in_a_row >= PATIENCE * self._window
+
+    def _pass(self, points: Iterator[Point]) -> None:
         from distributed import CancelledError, as_completed
 
         queue = as_completed([])
@@ -277,7 +368,11 @@ class _Runner:
     def _fill(self, points: Iterator[Point], queue: Any) -> None:
         """Give the scheduler points up to the window; followers of a running leader wait, at most a
         window of them."""
-        while len(self._active) < self._window and self._waiting < 64 * self._window:
+        while (
+            len(self._active) < self._window
+            and self._waiting < 64 * self._window
+            and not self._stuck
+        ):
             point = next(points, None)
             if point is None:
                 return
@@ -295,13 +390,17 @@ class _Runner:
         job = Job(
             point.key,
             point.tree,
+            point.ground,
             str(self._plan.base.folder),
             str(self._outcomes.folder),
             self._threads,
             self._retry_failed,
         )
         self._active[point.key] = point
-        queue.add(self._client.submit(run_job, job, key=f"point-{point.key}", pure=False))
+        good = self._troubled and [w for w in self._client.nthreads() if w not in self._troubled]
+        rather = {"workers": good, "allow_other_workers": True} if good else {}
+        task = f"point-{point.key}"
+        queue.add(self._client.submit(run_job, job, key=task, pure=False, **rather))
 
     def _finish(self, future: Any, queue: Any) -> None:
         from distributed import CancelledError
@@ -311,22 +410,16 @@ class _Runner:
         if future.cancelled() or future.status == "lost":
             self._active[key] = point
             raise CancelledError("its tasks are gone")
-        if future.status == "error":
-            self._outcomes.write(
-                key,
-                {
-                    "key": key,
-                    "scenario": point.tree,
-                    "status": "failed",
-                    "error": _of_worker(future),
-                    "where": "",
-                },
-            )
-            good = False
-        else:
-            good = future.result()[1]
+        ended = Ended("left", _of_worker(future)) if future.status == "error" else future.result()
         future.release()
-        self._done, self._failed = self._done + good, self._failed + (not good)
+        if ended.status == "left":
+            self._left[key] = point, ended.why
+            self._in_a_row += 1
+            self._troubled |= {ended.worker} - {""}
+        else:
+            self._in_a_row = 0
+            self._done += ended.status == "done"
+            self._failed += ended.status == "failed"
         if self._progress:
             self._progress(self._done, self._failed, self._plan.sweep.num_points)
         if point.paths_key is not None:
@@ -339,10 +432,6 @@ class _Runner:
 def _of_worker(future: Any) -> str:
     """What took a worker's task down."""
     problem = future.exception()
-    name = type(problem).__name__
-    if name == "KilledWorker":
-        return (
-            f"KilledWorker: {LOST_AFTER} workers in turn died while they ran this point (out of "
-            "memory?)"
-        )
-    return f"{name}: {problem}"
+    if type(problem).__name__ == "KilledWorker":
+        return f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
+    return _words(problem)

@@ -1,8 +1,8 @@
 """Outcomes of a sweep's points on disk, and the labelled dataset that is made of them.
 
-A point's file holds the summary of its run, or its error. It appears whole or not at all, under the
-digest of the point's content; so the files are the only state of a sweep: what is there is done,
-whoever did it.
+A point's file holds the summary of its run, or its error, under the digest of the point's content,
+which stands in the file with a checksum; so the files are the only state of a sweep: what is there
+and whole is done, whoever did it, and anything else in its place is made anew.
 """
 
 from __future__ import annotations
@@ -12,20 +12,40 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
+from pydantic import BaseModel
 
-from isac_rt.results.files import ResultsError, write_bytes, write_text
+from isac_rt.results.files import ResultsError, write_dataset
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import commit, program_fingerprint, versions
 from isac_rt.scenario.file import plain_tree
 from isac_rt.scenario.tree import Scenario
+from isac_rt.storage import BAD_DATA, checksum, read_whole, write_whole
 from isac_rt.sweep.definition import Plan, Point, Sweep, flat_numbers
 
 FILE, DEFINITION = "sweep.nc", "sweep.json"
 CONFIDENCE = 0.95
+MOST_BYTES = 64 * 1024**2
+"""No outcome is larger: that of a point with ten links has some 30 kB."""
+
+
+class _Link(BaseModel):
+    """What the dataset takes of a link's outcome, beside the numbers in it."""
+
+    counts: dict[str, tuple[int, int]] = {}
+
+
+class _Outcome(BaseModel):
+    """What the dataset and the status take of an outcome."""
+
+    key: str
+    status: Literal["done", "failed"]
+    error: str = ""
+    links: dict[str, _Link] = {}
+    paths: dict[str, int] = {}
 
 
 @dataclass(frozen=True)
@@ -34,25 +54,42 @@ class Outcomes:
 
     folder: Path
 
+    @property
+    def points(self) -> Path:
+        """Where the points' files are; made by whoever starts the sweep, so that a worker sees
+        whether it looks at the same disk."""
+        return self.folder / "points"
+
     def file(self, key: str) -> Path:
         """A point's file; 256 folders keep each of them short."""
-        return self.folder / "points" / key[:2] / f"{key}.json"
+        return self.points / key[:2] / f"{key}.json"
 
     def read(self, key: str) -> dict[str, Any] | None:
-        """A point's outcome, None where there is none yet."""
+        """A point's outcome; None where there is none yet, or what is there is not whole, or of
+        another point."""
         try:
-            return json.loads(self.file(key).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            outcome = json.loads(read_whole(self.file(key), MOST_BYTES))
+            claimed = outcome.pop("checksum")
+            if _Outcome.model_validate(outcome).key != key or claimed != _checksum(key, outcome):
+                return None
+        except (OSError, *BAD_DATA):
             return None
+        return outcome
 
     def write(self, key: str, outcome: dict[str, Any]) -> None:
-        write_text(self.file(key), json.dumps(outcome, allow_nan=False) + "\n")
+        """Keep a point's outcome, of plain values.
+
+        Raises
+        ------
+        isac_rt.storage.StorageError  If it cannot be written.
+        """
+        kept = {"key": key, **outcome, "checksum": _checksum(key, {"key": key, **outcome})}
+        write_whole(self.file(key), json.dumps(kept) + "\n")
 
     def done(self, key: str, retry_failed: bool) -> bool:
         """Whether a point needs no run: it succeeded, or it failed and is not to be tried again."""
-        if not self.file(key).is_file():
-            return False
-        return not retry_failed or (self.read(key) or {}).get("status") == "done"
+        outcome = self.read(key)
+        return outcome is not None and (not retry_failed or outcome["status"] == "done")
 
     def save_definition(self, plan: Plan) -> None:
         """Keep the sweep and its base scenario beside the outcomes, so that the folder can be read
@@ -62,7 +99,8 @@ class Outcomes:
             "base": plain_tree(plan.base),
             "folder": str(plan.base.folder),
         }
-        write_text(self.folder / DEFINITION, json.dumps(tree, indent=1) + "\n")
+        write_whole(self.folder / DEFINITION, json.dumps(tree, indent=1) + "\n")
+        self.points.mkdir(exist_ok=True)
 
     def definition(self) -> Plan:
         """The sweep that this folder belongs to.
@@ -72,12 +110,12 @@ class Outcomes:
         ResultsError  If it is the folder of no sweep.
         """
         try:
-            tree = json.loads((self.folder / DEFINITION).read_text(encoding="utf-8"))
+            tree = json.loads(read_whole(self.folder / DEFINITION))
             return Plan(
                 Sweep.model_validate(tree["sweep"]),
                 Scenario.model_validate(tree["base"]).in_folder(Path(tree["folder"])),
             )
-        except (OSError, ValueError, KeyError) as problem:
+        except (OSError, *BAD_DATA) as problem:
             raise ResultsError(
                 f"{self.folder} holds no sweep ({problem}); give the folder that `isac-rt sweep` "
                 "wrote"
@@ -112,6 +150,10 @@ def status(folder: Path | str) -> Status:
             if len(errors) < 20:
                 errors.append((point.index, outcome["error"]))
     return Status(plan.sweep.num_points, done, failed, errors)
+
+
+def _checksum(key: str, outcome: dict[str, Any]) -> str:
+    return checksum(key, json.dumps(outcome, sort_keys=True, allow_nan=False).encode())
 
 
 Columns = dict[str, np.ndarray]
@@ -217,8 +259,7 @@ def _dataset(plan: Plan, variables: dict[str, xr.Variable], links: list[str]) ->
     keys = {f"axis_{name}": ", ".join(sorted(axis.keys)) for name, axis in sweep.axes.items()}
     about = {
         "title": f"isac_rt sweep: {sweep.name}",
-        "program": program_fingerprint(),
-        "versions": json.dumps(versions()),
+        **_made_by(),
         "commit": commit(),
         "base": json.dumps(plain_tree(plan.base)),
         "seed": sweep.seed,
@@ -226,18 +267,24 @@ def _dataset(plan: Plan, variables: dict[str, xr.Variable], links: list[str]) ->
     return xr.Dataset(kept, coordinates, {**about, **keys})
 
 
+def _made_by() -> dict[str, str]:
+    """The program and the versions under it, to which the points in a folder belong."""
+    return {"program": program_fingerprint(), "versions": json.dumps(versions())}
+
+
 def save_dataset(dataset: xr.Dataset, folder: Path) -> Path:
     """Write ``sweep.nc`` into a sweep's folder, whole or not at all."""
     file = folder / FILE
-    write_bytes(file, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf"))
+    write_dataset(dataset, file)
     return file
 
 
 def open_sweep(folder: Path | str) -> xr.Dataset:
     """The outcomes of a sweep so far, finished or not, as one labelled dataset (see `assemble`).
 
-    Points belong to the program that ran them. Where another version of it finished the sweep, the
-    dataset is the one that it wrote; its attribute ``program`` says which.
+    Points belong to the program that ran them and the versions under it. Where others finished the
+    sweep, the dataset is the one that they wrote; its attributes ``program`` and ``versions`` say
+    which.
 
     Raises
     ------
@@ -248,9 +295,9 @@ def open_sweep(folder: Path | str) -> xr.Dataset:
     if file.is_file():
         try:
             with xr.open_dataset(file, engine="h5netcdf") as written:
-                if written.attrs.get("program") != program_fingerprint():
+                if any(written.attrs.get(name) != value for name, value in _made_by().items()):
                     return written.load()
-        except (OSError, ValueError) as problem:
+        except (OSError, *BAD_DATA) as problem:
             raise ResultsError(f"{file} cannot be read ({problem}); delete it") from problem
     return assemble(outcomes.definition(), outcomes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -12,8 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from isac_rt.frame.antennas import unit_vector
-from isac_rt.results.files import ResultsError, write_bytes
+from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
+from isac_rt.storage import write_whole
 from isac_rt.views.figures import STYLE, colour_of, range_doppler, scene_map
 from isac_rt.world.city.mesh import CityMesh
 
@@ -136,8 +138,8 @@ def write_animation(
 
     Raises
     ------
-    ResultsError  If the suffix is another, ffmpeg is missing, too few frames have maps, or the file
-    cannot be written.
+    ResultsError  If the suffix is another, ffmpeg is missing or too few frames have maps.
+    isac_rt.storage.StorageError  If the file cannot be written.
     """
     file = Path(file)
     writer = WRITERS.get(file.suffix)
@@ -149,14 +151,7 @@ def write_animation(
             "write a .gif"
         )
     _, moving = animate(results, observer, city)
-    write_bytes(file, lambda temporary: _save(moving, temporary, file.suffix, writer, rate))
-
-
-def _save(moving: FuncAnimation, temporary: Path, suffix: str, writer: str, rate: float) -> None:
-    """Writers go by the suffix, which a temporary name does not have."""
-    named = temporary.with_name(temporary.name + suffix)
-    try:
-        moving.save(named, writer=writers[writer](fps=rate))  # type: ignore[arg-type]  # a rate need not be whole
-        named.replace(temporary)
-    finally:
-        named.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as folder:  # writers need a name that ends in the suffix
+        made = Path(folder) / f"moving{file.suffix}"
+        moving.save(made, writer=writers[writer](fps=rate))  # type: ignore[arg-type]  # a rate need not be whole
+        write_whole(file, made.read_bytes())

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.dataset import MEASURES, errors_of
-from isac_rt.results.files import write_bytes
+from isac_rt.results.files import write_figure
 from isac_rt.results.recorder import Results
 from isac_rt.results.records import KINDS
 from isac_rt.world.city.mesh import CityMesh
@@ -565,7 +565,7 @@ def _written(figures: Iterable[tuple[str, Figure]], folder: str | Path) -> list[
     with matplotlib.rc_context(STYLE):
         for name, figure in figures:
             file = Path(folder) / "figures" / f"{name}.png"
-            write_bytes(file, partial(figure.savefig, format="png", metadata={"Software": None}))
+            write_figure(file, figure)
             written.append(file)
     return written
 
@@ -576,7 +576,7 @@ def make_figures(results: Results, folder: str | Path, city: CityMesh | None = N
 
     Raises
     ------
-    isac_rt.results.files.ResultsError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written.
     """
     return _written(_all(results.dataset, city), folder)
 

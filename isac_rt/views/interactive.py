@@ -14,7 +14,7 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind, PathSet
-from isac_rt.results.files import write_text
+from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.views.render import polyline
 from isac_rt.world.city.mesh import CityMesh
@@ -181,6 +181,6 @@ def write_page(figure: Figure, file: str | Path) -> None:
 
     Raises
     ------
-    isac_rt.results.files.ResultsError  If the file cannot be written.
+    isac_rt.storage.StorageError  If the file cannot be written.
     """
-    write_text(Path(file), figure.to_html(include_plotlyjs=True, full_html=True))
+    write_whole(file, figure.to_html(include_plotlyjs=True, full_html=True))

@@ -23,8 +23,9 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column
-from isac_rt.results.files import ResultsError, write_bytes, write_dataset
+from isac_rt.results.files import ResultsError, write_dataset
 from isac_rt.results.records import KINDS
+from isac_rt.storage import write_whole
 
 if TYPE_CHECKING:
     import sionna.rt as rt
@@ -53,7 +54,7 @@ def write_ledger(
 
     Raises
     ------
-    ResultsError  If the file cannot be written.
+    isac_rt.storage.StorageError  If the file cannot be written.
     """
     depth = max((p.faces.shape[1] for p in paths.values()), default=0)
     shapes = {"points": (0, depth, 3), "faces": (0, depth)}
@@ -171,8 +172,7 @@ def save_cube(cube: IFCube, file: str | Path) -> None:
     >>> bool((again.samples == cube.samples).all())
     True
     """
-    dataset = cube_dataset(cube)
-    write_bytes(Path(file), lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf"))
+    write_dataset(cube_dataset(cube), Path(file))
 
 
 def load_cube(file: str | Path) -> IFCube:
@@ -218,7 +218,7 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
         base.with_name(base.name + ".sigmf-meta"),
     )
     rows = cube.samples.transpose(2, 3, 0, 1).reshape(-1, groups * antennas).astype("<c8")
-    write_bytes(data, lambda temporary: rows.tofile(temporary))
+    write_whole(data, rows.tobytes())
     made = sigmf.SigMFFile(
         data_file=str(data),
         global_info={
@@ -242,7 +242,7 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
             metadata={"core:label": f"chirp {p}", "core:comment": f"transmit antennas {senders}"},
         )
     made.validate()
-    write_bytes(meta, lambda temporary: temporary.write_text(made.dumps(), encoding="utf-8"))
+    write_whole(meta, made.dumps())
     return data, meta
 
 

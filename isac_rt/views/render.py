@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from isac_rt.frame.link import Link
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.results.files import write_bytes
+from isac_rt.results.files import write_figure
 from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -334,6 +334,6 @@ def write_view(figure: Figure, file: str | Path) -> None:
 
     Raises
     ------
-    isac_rt.results.files.ResultsError  If the file cannot be written.
+    isac_rt.storage.StorageError  If the file cannot be written.
     """
-    write_bytes(Path(file), lambda temporary: figure.savefig(temporary, format="png"))
+    write_figure(Path(file), figure)

@@ -12,9 +12,9 @@ from typing import Any
 
 import jinja2
 
-from isac_rt.results.files import write_text
 from isac_rt.results.recorder import TIMINGS, Results
 from isac_rt.scenario.tree import OWN
+from isac_rt.storage import write_whole
 
 DASH = "\u2013"
 _CAPTIONS = {
@@ -204,7 +204,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
 
     Raises
     ------
-    isac_rt.results.files.ResultsError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written.
     """
     s, d, radio = results.summary, results.dataset, results.scenario.radio
     materials = json.loads(d.attrs["materials"])
@@ -248,5 +248,5 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         scenario_yaml=d.attrs["scenario"],
     )
     file = Path(folder) / "report.html"
-    write_text(file, page)
+    write_whole(file, page)
     return file

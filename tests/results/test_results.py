@@ -13,12 +13,15 @@ import pytest
 import xarray as xr
 from fake_run import TIMING, fake_records, fake_run, fake_scenario
 
+from isac_rt import storage
 from isac_rt.results import provenance
 from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import ResultsError, check_folder, open_results, save
 from isac_rt.results.records import KINDS
+from isac_rt.runtime import UserError
 from isac_rt.scenario.file import to_yaml
 from isac_rt.simulation import simulate
+from isac_rt.storage import StorageError
 from isac_rt.views.interchange import write_ledger
 from isac_rt.views.report import write_report
 
@@ -199,25 +202,24 @@ def test_failure_while_writing_leaves_the_old_file_and_no_rest(tmp_path, run, mo
     save(run, tmp_path)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
 
-    def full(self, path, **_):
-        path.write_bytes(b"half of it")
+    def full(_):
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", full)
-    with pytest.raises(ResultsError, match="No space left"):
+    monkeypatch.setattr(storage.os, "fsync", full)
+    with pytest.raises(StorageError, match="No space left"):
         save(run, tmp_path)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
-    with pytest.raises(ResultsError):
+    monkeypatch.setattr(storage, "_sync", lambda _: None)
+    with pytest.raises(StorageError):
         save(run, tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
 
 
 def test_interrupt_while_writing_leaves_nothing(tmp_path, run, monkeypatch):
-    def stopped(self, path, **_):
-        path.write_bytes(b"half of it")
+    def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", stopped)
+    monkeypatch.setattr(storage.os, "replace", stopped)
     with pytest.raises(KeyboardInterrupt):
         save(run, tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
@@ -230,7 +232,7 @@ def test_bad_folders_get_one_message(tmp_path, run):
         lambda: check_folder(tmp_path / "file" / "deeper"),
         lambda: open_results(tmp_path / "none"),
     ):
-        with pytest.raises(ResultsError) as caught:
+        with pytest.raises(UserError) as caught:
             call()
         assert "\n" not in str(caught.value)
     (tmp_path / "results.nc").write_text("not a NetCDF file")

@@ -8,7 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +18,10 @@ from test_fall_back import scenario as dense_scenario
 from isac_rt.cli.cli import main
 from isac_rt.results.files import open_results
 from isac_rt.results.provenance import run_content
-from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.simulation import simulate
-from isac_rt.simulation.resume import ARRAY, EARLIER, FILE, Resume, ResumeError, pack, unpack
+from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
+from isac_rt.storage import ARRAY, checksum, pack, unpack
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes"
@@ -114,17 +115,22 @@ def kept(folder, *entries):
     return resume
 
 
-def test_entries_come_back_in_order_and_another_run_sees_none(tmp_path):
+def test_entries_come_back_in_order_and_another_run_takes_none_away(tmp_path):
+    """Planted bugs: another's entries removed by `append`; the same digest for all."""
     kept(tmp_path, {"a": np.arange(3.5)}, ["b"])
     first, second = Resume(tmp_path, "content").entries()
     assert np.array_equal(first["a"], np.arange(3.5)) and second == ["b"]
     other = Resume(tmp_path, "contents")
-    assert not other.begun and other.other == tmp_path / FILE and list(other.entries()) == []
-    other.append(1)
-    assert list(other.entries()) == [1] and other.other is None
-    assert list(Resume(tmp_path, "content").entries()) == []
+    assert not other.begun
+    with pytest.raises(
+        ResumeError, match=r"resume\.sqlite keeps frames of another .*--out, or --re"
+    ):
+        list(other.entries())
+    with pytest.warns(ScenarioWarning, match="not kept"):
+        assert not other.append(1)
+    assert len(list(Resume(tmp_path, "content").entries())) == 2
     other.remove()
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir()) and other.append(1) and list(other.entries()) == [1]
 
 
 @pytest.mark.parametrize(
@@ -161,7 +167,7 @@ import os, sqlite3
 database = sqlite3.connect({str(tmp_path / FILE)!r})
 database.execute("PRAGMA cache_size = 1")
 for i in range(200):  # more than the cache holds: a part is in the file
-    database.execute("INSERT INTO entry (tree, arrays) VALUES ('1', zeroblob(9000))")
+    database.execute("INSERT INTO entry (tree, arrays, checksum) VALUES ('1', zeroblob(9000), '')")
 os._exit(9)
 """
     size = (tmp_path / FILE).stat().st_size
@@ -173,11 +179,15 @@ os._exit(9)
 
 
 def hostile(tree, arrays=b""):
-    """An entry that this package did not write."""
+    """An entry that this package did not write, with the checksum of one that it did."""
 
     def spoil(file):
         with closing(sqlite3.connect(file)) as database, database:
-            database.execute("INSERT INTO entry (tree, arrays) VALUES (?, ?)", (tree, arrays))
+            ((digest,),) = database.execute("SELECT digest FROM run").fetchall()
+            seal = checksum(digest, tree.encode() + arrays) if tree else None
+            database.execute(
+                "INSERT INTO entry (tree, arrays, checksum) VALUES (?, ?, ?)", (tree, arrays, seal)
+            )
 
     return spoil
 
@@ -198,7 +208,7 @@ def test_a_file_from_elsewhere_is_refused_with_one_message(tmp_path, spoil):
     """Planted bug: arrays of objects made."""
     resume = kept(tmp_path, "one" * 4000)
     spoil(tmp_path / FILE)
-    with pytest.raises(ResumeError, match=r"not written by isac-rt.*delete it"):
+    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart lets go"):
         list(resume.entries())
 
 
@@ -215,30 +225,72 @@ def test_an_entry_that_is_no_runs_is_refused_before_a_frame(tmp_path, entry):
     scenario = dense_scenario(frames=4)
     resume = Resume(tmp_path, run_content(scenario, 1))
     resume.append(entry)
-    with pytest.raises(ResumeError, match=r"not written by isac-rt.*delete it"):
+    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart lets go"):
         simulate.run(scenario, snapshots=1, resume=resume)
 
 
-def test_a_file_that_is_no_database_is_not_taken_up(tmp_path):
-    """Nor what earlier versions wrote; both make room."""
+def test_bent_entries_are_done_once_more(tmp_path):
+    """Any byte of an entry's arrays or tree changed: it is as if it had not been kept, and those
+    about it are there. Planted bug: the checksum not compared."""
+    resume = kept(tmp_path, "one", {"a": np.arange(3.0)}, "three")
+    with closing(sqlite3.connect(tmp_path / FILE)) as database, database:
+        database.execute("UPDATE entry SET arrays = zeroblob(24) WHERE id = 2")
+    assert list(resume.entries()) == ["one", "three"]
+    with closing(sqlite3.connect(tmp_path / FILE)) as database, database:
+        database.execute("UPDATE entry SET tree = '\"ten\"' WHERE id = 3")
+    assert list(resume.entries()) == ["one"]
+
+
+def test_a_file_that_is_no_database_is_not_taken_away(tmp_path):
+    """Nor what earlier versions wrote; an empty one, of a run killed before its first entry, is
+    taken up."""
     resume = Resume(tmp_path, "content")
     (tmp_path / EARLIER).write_bytes(b"isac_rt")
-    assert resume.other == tmp_path / EARLIER and not resume.begun
+    with pytest.raises(ResumeError, match=EARLIER):
+        resume.check()
+    resume.remove()
     cut = kept(tmp_path, "one" * 9000).file.read_bytes()[:-5000]
     for content in (b"no database" * 999, cut):
         (tmp_path / FILE).write_bytes(content)
-        assert resume.other == tmp_path / FILE and list(resume.entries()) == []
-        resume.append("one")
-        assert list(resume.entries()) == ["one"] and not (tmp_path / EARLIER).exists()
+        with pytest.raises(ResumeError, match="damaged"):
+            list(resume.entries())
+        assert (tmp_path / FILE).read_bytes() == content
+    (tmp_path / FILE).write_bytes(b"")
+    assert list(resume.entries()) == []
+    assert resume.append("one") and list(resume.entries()) == ["one"]
 
 
-def test_what_cannot_be_kept_does_not_end_the_run(tmp_path):
-    """A folder in the file's place: no entry, and none is tried again."""
-    (tmp_path / FILE).mkdir()
-    resume = Resume(tmp_path, "content", every=0.0)
-    assert resume.due()
-    resume.append(1)
-    assert not resume.due() and list(resume.entries()) == []
+def test_what_cannot_be_kept_does_not_end_the_run_nor_take_away_what_was(tmp_path):
+    """A database that is full: a warning, the entries before it stay, the next follows once there
+    is room, and the run that goes on is the same. Planted bug: the file removed."""
+    resume = kept(tmp_path, "one")
+    pages = resume.file.stat().st_size // 4096
+
+    class Full(Resume):
+        @contextmanager
+        def _open(self, mode):
+            with super()._open(mode) as database:
+                database.execute(f"PRAGMA max_page_count = {pages}")
+                yield database
+
+    full = Full(tmp_path, "content", every=0.0)
+    with pytest.warns(ScenarioWarning, match=r"not kept \(database or disk is full"):
+        assert not full.append("two" * 9000)
+    assert list(resume.entries()) == ["one"]
+    assert resume.append("three") and list(resume.entries()) == ["one", "three"]
+
+
+def test_frames_that_could_not_be_kept_are_kept_with_the_next(tmp_path, monkeypatch):
+    """Planted bug: frames taken for kept before they are."""
+    scenario = dense_scenario(frames=5)
+    whole = simulate.run(scenario, snapshots=1)
+    resume = Resume(tmp_path, run_content(scenario, 1), every=0.0)
+    append, tries = resume.append, iter([False, True, False, True])
+    monkeypatch.setattr(resume, "append", lambda entry: next(tries) and append(entry))
+    simulate.run(scenario, snapshots=1, resume=resume)
+    assert [len(entry["rows"]) for entry in resume.entries()] == [2, 2]
+    again = Resume(tmp_path, run_content(scenario, 1), every=1e3)
+    assert_equal_results(simulate.run(scenario, snapshots=1, resume=again), whole)
 
 
 def test_entries_are_some_time_apart(tmp_path):
@@ -250,8 +302,8 @@ def test_entries_are_some_time_apart(tmp_path):
 
 
 def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsys):
-    """Ctrl-C after three frames: exit 130 and where they are; the next call says that it goes on,
-    and leaves no such file behind."""
+    """Ctrl-C after three frames: exit 130 and where they are; another scenario leaves them alone
+    unless told to let go; the next call says that it goes on, and leaves no such file behind."""
     (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
     monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
@@ -264,6 +316,7 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
         return work(report)
 
     command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
+    other = [*command, "--seed", "77"]
     with monkeypatch.context() as once:
         once.setattr("isac_rt.cli.simulation.with_progress", stopped)
         assert main(command) == 130
@@ -273,9 +326,17 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
         and "interrupted" in said
         and "going on" not in said
     )
+    kept = (tmp_path / "out" / FILE).read_bytes()
+    assert main(other) == 2
+    said = capsys.readouterr().err
+    assert "keeps frames of another" in said and len(said.strip().splitlines()) == 1
+    assert (tmp_path / "out" / FILE).read_bytes() == kept
     assert main(command) == 0
     assert "going on after the frames" in capsys.readouterr().err
     assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
+    Resume(tmp_path / "out", "another").append(1)
+    assert main([*other, "--restart"]) == 0
+    assert open_results(tmp_path / "out").summary["seed"] == 77
 
 
 @pytest.mark.slow

@@ -14,9 +14,9 @@ from isac_rt.cli.cli import main
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform, waveform_of
-from isac_rt.results.files import ResultsError
 from isac_rt.results.metrics import truth_of
 from isac_rt.simulation.setup import swarm_of
+from isac_rt.storage import StorageError
 from isac_rt.studies import paper as experiments
 from isac_rt.studies.paper import fig1, fig5, fig13, flight, onepath, table1, table2, tracks
 from isac_rt.studies.paper.outcome import Outcome, Verdict, blank, proportion, style, write
@@ -65,7 +65,7 @@ def test_several_tables_get_names(tmp_path):
 
 def test_an_unwritable_place_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ResultsError, match="cannot write"):
+    with pytest.raises(StorageError, match="cannot write"):
         write(outcome(), tmp_path / "file")
 
 

@@ -188,7 +188,7 @@ def test_kept_frames_are_not_run_again(tmp_path):
         other = Trials()
         sample(other, SNR, Precision(5, absolute=0), silent, key="another seed")
         assert sorted(other.asked) == list(range(5))
-    assert [f.suffix for f in (tmp_path / "x").iterdir()] == [".npz"] * 2
+    assert [f.suffix for f in (tmp_path / "x").iterdir()] == [".frames"] * 2
 
 
 def test_steps_of_a_run_that_stops_early_are_filled_up():

@@ -30,6 +30,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import summarise
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, save_dataset, status
+from isac_rt.sweep.definition import ground_of, paths_key
 from isac_rt.sweep.execute import Job, run_job
 
 ROOT = Path(__file__).parents[2]
@@ -70,10 +71,15 @@ def plan_of(folder: Path, text: str = SWEEP, **options):
     return load_sweep(folder / "sweep.yaml", **options)
 
 
+def job_of(plan, out: Path, point) -> Job:
+    return Job(point.key, point.tree, point.ground, str(plan.base.folder), str(out), 1)
+
+
 def run_here(plan, out: Path, points=None) -> None:
     """Without a cluster, in any order."""
+    (out / "points").mkdir(parents=True, exist_ok=True)
     for p in points or plan.points():
-        run_job(Job(p.key, p.tree, str(plan.base.folder), str(out), 1))
+        run_job(job_of(plan, out, p))
 
 
 # ---- what a sweep is
@@ -88,7 +94,7 @@ def test_points_hold_the_axes_and_the_spawned_seeds(folder):
     by_hand = load(
         folder / "base.yaml", ["noise.snr_db=-9.5", "modulation.dpsk_order=2"], seed=plan.seed(1)
     )
-    made = Job(third.key, third.tree, str(folder), "", 1).tree
+    made = third.tree
     assert type(by_hand).model_validate(made).model_dump(exclude={"name"}) == by_hand.model_dump(
         exclude={"name"}
     )
@@ -649,8 +655,9 @@ def test_paths_are_shared_by_what_differs_in_nothing_that_they_depend_on(folder)
     plan = plan_of(folder)
     base = plain_tree(plan.base)
     assert set(CHANGES) == set(Scenario.model_fields)
-    keys = {part: plan.paths_key(merged(base, {part: CHANGES[part]})) for part in CHANGES}
-    shared = {part for part, key in keys.items() if key == plan.paths_key(base)}
+    ground = ground_of(base, folder)
+    keys = {part: paths_key(merged(base, {part: CHANGES[part]}), ground) for part in CHANGES}
+    shared = {part for part, key in keys.items() if key == paths_key(base, ground)}
     assert shared == set(UNSEEN_BY_PATHS)
     free = base | {"city": None, "propagation": {"leakage": {"enabled": False}}}
     expected = prepare(Scenario.model_validate(free))
@@ -668,7 +675,7 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     traced, census = Traced(setup.frame(0).paths, 1), Census()
     one = PathStore(tmp_path / "probe")
     one.put("aa", traced, census)
-    size = next((tmp_path / "probe").rglob("*.npz")).stat().st_size
+    size = next((tmp_path / "probe").rglob("*.paths")).stat().st_size
     store = PathStore(tmp_path / "paths", limit=int(4.5 * size))
     for i, key in enumerate(["a1", "b2", "c3", "d4"]):
         store.put(key, traced, census)

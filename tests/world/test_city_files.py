@@ -523,9 +523,6 @@ axes: {snr: {key: noise.snr_db, values: [1, 2]}}
 
 def keys(folder: Path) -> dict[str, str]:
     """All keys that hold the city of the scenario in a folder."""
-    from isac_rt.sweep.definition import _city_digest
-
-    _city_digest.cache_clear()
     read = load(folder / "s.yaml")
     point = next(load_sweep(folder / "w.yaml").points())
     return {

@@ -140,12 +140,11 @@ def _line(method: str, unit: str, row: Row) -> str:
 
 def write(found: Mapping[str, Any], folder: Path) -> list[Path]:
     """bench.json, bench.md and one figure per stage."""
-    from isac_rt.results.files import write_text
+    from isac_rt.storage import write_whole
 
-    folder.mkdir(parents=True, exist_ok=True)
     files = [folder / "bench.json", folder / "bench.md"]
-    write_text(files[0], json.dumps(found, indent=1) + "\n")
-    write_text(files[1], markdown(found))
+    write_whole(files[0], json.dumps(found, indent=1) + "\n")
+    write_whole(files[1], markdown(found))
     for kind in dict.fromkeys(row["kind"] for row in found["rows"]):
         files.append(figure(found, kind, folder / f"{kind}.png"))
     return files
@@ -158,6 +157,8 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
     """Cost against error and against size of one stage; the oracle is marked, the floor is the line
     at one."""
     import matplotlib.pyplot as plt
+
+    from isac_rt.results.files import write_figure
 
     drawn = [
         (method, unit, rows)
@@ -191,7 +192,7 @@ def figure(found: Mapping[str, Any], kind: str, file: Path) -> Path:
         right.set_xlabel("size")
         canvas.legend(fontsize=6.5, loc="outside lower center", ncols=2)
         canvas.suptitle(f"{kind}: {found['machine']['processor']}; star: oracle; dotted: floor")
-        canvas.savefig(file, dpi=130)
+        write_figure(file, canvas, dpi=130)
         plt.close(canvas)
     return file
 

@@ -13,6 +13,7 @@ frames.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,16 +22,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import special, stats
 
 from isac_rt.randomness import generator
-from isac_rt.results.files import write_bytes
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.results.provenance import program_fingerprint
+from isac_rt.results.provenance import program_fingerprint, versions
+from isac_rt.storage import load_data, save_data
 from isac_rt.studies.paper.outcome import Progress
 
 Counts = Mapping[str, tuple[np.ndarray, int]]
@@ -52,7 +52,8 @@ def kept_in(folder: str | Path) -> Iterator[None]:
     """Inside, `sample` keeps the counts of its frames in `folder` and does not run again those that
     it finds there.
 
-    They are found by seed, curve and the digest of this program: a changed program starts anew.
+    They are found by seed, curve, the digest of this program and the versions under it: a changed
+    program starts anew.
     """
     token = _folder.set(Path(folder))
     try:
@@ -180,11 +181,6 @@ class Curve:
         return crossing(self.snr_db, self.events.sum(axis=0), total, level), float(low), float(high)
 
 
-def _savez(file: Path, arrays: dict[str, Any]) -> None:
-    with open(file, "wb") as out:  # given a name savez would append ".npz" to it
-        np.savez(out, **arrays)
-
-
 def crossing(snr_db: np.ndarray, events: np.ndarray, trials: int, level: float) -> float:
     """First SNR at which a rate passes `level`, linear in the logit; a rate of 0 or 1 counts as
     half an event."""
@@ -241,25 +237,15 @@ class _Store:
     """Counts of the frames of one curve on disk, if there is a folder for them."""
 
     def __init__(self, key: str, snr_db: np.ndarray) -> None:
-        whole = "\0".join((key, program_fingerprint(), repr(snr_db.tolist())))
-        folder = _folder.get()
-        self._file = (
-            None
-            if folder is None
-            else folder / f"{hashlib.sha256(whole.encode()).hexdigest()[:24]}.npz"
-        )
-        self._known: list[Counts] = []
+        whole = json.dumps([key, program_fingerprint(), versions(), snr_db.tolist()])
+        self._key, folder = hashlib.sha256(whole.encode()).hexdigest()[:24], _folder.get()
+        self._file = None if folder is None else folder / f"{self._key}.frames"
         self._saved_at = time.monotonic()
-        if self._file is not None and self._file.exists():
-            with np.load(self._file) as kept:
-                names = [n.removeprefix("events ") for n in kept.files if n.startswith("events ")]
-                events, totals = (
-                    {n: kept[f"events {n}"] for n in names},
-                    {n: int(kept[f"total {n}"]) for n in names},
-                )
-            self._known = [
-                {n: (events[n][i], totals[n]) for n in names} for i in range(len(events[names[0]]))
-            ]
+        kept = None if self._file is None else load_data(self._file, self._key)
+        self._known: list[Counts] = [
+            {name: (events, total) for name, (events, total) in frame.items()}
+            for frame in kept or ()
+        ]
 
     def known(self, number: int) -> Counts | None:
         return self._known[number] if number < len(self._known) else None
@@ -271,10 +257,7 @@ class _Store:
             or not (now or time.monotonic() - self._saved_at > SAVE_EVERY)
         ):
             return
-        arrays = {f"events {n}": np.array([f[n][0] for f in frames]) for n in frames[0]}
-        arrays |= {f"total {n}": np.array(frames[0][n][1]) for n in frames[0]}
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(self._file, lambda temporary: _savez(temporary, arrays))
+        save_data(self._file, self._key, frames)
         self._known, self._saved_at = list(frames), time.monotonic()
 
 

@@ -13,9 +13,10 @@ import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
-from isac_rt.results.files import write_bytes, write_text
+from isac_rt.results.files import write_figure
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import commit, versions
+from isac_rt.storage import write_whole
 
 Judgement = Literal["holds", "holds under a condition", "does not hold"]
 Progress = Callable[[int, int], None]
@@ -149,22 +150,17 @@ def write(outcome: Outcome, folder: str | Path) -> list[Path]:
 
     Raises
     ------
-    isac_rt.results.files.ResultsError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written.
     """
     folder, written = Path(folder), []
     for table, frame in outcome.tables.items():
         stem = outcome.name if len(outcome.tables) == 1 else f"{outcome.name}_{table}"
         written.append(folder / f"{stem}.csv")
-        write_text(written[-1], frame.to_csv(index=False, lineterminator="\n"))
+        write_whole(written[-1], frame.to_csv(index=False, lineterminator="\n"))
     if (figure := outcome.figure) is not None:
         written.append(folder / f"{outcome.name}.png")
         with style():
-            write_bytes(
-                written[-1],
-                lambda temporary: figure.savefig(
-                    temporary, format="png", metadata={"Software": None}
-                ),
-            )
+            write_figure(written[-1], figure)
     about = {
         "name": outcome.name,
         "title": outcome.title,
@@ -175,5 +171,5 @@ def write(outcome: Outcome, folder: str | Path) -> list[Path]:
         "commit": commit(),
     }
     written.append(folder / f"{outcome.name}.json")
-    write_text(written[-1], json.dumps(about, indent=1, allow_nan=False) + "\n")
+    write_whole(written[-1], json.dumps(about, indent=1, allow_nan=False) + "\n")
     return written

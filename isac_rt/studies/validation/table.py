@@ -8,8 +8,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from isac_rt.results.files import write_text
 from isac_rt.results.provenance import commit, program_fingerprint, versions
+from isac_rt.storage import write_whole
 from isac_rt.studies.validation.case import Measured
 
 STATES = {True: "passes", False: "FAILS", None: "left out"}
@@ -91,9 +91,9 @@ def as_markdown(verdicts: Sequence[Measured]) -> str:
 
 def write_json(verdicts: Sequence[Measured], file: Path) -> None:
     """The table as JSON; the file appears whole or not at all."""
-    write_text(file, json.dumps(as_data(verdicts), indent=1, allow_nan=False) + "\n")
+    write_whole(file, json.dumps(as_data(verdicts), indent=1, allow_nan=False) + "\n")
 
 
 def write_markdown(verdicts: Sequence[Measured], file: Path) -> None:
     """The table as Markdown; the file appears whole or not at all."""
-    write_text(file, as_markdown(verdicts))
+    write_whole(file, as_markdown(verdicts))
