@@ -1,4 +1,5 @@
-"""Virtual channels of the L: which antennas go together, and where their phase centres lie."""
+"""Virtual channels of the L: which antennas go together, where their phase centres lie, and when a
+spherical wave reaches them."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.known import Known
 
 
@@ -60,3 +62,14 @@ def both_arms(antennas: Antennas) -> Channels:
         np.append(x.rx, z.rx[new]),
         np.concatenate([x.places, z.places[new]]),
     )
+
+
+def element_delays(
+    positions: np.ndarray, direction: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Delay of elements (E, 3) against the centroid for a spherical wave [s], (E,), and its
+    derivative with respect to u_x, u_z (2, E)."""
+    place = positions[:, [0, 2]]
+    along = place @ direction
+    delay = (-along + ((positions**2).sum(axis=1) - along**2) / (2 * radius)) / SPEED_OF_LIGHT
+    return delay, (-(1 + along / radius) * place.T) / SPEED_OF_LIGHT

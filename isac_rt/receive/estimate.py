@@ -14,6 +14,7 @@ of it is linearised in the frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +22,14 @@ import numpy as np
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
-from isac_rt.receive.arms import arm
+from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
 
 # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
 HALF_WIDTH = 3
+PULL = 1.0
+"""Distance of another path in the cell [cells, bins]."""
 
 
 @dataclass(frozen=True)
@@ -317,19 +320,55 @@ def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False
     return [direction_cosine(flat, known, axis, on_grid=on_grid) for axis in (0, 2)]
 
 
-def standard_deviations(snr: float, known: Known) -> np.ndarray:
-    """Standard deviations of range, velocity, u_x, u_z at a summed post-processing SNR (Cramer-Rao
-    of a tone, with Hann's loss of 2 on the two windowed axes), and never below the floors at which
-    other paths' sidelobes usually end the gain."""
-    w, tone = known.waveform, np.sqrt(2 * 6 / (4 * np.pi**2 * max(snr, 1.0)))
+def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Known) -> float:
+    """Power that one wave from `direction` leaves in the channels of an estimate, over the wave's
+    own and beyond what noise leaves; 0 where there is no direction.
+
+    A wave has one amplitude at the active terminal and one for each transmit antenna at a passive
+    one. What is left comes from other paths in the cell.
+    """
+    u = np.asarray(direction, float)
+    if not np.isfinite(u).all() or (u**2).sum() > 1:
+        return 0.0
+    a, radius = known.antennas, known.radius(estimate.delay)
+    turn = 2j * np.pi * known.waveform.effective_carrier
+    sent, heard = (
+        np.exp(turn * element_delays(places, u, radius)[0])
+        for places in (a.tx_positions, a.rx_positions)
+    )
+    waves = estimate.channels @ heard.conj() / heard.size
+    free = waves.size
+    if known.passes == 2:
+        waves, free = np.atleast_1d(waves @ sent.conj() / sent.size), 1
+    total = float((np.abs(estimate.channels) ** 2).mean())
+    wave = float((np.abs(waves) ** 2).mean())
+    left = (total - wave) / (1 - free / estimate.channels.size)
+    return max(left - total / max(snr, 1.0), 0.0) / max(wave, 1e-3 * total)
+
+
+def standard_deviations(snr: float, excess: float, known: Known) -> np.ndarray:
+    """Standard deviations of range, velocity, u_x, u_z of a path.
+
+    Cramer-Rao of a tone, with Hann's loss of 2 on the two windowed axes, and never below the floors
+    at which other paths' sidelobes usually end the gain. Other paths in the cell count twice: as
+    noise of their power, different in every channel, and as a pull of range and velocity towards
+    where they are, by their share of the power.
+
+    Parameters
+    ----------
+    snr : of a channel, after processing
+    excess : power of other paths in the cell over the path's own
+    """
+    w, total = known.waveform, known.channels / (1 / max(snr, 1.0 / known.channels) + excess)
+    tone, pull = np.sqrt(2 * 6 / (4 * np.pi**2 * max(total, 1.0))), PULL * excess / (1 + excess)
     spread = [
-        max(tone, 2e-3) * known.range_cell,
-        max(tone, 4e-3) * w.velocity_cell(known.passes),
+        np.hypot(max(tone, 2e-3), pull) * known.range_cell,
+        np.hypot(max(tone, 4e-3), pull) * w.velocity_cell(known.passes),
     ]
     angles = []
     for axis in (0, 2):
         place = arm(known.antennas, axis, known.passes).places[:, axis]
         slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
         share = place.size / known.channels
-        angles.append(max(1 / (slope * np.sqrt(2 * max(snr, 1.0) * share)), 2e-4))
+        angles.append(max(1 / (slope * np.sqrt(2 * max(total, 1.0) * share)), 2e-4))
     return np.array(spread + angles)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.receive.arms import element_delays
 from isac_rt.receive.cfar import CfarRule, first_row
 from isac_rt.receive.estimate import (
     Estimate,
@@ -22,7 +23,6 @@ from isac_rt.receive.estimate import (
     refine,
     start_point,
 )
-from isac_rt.receive.joint.fit import element_delays
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import LATIN_UNION, LatinUnion, power_map
 from isac_rt.receive.sense import Cfar, Sensed, describe

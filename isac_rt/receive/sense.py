@@ -16,6 +16,7 @@ from isac_rt.receive.estimate import (
     Estimator,
     LocalSpectra,
     direction_cosines,
+    excess,
     standard_deviations,
 )
 from isac_rt.receive.known import Known
@@ -130,7 +131,7 @@ def describe(
     for i, e in enumerate(estimates):
         u = direction_cosines(e, known, on_grid=on_grid)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]
-        std[i] = standard_deviations(snr[i] * e.channels.size, known)
+        std[i] = standard_deviations(snr[i], excess(e, u, snr[i], known), known)
     return Detections(
         range=np.array([e.delay for e in estimates]) * known.metres,
         velocity=np.array([e.delay_rate for e in estimates]) * known.metres,

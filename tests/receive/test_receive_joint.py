@@ -14,12 +14,12 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
+from isac_rt.receive.arms import element_delays
 from isac_rt.receive.joint.fit import (
     JointPath,
     _moments,
     _normal_equations,
     _tone,
-    element_delays,
     fit,
     residual_channels,
     tone_sums,

@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.arms import element_delays
 from isac_rt.receive.known import Known
 
 PARAMETERS = 4  # delay, delay rate, u_x, u_z
@@ -62,17 +63,6 @@ def units(known: Known) -> np.ndarray:
 def amplitude_index(known: Known) -> np.ndarray:
     """(M, P) which of a path's amplitudes each chirp has."""
     return known.schedule if known.passes == 1 else np.zeros_like(known.schedule)
-
-
-def element_delays(
-    positions: np.ndarray, direction: np.ndarray, radius: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of elements (E, 3) against the centroid for a spherical wave [s], (E,), and its
-    derivative with respect to u_x, u_z (2, E)."""
-    place = positions[:, [0, 2]]
-    along = place @ direction
-    delay = (-along + ((positions**2).sum(axis=1) - along**2) / (2 * radius)) / SPEED_OF_LIGHT
-    return delay, (-(1 + along / radius) * place.T) / SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True)

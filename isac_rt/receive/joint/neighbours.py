@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.receive.arms import element_delays
 from isac_rt.receive.joint.fit import (
     JointPath,
-    element_delays,
     fit,
     rate_bin,
     residual_channels,

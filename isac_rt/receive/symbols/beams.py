@@ -18,8 +18,8 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter.filter import chirp_runs
-from isac_rt.receive.joint.fit import element_delays
 from isac_rt.receive.symbols.powers import (
     EXTRA_CELLS,
     WEAKEST_WEIGHT,
