@@ -27,7 +27,16 @@ TIMING = {
     "synthesis": 3.75,
     "receive": 4.5,
     "track": 0.125,
-    "total": 12.125,
+    "other": 0.5,
+    "total": 12.625,
+    "wall": {
+        "setup": 1.5,
+        "trace": 2.5,
+        "synthesis": 3.75,
+        "receive": 4.75,
+        "track": 0.25,
+        "total": 8.5,
+    },
 }
 
 

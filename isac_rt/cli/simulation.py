@@ -139,7 +139,9 @@ def _say_summary(results: Results) -> None:
     found = ", ".join(
         f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n
     )
-    say(f"paths: {found}; {number(results.summary['timing_s']['total'])} s")
+    seconds = results.summary["timing_s"]
+    spent = f"{number(seconds['total'])} s of processor time, {number(seconds['wall']['total'])} s"
+    say(f"paths: {found}; {spent} by the clock")
 
 
 def plan(

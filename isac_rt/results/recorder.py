@@ -17,7 +17,8 @@ from isac_rt.results.provenance import versions
 from isac_rt.results.records import KINDS, FrameRecord
 from isac_rt.scenario.tree import Scenario
 
-TIMINGS = ("setup", "trace", "synthesis", "receive", "track", "total")
+STAGES = ("setup", "trace", "synthesis", "receive", "track")
+TIMINGS = (*STAGES, "other", "total", "wall")
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class Figures:
     Attributes
     ----------
     scores : every link's sensing
-    timing : seconds by stage, of `TIMINGS`
+    timing : processor seconds by stage, what no stage counts, and their total; under ``wall`` the
+        wall seconds of stages and total (`TIMINGS`)
     plan : what was modelled: the summary's `fidelity`, but for what was kept of the paths
     access : what became of the stages before the data, None without them
     compared : `Recorder.blocks` of the sets of receivers that heard the same samples, by name
@@ -71,7 +73,7 @@ class Figures:
     """
 
     scores: Mapping[Link, SensingScore]
-    timing: Mapping[str, float]
+    timing: Mapping[str, Any]
     plan: Mapping[str, Any]
     access: Mapping[str, Any] | None = None
     compared: Mapping[str, Any] = field(default_factory=dict)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -45,6 +44,7 @@ from isac_rt.simulation.preflight import (
     check_reference,
     warn_of_aliases,
 )
+from isac_rt.simulation.stopwatch import NONE, Seconds
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
@@ -184,8 +184,8 @@ class Setup:
     expectation: ClutterExpectation | None
     """What an active terminal's receiver predicts of its clutter from the mesh; None where its
     detector needs none."""
-    seconds: float = 0.0
-    """What `prepare` took [s]."""
+    seconds: Seconds = NONE
+    """What `prepare` took."""
 
     @property
     def schedule(self) -> Schedule:
@@ -309,7 +309,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     >>> setup.frame(0).samples(("AT", "AT")).samples.dtype
     dtype('complex64')
     """
-    begin = time.perf_counter()
+    begin = Seconds.of_process()
     waveform = waveform_of(scenario.radio, scenario.array)
     antennas = antennas_of(scenario.array, waveform)
     swarm = swarm_of(scenario)
@@ -361,7 +361,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         if scenario.needs_mesh
         else None,
     )
-    return replace(_connected(setup), seconds=time.perf_counter() - begin)
+    return replace(_connected(setup), seconds=Seconds.of_process() - begin)
 
 
 def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
 from isac_rt.results.provenance import provenance
-from isac_rt.results.recorder import TIMINGS, Figures, Recorder, Results
+from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.scenario.receivers import ReceiverSet
@@ -27,28 +27,16 @@ from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
+from isac_rt.simulation.stopwatch import Stopwatch
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 
 Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
+Jobs = dict[Link, Future[list[Heard]]]
 
 
-@dataclass
-class _Clock:
-    """Seconds per stage, summed over the threads that work in it."""
-
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMINGS, 0.0))
-    begun: float = field(default_factory=time.perf_counter)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - start
-
-    def so_far(self) -> dict[str, float]:
-        """The seconds with those of the whole run until now."""
-        return self.seconds | {"total": self.seconds["total"] + time.perf_counter() - self.begun}
+AHEAD = 2
+"""Frames at work at once: a frame does not wait for the slowest link of the one before."""
 
 
 def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
@@ -269,15 +257,15 @@ def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[
     links = setup.timetable.links(frame.number)
     # the first once more: what is compiled on first use is not a frame's cost
     for link in links[:1] + links:
-        clock = _Clock()
-        with clock.stage("synthesis"):
+        stopwatch = Stopwatch()
+        with stopwatch.stage("synthesis"):
             cube = frame.heard(link)
         if receive:
             observer = _Observer(setup, link, standard_terminal(setup, link))
-            with clock.stage("receive"):
+            with stopwatch.stage("receive"):
                 observer.hear(frame, cube, False)
         stages = ("synthesis", "receive") if receive else ("synthesis",)
-        out[link] = {stage: clock.seconds[stage] for stage in stages}
+        out[link] = {stage: stopwatch.spent[stage].processor for stage in stages}
     return out
 
 
@@ -291,7 +279,7 @@ class _Run:
     compared: dict[str, _Listeners]
     schedules: Schedules
     snapshots: set[int]
-    clock: _Clock
+    stopwatch: Stopwatch
     kept: int = 0
     """Frames that a later call could go on after."""
 
@@ -304,8 +292,8 @@ class _Run:
         terminal: Callable[[Setup, Link], Terminal],
     ) -> _Run:
         """Before the first frame."""
-        s, clock = setup or prepare(scenario), _Clock()
-        clock.seconds["setup"] = clock.seconds["total"] = s.seconds
+        s, stopwatch = setup or prepare(scenario), Stopwatch()
+        stopwatch.set_up(s.seconds)
         compared = {
             name: _Listeners.of(s, partial(standard_terminal, s, settings=one))
             for name, one in scenario.compare.items()
@@ -316,7 +304,7 @@ class _Run:
             compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),
-            clock,
+            stopwatch,
         )
 
     @property
@@ -325,51 +313,66 @@ class _Run:
         return self.own.recorder
 
     def fly(self, progress: Progress | None, threads: int | None, resume: Resume | None) -> None:
-        """Frame after frame; while the receivers work on one the next is traced."""
-        setup, clock, frames = self.setup, self.clock, self.setup.timetable.frames
-        at_work: tuple[Frame, dict[Link, Future[list[Heard]]]] | None = None
+        """Frame after frame; while the receivers work the next ones are traced.
+
+        A link's frames are heard one after the other. Where what is sent depends on what was
+        received, a frame waits for all receivers of the one before.
+        """
+        setup, frames = self.setup, self.setup.timetable.frames
+        dependent = setup.scenario.access.feedback or setup.scenario.array.fall_back
+        at_work: deque[tuple[Frame, Jobs]] = deque()
+        last: Jobs = {}
+
+        def settle(left: int, keep: Resume | None = None) -> None:
+            """Collect all but so many frames at work, keep them, and say so."""
+            if len(at_work) <= left:
+                return
+            while len(at_work) > left:
+                self.collect(*at_work.popleft())
+            if keep is not None and keep.append(self.memory()):
+                self.kept = len(self.recorder.rows)
+            if progress:
+                progress(len(self.recorder.rows), frames)
+
         with (
             threadpool_limits(limits=1),
             ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
         ):
             for number in range(self.restore(resume) if resume else 0, frames):
-                with clock.stage("trace"):
+                with self.stopwatch.stage("trace"):
                     frame = setup.frame(number)
-                if at_work is not None:
-                    self.collect(*at_work)
-                    if resume and resume.due() and resume.append(self.memory()):
-                        self.kept = len(self.recorder.rows)
-                if progress and number:
-                    progress(number, frames)
+                keep = resume if resume and at_work and resume.due() else None
+                settle(0 if keep or dependent else AHEAD - 1, keep)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
-                at_work = (
-                    frame,
-                    {
-                        link: pool.submit(self.hear, frame, link)
-                        for link in setup.timetable.links(number)
-                    },
-                )
-            if at_work is not None:
-                self.collect(*at_work)
-            if progress:
-                progress(frames, frames)
+                jobs = {
+                    link: pool.submit(self.hear, frame, link, last.get(link))
+                    for link in setup.timetable.links(number)
+                }
+                last |= jobs
+                at_work.append((frame, jobs))
+            settle(0)
 
-    def hear(self, frame: Frame, link: Link) -> list[Heard]:
+    def hear(self, frame: Frame, link: Link, before: Future[list[Heard]] | None) -> list[Heard]:
         """What a link's receivers make of a frame, those of the scenario first; all are given the
-        same samples."""
-        with self.clock.stage("synthesis"):
+        same samples.
+
+        The frame `before` is one that the pool began earlier, so that waiting for it ends.
+        """
+        with self.stopwatch.stage("synthesis"):
             cube = frame.heard(link)
-        with self.clock.stage("receive"):
+        if before is not None:
+            before.result()
+        with self.stopwatch.stage("receive"):
             maps = frame.number in self.snapshots
             heard = self.own.observers[link].hear(frame, cube, maps)
         others = self.compared.values()
         return [heard, *(s.observers[link].hear(frame, cube, False) for s in others)]
 
-    def collect(self, frame: Frame, jobs: dict[Link, Future[list[Heard]]]) -> None:
+    def collect(self, frame: Frame, jobs: Jobs) -> None:
         """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
         results = {link: job.result() for link, job in jobs.items()}
         heard = {link: by_set[0] for link, by_set in results.items()}
-        with self.clock.stage("track"):
+        with self.stopwatch.stage("track"):
             if self.setup.scenario.access.feedback:
                 for tx, rx in heard:
                     if (tx, tx) in heard:
@@ -394,7 +397,7 @@ class _Run:
             **self.own.memory(self.kept),
             "compared": {name: one.memory(self.kept) for name, one in self.compared.items()},
             "advice": self.schedules.memory(),
-            "seconds": self.clock.so_far(),
+            "seconds": self.stopwatch.so_far(),
         }
 
     def restore(self, resume: Resume) -> int:
@@ -413,8 +416,7 @@ class _Run:
                 for name, one in self.compared.items():
                     one.restore(last["compared"][name]["observers"])
                 self.schedules.restore(last["advice"])
-                for stage in TIMINGS:
-                    self.clock.seconds[stage] += last["seconds"][stage]
+                self.stopwatch.restore(last["seconds"])
         self.kept = len(self.recorder.rows)
         return self.kept
 
@@ -424,7 +426,7 @@ class _Run:
         sets = {OWN: self.own, **self.compared} if self.compared else {}
         figures = Figures(
             scores={link: o.scorer.score for link, o in self.own.observers.items()},
-            timing=self.clock.so_far(),
+            timing=self.stopwatch.so_far(),
             plan={
                 **mechanisms(s.scenario.propagation, s.scenario.clutter),
                 **decisions(s.plan),

@@ -183,6 +183,17 @@ def _title(key: str) -> str:
     return key.removesuffix(ending).replace("_", " ").replace("snr", "SNR") + _UNITS.get(ending, "")
 
 
+def _timing(seconds: Mapping[str, Any]) -> Table:
+    """Processor and wall seconds of every stage; runs of earlier versions have the former alone."""
+    wall = seconds.get("wall", {})
+    rows = [
+        (stage, number(seconds[stage]), number(wall.get(stage)))
+        for stage in TIMINGS
+        if stage in seconds and stage != "wall"
+    ]
+    return Table(("Stage", "Processor [s]", "Wall [s]"), rows)
+
+
 def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
     out, last = [], ""
     for picture in pictures:
@@ -236,7 +247,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         ),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
-        timing=Table(("Stage", "Seconds"), [(k, number(s["timing_s"][k])) for k in TIMINGS]),
+        timing=_timing(s["timing_s"]),
         versions=Table(
             ("Package", "Version"),
             [

@@ -1,0 +1,92 @@
+"""Where the time of a run goes: processor seconds of each stage, and wall seconds beside them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from isac_rt.results.recorder import STAGES
+
+
+class Seconds(NamedTuple):
+    """Of one stretch of work.
+
+    Attributes
+    ----------
+    processor : user and system time
+    wall : from its beginning to its end
+    """
+
+    processor: float = 0.0
+    wall: float = 0.0
+
+    def __add__(self, other: Any) -> Seconds:
+        return Seconds(self[0] + other[0], self[1] + other[1])
+
+    def __sub__(self, other: Any) -> Seconds:
+        return Seconds(self[0] - other[0], self[1] - other[1])
+
+    @classmethod
+    def of_process(cls) -> Seconds:
+        """All threads of the process so far; the wall's zero is arbitrary."""
+        return cls(time.process_time(), time.perf_counter())
+
+    @classmethod
+    def of_thread(cls) -> Seconds:
+        """The calling thread so far; the wall's zero is arbitrary."""
+        return cls(time.thread_time(), time.perf_counter())
+
+
+NONE = Seconds()
+
+
+@dataclass
+class Stopwatch:
+    """Seconds of each stage of a run, summed over the threads that work in it.
+
+    Stages of several threads overlap, so their wall seconds may add up to more than the total's.
+    Processor seconds add up: what no stage counts (threads of the ray tracer, waiting, progress)
+    is `other`.
+    """
+
+    spent: dict[str, Seconds] = field(default_factory=lambda: dict.fromkeys(STAGES, NONE))
+    before: Seconds = NONE
+    """Set-up, and earlier calls of a run that goes on."""
+    begun: Seconds = field(default_factory=Seconds.of_process)
+    _adding: threading.Lock = field(default_factory=threading.Lock)
+
+    def set_up(self, seconds: Seconds) -> None:
+        """Count the set-up, which lies before the beginning."""
+        self.spent["setup"] += seconds
+        self.before += seconds
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count what this thread does within."""
+        start = Seconds.of_thread()
+        yield
+        seconds = Seconds.of_thread() - start
+        with self._adding:
+            self.spent[name] += seconds
+
+    def so_far(self) -> dict[str, Any]:
+        """Processor seconds of every stage, ``other`` and ``total``; under ``wall`` the same by the
+        wall, without ``other``."""
+        total = self.before + (Seconds.of_process() - self.begun)
+        processor = {name: one.processor for name, one in self.spent.items()}
+        return {
+            **processor,
+            "other": max(total.processor - sum(processor.values()), 0.0),
+            "total": total.processor,
+            "wall": {**{name: one.wall for name, one in self.spent.items()}, "total": total.wall},
+        }
+
+    def restore(self, earlier: Mapping[str, Any]) -> None:
+        """Add what an earlier call of the same run had spent (`so_far`)."""
+        for name in STAGES:
+            self.spent[name] += Seconds(earlier[name], earlier["wall"][name])
+        self.before += Seconds(earlier["total"], earlier["wall"]["total"])
