@@ -153,3 +153,37 @@ def splitmix64(state: int, word: int) -> int:
     z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9 & mask
     z = (z ^ z >> 27) * 0x94D049BB133111EB & mask
     return z ^ z >> 31
+
+
+def what_is_measured(state, own, sender=None):
+    """Length of the way to a body, its rate and the direction cosines u_x, u_z of arrival (..., 4),
+    of states (..., 6 or more) in long double.
+
+    The rate is the imaginary part of the length an imaginary instant later; `sender` is the state
+    (..., 6 or more) of the end from which the wave comes to the body, None: only the way from the
+    body counts.
+    """
+    instant = 1e-15
+
+    def way(start):
+        gap = (state - start).astype(np.longdouble)
+        later = gap[..., :3] + 1j * instant * gap[..., 3:]
+        length = np.sqrt((later**2).sum(-1))
+        return length.real, length.imag / instant
+
+    state = np.asarray(state)[..., :6]
+    length, rate = way(np.concatenate([own.position, own.velocity]))
+    towards = (state[..., :3] - own.position) @ own.rotation / length[..., None]
+    if sender is not None:
+        more = way(np.asarray(sender)[..., :6])
+        length, rate = length + more[0], rate + more[1]
+    return np.stack([length, rate, towards[..., 0], towards[..., 2]], axis=-1)
+
+
+def slopes(function, at, step=1e-5):
+    """Derivative of a vector function with respect to a vector, by central differences in long
+    double: (values, variables)."""
+    at = np.asarray(at).astype(np.longdouble)
+    moves = step * np.eye(at.size)
+    columns = [(function(at + move) - function(at - move)) / (2 * step) for move in moves]
+    return np.stack(columns, axis=-1)
