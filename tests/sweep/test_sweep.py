@@ -635,6 +635,8 @@ CHANGES = {
     "clutter": {"model": "field"},
     "noise": {"snr_db": 5},
     "receivers": {"clutter_filter": "runs"},
+    "receiver_preset": "paper",
+    "compare": {"runs": {"receivers": {"clutter_filter": "runs"}}},
     "tracking": {"confirm_hits": 2},
 }
 """One change of each part of a scenario."""
