@@ -259,7 +259,7 @@ def test_interrupt_ends_within_two_seconds(stuck, scenario_file, tmp_path):
     to fail without the thread."""
     program = f"""
 import ctypes, sys, time, types, os, pathlib
-import isac_rt.results.files
+import isac_rt.storage
 from isac_rt.cli.cli import main
 import isac_rt.simulation.setup
 def native():
@@ -269,9 +269,10 @@ def native():
         try: libc.sleep(60)
         except KeyboardInterrupt: pass
 def prepare(scenario):
-    pathlib.Path({str(tmp_path / "o")!r}, f".results.nc.{{os.getpid()}}.tmp").write_text("half")
-    print("ready", flush=True)
-    {stuck}
+    with isac_rt.storage._beside(pathlib.Path({str(tmp_path / "o")!r}, "results.nc")) as half:
+        half[1].write(b"half")
+        print("ready", flush=True)
+        {stuck}
 isac_rt.simulation.setup.prepare = prepare
 sys.exit(main(["run", {str(scenario_file)!r}, "--out", {str(tmp_path / "o")!r}]))
 """
