@@ -4,6 +4,7 @@ command line."""
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.coverage import Coverage, coverage
 from isac_rt.simulation.setup import swarm_of, timetable_of
 
 STATES = ("acquiring", "tracking", "lost")
@@ -218,6 +220,15 @@ def fake_recorder(scenario: Scenario) -> Recorder:
     return Recorder(timetable_of(scenario, w, schedule), STATES)
 
 
+def fake_coverage(scenario: Scenario) -> Coverage:
+    w, a = waveform_of(scenario.radio, scenario.array), scenario.array
+    schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
+    timetable = timetable_of(scenario, w, schedule)
+    return coverage(
+        swarm_of(scenario), timetable, antennas_of(a, w), scenario.receivers, a.schedule
+    )
+
+
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
     w = waveform_of(scenario.radio, scenario.array)
@@ -248,6 +259,7 @@ def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Result
     plan = {"model": "free_space", "if_model": "exact"}
     summary = recorder.summary(Figures(scores, TIMING, plan))
     attributes = {"fidelity": summary["fidelity"], "materials": {}, "link_budget": budget}
+    attributes["coverage"] = asdict(fake_coverage(scenario))
     dataset = recorder.dataset().assign_attrs(
         provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}
     )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from isac_rt.cli.arguments import FrameNumber, InputProblem, Overrides, ScenarioFile, check_frame
-from isac_rt.cli.console import err, say, say_table, with_progress
+from isac_rt.cli.console import err, out, say, say_table, with_progress
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
 if TYPE_CHECKING:
@@ -67,6 +69,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     with err().status("setting up"):
         setup = prepare(loaded)
         budget = link_budgets(setup)
+    _say_coverage(asdict(setup.coverage))
     _say_budget(budget)
     if resume.begun:
         err().print(f"going on after the frames in {resume.file}", soft_wrap=True)
@@ -90,6 +93,17 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         write_report(results, folder, make_figures(results, folder, setup.city))
     resume.remove()
     _say_summary(results)
+
+
+def _say_coverage(seen: Mapping[str, Any]) -> None:
+    """What the radar can see, as of `isac_rt.simulation.coverage.Coverage`."""
+    from isac_rt.views.report import coverage_tables
+
+    limits, words, outside = coverage_tables(seen)
+    say_table(limits.columns, limits.rows)
+    out().print(words)
+    if outside.rows:
+        say_table(outside.columns, outside.rows)
 
 
 def _say_budget(rows: list[Any]) -> None:
@@ -170,6 +184,7 @@ def plan(
 
 def _say_plan(found: dict[str, Any], frames: int) -> None:
     """The plan of `isac_rt.simulation.audit.make_plan`."""
+    _say_coverage(found["coverage"])
 
     def error(item: dict[str, Any]) -> str:
         value = item["estimate"]

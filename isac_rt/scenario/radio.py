@@ -76,9 +76,9 @@ class Radio(Node):
     wider sweep gives finer range cells: 25 cm for an echo with the default, which is the
     paper's."""
     sampling_rate_hz: Positive = 20e6
-    """Rate of the complex samples behind the receiver's mixer [Hz]. It sets the longest delay that
-    can be told: 256 m for an echo with the default, which is the paper's, and half of that while
-    chirps carry data."""
+    """Rate of the complex samples behind the receiver's mixer [Hz]. With the bandwidth and the
+    samples it sets the longest delay that passes the filter: 256 m for an echo with the default,
+    which is the paper's. Receivers look at the half of it in which every data symbol arrives."""
     samples_per_chirp: Annotated[int, Field(ge=16, le=65536)] = 1024
     """Samples taken of each chirp, an even number because half of the range cells carry the data
     symbols. More samples make chirps and frames longer. The default is the paper's."""

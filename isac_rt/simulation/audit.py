@@ -140,6 +140,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
         **extent(setup.city, setup.propagation.census(), setup.scenario.clutter),
+        "coverage": asdict(setup.coverage),
         "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],

@@ -18,6 +18,7 @@ from isac_rt.scenario.environment import Clutter
 from isac_rt.scenario.file import ScenarioWarning
 from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.tree import NEAREST_M
+from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.passage import TOUCH_M, enclosed, first_passage
 from isac_rt.world.swarm import Pose, Swarm
@@ -155,19 +156,13 @@ def warn_of_aliases(
 
     Parameters
     ----------
-    velocity_method, schedule : ``receivers.velocity_method`` and ``array.schedule``; by a
-        conventional schedule of few groups the limit is divided by the transmit antennas
+    velocity_method, schedule : ``receivers.velocity_method`` and ``array.schedule``
     """
-    w = timetable.waveform
     frames = np.unique(np.linspace(0, timetable.frames - 1, ALIAS_EPOCHS).round().astype(int))
     poses = [swarm.poses(timetable.epoch(int(frame))) for frame in frames]
     for link in timetable.all_links:
         tx, rx = link
-        groups = len(timetable.groups(link) or range(w.num_groups))
-        whole = schedule == "pseudo_random" or (
-            groups == w.num_tx and velocity_method != "conventional"
-        )
-        limit = w.max_velocity(link.passes) / (1 if whole else w.num_tx)
+        limit = unambiguous_velocity(link, timetable, velocity_method, schedule)
         for name in [n for n in swarm.uavs if n != tx] if link.own else [rx]:
             rates = np.array([_closing(at[tx], at[name], antennas, link.passes) for at in poses])
             worst = int(np.abs(rates).argmax())
@@ -192,6 +187,46 @@ def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
         passes == 2 or antennas.in_view(other.to_body(-line))
     )
     return float((other.velocity - own.velocity) @ line) if seen else 0.0
+
+
+def warn_of_unseen(seen: Coverage) -> None:
+    """Warn of what cannot be seen: terminals whose data are lost, and UAVs that nobody sees."""
+    limits, by_uav = {of.link: of for of in seen.links}, dict[str, list[Outside]]()
+    for row in seen.outside:
+        tx, _, rx = row.link.partition("->")
+        if row.uav != tx:
+            by_uav.setdefault(row.uav, []).append(row)
+        elif row.beyond_range:
+            _warn(
+                f"{rx} is beyond {limits[row.link].max_range_m:.4g} m from {tx} in "
+                f"{row.beyond_range} of {row.frames} frames, where it loses the line of sight and "
+                "every data symbol; fly it nearer, raise radio.samples_per_chirp or lower "
+                "radio.bandwidth_hz"
+            )
+        elif row.unseen == row.frames:
+            _warn(
+                f"{rx} never sees {tx}, {_causes(row)}: it gets no data; turn the boresight of "
+                "one of them, or move it"
+            )
+    for name, rows in by_uav.items():
+        others = [link for link in limits if link.partition("->")[2] != name]
+        if len(rows) == len(others) and all(row.unseen == row.frames for row in rows):
+            causes = "; ".join(f"{row.link.replace('->', ' to ')}: {_causes(row)}" for row in rows)
+            _warn(f"{name} is seen by no terminal in any frame ({causes}); move or turn it or them")
+
+
+def _warn(said: str) -> None:
+    warnings.warn(said, ScenarioWarning, stacklevel=4)
+
+
+def _causes(row: Outside) -> str:
+    """Why it is not seen, with the frames of each cause."""
+    counts = {
+        "out of view": row.out_of_view,
+        "beyond the range": row.beyond_range,
+        "too near": row.too_near,
+    }
+    return ", ".join(f"{cause} in {n} frames" for cause, n in counts.items() if n)
 
 
 def check_reference(noise: Noise, clutter: Clutter, swarm: Swarm, timetable: Timetable) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
+from isac_rt.simulation.coverage import Coverage, coverage
 from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
     check_flights,
@@ -43,6 +44,7 @@ from isac_rt.simulation.preflight import (
     check_passage,
     check_reference,
     warn_of_aliases,
+    warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
@@ -190,6 +192,12 @@ class Setup:
     @property
     def schedule(self) -> Schedule:
         return self.timetable.schedule
+
+    @cached_property
+    def coverage(self) -> Coverage:
+        """What the links can see, and what of the swarm they cannot."""
+        s = self.scenario
+        return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.array.schedule)
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
@@ -361,7 +369,9 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         if scenario.needs_mesh
         else None,
     )
-    return replace(_connected(setup), seconds=Seconds.of_process() - begin)
+    setup = _connected(setup)
+    warn_of_unseen(setup.coverage)
+    return replace(setup, seconds=Seconds.of_process() - begin)
 
 
 def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -234,6 +234,7 @@ def run(
             for name, entry in materials.items()
         },
         "link_budget": [vars(row) for row in link_budgets(run.setup)],
+        "coverage": asdict(run.setup.coverage),
     }
     dataset = run.recorder.dataset().assign_attrs(
         provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}

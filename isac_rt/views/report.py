@@ -154,6 +154,59 @@ def rmse_table(summary: Mapping[str, Any]) -> Table:
     return Table(columns, rows)
 
 
+_SEES = {
+    "Range to [m]": "max_range_m",
+    "Range cell [m]": "range_resolution_m",
+    "Velocity to [m/s]": "max_velocity_mps",
+    "Velocity cell [m/s]": "velocity_resolution_mps",
+    "Azimuth beam [deg]": "azimuth_resolution_deg",
+    "Elevation beam [deg]": "elevation_resolution_deg",
+    "View to [deg]": "field_of_view_deg",
+    "Bit rate [kbit/s]": "bit_rate_bps",
+}
+_OUTSIDE = ("out_of_view", "beyond_range", "too_near", "too_fast")
+
+
+def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
+    """What the radar can see: one row for each set of links that see alike, the times and what the
+    columns mean in words, and the frames in which UAVs are outside.
+
+    Parameters
+    ----------
+    seen : `isac_rt.simulation.coverage.Coverage` as a mapping
+    """
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for of in seen["links"]:
+        row = {
+            **of,
+            "bit_rate_bps": None if of["bit_rate_bps"] is None else of["bit_rate_bps"] / 1e3,
+        }
+        alike.setdefault(tuple(number(row[key]) for key in _SEES.values()), []).append(
+            _link(of["link"])
+        )
+    limits = Table(("Sees", *_SEES), [(", ".join(names), *row) for row, names in alike.items()])
+    farthest = max(seen["links"], key=lambda of: of["max_range_m"])
+    words = (
+        f"A slot lasts {number(1e6 * seen['slot_s'])} us, a frame {number(1e3 * seen['frame_s'])} "
+        f"ms, and one begins every {number(1e3 * seen['frame_interval_s'])} ms. Ranges are one way "
+        "for echoes, the whole way from transmitter to receiver otherwise, and hold with data as "
+        "without; paths of up to twice that range still disturb some chirps. Faster UAVs are seen "
+        "at a wrong velocity. A beam is the width of the array's main lobe ahead; the view reaches "
+        "so far to each side, and directions are unambiguous to "
+        f"{number(farthest['unambiguous_angle_deg'])} deg. Walls in between are not counted here."
+    )
+    rows = [
+        (
+            f"{row['uav']} on {_link(row['link'])}",
+            *(f"{row[key]}" for key in _OUTSIDE),
+            f"{row['frames']}",
+        )
+        for row in seen["outside"]
+    ]
+    titles = ("Frames outside", "Out of view", "Beyond range", "Too near", "Too fast", "Of frames")
+    return limits, words, Table(titles, rows)
+
+
 def flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     """Leaves of a nested mapping as (dotted name, text)."""
     out: list[tuple[str, str]] = []
@@ -236,6 +289,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         terminals=per_terminal(s),
         rmse=rmse_table(s),
         compared=side_by_side(s),
+        sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
         budget=row_table(json.loads(d.attrs["link_budget"])),
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]

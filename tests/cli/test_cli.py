@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from fake_run import fake_records, fake_run, fake_scenario
+from fake_run import fake_coverage, fake_records, fake_run, fake_scenario
 from matplotlib.image import imread
 
 import isac_rt.simulation
@@ -46,6 +46,7 @@ def simulation(monkeypatch):
             city=empty_city("none", np.zeros(3)),
             swarm=swarm_of(scenario),
             timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
+            coverage=fake_coverage(scenario),
         )
 
     def run(scenario, *, setup, progress, snapshots, resume):

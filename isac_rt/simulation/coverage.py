@@ -1,0 +1,238 @@
+"""What a radar can see: ranges, velocities and angles link by link, and what of the swarm
+lies outside them in how many frames.
+
+A receiver's maps hold N/2 range cells. What lies within them arrives in every chirp, whatever its
+data symbol; half a cell farther a passive terminal finds no line of sight and loses every symbol.
+From there to N cells the IF filter lets pass the chirps whose symbol is small enough, and beyond N
+cells (the delay T_d) none. Shadows of the city are not counted here: they are known when its paths
+are traced. Clocks are taken to agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.receive.cfar import first_row
+from isac_rt.results.metrics import resolutions
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.world.swarm import Swarm
+
+MOST_FRAMES = 1_000
+"""Of longer runs so many frames are looked at, evenly spread."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkCoverage:
+    """What one link's receiver can see.
+
+    Attributes
+    ----------
+    link : "TX->RX"
+    max_range_m : of an echo, one way, at an active terminal; of a path's whole length at a passive
+        one: what every chirp carries and the maps hold, with data and without
+    filtered_range_m : beyond it the IF filter stops the path in every chirp
+    min_range_m : nearer detections are left out, the line of sight of pilots among them
+    range_resolution_m, velocity_resolution_mps : one cell of the map
+    max_velocity_mps : beyond it a velocity is reported a whole period off
+    azimuth_resolution_deg, elevation_resolution_deg : wavelength over aperture, at broadside
+    field_of_view_deg : to each side of the boresight
+    unambiguous_angle_deg : to each side; beyond it a direction is reported on the other side
+    bit_rate_bps : sent for this receiver over the whole run, pilots and pauses included; None for
+        echoes
+    """
+
+    link: str
+    max_range_m: float
+    filtered_range_m: float
+    min_range_m: float
+    range_resolution_m: float
+    velocity_resolution_mps: float
+    max_velocity_mps: float
+    azimuth_resolution_deg: float
+    elevation_resolution_deg: float
+    field_of_view_deg: float
+    unambiguous_angle_deg: float
+    bit_rate_bps: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outside:
+    """Frames in which a UAV is not seen on a link, each counted under its first cause.
+
+    Attributes
+    ----------
+    link : "TX->RX"
+    uav : what reflects, or the transmitter itself, whose line of sight carries the data
+    frames : looked at
+    out_of_view : of the field of view of the receiver or of the transmitter
+    beyond_range, too_near : than `LinkCoverage.max_range_m` and `min_range_m`
+    too_fast : for `LinkCoverage.max_velocity_mps`; it is seen, at another velocity
+    """
+
+    link: str
+    uav: str
+    frames: int
+    out_of_view: int
+    beyond_range: int
+    too_near: int
+    too_fast: int
+
+    @property
+    def unseen(self) -> int:
+        """Frames without a detection to hope for."""
+        return self.out_of_view + self.beyond_range + self.too_near
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """All that `coverage` finds; `outside` has a row only for what is outside in some frame."""
+
+    slot_s: float
+    frame_s: float
+    frame_interval_s: float
+    links: tuple[LinkCoverage, ...]
+    outside: tuple[Outside, ...]
+
+
+def coverage(
+    swarm: Swarm,
+    timetable: Timetable,
+    antennas: Antennas,
+    receivers: Receivers,
+    schedule: str,
+) -> Coverage:
+    """What every link of a run can see, and what of the swarm it cannot.
+
+    Parameters
+    ----------
+    swarm, timetable, antennas : of the run
+    receivers : for `min_range_m` and `velocity_method`
+    schedule : ``array.schedule``
+    """
+    w = timetable.waveform
+    step = max(1, -(-timetable.frames // MOST_FRAMES))
+    frames = range(0, timetable.frames, step)
+    flights = _flights(swarm, [timetable.epoch(f) for f in frames])
+    received = [set(timetable.links(f)) for f in frames]
+    links, outside = [], []
+    for link in timetable.all_links:
+        here = np.array([link in of_frame for of_frame in received])
+        seen = _link_coverage(link, timetable, antennas, receivers, schedule)
+        links.append(seen)
+        own = {name: flight.at(here) for name, flight in flights.items()}
+        rows = (_outside(link, name, own, antennas, seen) for name in own if name != link.rx)
+        outside += [row for row in rows if row.unseen or row.too_fast]
+    return Coverage(
+        slot_s=w.slot_duration,
+        frame_s=w.frame_duration,
+        frame_interval_s=timetable.interval,
+        links=tuple(links),
+        outside=tuple(outside),
+    )
+
+
+def unambiguous_velocity(
+    link: Link, timetable: Timetable, velocity_method: str, schedule: str
+) -> float:
+    """Largest radial speed that a link reports as it is [m/s]: that of a chirp in every slot, and
+    divided by the transmit antennas where each is looked at alone and sends at equal distances."""
+    w = timetable.waveform
+    groups = len(timetable.groups(link) or range(w.num_groups))
+    whole = schedule == "pseudo_random" or (
+        groups == w.num_tx and velocity_method != "conventional"
+    )
+    return w.max_velocity(link.passes) / (1 if whole else w.num_tx)
+
+
+def _link_coverage(
+    link: Link, timetable: Timetable, antennas: Antennas, receivers: Receivers, schedule: str
+) -> LinkCoverage:
+    w, passes = timetable.waveform, link.passes
+    cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
+    apart = SPEED_OF_LIGHT / (float(w.carrier()) * antennas.spacing)
+    return LinkCoverage(
+        link=str(link),
+        max_range_m=w.num_delay_symbols * cell,
+        filtered_range_m=w.num_samples * cell,
+        min_range_m=first_row(receivers, cell) * cell,
+        range_resolution_m=cell,
+        velocity_resolution_mps=velocity,
+        max_velocity_mps=unambiguous_velocity(link, timetable, receivers.velocity_method, schedule),
+        azimuth_resolution_deg=_degrees(across),
+        elevation_resolution_deg=_degrees(up),
+        field_of_view_deg=float(np.degrees(antennas.half_view)),
+        unambiguous_angle_deg=_degrees(apart / 2),
+        bit_rate_bps=None if link.own else _bit_rate(link, timetable),
+    )
+
+
+def _degrees(sine: float) -> float:
+    return float(np.degrees(np.arcsin(min(sine, 1.0))))
+
+
+def _bit_rate(link: Link, timetable: Timetable) -> float:
+    groups, order = timetable.groups(link), timetable.modulation.dpsk_order
+    w = timetable.waveform if groups is None else timetable.waveform.of_groups(groups)
+    carried = sum(
+        timetable.modulated(f) for f in range(timetable.frames) if link in timetable.links(f)
+    )
+    return w.bits_per_frame(order) * carried / (timetable.frames * timetable.interval)
+
+
+class _Flight(NamedTuple):
+    """Positions and velocities (T, 3) of a UAV, and its axes (T, 3, 3)."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    rotation: np.ndarray
+
+    def at(self, frames: np.ndarray) -> _Flight:
+        return _Flight(*(values[frames] for values in self))
+
+
+def _flights(swarm: Swarm, epochs: list[float]) -> dict[str, _Flight]:
+    out = {}
+    for name, flight in swarm.trajectories.items():
+        poses = [flight.pose(t) for t in epochs]
+        each = [[p.position, p.velocity, p.rotation] for p in poses]
+        out[name] = _Flight(*(np.array(values) for values in zip(*each, strict=True)))
+    return out
+
+
+def _leg(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarray, ...]:
+    """Length (T,), its rate, and whether the end is in the view of the start."""
+    offset = end.position - start.position
+    length = np.linalg.norm(offset, axis=1)
+    towards = offset / length[:, None]
+    rate = (towards * (end.velocity - start.velocity)).sum(axis=1)
+    return length, rate, antennas.in_view(np.einsum("ti,tij->tj", towards, start.rotation))
+
+
+def _outside(
+    link: Link, name: str, flights: dict[str, _Flight], antennas: Antennas, of: LinkCoverage
+) -> Outside:
+    tx, rx, body = (flights[n] for n in (link.tx, link.rx, name))
+    length, rate, in_view = _leg(rx, body, antennas)
+    if name == link.tx:  # the line of sight
+        in_view &= _leg(tx, rx, antennas)[2]
+    elif not link.own:
+        first, first_rate, lit = _leg(tx, body, antennas)
+        length, rate, in_view = length + first, rate + first_rate, in_view & lit
+    half = of.range_resolution_m / 2  # a path is looked for in the row that is nearest
+    far, near = length >= of.max_range_m - half, length < of.min_range_m - half
+    return Outside(
+        link=of.link,
+        uav=name,
+        frames=len(length),
+        out_of_view=int((~in_view).sum()),
+        beyond_range=int((in_view & far).sum()),
+        too_near=int((in_view & near).sum()),
+        too_fast=int((in_view & ~far & ~near & (np.abs(rate) > of.max_velocity_mps)).sum()),
+    )
