@@ -36,7 +36,7 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
     encoding = {
         name: {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
         for name, v in dataset.variables.items()
-        if v.dtype != object and v.ndim and v.size
+        if v.dtype.kind not in "OU" and v.ndim and v.size  # words cannot be filtered
     }
     write_whole(file, bytes(dataset.to_netcdf(engine="h5netcdf", encoding=encoding)))
 

@@ -76,6 +76,8 @@ def test_round_trip_is_bit_exact(tmp_path, detections):
         back.scenario
     ) == to_yaml(made.scenario)
     assert back.dataset.attrs["scenario"] == made.dataset.attrs["scenario"]
+    save(back, tmp_path / "again")
+    _same(made.dataset, open_results(tmp_path / "again").dataset)
 
 
 def test_two_runs_are_bit_identical(run, monkeypatch):
