@@ -105,9 +105,7 @@ OF_CASES = {
         "departure = first - 1.01 * start.position",
     ),
     "every path of a box": Bug(
-        "propagation/raytrace.py",
-        "chain = faces[which][:, :count]",
-        "chain = faces[which][:, :count][:, ::-1]",
+        "propagation/legs/images.py", "some[:, 2 : 2 + count]", "some[:, 1 + count : 1 : -1]"
     ),
     "a wall 10 km off reflects once": Bug(
         "propagation/legs/geometry.py", "return which[first]", "return which"
@@ -142,13 +140,14 @@ OF_CASES = {
         "return cls(leg.length / 2, leg.rate",
     ),
     "conducting corner": Bug(
-        "propagation/raytrace.py",
-        """if depth > 1
-            else {}""",
-        "if depth > 9 else {}",
+        "propagation/legs/images.py",
+        "planes = edges_in_any_order(self._city.plane_of_face[part.faces], part.legs.points)",
+        "planes = self._city.plane_of_face[part.faces]",
     ),
     "reflection of a slab": Bug(
-        "world/city/scene.py", "conductivity=material.conductivity,", "conductivity=0.0,"
+        "propagation/legs/reflection.py",
+        "root = np.sqrt(eta - (1 - cosine**2))",
+        "root = np.sqrt(eta.real - (1 - cosine**2))",
     ),
     "ghosts over a conducting wall": Bug(
         "propagation/raytrace.py",
@@ -441,13 +440,12 @@ OF_CASES = {
         "betaincinv(successes + 1, trials - successes + 1, tail)",
     ),
     "paths of a canyon against sionna": Bug(
-        "propagation/raytrace.py",
-        """return amplitude, valid, faces, points
-
-    def _leg_set""",
-        """return np.abs(amplitude), valid, faces, points
-
-    def _leg_set""",
+        "propagation/legs/reflection.py",
+        "return (field * vertical(legs.arrival)).sum(1)",
+        "return np.abs((field * vertical(legs.arrival)).sum(1))",
+    ),
+    "paths missed in a city": Bug(
+        "propagation/legs/chains.py", "- LIFT * np.sign(into)", "+ LIFT * np.sign(into)"
     ),
     "echoes against sionna": Bug(
         "propagation/raytrace.py",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.free_space import FreeSpace
@@ -20,12 +18,12 @@ def make_propagation(
     free: FreeSpace,
     city: CityMesh,
     waveform: Waveform,
-    instants: Sequence[float] = (),
+    knot_spacing: float = 0.0,
 ) -> Propagation:
     """The model that a scenario asks for. `ray_traced` starts the JIT back end.
 
-    With `instants` (rising, those of the first and the last frame among them) the city is traced
-    then only; between them paths are unfolded anew (`legs.between`).
+    Rays search for chains of walls from knots that are at most `knot_spacing` of flight apart [m];
+    0: from where a terminal is (`legs.chains`).
     """
     model: Propagation = free
     if propagation.model == "ray_traced":
@@ -35,7 +33,7 @@ def make_propagation(
         from isac_rt.propagation.raytrace import RayTracer
 
         model = RayTracer(
-            propagation, clutter, swarm, free, city, waveform.carrier_frequency, instants
+            propagation, clutter, swarm, free, city, waveform.carrier_frequency, knot_spacing
         )
     if clutter.model == "rayleigh":
         return RayleighClutter(model, free, clutter, waveform)

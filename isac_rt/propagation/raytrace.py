@@ -1,11 +1,17 @@
-"""Ray-traced paths: Sionna RT discovers them, float64 geometry says where they are.
+"""Ray-traced paths: rays in Sionna RT's scene find the chains of walls, float64 images say which of
+them are paths, and where.
 
-One solve per frame, from the terminals to every UAV, gives the legs of all links: terminal to
-terminal, terminal back to itself, and terminal to target. Of each leg only the chain of faces, its
-visibility and its complex amplitude (which holds no carrier phase) come from Sionna; length, rate,
-acceleration, directions and points are unfolded in float64 from the planes of the mesh. Sionna's
-float32 delays are off by up to a radian and more at this carrier. Straight legs then bend round
-shadow edges, and the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
+Legs run from the terminals to every UAV: terminal to terminal, terminal back to itself, and
+terminal to target. Rays that leave the terminals from knots of their flights find which walls a
+wave may meet one after the other (`legs.chains`); images place the pooled chains in each frame
+(`legs.images`), with length, rate, acceleration, directions and points from the planes of the mesh,
+and slab coefficients of the faces that hold the points. Straight legs then bend round shadow edges,
+and the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
+
+`RayTracer.by_sionna` gives the same tracer with the legs of Sionna's own solver, which shares with
+the above neither the search nor the images, the visibility nor the amplitudes (its delays are
+unfolded in float64 too: in float32 they are off by up to a radian and more at this carrier). It is
+the cross-check of the paths that a run misses.
 
 Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point
 scatterer. Sionna's own RCS solver gives the same paths, but wants the bodies in the scene, where
@@ -14,12 +20,6 @@ other. What is left out: a wave that one leg turns from vertical to horizontal p
 other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of two
 bounces in a street canyon).
 
-Where walls meet at right angles (or a wall the ground), the mirror path of a terminal to itself
-runs through their edge, in every order of the walls at once: each order holds a part of the
-wavefront, and together they make one image. Sionna finds none of them from a terminal to itself,
-and one of them to a point that is not the terminal, so chains of two and more bounces are also
-sought to points beside each terminal, and unfolded to the terminal itself.
-
 Points are world coordinates outside this module and local (recentred) coordinates inside. Import
 only after `isac_rt.runtime.activate()`.
 """
@@ -27,7 +27,6 @@ only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from dataclasses import replace
 
 import mitsuba as mi
@@ -37,10 +36,11 @@ import sionna.rt as rt
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.resampled import scatterer_phase
+from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.between import Between, LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.chains import Search
 from isac_rt.propagation.legs.clearance import Clearance
 from isac_rt.propagation.legs.direct import past_edges_and_bodies
 from isac_rt.propagation.legs.edges import ShadowEdges
@@ -51,6 +51,8 @@ from isac_rt.propagation.legs.geometry import (
     straight,
     unfold,
 )
+from isac_rt.propagation.legs.images import ASIDE, SLACK, STRETCH, Images
+from isac_rt.propagation.legs.legset import LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
@@ -60,14 +62,6 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scene
 from isac_rt.world.swarm import Pose, Swarm
 
-POINT_TOLERANCE = 1e-3
-"""Share of a path's length by which its points may differ from Sionna's; beyond, it is another
-path. Sionna's mirrors are float32 triangles whose normals err by up to 3e-4 rad in Munich, which
-moves points by centimetres and lengths by micrometres."""
-ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
-"""From a terminal to the points beside it to which corners are sought, local coordinates [m]. A
-tenth of a metre is what Sionna's ray offsets need (3 cm: half of the corners, 1 cm: none) and less
-than a Fresnel zone; two points, because one that lies towards the corner does not help."""
 MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
 fewer rays get less room."""
@@ -84,7 +78,7 @@ class RayTracer:
         free: FreeSpace,
         city: CityMesh,
         carrier: float,
-        instants: Sequence[float] = (),
+        knot_spacing: float = 0.0,
     ) -> None:
         self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
         self._free, self._city, self._terminals = free, city, swarm.terminals
@@ -104,13 +98,14 @@ class RayTracer:
                 self.two_bounces = TwoBounces.plan(
                     self.field, city, wavelength, free.seed, clutter.mirrors
                 )
-        self.between: Between | None = None
-        """Legs from those of the traced instants; None: every frame is traced."""
-        if len(instants) > 1:
-            mirrors = self._normals, self._offsets
-            self.between = Between(
-                np.array(instants), self._legs_on_the_way, city, mirrors, shadows, wavelength
-            )
+        depth = propagation.max_bounces if propagation.specular and city.num_faces else 0
+        flights = {
+            name: Flight(swarm.trajectories[name], swarm.duration, city.origin, knot_spacing)
+            for name in (self._terminals if knot_spacing and depth else [])
+        }
+        self._search = Search(self._handle, city, propagation.rays, depth, flights)
+        self._images = Images(city, shadows, wavelength, depth)
+        self._solved_with: int | None = None
         self._clearance = Clearance(city)
         self._handle.scene.tx_array = self._handle.scene.rx_array = rt.PlanarArray(
             num_rows=1, num_cols=1, pattern="iso", polarization="V"
@@ -124,11 +119,21 @@ class RayTracer:
             None if self.two_bounces is None else self.two_bounces.census(),
         )
 
-    def every_frame(self) -> RayTracer:
-        """The same tracer, but one that traces every frame anew."""
-        full = copy.copy(self)
-        full.between = None
-        return full
+    def by_half(self, which: int) -> RayTracer:
+        """The same tracer with the chains of the even (0) or the odd (1) knots alone, without
+        scatterers."""
+        out = copy.copy(self)
+        out.field = out.two_bounces = None
+        out._search = self._search.half(which)
+        return out
+
+    def by_sionna(self, num_rays: int) -> RayTracer:
+        """The same tracer with the legs of Sionna's own solver, solved anew at each instant with so
+        many rays, without scatterers."""
+        out = copy.copy(self)
+        out.field = out.two_bounces = None
+        out._solved_with = num_rays
+        return out
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link, in a fixed order.
@@ -144,9 +149,14 @@ class RayTracer:
         ):
             raise ValueError("a UAV's position or velocity is not finite")
         self._clearance.check({name: pose.position for name, pose in local.items()}, epoch)
-        legs, dropped = (
-            self._specular_legs(local) if self.between is None else self.between.legs(local, epoch)
-        )[:2]
+        dropped = 0
+        if self._solved_with is None:
+            chains = {
+                name: self._search.chains(name, local[name], epoch) for name in self._terminals
+            }
+            legs = self._images.legs(chains, {name: local[name] for name in self._free.names})
+        else:
+            legs, dropped, _ = self._solved_legs(local, self._solved_with)
         bodies = Bodies.of(self._swarm.uavs, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._free.wavelength)
         hits = self._diffuse_hits(local, links) if self._clutter.model == "diffuse" else {}
@@ -162,10 +172,6 @@ class RayTracer:
         return {
             name: replace(pose, position=pose.position - origin) for name, pose in poses.items()
         }
-
-    def _legs_on_the_way(self, time: float) -> TracedLegs:
-        """Legs traced at an instant of the run."""
-        return self._specular_legs(self._local(self._swarm.poses(time)))
 
     def _solve(
         self,
@@ -207,8 +213,8 @@ class RayTracer:
             )
         return found
 
-    def _specular_legs(self, local: dict[str, Pose]) -> TracedLegs:
-        """Legs from every terminal to every UAV, by mirror reflections only."""
+    def _solved_legs(self, local: dict[str, Pose], num_rays: int) -> TracedLegs:
+        """Legs from every terminal to every UAV, by mirror reflections only, of Sionna's solver."""
         p = self._propagation
         depth = p.max_bounces if p.specular and self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
@@ -226,12 +232,11 @@ class RayTracer:
             sources,
             sinks | beside,
             max_depth=depth,
-            samples_per_src=p.rays,
+            samples_per_src=num_rays,
             specular_reflection=depth > 0,
         )
         amplitude, valid, faces, points = self._read(found, max(depth, 1))
         corner = valid & ((faces >= 0).sum(axis=-1) > 1)
-        slack = 4 * np.linalg.norm(ASIDE, axis=1).max()
         out, dropped, duplicates = {}, 0, 0
         for j, start in enumerate(sources):
             for i, end in enumerate(sinks):
@@ -241,7 +246,7 @@ class RayTracer:
                     first = len(sinks) + len(ASIDE) * j
                     steps, found_beside = np.nonzero(corner[first : first + len(ASIDE), j])
                     rows, which = np.append(rows, first + steps), np.append(which, found_beside)
-                    loose = np.append(loose, np.full(steps.size, slack))
+                    loose = np.append(loose, np.full(steps.size, SLACK))
                 at = rows, j, which
                 out[Link(start, end)], astray, again = self._leg_set(
                     local[start], local[end], amplitude[at], faces[at], points[at], loose
@@ -289,7 +294,7 @@ class RayTracer:
             apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(
                 axis=1, initial=0.0
             )
-            good = apart < POINT_TOLERANCE * legs.length + slack[which]
+            good = apart < STRETCH * legs.length + slack[which]
             # what stands beside may well go astray at grazing angles
             dropped += int((~good & (slack[which] == 0)).sum())
             planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)

@@ -166,10 +166,12 @@ class Propagation(Node):
     """Most mirror reflections on a path between two terminals, and on the ways to and from a target
     together. More reflections cost time and add weaker paths; the default finds single and double
     ones."""
-    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
-    """Rays that search for mirror reflections, per transmitter. More rays find paths over small
-    faces more surely and take longer. Paths that are found do not depend on it. The default suits
-    cities of some hundred metres."""
+    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 60_000
+    """Rays that a terminal sends out at each knot of its flight to find which walls a wave may meet
+    one after the other; five knots are pooled (`accuracy.max_untraced_m` says how far apart they
+    are). More rays find paths over small faces more surely and take longer. Paths that are found do
+    not depend on it. The default misses none over the noise of a cell in cities of some hundred
+    metres."""
     ghosts: bool = True
     """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
     for targets."""
@@ -283,16 +285,17 @@ class Accuracy(Node):
 
     preset: Literal["budget", "everything", "fastest"] = "budget"
     """What may be left out. `budget`, the default: what the keys below and
-    `propagation.weakest_path_db` allow. `everything`: nothing is left out, every frame is traced.
-    `fastest`: plane wavefronts, straight flight within a frame, no path below the noise of a cell,
-    few traces."""
+    `propagation.weakest_path_db` allow. `everything`: nothing is left out, rays search for walls in
+    every frame. `fastest`: plane wavefronts, straight flight within a frame, no path below the
+    noise of a cell, few searches."""
     max_phase_error_rad: Positive = 0.05
     """Most by which approximations together may turn the phase of a path at any element and chirp
     [rad], for `budget`. The default costs at most 0.01 dB of the path's power."""
-    max_untraced_m: Annotated[float, Field(ge=0)] = 1.0
-    """Farthest that a UAV flies between two traced instants [m], for `budget`; 0: every frame is
-    traced. A longer way is faster and misses paths that last less than that; the default misses
-    none that lasts more than a metre of flight."""
+    max_untraced_m: Annotated[float, Field(ge=0)] = 2.0
+    """Farthest that a terminal flies between two knots, places from which rays search for chains of
+    walls [m], for `budget`; 0: they search from where it is in each frame. A longer way is faster
+    and may miss paths over walls that are seen for a shorter way only. Where the chains run, and
+    which of them are free, is found out in every frame."""
     synthesis_error: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-4
     """Relative RMS error that fast synthesis of IF samples may have, for `budget` and `everything`;
     the cheapest method that keeps it is taken. The default is 80 dB below the signal."""

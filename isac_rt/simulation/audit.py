@@ -4,12 +4,12 @@ what was, against the full model.
 Estimates come from `PILOT_FRAMES` frames of the run, spread over it, with a margin for the others
 and the plan's own limits as ceilings. The truth is measured on other frames, drawn at random: every
 one of them is traced in full, with spherical wavefronts of all elements, with every body where its
-trajectory puts it at the ends of the frame, and with the direct synthesis.
+trajectory puts it at the ends of the frame, and with the direct synthesis. Paths that were missed
+are those that Sionna's own solver finds with `CHECK_RAYS`.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -30,11 +30,12 @@ from isac_rt.results.records import Use
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct
 from isac_rt.simulation.plan import (
+    MATTERS_DB,
     decisions,
     extent,
     frame_reach,
     mechanisms,
-    missed_chains,
+    missed_paths,
     standing,
 )
 from isac_rt.simulation.setup import Frame, Setup
@@ -46,7 +47,9 @@ if TYPE_CHECKING:
     from isac_rt.propagation.raytrace import RayTracer
 
 PILOT_FRAMES = 5
-PILOT_INTERVALS = 3
+FOLLOWED = 2
+"""Frames after each pilot frame whose tracing is timed: knots are passed now and then."""
+CHECK_RAYS = 300_000
 POWER_MARGIN = 10.0
 """Estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
 PHASE_MARGIN = 2.0
@@ -66,7 +69,7 @@ class Item:
     modelled, left_out : in words
     estimate : of the error, None where there is none
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative",
-        "chains/frame" or "of the power radiated"
+        "paths/frame" or "of the power radiated"
     link : "TX->RX", or "all"
     seconds : per frame, None where it has no time of its own
     """
@@ -102,18 +105,17 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
 def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     """The plan of a run: decisions, one item per line, and the seconds of each stage per frame.
 
-    Traces a few frames of the run and makes the samples of one; with `receive` its receivers work
-    on them too.
+    Traces a few frames of the run, and those that follow, and makes the samples of one; with
+    `receive` its receivers work on them too.
     """
-    plan, tracer = setup.plan, tracer_of(setup)
-    frames = _spread(plan.traced_frames, PILOT_FRAMES)
+    plan = setup.plan
+    frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
     trace: list[float] = []
     phases: dict[str, float] = {}
     for frame in frames:
-        begin = time.perf_counter()
         poses, found = setup.find(frame)
-        trace.append(time.perf_counter() - begin)
+        trace += _seconds_after(setup, frame)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
         last = setup.frame_of(frame, poses, found)
         for link, use in last.uses.items():
@@ -122,10 +124,8 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
             for what, value in standing(paths, setup.antennas, setup.waveform, fastest).items():
                 phases[what] = max(phases.get(what, 0.0), value)
     stages = stage_seconds(last, setup, receive)
-    advance, missed = _advance(setup)
-    share = len(plan.traced_frames) / plan.timetable.frames
-    tracing = float(np.median(trace)) * share + advance * (1 - share)
-    items = [_tracing_item(setup, share, missed, tracing)]
+    tracing = float(np.mean(trace))
+    items = [_tracing_item(setup, frames, tracing)]
     items += _scene_items(setup)
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link, stages.get(link))
@@ -141,49 +141,51 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         **decisions(plan),
         **extent(setup.city, setup.propagation.census(), setup.scenario.clutter),
         "coverage": asdict(setup.coverage),
-        "traced_share": share if tracer is not None else 0.0,
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
         "seconds_per_frame": seconds,
     }
 
 
-def _advance(setup: Setup) -> tuple[float, float]:
-    """Seconds of a frame between two traced instants, and chains missed in it, from a few
-    intervals; zeros where all are traced."""
-    tracer, traced = tracer_of(setup), setup.plan.traced_frames
-    gaps = [a for a, b in itertools.pairwise(traced) if b - a > 1]
-    if tracer is None or tracer.between is None or not gaps:
-        return 0.0, 0.0
-    seconds = []
-    for a in _spread(gaps, PILOT_INTERVALS):
-        setup.find(a + 1)  # traces both ends
+def _seconds_after(setup: Setup, frame: int) -> list[float]:
+    """Seconds that tracing the frames after a traced one takes; of the last, itself again."""
+    out = []
+    for number in range(frame + 1, frame + 1 + FOLLOWED):
         begin = time.perf_counter()
-        setup.find(a + 1)
-        seconds.append(time.perf_counter() - begin)
-    return float(np.median(seconds)), missed_per_frame(tracer.between)
+        setup.find(min(number, setup.timetable.frames - 1))
+        out.append(time.perf_counter() - begin)
+    return out
 
 
-def missed_per_frame(between: Any) -> float:
-    """Chains missed in a frame between traced instants, all pairs of bodies together, from the
-    births and deaths seen so far."""
-    total = [
-        float(sum(values))
-        for values in (between.num_chains.values(), *zip(*between.changes.values(), strict=True))
-    ]
-    count = len(between.changes)
-    return missed_chains(*(value / count for value in total)) if count else 0.0
+def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
+    """Estimate of the paths of a frame over `MATTERS_DB` that are missed, all links together, from
+    some frames."""
+    tracer = tracer_of(setup)
+    assert tracer is not None
+    only, both = [0, 0], 0
+    for frame in frames:
+        poses, found = setup.find(frame)
+        when, links = setup.timetable.epoch(frame), list(found)
+        halves = [tracer.by_half(k).trace(poses, when, links).paths for k in (0, 1)]
+        for link in links:
+            level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
+            here = [half[link] for half in halves]
+            here = [paths.select(paths.power > level * 10 ** (MATTERS_DB / 10)) for paths in here]
+            alone = [int((~present(here[k], here[1 - k])).sum()) for k in (0, 1)]
+            both += len(here[0]) - alone[0]
+            only = [a + b for a, b in zip(only, alone, strict=True)]
+    return missed_paths(only[0], only[1], both) / len(frames)
 
 
-def _tracing_item(setup: Setup, share: float, missed: float, seconds: float) -> Item:
-    if tracer_of(setup) is None:
+def _tracing_item(setup: Setup, frames: Sequence[int], seconds: float) -> Item:
+    tracer, spacing = tracer_of(setup), setup.plan.max_untraced
+    if tracer is None:
         return Item("propagation", "closed forms", "the city", seconds=seconds)
-    number = len(setup.plan.traced_frames)
-    if share == 1:
-        return Item("tracing", f"all {number} frames", seconds=seconds)
-    said = f"{number} of {setup.timetable.frames} frames traced, unfolded in between"
-    left = "chains that live between two traces"
-    return Item("tracing", said, left, missed, "chains/frame", seconds=seconds)
+    where = f"every {spacing:g} m of flight" if spacing else "each frame"
+    said = f"{setup.scenario.propagation.rays} rays for walls from {where}; images of each frame"
+    missed = missed_per_frame(setup, frames)
+    left = f"paths over {MATTERS_DB:g} dB over walls that no ray met"
+    return Item("tracing", said, left, missed, "paths/frame", seconds=seconds)
 
 
 def _scene_items(setup: Setup) -> list[Item]:
@@ -281,9 +283,9 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
     for number in chosen:
         poses, found = setup.find(number)
         frame, truth = setup.frame_of(number, poses, found), found
-        if tracer is not None and tracer.between is not None:
+        if tracer is not None:
             epoch = setup.timetable.epoch(number)
-            truth = tracer.every_frame().trace(poses, epoch, list(found)).paths
+            truth = tracer.by_sionna(CHECK_RAYS).trace(poses, epoch, list(found)).paths
         for link in found:
             into = out.setdefault(str(link), {})
             for key, value in _errors(setup, frame, link, found[link], truth[link]).items():

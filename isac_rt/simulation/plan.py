@@ -13,13 +13,18 @@ Phases. Two approximations turn the phase of a path that is kept; each may use h
 Left out. Paths the IF filter stops in every group, chirp and symbol are left out at no error.
 Ghosts and paths of the city so weak that all that are left out of one range cell together stay
 ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
-whatever the phases, on average. Between traced instants chains of walls are unfolded anew without
-error (`isac_rt.propagation.legs.between`) but for those that live for less than the way between two
-instants. Of n chains, of which b are born and d die from one instant to the next, with lives that
-end at random, b d / (6 n) are missed in a frame in between on average.
+whatever the phases, on average. Chains of walls that no ray met are missed
+(`isac_rt.propagation.legs.chains`); those that are met are placed without error. Of the paths over
+`MATTERS_DB` that the even or the odd knots alone find, m are found by both, a by the even and b by
+the odd ones only; as their rays know nothing of each other, a b / m are missed by both (Lincoln and
+Petersen's estimate [1]_, which is low where some paths are much harder to find than others).
 
 What is not modelled whatever the budget (`standing`): directions that turn within a frame, jerk,
 motion during the flight of light.
+
+References
+----------
+.. [1] G. A. F. Seber, "The Estimation of Animal Abundance", 2nd ed., 1982, section 3.1.
 """
 
 from __future__ import annotations
@@ -45,7 +50,9 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 FASTEST_UNTRACED_M = 4.0
-"""Flight between traced instants under the preset fastest."""
+"""Flight between knots under the preset fastest."""
+MATTERS_DB = -10.0
+"""Paths over this count as missed [dB over the noise of a cell]."""
 FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
@@ -103,7 +110,8 @@ class Plan:
 
     @property
     def max_untraced(self) -> float:
-        """Most flight between traced instants [m]."""
+        """Most flight of a terminal between two knots, places from which rays search for walls; 0:
+        they search from each frame's own [m]."""
         return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(
             self.preset, self.accuracy.max_untraced_m
         )
@@ -126,44 +134,6 @@ class Plan:
     def synthesis_error(self) -> float:
         """Relative RMS error that the samples may have."""
         return GRIDDED_ERROR if self.preset == "fastest" else self.accuracy.synthesis_error
-
-    @cached_property
-    def traced_frames(self) -> tuple[int, ...]:
-        """Frames at whose epochs the city is traced: the first, the last, and as few in between as
-        `max_untraced` allows.
-
-        Every frame is traced where frames are farther apart than that, or where nothing is to be
-        traced.
-        """
-        frames = self.timetable.frames
-        if self.propagation.model != "ray_traced" or self.max_untraced == 0:
-            return tuple(range(frames))
-        places = np.array(
-            [
-                [p.position for p in self.swarm.poses(self.timetable.epoch(f)).values()]
-                for f in range(frames)
-            ]
-        )
-        flown = np.concatenate(
-            [
-                np.zeros((1, places.shape[1])),
-                np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=2), axis=0),
-            ]
-        )
-        out = [0]
-        while out[-1] < frames - 1:
-            ahead = np.flatnonzero(
-                (flown[out[-1] + 1 :] - flown[out[-1]]).max(axis=1) <= self.max_untraced
-            )
-            out.append(out[-1] + 1 + (int(ahead[-1]) if ahead.size else 0))
-        return tuple(out)
-
-    @property
-    def instants(self) -> tuple[float, ...]:
-        """Traced instants [s]; () if every frame is traced."""
-        if len(self.traced_frames) == self.timetable.frames:
-            return ()
-        return tuple(self.timetable.epoch(frame) for frame in self.traced_frames)
 
     @cached_property
     def longest_delay(self) -> float:
@@ -350,9 +320,10 @@ def standing(
     }
 
 
-def missed_chains(found: float, born: float, died: float) -> float:
-    """Chains missed in a frame between two traced instants, on average (module docstring)."""
-    return born * died / (6 * found) if found else 0.0
+def missed_paths(only_even: float, only_odd: float, both: float) -> float:
+    """Paths that two searches which know nothing of each other both missed, from how many either
+    found alone and both found (module docstring)."""
+    return only_even * only_odd / max(both, 1.0)
 
 
 def decisions(plan: Plan) -> dict[str, Any]:
@@ -362,7 +333,6 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "preset": plan.preset,
         "max_phase_error_rad": None if np.isinf(plan.phase_share) else 2 * plan.phase_share,
         "weakest_path_db": None if everything else round(float(-10 * np.log10(plan.weakest)), 6),
-        "traced_frames": len(plan.traced_frames) if plan.propagation.model == "ray_traced" else 0,
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0).name,

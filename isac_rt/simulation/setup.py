@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -346,7 +346,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         free,
         city,
         waveform,
-        plan.instants,
+        plan.max_untraced,
     )
     if store is None or scenario.propagation.model == "free_space":
         propagation = make()
@@ -467,15 +467,13 @@ def city_of(scenario: Scenario, radius: float = np.inf) -> CityMesh:
     return city_about(centre, scenario.city, scenario.folder, carrier, radius)
 
 
-def propagation_in(
-    city: CityMesh, scenario: Scenario, instants: Sequence[float] = ()
-) -> Propagation:
+def propagation_in(city: CityMesh, scenario: Scenario, knot_spacing: float = 0.0) -> Propagation:
     """The scenario's propagation model in a city, which need not be the scenario's own."""
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     antennas = antennas_of(scenario.array, waveform)
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     return make_propagation(
-        scenario.propagation, scenario.clutter, swarm, free, city, waveform, instants
+        scenario.propagation, scenario.clutter, swarm, free, city, waveform, knot_spacing
     )
 
 

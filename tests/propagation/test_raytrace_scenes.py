@@ -406,9 +406,8 @@ def test_two_rays_over_a_plane(material, h):
     length = np.hypot(np.hypot(23.6, 7.4), 1.7 * h)
     assert C * paths.delay[k] == pytest.approx(length, abs=LENGTH)
     expected = fresnel(material, 1.7 * h / length) * LAMBDA / (4 * np.pi * length)
-    assert (
-        abs(paths.gain[k] - expected) < AMPLITUDE * LAMBDA / (4 * np.pi * length) * 5
-    )  # the pane's phase turns with float32 angles
+    # float64, and constants of nature to as many digits
+    assert abs(paths.gain[k] / expected - 1) < 1e-9
     assert paths.bounces[k] == 1
 
 
@@ -508,7 +507,7 @@ def test_a_corner_returns_one_image_to_its_radar(walls):
 
 def test_a_wall_far_from_the_origin_reflects_once():
     """Ten kilometres off, Sionna's float32 finds one reflection several times over, each at full
-    amplitude. Seen failing with none dropped."""
+    amplitude; images find one, and of Sionna's one is taken. Seen failing with none dropped."""
     far = np.array([7100.3, -6900.7, 310.1])
     city = rectangle(far + np.array([31.3, -60, -60]), (5.0, 120, 0), (0, 0, 120), slab())
     model, _ = tracer(city, 1)
@@ -517,9 +516,10 @@ def test_a_wall_far_from_the_origin_reflects_once():
         far + np.array([1.7, 17.4, 8.1]),
         far + np.array([-3.3, -2.2, 7.9]),
     )
-    paths = model.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
-    assert paths.counts()["specular"] == 1
-    assert model._specular_legs(model._local(poses)).duplicates > 0
+    for one in (model, model.by_sionna(20_000)):
+        paths = one.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
+        assert paths.counts()["specular"] == 1
+    assert model._solved_legs(model._local(poses), 20_000).duplicates > 0
 
 
 def test_leakage():

@@ -42,16 +42,23 @@ class Flight:
     trajectory : of the terminal
     duration : of the run [s]
     origin : (3,) of the local coordinates [m]
+    spacing : most flight from knot to knot [m]
     """
 
-    def __init__(self, trajectory: Trajectory, duration: float, origin: np.ndarray) -> None:
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        duration: float,
+        origin: np.ndarray,
+        spacing: float = KNOT_SPACING,
+    ) -> None:
         self._trajectory, self._origin = trajectory, origin
         self._times = np.linspace(0.0, duration, 2001)
         track = trajectory.positions(self._times)
         self._way = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))]
         )
-        self.spacing = max(self._way[-1] / max(np.ceil(self._way[-1] / KNOT_SPACING), 1.0), 1e-9)
+        self.spacing = max(self._way[-1] / max(np.ceil(self._way[-1] / spacing), 1.0), 1e-9)
         count = round(self._way[-1] / self.spacing) + 1
         times = np.interp(self.spacing * np.arange(count), self._way, self._times)
         self.knots = trajectory.positions(times) - origin

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation.legs.between import LegSet, leg_set
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.diffraction import edge_factor
 from isac_rt.propagation.legs.edges import ShadowEdges
 from isac_rt.propagation.legs.geometry import Legs, straight
+from isac_rt.propagation.legs.legset import LegSet, leg_set
 from isac_rt.world.swarm import Pose
 
 Direct = tuple[np.ndarray, Legs]

@@ -56,7 +56,6 @@ def rows(quick: bool) -> list[dict[str, object]]:
                     "oracle": preset == "everything",
                     "job": JOB,
                     "error_of": "samples of a frame",
-                    "traced_frames": len(prepare(s).plan.traced_frames),
                 }
             )
     return out
