@@ -154,7 +154,7 @@ def bench(
         return _fit(fit)
     from isac_rt.results.files import check_folder
     from isac_rt.storage import write_whole
-    from isac_rt.studies.bench import report
+    from isac_rt.studies.bench import command, report
 
     chosen = list(dict.fromkeys(stages or report.stages()))
     check_names(chosen, report.stages(), "stage")
@@ -176,6 +176,9 @@ def bench(
         for row in found["rows"]
     ]
     say_table(("method", "size", "cost [floors]", "error"), rows)
+    if found["commands"]:
+        lines = [line.strip("| ").split(" | ") for line in command.markdown(found["commands"])]
+        say_table(lines[0], lines[2:])
     say(*(f"{name} left out: {reason}" for name, reason in found["left_out"].items()))
     say(f"in {out}: {', '.join(file.name for file in files)}")
 

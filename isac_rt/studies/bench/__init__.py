@@ -3,7 +3,8 @@
 Every stage has a module with ``rows(quick: bool) -> list[dict[str, object]]``: `synthesis`,
 `reception`, `tracing`, `clutter`, `endtoend` and `hermes`. One that needs what may not be installed
 also has ``missing() -> str | None``, which says why it is left out; one that leaves out some of its
-methods has ``left_out() -> dict[str, str]``, reasons by method. A row is one method at one
+methods has ``left_out() -> dict[str, str]``, reasons by method; `endtoend` also has
+``commands(quick)``, the parts of whole commands (`command.tables`). A row is one method at one
 size, with these keys:
 
 kind : str

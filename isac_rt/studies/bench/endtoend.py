@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from isac_rt.signal.if_signal import if_signal
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.simulation.simulate import summarise
 from isac_rt.studies import scene_file
+from isac_rt.studies.bench import command
 from isac_rt.studies.bench.measure import floor_seconds
 
 PRESETS = ("fastest", "budget", "everything")
@@ -59,6 +61,11 @@ def rows(quick: bool) -> list[dict[str, object]]:
                 }
             )
     return out
+
+
+def commands(quick: bool) -> list[dict[str, Any]]:
+    """Whole commands, part by part."""
+    return command.tables(quick)
 
 
 def scenario(preset: str, frames: int) -> Scenario:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.results.provenance import versions
-from isac_rt.studies.bench import STAGES
+from isac_rt.studies.bench import STAGES, command
 
 Row = Mapping[str, Any]
 
@@ -54,12 +54,14 @@ def measure(
     left out."""
     rows: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
+    commands: list[dict[str, Any]] = []
     for done, name in enumerate(names):
         module = importlib.import_module(f"isac_rt.studies.bench.{STAGES[name]}")
         reason = module.missing() if hasattr(module, "missing") else None
         if reason is None:
             rows += module.rows(quick)
             left_out |= module.left_out() if hasattr(module, "left_out") else {}
+            commands += module.commands(quick) if hasattr(module, "commands") else []
         else:
             left_out[name] = reason
         if progress:
@@ -70,6 +72,7 @@ def measure(
         "rows": rows,
         "growth": growth(rows),
         "left_out": left_out,
+        "commands": commands,
     }
 
 
@@ -115,6 +118,9 @@ def markdown(found: Mapping[str, Any]) -> str:
             if of_kind == kind:
                 text += [_line(method, unit, row) for row in rows]
         text.append("")
+    if found.get("commands"):
+        title = "## Whole commands: processor seconds, in brackets wall seconds"
+        text += [title, "", *command.markdown(found["commands"]), ""]
     text += [
         "## Growth of cost with size",
         "",

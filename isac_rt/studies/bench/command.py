@@ -1,0 +1,151 @@
+"""The whole job of `isac-rt run`, part by part, each scene in a process of its own.
+
+A part's processor time is that of all threads of the process, its wall time that of its beginning
+to its end; both begin with the interpreter. The first frame ends when its receivers are done. The
+frames' time by stage is that of `summary.json`. Machine code and what set-ups keep are those of
+earlier calls: every scene is run twice, but with `quick` once, and the last call counts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+PARTS = ("import", "set-up", "first frame", "other frames", "saving", "figures", "report")
+LONGEST_S = 3000
+SAN_FRANCISCO = (
+    "city={source: builtin, name: san_francisco}",
+    "swarm.AT={role: active, position_m: [-41, 23, 44.3], velocity_mps: [8.3, 3.1, 0.7]}",
+    "swarm.PT1={role: passive, position_m: [27, -38, 48.1], velocity_mps: [-2.9, 7.7, 0.9]}",
+    "swarm.U1={role: target, position_m: [-22, 27, 46.7], velocity_mps: [3.1, -2.3, 0.4]}",
+)
+"""The canyon's swarm and chirps over the largest of the built-in cities."""
+SCENES: dict[str, tuple[str, int, int, tuple[str, ...]]] = {
+    "canyon": ("street_canyon.yaml", 8, 8, ()),
+    "paper's swarm": ("paper_swarm_consistent.yaml", 100, 20, ()),
+    "Munich": ("munich_swarm.yaml", 78, 6, ()),
+    "San Francisco": ("street_canyon.yaml", 8, 4, SAN_FRANCISCO),
+}
+"""By name: the file, its frames, those of a quick measurement, changes."""
+
+
+def tables(quick: bool) -> list[dict[str, Any]]:
+    """One dict for each scene: `scene`, `frames`, `peak_memory_mib`, `paths_per_frame`, `processor`
+    and `wall` [s] by part and ``total``, and `stages`, the processor seconds of the frames."""
+    return [measured(name, quick) for name in SCENES]
+
+
+def measured(name: str, quick: bool) -> dict[str, Any]:
+    """One scene's parts.
+
+    Raises
+    ------
+    RuntimeError  If the run ends with an error: the last line of what it said.
+    """
+    file, frames, few, changes = SCENES[name]
+    number = few if quick else frames
+    for _ in range(1 if quick else 2):
+        job = [file, [*changes, f"frames={number}"], time.time()]
+        done = subprocess.run(
+            [sys.executable, "-m", "isac_rt.studies.bench.command", json.dumps(job)],
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
+        if done.returncode:
+            said = done.stderr.strip().splitlines() or ["nothing"]
+            raise RuntimeError(f"{file} ended with {done.returncode} and said: {said[-1]}")
+    return {"scene": name, "frames": number, **json.loads(done.stdout.splitlines()[-1])}
+
+
+class _Parts:
+    """Processor and wall seconds between marks, from the interpreter's beginning on."""
+
+    def __init__(self, begun: float) -> None:
+        self.processor: dict[str, float] = {}
+        self.wall: dict[str, float] = {}
+        self._begun = self._last_wall = begun
+        self._last = 0.0
+
+    def mark(self, part: str) -> None:
+        """A part ends here."""
+        processor, wall = time.process_time(), time.time()
+        self.processor[part] = processor - self._last
+        self.wall[part] = wall - self._last_wall
+        self._last, self._last_wall = processor, wall
+        self.processor["total"], self.wall["total"] = processor, wall - self._begun
+
+
+def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
+    """Do what the command does and say where its time went."""
+    parts = _Parts(begun)
+    import isac_rt as irt
+    from isac_rt.studies import scene_file
+
+    scenario = irt.load(scene_file(file), changes)
+    from isac_rt.simulation import simulate
+
+    parts.mark("import")
+    setup = irt.prepare(scenario)
+    parts.mark("set-up")
+
+    def progress(done: int, _: int) -> None:
+        if "first frame" not in parts.wall:
+            parts.mark("first frame")
+
+    results = simulate.run(scenario, setup=setup, progress=progress)
+    parts.mark("other frames")
+    with _folder() as folder:
+        irt.save(results, folder)
+        parts.mark("saving")
+        from isac_rt.views.figures import make_figures
+        from isac_rt.views.report import write_report
+
+        pictures = make_figures(results, folder, setup.city)
+        parts.mark("figures")
+        write_report(results, folder, pictures)
+    parts.mark("report")
+    stages = ("trace", "synthesis", "receive", "track", "other")
+    return {
+        "processor": parts.processor,
+        "wall": parts.wall,
+        "stages": {stage: results.summary["timing_s"][stage] for stage in stages},
+        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "paths_per_frame": sum(results.summary["paths"].values()) / scenario.frames,
+    }
+
+
+@contextmanager
+def _folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def markdown(found: list[dict[str, Any]]) -> list[str]:
+    """The table's lines: processor seconds with wall seconds in brackets."""
+    names = [f"{one['scene']}, {one['frames']} frames" for one in found]
+    lines = [f"| part | {' | '.join(names)} |", "|---" * (len(found) + 1) + "|"]
+    for part in (*PARTS, "total"):
+        cells = [f"{one['processor'][part]:.2f} ({one['wall'][part]:.2f})" for one in found]
+        lines.append(f"| {part} [s] | {' | '.join(cells)} |")
+    for stage in found[0]["stages"]:
+        cells = [f"{one['stages'][stage] / one['frames']:.3f}" for one in found]
+        lines.append(f"| a frame's {stage} [s] | {' | '.join(cells)} |")
+    for key, title in (("peak_memory_mib", "peak memory [MiB]"), ("paths_per_frame", "paths")):
+        cells = [f"{one[key]:,.0f}" for one in found]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return lines
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(*json.loads(sys.argv[1]))))
