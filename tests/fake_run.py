@@ -8,12 +8,12 @@ from dataclasses import asdict
 
 import numpy as np
 
-from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections, Maps, Reception
-from isac_rt.results.metrics import SensingScore, SymbolCount, Truth, resolutions
+from isac_rt.results.losses import Loss
+from isac_rt.results.metrics import Gospa, SymbolCount
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
@@ -178,9 +178,18 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     u_x=np.array([0.1]),
                     u_z=np.array([0.02]),
                     confirmed=np.array([True]),
-                    uav=np.array([2]),
+                    kind=np.array([1]),
+                    target=np.array([2]),
+                    uav=np.array([2 if see[2] else -1]),
                 ),
                 state=int(f > 0),
+                hit=see & (f != 5),
+                loss=np.where(see, Loss.INACCURATE if f == 5 else Loss.FOUND, -1),
+                target_snr=np.where(see, 317.0, np.nan),
+                target_clutter=np.where(see, 0.37, np.nan),
+                gospa=Gospa(
+                    np.sqrt(0.09 + 12.5), 0.09, 12.5 * (see.sum() - 1), 12.5 * (not see[2])
+                ),
                 detection_kind=np.array([1, 3, -1, 4][:detections])
                 if detections
                 else np.zeros(0, int),
@@ -193,12 +202,14 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 detection_face=np.array([-1, 70123, -1, 5][:detections])
                 if detections
                 else np.zeros(0, int),
+                detection_skirt=np.zeros(detections, bool),
                 symbols=SymbolCount(
                     360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1
                 )
                 if sent
                 else SymbolCount(),
                 num_false=1,
+                num_clutter=1,
                 reference_snr=7.7,
             )
         out.append(
@@ -231,33 +242,12 @@ def fake_coverage(scenario: Scenario) -> Coverage:
 
 def fake_run(scenario: Scenario | None = None, *, detections: int = 3) -> Results:
     scenario = scenario or fake_scenario()
-    w = waveform_of(scenario.radio, scenario.array)
     recorder = fake_recorder(scenario)
-    scores = {
-        ("AT", name): SensingScore(resolutions(w, antennas_of(scenario.array, w), passes))
-        for name, passes in (("AT", 2), ("PT1", 1))
-    }
     for record in fake_records(scenario, detections=detections):
         recorder.add(record)
-        for name, o in record.observers.items():
-            t = o.truth
-            truth = (
-                Truth(
-                    t.range[2],
-                    t.velocity[2],
-                    *o.reception.detections.direction[0],
-                    t.azimuth[2],
-                    t.elevation[2],
-                )
-                if detections
-                else None
-            )
-            scores["AT", name].add(
-                [truth] if truth else [], o.reception.detections, kinds=o.detection_kind
-            )
     budget = [{"link": "AT->PT1", "range_m": 34.4, "received_dbm": -71.2, "snr_db": 18.6}]
     plan = {"model": "free_space", "if_model": "exact"}
-    summary = recorder.summary(Figures(scores, TIMING, plan))
+    summary = recorder.summary(Figures(TIMING, plan))
     attributes = {"fidelity": summary["fidelity"], "materials": {}, "link_budget": budget}
     attributes["coverage"] = asdict(fake_coverage(scenario))
     dataset = recorder.dataset().assign_attrs(

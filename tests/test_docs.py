@@ -9,6 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from access.test_access_run import run as access_run
+from simulation.test_fall_back import scenario as dense
+
+from isac_rt.simulation import simulate
 
 ROOT = Path(__file__).parent.parent
 
@@ -88,3 +92,63 @@ def test_the_page_shows_the_rooms_in_the_order_that_the_tests_hold():
     assert rows == [room for room in ORDER if room not in ("runtime", "randomness")]
     drawn = re.findall(r'class="name"[^>]*>(\w+)<', (ROOT / "docs" / "rooms.svg").read_text())
     assert sorted(drawn) == sorted(rows)
+
+
+def explained() -> dict[str, set[str]]:
+    """Keys that `docs/outputs.md` explains in a sentence, by what they are of."""
+    page = (ROOT / "docs" / "outputs.md").read_text(encoding="utf-8").partition("## Keys")[2]
+    parts = re.split(r"^### Of (.+)$", "### Of all\n" + page, flags=re.MULTILINE)[1:]
+    rows = re.compile(r"^\| `([\w.]+)` \| .+\. \|$", re.MULTILINE)
+    pairs = zip(parts[::2], parts[1::2], strict=True)
+    return {name.strip("`"): set(rows.findall(text)) for name, text in pairs}
+
+
+NAMES = {"targets": "UAV", "links": "LINK"}
+"""Keys whose keys are names, and the word that stands for them."""
+ELSEWHERE = {
+    "rmse_tracked",
+    "counts",
+    "targets.UAV.median",
+    "targets.UAV.p90",
+    "targets.UAV.losses",
+    "cost_model",
+    "links.LINK.kept_per_frame",
+    "blocks",
+    "missed_blocks",
+    "false_blocks",
+    "feedback",
+}
+"""Keys whose own keys are names, or explained with another key."""
+AT_TIMES = {"checked"}
+"""Keys that only some runs write."""
+
+
+def keys_of(tree: dict, at: str = ""):
+    for key, value in tree.items():
+        name = f"{at}{key}"
+        yield name
+        if isinstance(value, dict) and name not in ELSEWHERE:
+            inside = value.values() if name in NAMES else [value]
+            way = f"{name}.{NAMES[name]}." if name in NAMES else f"{name}."
+            for one in inside:
+                yield from keys_of(one, way)
+
+
+def test_every_key_of_a_summary_has_a_sentence():
+    """Two small runs, one with the stages before the data and feedback, one whose receivers judge
+    how sparse the scene is; no sentence is left without its key. Planted bugs: a key more in a
+    terminal's block; a sentence taken out."""
+    access = {"establish": True, "synchronisation": "two_round", "feedback": True}
+    with_access = access_run(frames=3, access=access).summary
+    sparse = simulate.run(dense(frames=3), snapshots=0).summary
+    written: dict[str, set[str]] = {"all": set(with_access)}
+    blocks = [*with_access["terminals"].values(), *with_access["links"].values()]
+    written["every terminal and link"] = {key for block in blocks for key in keys_of(block)}
+    for part in ("timing_s", "fidelity", "access"):
+        written[part] = set(keys_of(with_access[part]))
+    written["sparsity"] = {f"LINK.{key}" for row in sparse["sparsity"].values() for key in row}
+    found = explained()
+    assert written.keys() == found.keys()
+    for part, keys in written.items():
+        assert keys <= found[part], f"{part}: {sorted(keys - found[part])}"
+        assert found[part] - keys <= AT_TIMES, f"{part}: {sorted(found[part] - keys)}"

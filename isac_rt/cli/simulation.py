@@ -139,13 +139,14 @@ def _say_budget(rows: list[Any]) -> None:
 
 
 def _say_summary(results: Results) -> None:
-    from isac_rt.views.report import number, per_terminal, rmse_table, side_by_side
+    from isac_rt.views.report import gospa_table, number, per_terminal, rmse_table, side_by_side
 
     left_out = ("Role", "Matched", "Matched, tracked")
     compared = side_by_side(results.summary)
     for part in (
         per_terminal(results.summary),
         rmse_table(results.summary),
+        gospa_table(results.summary),
         *([compared] if compared.rows else []),
     ):
         kept = [i for i, title in enumerate(part.columns) if title not in left_out]
@@ -153,6 +154,16 @@ def _say_summary(results: Results) -> None:
     found = ", ".join(
         f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n
     )
+    for name, block in results.summary["links"].items():
+        counts = {k.replace("_", " "): n for k, n in block["losses"].items() if n}
+        if counts:
+            became = ", ".join(f"{n} {cause}" for cause, n in counts.items())
+            say(f"{name.replace('->', ' to ')}: of {sum(counts.values())} UAVs in view {became}")
+        by = {k.replace("_", " "): n for k, n in block["false_tracks"].items() if n}
+        if by:
+            total = number(block["false_tracks_per_frame"])
+            causes = ", ".join(f"{number(n)} {cause}" for cause, n in by.items())
+            say(f"{name.replace('->', ' to ')}: {total} false tracks a frame, by {causes}")
     seconds = results.summary["timing_s"]
     spent = f"{number(seconds['total'])} s of processor time, {number(seconds['wall']['total'])} s"
     say(f"paths: {found}; {spent} by the clock")

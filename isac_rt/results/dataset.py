@@ -16,6 +16,7 @@ import xarray as xr
 
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathSet
+from isac_rt.results.losses import LOSSES
 from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord
 
 Row = dict[str, Any]
@@ -31,12 +32,13 @@ MEASURES = {
 """What is estimated of a UAV: unit inside, key in the summary."""
 
 
-def errors_of(dataset: xr.Dataset, group: str, name: str) -> np.ndarray:
-    """Value of "detected" or "tracked" less the truth (frame, observer, uav), NaN where none.
+def errors_of(values: xr.Dataset | Row, group: str, name: str) -> np.ndarray:
+    """Value of "detected" or "tracked" less the truth, NaN where none: (frame, observer, uav) of a
+    dataset, (uav,) of an observer's row.
 
     Angles are wrapped to (-pi, pi] [rad].
     """
-    e = (dataset[f"{group}_{name}"] - dataset[f"truth_{name}"]).values
+    e = np.asarray(values[f"{group}_{name}"] - values[f"truth_{name}"])
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 
 
@@ -89,6 +91,47 @@ OBSERVERS: dict[str, Column] = {
     },
     "in_view": _number("UAV inside the field of view", "in_view", bool, dims=("uav",)),
     "shadowed": _number("UAV hidden by the city", "shadowed", bool, dims=("uav",)),
+    "hit": _number(
+        "UAV found by its own path within one resolution on all four axes",
+        "hit",
+        bool,
+        dims=("uav",),
+    ),
+    "loss": _number(
+        "what became of a UAV in view and unshadowed, -1: not one",
+        "loss",
+        np.int8,
+        dims=("uav",),
+        missing=-1,
+    ),
+    "target_snr": _number(
+        "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
+        "target_snr",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    "target_clutter": _number(
+        "power of the diffuse paths in the UAV's cell over the noise of one channel's map",
+        "target_clutter",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    **{
+        f"gospa_{part}": Column(
+            float,
+            "m2",
+            f"{words} in the square of the GOSPA distance of the confirmed tracks",
+            f"gospa.{part}",
+            missing=np.nan,
+        )
+        for part, words in (
+            ("localisation", "errors of position"),
+            ("missed", "UAVs without a track"),
+            ("false", "tracks without a UAV"),
+        )
+    },
     "processed": _number("the observer processed the frame", lambda o: True, bool),
     "state": _number("state of the terminal, -1: not processed", "state", np.int8, missing=-1),
     "decoded": _number("data symbols were decided", "reception.decoded", bool),
@@ -118,6 +161,9 @@ OBSERVERS: dict[str, Column] = {
         missing=np.nan,
     ),
     "num_false": _number("detections that no path explains", "num_false", np.int32),
+    "num_clutter": _number(
+        "detections that something other than a UAV's own path explains", "num_clutter", np.int32
+    ),
     "slips": _number("symbols decided outside their alphabet", "slips", np.int32),
     "path_count": _number("number of paths", _path_counts, np.int32, dims=("kind",)),
     "path_power": _number("sum of |gain|^2 of the paths", _path_powers, float, dims=("kind",)),
@@ -198,6 +244,9 @@ DETECTIONS: dict[str, Column] = {
         "detection_face",
         np.int32,
     ),
+    "skirt": _number(
+        "the path that explains it lies more than a cell away", "detection_skirt", bool
+    ),
 }
 TRACKS: dict[str, Column] = {
     "id": _number("number of the track, unique at its observer", "tracks.id", np.int32),
@@ -208,7 +257,15 @@ TRACKS: dict[str, Column] = {
     "u_x": _number("direction cosine along the body's X axis", "tracks.u_x", float),
     "u_z": _number("direction cosine along the body's Z axis", "tracks.u_z", float),
     "confirmed": _number("the track is confirmed", "tracks.confirmed", bool),
-    "uav": _number("index of the UAV that it follows, -1: none", "tracks.uav", np.int16),
+    "kind": _number(
+        "kind of the path that explains its latest detection, -1: none", "tracks.kind", np.int8
+    ),
+    "target": _number(
+        "index of the UAV on the path that explains its latest detection, -1: none",
+        "tracks.target",
+        np.int16,
+    ),
+    "uav": _number("index of the UAV in view that it follows, -1: none", "tracks.uav", np.int16),
 }
 
 
@@ -357,10 +414,11 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
         for i, j, row in present:
             values[i, j] = row[name]
         put(name, ["frame", "observer", *column.dims], values, column.units, column.meaning)
-    out["state"].attrs |= {
-        "flag_values": np.arange(len(states), dtype=np.int8),
-        "flag_meanings": " ".join(states),
-    }
+    for name, flags in (("state", states), ("loss", LOSSES)):
+        out[name].attrs |= {
+            "flag_values": np.arange(len(flags), dtype=np.int8),
+            "flag_meanings": " ".join(flags),
+        }
     for prefix, dim, columns in RAGGED:
         some = [(i, j, row[prefix]) for i, j, row in present if prefix in row]
         count = [len(row[next(iter(columns))]) for _, _, row in some]

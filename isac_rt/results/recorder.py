@@ -12,9 +12,10 @@ import xarray as xr
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.results.dataset import Row, dataset_of, row_of
-from isac_rt.results.metrics import SensingScore, SymbolCount, decibels, pool, summary_block
+from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions
 from isac_rt.results.records import KINDS, FrameRecord
+from isac_rt.results.sensing import Sensing, summary_block
 from isac_rt.scenario.tree import Scenario
 
 STAGES = ("setup", "trace", "synthesis", "receive", "track")
@@ -62,7 +63,6 @@ class Figures:
 
     Attributes
     ----------
-    scores : every link's sensing
     timing : processor seconds by stage, what no stage counts, and their total; under ``wall`` the
         wall seconds of stages and total (`TIMINGS`)
     plan : what was modelled: the summary's `fidelity`, but for what was kept of the paths
@@ -72,7 +72,6 @@ class Figures:
         empty without sets to compare
     """
 
-    scores: Mapping[Link, SensingScore]
     timing: Mapping[str, Any]
     plan: Mapping[str, Any]
     access: Mapping[str, Any] | None = None
@@ -103,6 +102,11 @@ class Recorder:
         dataset_of(rows, self.timetable, self.states)
         kept_of_paths([row["uses"] for row in rows])
         _ = [SymbolCount(*o["symbols"]) for row in rows for o in row["observers"].values()]
+        _ = [
+            Sensing.of([o], len(self.timetable.first_roles))
+            for row in rows
+            for o in row["observers"].values()
+        ]
         self.rows += rows
 
     def dataset(self) -> xr.Dataset:
@@ -119,7 +123,7 @@ class Recorder:
         )
         return {
             "frames": len(rows),
-            **self.blocks(figures.scores),
+            **self.blocks(),
             "compared": dict(figures.compared),
             "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
             "timing_s": {key: figures.timing.get(key) for key in TIMINGS}
@@ -139,9 +143,8 @@ class Recorder:
             "versions": versions(),
         }
 
-    def blocks(self, scores: Mapping[Link, SensingScore]) -> dict[str, Any]:
-        """The keys `terminals` and `links` of the summary; `scores` are of every link's
-        sensing."""
+    def blocks(self) -> dict[str, Any]:
+        """The keys `terminals` and `links` of the summary."""
         rows, timetable = self.rows, self.timetable
         duration = (
             (rows[-1]["frame"] - rows[0]["frame"]) * timetable.interval
@@ -150,21 +153,27 @@ class Recorder:
             else 0.0
         )
         symbols = {link: self._symbols(link) for link in timetable.all_links}
+        seen = {link: self._sensing(link) for link in timetable.all_links}
+
+        def block(
+            role: str | list[str], links: list[Link], symbols: SymbolCount | None
+        ) -> dict[str, Any]:
+            sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
+            others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
+            return summary_block(role, sensing, symbols, duration) | {"targets": others}
+
         terminals = {}
         for name in dict.fromkeys(link.rx for link in timetable.all_links):
             mine = [link for link in timetable.all_links if link.rx == name]
             received = [c for link in mine if (c := symbols[link]) is not None]
             roles = timetable.roles_taken(name)
-            terminals[name] = summary_block(
+            terminals[name] = block(
                 roles[0] if len(roles) == 1 else roles,
-                pool([scores[link] for link in mine]),
+                mine,
                 sum(received, SymbolCount()) if received else None,
-                duration,
             )
         links = {
-            str(link): summary_block(
-                "active" if link.own else "passive", scores[link], counted, duration
-            )
+            str(link): block("active" if link.own else "passive", [link], counted)
             for link, counted in symbols.items()
         }
         return {"terminals": terminals, "links": links}
@@ -173,6 +182,10 @@ class Recorder:
         """The rows of a link's receiver."""
         label = self.timetable.labels[link]
         return [row["observers"][label] for row in self.rows if label in row["observers"]]
+
+    def _sensing(self, link: Link) -> Sensing:
+        """What a link's receiver saw."""
+        return Sensing.of(self._of(link), len(self.timetable.first_roles))
 
     def _sparsity(self, link: Link) -> dict[str, int] | None:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent

@@ -10,7 +10,7 @@ import numpy as np
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.types import Reception
-from isac_rt.results.metrics import SymbolCount
+from isac_rt.results.metrics import Gospa, SymbolCount
 from isac_rt.world.swarm import Pose
 
 KINDS = tuple(kind.name.lower() for kind in PathKind)
@@ -36,9 +36,15 @@ class UavValues:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackTable:
-    """The tracks that an observer keeps after a frame, one row each: id, range [m], velocity [m/s],
-    direction cosines, whether confirmed, and the index of the UAV that the track follows in truth
-    (-1: none)."""
+    """The tracks that an observer keeps after a frame, one row each.
+
+    Attributes
+    ----------
+    id, range, velocity, u_x, u_z, confirmed : number, estimates [m, m/s], whether confirmed
+    kind, target : of the path that explains the latest detection that updated it: `PathKind` and
+        index of the UAV involved, -1: none
+    uav : index of the UAV in view that it follows (`isac_rt.results.scoring`), -1: none
+    """
 
     id: np.ndarray
     range: np.ndarray
@@ -46,6 +52,8 @@ class TrackTable:
     u_x: np.ndarray
     u_z: np.ndarray
     confirmed: np.ndarray
+    kind: np.ndarray
+    target: np.ndarray
     uav: np.ndarray
 
 
@@ -62,12 +70,21 @@ class ObserverRecord:
     in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
-    detection_kind, detection_target, detection_order, detection_face : (Q,) what explains each
-        detection, as `metrics.Explanation` says
+    hit : (U,) bool; whether a UAV in view and unshadowed was found by its own path, within one
+        resolution on all four axes
+    loss : (U,) `isac_rt.results.losses.Loss` of every UAV in view and unshadowed, -1 of the others
+    target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
+        frame (linear), NaN where it is not in view or shadowed
+    target_clutter : (U,) power of the clutter in its cell over the noise (linear), likewise
+    gospa : of the confirmed tracks against the UAVs in view and unshadowed
+    detection_kind, detection_target, detection_order, detection_face, detection_skirt : (Q,) what
+        explains each detection, as `isac_rt.results.labels.Explanation` says, targets as indices
+        of UAVs
     symbols : what was sent to it and became of it
     fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
         (`isac_rt.access.fall_back`)
-    num_false : detections that no path explains
+    num_false, num_clutter : detections that no path explains, and those that something other than a
+        UAV's own path explains
     slips : symbols decided outside their alphabet
     reference_snr : per sample and antenna before processing (linear); NaN where there is no
         reference path
@@ -83,13 +100,20 @@ class ObserverRecord:
     shadowed: np.ndarray
     tracks: TrackTable
     state: int
+    hit: np.ndarray
+    loss: np.ndarray
+    target_snr: np.ndarray
+    target_clutter: np.ndarray
+    gospa: Gospa
     detection_kind: np.ndarray
     detection_target: np.ndarray
     detection_order: np.ndarray
     detection_face: np.ndarray
+    detection_skirt: np.ndarray
     symbols: SymbolCount = field(default_factory=SymbolCount)
     fell_back: bool = False
     num_false: int = 0
+    num_clutter: int = 0
     slips: int = 0
     reference_snr: float = np.nan
 

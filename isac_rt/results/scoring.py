@@ -1,8 +1,14 @@
-"""A terminal's frame held against the truth."""
+"""A terminal's frame held against the truth.
+
+Every detection and every track is judged by the path that caused it, never by what happens to lie
+near: a UAV is found by a detection that its own path explains, and followed by a track whose latest
+detection its own path explains.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,21 +18,29 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.receive import Reception
+from isac_rt.receive.types import Detections
+from isac_rt.results.labels import Places, explain, owners
+from isac_rt.results.losses import Chance, Sensitivity, cause_of
 from isac_rt.results.metrics import (
-    SensingScore,
+    GOSPA_CUTOFF_M,
     SymbolCount,
     Truth,
-    associate,
     count_symbols,
-    direct_targets,
-    explain,
+    gospa,
     resolutions,
     truth_of,
     within_view,
 )
 from isac_rt.results.records import ObserverRecord, TrackTable, UavValues
+from isac_rt.scenario.receivers import Receivers
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.swarm import Swarm
+
+GATE_RESOLUTIONS = 3.0
+"""An estimate farther from a UAV than so many resolutions on some axis does not stand for it, even
+if the UAV's own path caused it: an alias, a range misread, a track that has drifted off."""
+MISREAD = 0.5
+"""Share of wrong delay symbols from which on a data frame shows nothing in its place."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +54,33 @@ class Heard:
 
 
 class Scorer:
-    """Holds the frames of one link's receiver against the truth, and keeps the score."""
+    """Holds the frames of one link's receiver against the truth. From frame to frame it remembers
+    what explained the latest detection of each track, and which track follows each UAV."""
 
-    def __init__(self, link: Link, antennas: Antennas, swarm: Swarm, timetable: Timetable) -> None:
+    def __init__(
+        self,
+        link: Link,
+        antennas: Antennas,
+        swarm: Swarm,
+        timetable: Timetable,
+        receivers: Receivers,
+    ) -> None:
         self.link, self._antennas, self._swarm, self._timetable = link, antennas, swarm, timetable
         self._passes = 2 if link[0] == link[1] else 1
-        self.score = SensingScore(resolutions(timetable.waveform, antennas, self._passes))
+        self._resolution = resolutions(timetable.waveform, antennas, self._passes)
+        self._receivers = receivers
+        self._labels: dict[int, list[int]] = {}
+        self._followed: dict[int, int] = {}
+
+    def memory(self) -> dict[str, Any]:
+        """What is remembered of the tracks as plain numbers, for `restore`."""
+        labels = [[track, *label] for track, label in self._labels.items()]
+        return {"labels": labels, "followed": [list(pair) for pair in self._followed.items()]}
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self._labels = {track: label for track, *label in memory["labels"]}
+        self._followed = {uav: track for uav, track in memory["followed"]}
 
     def record(
         self, frame: int, paths: PathSet, sent: Transmission, heard: Heard, noise_power: float
@@ -60,62 +95,192 @@ class Scorer:
         heard : what the receiver made of it
         noise_power : per sample at the receiver [W]
         """
-        (tx, rx), reception, timetable = self.link, heard.reception, self._timetable
-        poses = self._swarm.poses(timetable.epoch(frame, tx))  # of this link's own chirps
-        names, own, active = list(self._swarm.uavs), poses[rx], poses[tx]
+        reception, timetable, tracks = heard.reception, self._timetable, heard.tracks
+        view = self._view(frame, paths)
+        sees = self._sensitivity(frame, sent, noise_power)
+        labels = self._labels_of(reception.detections, paths, sees)
+        best, hit = self._found(view, reception.detections, labels.uav)
+        table = self._table(view, tracks, labels)
+        followed = {int(i): int(k) for k, i in enumerate(table.uav) if i >= 0}
+        symbols = SymbolCount()
+        if self._passes == 1:
+            symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
+        read = symbols.delay_errors <= MISREAD * symbols.delay_total
+        chances = self._chances(view, paths, sees)
+        loss = np.full(len(hit), -1, np.int8)
+        for i, chance in chances.items():
+            beside = labels.kind[self._beside(view.seen[i], reception.detections)]
+            own = bool((labels.uav == i).any())
+            loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
+        raw = reception.raw_delay_symbols
+        return ObserverRecord(
+            transmitter=self.link.tx,
+            reception=reception,
+            paths=paths,
+            truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
+            detected=_estimates(len(hit), _points(reception.detections), best),
+            tracked=_estimates(len(hit), _points(tracks), followed),
+            in_view=view.inside,
+            shadowed=view.inside & ~view.direct,
+            tracks=table,
+            state=heard.state,
+            hit=hit,
+            loss=loss,
+            target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
+            target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, len(hit)),
+            gospa=gospa(view.places, tracks.mean[tracks.confirmed, :3], GOSPA_CUTOFF_M),
+            **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
+            symbols=symbols,
+            fell_back=sent.schedule is not timetable.schedule,
+            num_false=int((labels.kind < 0).sum()),
+            num_clutter=int(((labels.kind >= 0) & (labels.uav < 0)).sum()),
+            slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
+            reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
+        )
+
+    def _view(self, frame: int, paths: PathSet) -> _View:
+        tx, rx = self.link
+        poses = self._swarm.poses(self._timetable.epoch(frame, tx))  # of this link's own chirps
+        own, active = poses[rx], poses[tx]
+        names = list(self._swarm.uavs)
         truth: list[Truth | None] = []
         for name in names:
             by_way = active if self._passes == 1 and name != tx else None
             truth.append(None if name == rx else truth_of(own, poses[name], by_way))
-        in_view = np.array(
+        inside = np.array(
             [name != rx and within_view(self._antennas, own, active, poses[name]) for name in names]
         )
-        direct = direct_targets(paths, names)
-        seen = [i for i in range(len(names)) if in_view[i] and direct[i]]
-        targets = [t for i in seen if (t := truth[i]) is not None]
-        explained = explain(reception.detections, paths, timetable.waveform, self._passes)
-        self.score.add(targets, reception.detections, heard.tracks, explained.kind)
-        d, tracks = reception.detections, heard.tracks
-        detected = np.column_stack([d.range, d.velocity, d.direction])
-        tracked = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
-        sure = np.flatnonzero(tracks.confirmed | tracks.is_reference)
-        to_detection = associate(targets, detected, self.score.resolution)
-        to_track = [
-            (i, int(sure[j])) for i, j in associate(targets, tracked[sure], self.score.resolution)
-        ]
-        followed = np.full(len(tracks), -1)
-        followed[[j for _, j in to_track]] = [seen[i] for i, _ in to_track]
-        stray = np.ones(len(d), bool)
-        stray[[j for _, j in to_detection]] = False
-        raw = reception.raw_delay_symbols
-        return ObserverRecord(
-            transmitter=tx,
-            reception=reception,
-            paths=paths,
-            truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in truth]),
-            detected=_estimates(len(names), detected, to_detection, seen),
-            tracked=_estimates(len(names), tracked, to_track, seen),
-            in_view=in_view,
-            shadowed=in_view & ~direct,
-            tracks=TrackTable(
-                id=tracks.ids,
-                range=tracks.range,
-                velocity=tracks.velocity,
-                u_x=tracks.direction[:, 0],
-                u_z=tracks.direction[:, 1],
-                confirmed=tracks.confirmed,
-                uav=followed,
-            ),
-            state=heard.state,
-            **{f"detection_{name}": value for name, value in explained._asdict().items()},
-            symbols=count_symbols(sent.payload, reception, timetable.groups(self.link))
-            if self._passes == 1
-            else SymbolCount(),
-            fell_back=sent.schedule is not timetable.schedule,
-            num_false=int((stray & (explained.kind < 0)).sum()),
-            slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
-            reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
+        straight = np.where(paths.bent, -1, owners(paths.kind, paths.target, paths, names))
+        direct = np.isin(np.arange(len(names)), straight)
+        seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
+        places = [poses[names[i]].position - own.position for i in seen]
+        return _View(truth, inside, direct, straight, seen, np.array(places).reshape(-1, 3))
+
+    def _sensitivity(self, frame: int, sent: Transmission, noise_power: float) -> Sensitivity:
+        timetable = self._timetable
+        mine = timetable.groups(self.link) if timetable.modulated(frame) else None
+        groups = timetable.waveform.num_groups if mine is None else len(mine)
+        return Sensitivity.of(
+            timetable.waveform, self._antennas, self._receivers, sent, noise_power, groups
         )
+
+    def _labels_of(self, d: Detections, paths: PathSet, sees: Sensitivity) -> _Labels:
+        found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell)
+        names = list(self._swarm.uavs)
+        uav = owners(found.kind, found.target, paths, names)
+        index = np.array([names.index(name) for name in paths.target_names] + [-1], np.int16)
+        return _Labels(
+            **found._replace(target=index[found.target])._asdict(),
+            uav=np.where(found.skirt, -1, uav),
+        )
+
+    def _off(self, truth: Truth, points: np.ndarray) -> np.ndarray:
+        """(Q,) largest distance on any axis in resolutions; a direction that was not found counts
+        as `GATE_RESOLUTIONS`."""
+        off = np.abs(points - np.array(truth[:4])) / self._resolution
+        return np.where(np.isnan(off), GATE_RESOLUTIONS, off).max(axis=1)
+
+    def _found(
+        self, view: _View, d: Detections, uav: np.ndarray
+    ) -> tuple[dict[int, int], np.ndarray]:
+        """Nearest detection of each UAV seen that its own path explains, within the gate, and
+        whether it is within one resolution on all axes."""
+        best, hit = {}, np.zeros(len(view.truth), bool)
+        for i, truth in view.seen.items():
+            off = np.where(uav == i, self._off(truth, _points(d)), np.inf)
+            if off.size and off.min() <= GATE_RESOLUTIONS:
+                best[i] = int(off.argmin())
+                hit[i] = off.min() <= 1
+        return best, hit
+
+    def _table(self, view: _View, tracks: TrackSet, labels: _Labels) -> TrackTable:
+        """The tracks, with what explains them and whom they follow: a UAV is followed by one
+        confirmed track within the gate whose latest detection its own path explains, the one that
+        followed it last if there are several."""
+        columns = np.column_stack([labels.kind, labels.target, labels.uav])
+        for track, row in zip(tracks.ids.tolist(), tracks.detection.tolist(), strict=True):
+            if row >= 0:
+                self._labels[track] = columns[row].tolist()
+        mine = {track: self._labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
+        self._labels = mine
+        kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
+        follows = np.full(len(tracks), -1)
+        for i, truth in view.seen.items():
+            off = self._off(truth, _points(tracks))
+            able = (uav == i) & tracks.confirmed & (off <= GATE_RESOLUTIONS)
+            if able.any():
+                rank = np.where(tracks.ids == self._followed.get(i), -1.0, off)
+                best = int(np.argmin(np.where(able, rank, np.inf)))
+                follows[best], self._followed[i] = i, int(tracks.ids[best])
+        return TrackTable(
+            id=tracks.ids,
+            range=tracks.range,
+            velocity=tracks.velocity,
+            u_x=tracks.direction[:, 0],
+            u_z=tracks.direction[:, 1],
+            confirmed=tracks.confirmed,
+            kind=kind,
+            target=target,
+            uav=follows,
+        )
+
+    def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:
+        """What the strongest straight path of each UAV seen amounts to."""
+        w, out = self._timetable.waveform, {}
+        places = Places.of(paths, w, self._passes)
+        for i in view.seen:
+            mine = np.flatnonzero(view.straight == i)
+            own = int(mine[np.argmax(paths.power[mine])])
+            out[i] = Chance.of(own, paths, places, w, sees)
+        return out
+
+    def _beside(self, truth: Truth, d: Detections) -> np.ndarray:
+        """(Q,) which detections lie within a cell of a UAV."""
+        w = self._timetable.waveform
+        rows, bins = Places.at(d.range, d.velocity, w, self._passes).apart(*truth[:2])
+        return (rows <= 1) & (bins <= 1)
+
+
+@dataclass(frozen=True)
+class _View:
+    """What a frame's receiver could see.
+
+    Attributes
+    ----------
+    truth : of each of U UAVs, None for the receiver itself
+    inside : (U,) in the field of view
+    direct : (U,) reached straight, without the city
+    straight : (K,) index of the UAV whose own straight path each path is, -1: none's
+    seen : the truth of those in view and unshadowed, by index
+    places : (S, 3) of these, relative to the receiver [m]
+    """
+
+    truth: list[Truth | None]
+    inside: np.ndarray
+    direct: np.ndarray
+    straight: np.ndarray
+    seen: dict[int, Truth]
+    places: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """An `Explanation` by indices of UAVs, and whose own path each is (`uav`, -1: none's)."""
+
+    kind: np.ndarray
+    target: np.ndarray
+    order: np.ndarray
+    face: np.ndarray
+    skirt: np.ndarray
+    uav: np.ndarray
+
+
+def _points(of: Detections | TrackSet) -> np.ndarray:
+    return np.column_stack([of.range, of.velocity, of.direction])
+
+
+def _by_uav(values: dict[int, float], count: int) -> np.ndarray:
+    return np.array([values.get(i, np.nan) for i in range(count)])
 
 
 def _reference_snr(paths: PathSet, amplitude: float, noise_power: float) -> float:
@@ -133,12 +298,10 @@ def _values(rows: list[np.ndarray | None]) -> UavValues:
     )
 
 
-def _estimates(
-    count: int, found: np.ndarray, pairs: list[tuple[int, int]], seen: list[int]
-) -> UavValues:
+def _estimates(count: int, points: np.ndarray, of_uav: dict[int, int]) -> UavValues:
     """Estimates by UAV; direction cosines become azimuth and elevation of the front half-space."""
     rows: list[np.ndarray | None] = [None] * count
-    for i, j in pairs:
-        r, v, u_x, u_z = found[j]
-        rows[seen[i]] = np.array([r, v, *azimuth_elevation([u_x, u_z])])
+    for i, j in of_uav.items():
+        r, v, u_x, u_z = points[j]
+        rows[i] = np.array([r, v, *azimuth_elevation([u_x, u_z])])
     return _values(rows)

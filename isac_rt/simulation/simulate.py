@@ -22,7 +22,7 @@ from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, ObserverRecord
 from isac_rt.results.scoring import Heard, Scorer
-from isac_rt.scenario.receivers import ReceiverSet
+from isac_rt.scenario.receivers import Receivers, ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
@@ -66,9 +66,9 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
 class _Observer:
     """One link's receiving terminal with its score."""
 
-    def __init__(self, setup: Setup, link: Link, terminal: Terminal) -> None:
+    def __init__(self, setup: Setup, link: Link, terminal: Terminal, receivers: Receivers) -> None:
         self.link, self.setup, self.terminal = link, setup, terminal
-        self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable)
+        self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable, receivers)
         self.feedback = {"answers": 0, "corrections": 0}
         self.seconds = 0.0
         """Processor time of reception and tracking so far."""
@@ -117,7 +117,7 @@ class _Observer:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
         return {
             "terminal": self.terminal.memory(),
-            "score": self.scorer.score.memory(),
+            "scorer": self.scorer.memory(),
             "feedback": self.feedback,
             "seconds": self.seconds,
         }
@@ -125,7 +125,7 @@ class _Observer:
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
         self.terminal.restore(memory["terminal"])
-        self.scorer.score.restore(memory["score"])
+        self.scorer.restore(memory["scorer"])
         self.feedback, self.seconds = memory["feedback"], memory["seconds"]
 
     def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
@@ -142,11 +142,13 @@ class _Listeners:
     recorder: Recorder
 
     @classmethod
-    def of(cls, setup: Setup, terminal: Callable[[Link], Terminal]) -> _Listeners:
-        """Before the first frame."""
+    def of(
+        cls, setup: Setup, terminal: Callable[[Link], Terminal], receivers: Receivers
+    ) -> _Listeners:
+        """Before the first frame; `receivers` are the settings that the terminals have."""
         links = setup.timetable.all_links
         return cls(
-            {link: _Observer(setup, link, terminal(link)) for link in links},
+            {link: _Observer(setup, link, terminal(link), receivers) for link in links},
             Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
         )
 
@@ -171,7 +173,7 @@ class _Listeners:
 
     def blocks(self) -> dict[str, Any]:
         """`terminals` and `links` of the summary."""
-        return self.recorder.blocks({link: o.scorer.score for link, o in self.observers.items()})
+        return self.recorder.blocks()
 
     def costs(self) -> dict[str, float]:
         """Processor seconds of reception and tracking by link."""
@@ -262,7 +264,8 @@ def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[
         with stopwatch.stage("synthesis"):
             cube = frame.heard(link)
         if receive:
-            observer = _Observer(setup, link, standard_terminal(setup, link))
+            terminal = standard_terminal(setup, link)
+            observer = _Observer(setup, link, terminal, setup.scenario.receivers)
             with stopwatch.stage("receive"):
                 observer.hear(frame, cube, False)
         stages = ("synthesis", "receive") if receive else ("synthesis",)
@@ -296,12 +299,12 @@ class _Run:
         s, stopwatch = setup or prepare(scenario), Stopwatch()
         stopwatch.set_up(s.seconds)
         compared = {
-            name: _Listeners.of(s, partial(standard_terminal, s, settings=one))
+            name: _Listeners.of(s, partial(standard_terminal, s, settings=one), one.receivers)
             for name, one in scenario.compare.items()
         }
         return cls(
             s,
-            _Listeners.of(s, partial(terminal, s)),
+            _Listeners.of(s, partial(terminal, s), scenario.receivers),
             compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),
@@ -426,7 +429,6 @@ class _Run:
         s = self.setup
         sets = {OWN: self.own, **self.compared} if self.compared else {}
         figures = Figures(
-            scores={link: o.scorer.score for link, o in self.own.observers.items()},
             timing=self.stopwatch.so_far(),
             plan={
                 **mechanisms(s.scenario.propagation, s.scenario.clutter),

@@ -19,8 +19,9 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
 from isac_rt.randomness import seed_sequence
-from isac_rt.results.metrics import RATES, SensingScore, SymbolCount, summary_block
+from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.provenance import path_content, program_fingerprint, versions
+from isac_rt.results.sensing import RATES, Sensing, summary_block
 from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import load, plain_tree
@@ -277,9 +278,9 @@ def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 @lru_cache(maxsize=1)
 def quantities() -> tuple[str, ...]:
-    """Names of what a link's outcome holds (see `isac_rt.results.metrics.summary_block`), the
+    """Names of what a link's outcome holds (see `isac_rt.results.sensing.summary_block`), the
     pooled rates included."""
-    block = summary_block("passive", SensingScore(np.ones(4)), SymbolCount(), 1.0)
+    block = summary_block("passive", Sensing.of((), 0), SymbolCount(), 1.0)
     names = [name for name, _ in flat_numbers(block)]
     return (
         *names,

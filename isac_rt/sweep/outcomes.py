@@ -189,7 +189,8 @@ def assemble(plan: Plan, outcomes: Outcomes) -> xr.Dataset:
             continue
         state[at] = 1 if outcome["status"] == "done" else -1
         for link, block in outcome.get("links", {}).items():
-            for name, value in flat_numbers(block):
+            of_link = {key: value for key, value in block.items() if key != "targets"}
+            for name, value in flat_numbers(of_link):
                 column(values.setdefault(name, {}), link, shape, np.nan)[at] = value
             for name, pair in block["counts"].items():
                 column(counts.setdefault(name, {}), link, (*shape[:-1], 2), 0)[at[:-1]] += pair

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as package_files
 from pathlib import Path
@@ -12,7 +12,9 @@ from typing import Any
 
 import jinja2
 
+from isac_rt.results.losses import LOSSES
 from isac_rt.results.recorder import TIMINGS, Results
+from isac_rt.results.sensing import FALSE_CAUSES
 from isac_rt.scenario.tree import OWN
 from isac_rt.storage import write_whole
 
@@ -39,7 +41,7 @@ _CAPTIONS = {
     "tracks": (
         "Tracks against truth",
         "Seen from one terminal. Estimates are drawn at the UAV they were associated with after "
-        "the fact; the receiver does not know it.",
+        "the fact, by the path that caused them; the receiver does not know it.",
     ),
     "errors": (
         "Errors",
@@ -119,13 +121,14 @@ def side_by_side(summary: Mapping[str, Any]) -> Table:
     """The scenario's own receivers and those compared with them on the same samples, link by link;
     no rows where none are compared."""
     titles = {t: k for t, k in _RATES.items() if k not in ("bits", "bit_rate_bps")}
-    titles["Clutter per frame"] = "clutter_per_frame"
+    titles["False tracks per frame"] = "false_tracks_per_frame"
     costs = summary["timing_s"].get("by_set", {})
     rows = [
         (
             _link(name),
             set_name,
             *_rates(links[name], titles.values()),
+            number(links[name]["gospa"]["total_m"]),
             number(costs[set_name][name]),
         )
         for name in summary["links"]
@@ -135,7 +138,7 @@ def side_by_side(summary: Mapping[str, Any]) -> Table:
         }.items()
         if set_name in costs
     ]
-    return Table(("Link", "Receivers", *titles, "Processor time [s]"), rows)
+    return Table(("Link", "Receivers", *titles, "GOSPA [m]", "Processor time [s]"), rows)
 
 
 def _link(name: str) -> str:
@@ -205,6 +208,86 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     ]
     titles = ("Frames outside", "Out of view", "Beyond range", "Too near", "Too fast", "Of frames")
     return limits, words, Table(titles, rows)
+
+
+def gospa_table(summary: Mapping[str, Any]) -> Table:
+    """GOSPA of each link's confirmed tracks with its parts."""
+    keys = {
+        "GOSPA [m]": "total_m",
+        "Empty picture [m]": "empty_m",
+        "Localisation [m]": "localisation_m",
+        "Missed": "missed",
+        "False": "false",
+    }
+    rows = [
+        (_link(name), *(number(s["gospa"][key]) for key in keys.values()))
+        for name, s in summary["links"].items()
+        if "gospa" in s
+    ]
+    return Table(("Picture", *keys), rows)
+
+
+def false_table(summary: Mapping[str, Any]) -> Table:
+    """False tracks per frame of each link by what feeds them; causes that never were are left
+    out."""
+    links = {name: s for name, s in summary["links"].items() if "false_tracks" in s}
+    causes = [c for c in FALSE_CAUSES if any(s["false_tracks"][c] for s in links.values())]
+    rows = [
+        (
+            _link(name),
+            *map(number, (s["false_tracks_per_frame"], *map(s["false_tracks"].get, causes))),
+        )
+        for name, s in links.items()
+    ]
+    titles = (cause.replace("_", " ").capitalize() for cause in causes)
+    return Table(("False tracks per frame", "All", *titles), rows)
+
+
+def _targets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """(link, UAV, figures) of what was in view at some time."""
+    for link, s in summary["links"].items():
+        for uav, t in s.get("targets", {}).items():
+            if t["in_view"]:
+                yield _link(link), uav, t
+
+
+def target_table(summary: Mapping[str, Any]) -> Table:
+    """Who saw whom, how often and how well."""
+    columns = (
+        "Link",
+        "UAV",
+        "In view",
+        "Found",
+        "Tracked",
+        "Switches",
+        "Range [m]",
+        "Velocity [m/s]",
+        "Azimuth [deg]",
+        "Elevation [deg]",
+    )
+    rows = [
+        (
+            link,
+            uav,
+            *(number(t[key]) for key in ("in_view", "found", "tracked", "switches")),
+            *(
+                DASH if middle is None else f"{number(middle, 2)} / {number(t['p90'][key], 2)}"
+                for key, middle in t["median"].items()
+            ),
+        )
+        for link, uav, t in _targets(summary)
+    ]
+    return Table(columns, rows)
+
+
+def loss_table(summary: Mapping[str, Any]) -> Table:
+    """What became of every target-frame in view; causes that never were are left out."""
+    rows = list(_targets(summary))
+    causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
+    return Table(
+        ("Link", "UAV", *(cause.replace("_", " ").capitalize() for cause in causes)),
+        [(link, uav, *(number(t["losses"][c]) for c in causes)) for link, uav, t in rows],
+    )
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -290,6 +373,10 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         rmse=rmse_table(s),
         compared=side_by_side(s),
         sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
+        gospa=gospa_table(s),
+        false_tracks=false_table(s),
+        targets=target_table(s),
+        losses=loss_table(s),
         budget=row_table(json.loads(d.attrs["link_budget"])),
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.results.metrics import SensingScore, pool
 from isac_rt.scenario.environment import Propagation
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Receivers
@@ -127,13 +126,6 @@ def test_a_change_of_roles_in_flight():
     decoded = d.decoded.sel(observer="P1->A").values
     assert decoded.tolist() == [False] * 7 + [True] * 4
     assert not d.processed.sel(observer="A->A").values[5:].any()
-
-
-def test_pooled_scores_add_up():
-    one, two = (SensingScore(np.ones(4), frames=n, hits=2 * n, target_frames=3 * n) for n in (2, 5))
-    both = pool([one, two])
-    assert (both.frames, both.hits, both.target_frames) == (7, 14, 21)
-    assert one.frames == 2
 
 
 @pytest.mark.slow

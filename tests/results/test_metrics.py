@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+import datetime
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -11,30 +12,23 @@ from scipy.stats import binom
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.receive.types import Detections, Reception
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.types import Reception, no_detections
 from isac_rt.results.metrics import (
-    ERROR_KEYS,
-    SensingScore,
     SymbolCount,
-    Truth,
-    associate,
     binomial_interval,
     count_symbols,
-    explain,
     gospa,
     resolutions,
-    summary_block,
     truth_of,
+    within_view,
 )
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.results.sensing import ERROR_KEYS, Sensing, summary_block
 from isac_rt.world.swarm import Pose, attitude
 
 WAVEFORM = Waveform()
 ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * WAVEFORM.wavelength)
 SMALL = Waveform(num_samples=64, num_chirps=12, num_groups=2)
-RESOLUTION = np.array([0.25, 0.25, 0.108, 0.108])
 
 
 def pose(position, velocity, boresight=(0.0, 1.0, 0.0)) -> Pose:
@@ -43,25 +37,6 @@ def pose(position, velocity, boresight=(0.0, 1.0, 0.0)) -> Pose:
         np.array(velocity, float),
         np.zeros(3),
         attitude(np.array(boresight)),
-    )
-
-
-def detections(rows) -> Detections:
-    z = np.array(rows, float).reshape(-1, 4)
-    q = len(z)
-    return Detections(
-        range=z[:, 0].copy(),
-        velocity=z[:, 1].copy(),
-        direction=z[:, 2:].copy(),
-        snr=np.ones(q),
-        std=np.ones((q, 4)),
-        is_reference=np.zeros(q, bool),
-    )
-
-
-def truth(r=20.3, v=1.7, u_x=0.31, u_z=-0.12) -> Truth:
-    return Truth(
-        r, v, u_x, u_z, float(np.arctan2(u_x, np.sqrt(1 - u_x**2 - u_z**2))), float(np.arcsin(u_z))
     )
 
 
@@ -105,51 +80,9 @@ def test_resolutions_of_table_one():
     )
 
 
-def test_association_is_one_to_one_and_gated():
-    """The nearest estimate of the first truth is the only one of the second; planted bug: greedy
-    choice."""
-    truths = [truth(20.0), truth(20.5)]
-    rows = [[20.3, 1.7, 0.31, -0.12], [19.6, 1.7, np.nan, np.nan], [40.0, 1.7, 0.31, -0.12]]
-    assert sorted(associate(truths, np.array(rows), RESOLUTION)) == [(0, 1), (1, 0)]
-    assert associate(truths, np.array([[20.3, 1.7 + 3.1 * 0.25, 0.31, -0.12]]), RESOLUTION) == []
-    assert associate([], np.array(rows), RESOLUTION) == []
-
-
-def test_explain_takes_the_strongest_near_path():
-    """Strongest within a cell, velocity modulo the unambiguous span, -1 where none is near; planted
-    bug: the nearest path. The face is the first that the path meets, whether a UAV's point comes
-    before it or not; planted bug: the first column of the faces."""
-    passes, span = 2, 2 * WAVEFORM.max_velocity(2)
-    delays = np.array([20.0, 20.2, 33.0, 47.0]) * passes / SPEED_OF_LIGHT
-    rates = np.array([1.0, 1.1, span + 3.0, 0.0]) * passes / SPEED_OF_LIGHT
-    paths = make_paths(
-        gain=np.array([1.0, 3.0j, 0.2, 5.0]),
-        delay=delays,
-        delay_rate=rates,
-        departure=np.tile([0.0, 1.0, 0.0], (4, 1)),
-        arrival=np.tile([0.0, 1.0, 0.0], (4, 1)),
-        kind=np.array([PathKind.TARGET, PathKind.SPECULAR, PathKind.GHOST, PathKind.DIFFUSE]),
-        target=np.array([0, -1, 2, -1]),
-        bounces=np.array([0, 1, 2, 1]),
-        faces=np.array([[-1, -1, -1], [41, -1, -1], [-1, 17, 5], [8, -1, -1]]),
-        points=np.zeros((4, 3, 3)),
-        epoch=0.1,
-        tx="AT",
-        rx="AT",
-        target_names=("a", "b", "c"),
-    )
-    found = detections(
-        [[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]]
-    )
-    kind, target, order, face = explain(found, paths, WAVEFORM, passes)
-    assert kind.tolist() == [PathKind.SPECULAR, PathKind.GHOST, -1, PathKind.TARGET]
-    assert target.tolist() == [-1, 2, -1, 0]
-    assert order.tolist() == [1, 2, -1, 0] and face.tolist() == [41, 17, -1, -1]
-
-
 def reception(payload, delay, transitions, bits, decoded=True) -> Reception:
     return Reception(
-        detections=detections([]),
+        detections=no_detections(),
         decoded=decoded,
         delay_symbols=delay,
         transitions=transitions,
@@ -184,7 +117,7 @@ def test_symbol_counts():
         count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False))
         == SymbolCount()
     )
-    block = summary_block("passive", SensingScore(RESOLUTION), one + lost, duration=0.1)
+    block = summary_block("passive", Sensing.of((), 3), one + lost, duration=0.1)
     assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(
         21 / 36
     )
@@ -194,73 +127,6 @@ def test_symbol_counts():
         p.bits.size / 0.1
     )
     assert block["hit_rate"] is None and block["rmse"] == dict.fromkeys(ERROR_KEYS)
-
-
-def tracks(rows, confirmed) -> TrackSet:
-    z, k = np.array(rows, float), len(rows)
-    return TrackSet(
-        ids=np.arange(k),
-        mean=np.zeros((k, 6)),
-        covariance=np.zeros((k, 6, 6)),
-        range=z[:, 0],
-        velocity=z[:, 1],
-        direction=z[:, 2:],
-        std=np.ones((k, 4)),
-        age=np.zeros(k, int),
-        confirmed=np.array(confirmed),
-        is_reference=np.zeros(k, bool),
-        detection=np.full(k, -1),
-    )
-
-
-def test_sensing_score():
-    """Frame 1: a hit, one match beyond a resolution, one stray that a path explains and one that
-    none does; frame 2: a match without direction. RMS by hand; planted bug: RMS over all
-    target-frames."""
-    score, first, second = SensingScore(RESOLUTION), truth(20.0, 1.7), truth(50.0, -3.1)
-    rows = [
-        [20.1, 1.6, 0.31, -0.12],
-        [50.5, -3.1, 0.31, -0.12],
-        [70.0, 0.0, 0.0, 0.0],
-        [90.0, 0.0, 0.0, 0.0],
-    ]
-    score.add(
-        [first, second],
-        detections(rows),
-        tracks(rows[:2], [True, False]),
-        np.array([1, 1, 4, -1], np.int8),
-    )
-    score.add([first], detections([[20.2, 1.7, np.nan, np.nan]]))
-    assert (score.frames, score.target_frames, score.hits, score.matched) == (2, 3, 1, 3)
-    assert (score.false, score.clutter, score.matched_tracks) == (1, 1, 1)
-    block = summary_block("active", score, None, 1.0)
-    assert block["rmse"]["range_m"] == pytest.approx(np.sqrt((0.1**2 + 0.5**2 + 0.2**2) / 3))
-    assert block["rmse"]["azimuth_deg"] == pytest.approx(0.0, abs=1e-9)
-    assert block["rmse_tracked"]["range_m"] == pytest.approx(0.1)
-    assert (
-        block["hit_rate"] == pytest.approx(1 / 3)
-        and block["matched"] == 1.0
-        and block["bits"] is None
-    )
-    assert block["false_per_frame"] == 0.5 and block["ser_dpsk"] is None
-    pooled = SensingScore(RESOLUTION)
-    pooled.merge(score)
-    pooled.merge(score)
-    assert (
-        pooled.target_frames == 6
-        and pooled.detection_errors.rmse() == score.detection_errors.rmse()
-    )
-
-
-def test_angle_errors_are_in_degrees_of_azimuth_and_elevation():
-    azimuth, elevation, score = np.deg2rad(31.0), np.deg2rad(-7.0), SensingScore(RESOLUTION)
-    t = Truth(20.0, 1.0, np.sin(azimuth) * np.cos(elevation), np.sin(elevation), azimuth, elevation)
-    a, e = azimuth + np.deg2rad(0.4), elevation - np.deg2rad(0.9)
-    score.add([t], detections([[20.0, 1.0, np.sin(a) * np.cos(e), np.sin(e)]]))
-    rmse = score.detection_errors.rmse()
-    assert rmse["azimuth_deg"] == pytest.approx(0.4, abs=1e-9) and rmse[
-        "elevation_deg"
-    ] == pytest.approx(0.9, abs=1e-9)
 
 
 def test_gospa_closed_forms():
@@ -279,6 +145,69 @@ def test_gospa_closed_forms():
         for order in permutations(range(4), 3)
     )
     assert gospa(x, y, c).distance == pytest.approx(np.sqrt(best))
+
+
+def assignments(x, y, cutoff):
+    """GOSPA's (distance^2, localisation, missed, false) by trying every partial assignment."""
+    best = (np.inf,)
+    for k in range(min(len(x), len(y)) + 1):
+        for rows in combinations(range(len(x)), k):
+            for columns in permutations(range(len(y)), k):
+                near = sum(np.sum((x[i] - y[j]) ** 2) for i, j in zip(rows, columns, strict=True))
+                missed, false = ((n - k) * cutoff**2 / 2 for n in (len(x), len(y)))
+                best = min(best, (near + missed + false, near, missed, false))
+    return best
+
+
+@pytest.mark.parametrize(("targets", "tracks"), [(3, 4), (4, 2), (2, 2), (1, 4)])
+def test_gospa_parts_by_enumeration(targets, tracks):
+    """Some pairs beyond the cut-off, so that missed and false differ from the difference in number.
+    Planted bugs: missed and false swapped; a pair at the cut-off counted as localisation."""
+    beyond, rng = 0, np.random.default_rng([3, targets, tracks])
+    for _ in range(12):
+        x, y = rng.normal(0, 4, (targets, 3)), rng.normal(0, 4, (tracks, 3))
+        found = gospa(x, y, 5.0)
+        square, *parts = assignments(x, y, 5.0)
+        assert found[1:] == pytest.approx(tuple(parts), abs=1e-9)  # rounding of sums near 100
+        assert found.distance == pytest.approx(np.sqrt(square))
+        beyond += found.missed > max(targets - tracks, 0) * 12.5
+    assert beyond > 3
+
+
+def test_gospa_parts_against_stone_soup():
+    """Localisation, missed and false of scenes with different numbers of targets and tracks."""
+    pytest.importorskip("stonesoup")
+    from stonesoup.metricgenerator.ospametric import GOSPAMetric
+    from stonesoup.types.state import State
+
+    rng, now = np.random.default_rng(4), datetime.datetime(2026, 1, 1)
+    metric = GOSPAMetric(p=2, c=5.0)
+    for targets, tracks in ((3, 5), (4, 1), (2, 2)):
+        x, y = rng.normal(0, 4, (targets, 3)), rng.normal(0, 4, (tracks, 3))
+        measured, truth = ([State(p[:, None], timestamp=now) for p in side] for side in (y, x))
+        value = metric.compute_gospa_metric(measured, truth)[0].value
+        expected = tuple(float(value[k]) for k in ("distance", "localisation", "missed", "false"))
+        assert tuple(gospa(x, y, 5.0)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_both_fields_of_view_count():
+    """A UAV before the receiver and behind the transmitter is not in view, and the other way round;
+    between the two it is. The transmitter itself is in view of a receiver that it illuminates.
+    Planted bugs: one of the two ends left out."""
+    at, pt = pose([0, 0, 9], [0, 0, 0]), pose([3, 40, 9], [0, 0, 0], (0, -1, 0))
+    between, behind_at, behind_pt = (
+        pose([x, y, 9], [0, 0, 0]) for x, y in ((1, 20), (1, -20), (1, 70))
+    )
+    assert within_view(ANTENNAS, pt, at, between)
+    assert not within_view(ANTENNAS, pt, at, behind_at)
+    assert not within_view(ANTENNAS, pt, at, behind_pt)
+    assert within_view(ANTENNAS, at, at, between) and within_view(ANTENNAS, at, at, behind_pt)
+    assert not within_view(ANTENNAS, at, at, behind_at)
+    assert within_view(ANTENNAS, pt, at, at)
+    away = pose([0, 0, 9], [0, 0, 0], (0, -1, 0))
+    assert not within_view(ANTENNAS, pt, away, away)
+    turned = pose([3, 40, 9], [0, 0, 0])
+    assert not within_view(ANTENNAS, turned, at, at)
 
 
 def test_binomial_interval():

@@ -41,6 +41,11 @@ TERMINAL_KEYS = {
     "matched_tracked",
     "false_per_frame",
     "clutter_per_frame",
+    "gospa",
+    "false_tracks_per_frame",
+    "false_tracks",
+    "losses",
+    "targets",
 }
 RMSE_KEYS = {"range_m", "velocity_mps", "azimuth_deg", "elevation_deg"}
 ROUNDING = 1e-12

@@ -1,0 +1,142 @@
+"""Which path caused a detection."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.receive.cfar import hann_envelope
+from isac_rt.receive.maps import UNION_FLOOR
+from isac_rt.receive.types import Detections
+
+EXPLAINS = 0.25
+"""Least power over the noise of one channel's cell that explains a detection. Averaged over the 45
+channels of the default arrays, 0.25 passes the threshold in one of a thousand cells; less is hardly
+more than noise."""
+
+
+class Explanation(NamedTuple):
+    """What caused each of Q detections; -1 where nothing stands out of the noise (a false alarm).
+
+    kind : (Q,) int8 `PathKind`
+    target : (Q,) int16 index into the set's target names, -1 also where no UAV is involved
+    order : (Q,) int16 interactions with the city, 0 of a direct path
+    face : (Q,) int32 face of the city's mesh that the path meets first, -1 also where it meets none
+    skirt : (Q,) bool, the path lies more than a cell away: the detection is in its skirt
+    """
+
+    kind: np.ndarray
+    target: np.ndarray
+    order: np.ndarray
+    face: np.ndarray
+    skirt: np.ndarray
+
+
+def owners(kind: np.ndarray, target: np.ndarray, paths: PathSet, names: list[str]) -> np.ndarray:
+    """(Q,) index into `names` of the UAV whose own path each label names, -1 where it is none's:
+    its straight echo, or the line of sight of the link's transmitter.
+
+    Parameters
+    ----------
+    kind, target : (Q,) of `paths` themselves or of what they explain
+    """
+    index = np.array([names.index(name) for name in paths.target_names] + [-1])
+    out = np.where(kind == PathKind.TARGET, index[target], -1)
+    if paths.tx != paths.rx:
+        out[kind == PathKind.LINE_OF_SIGHT] = names.index(paths.tx)
+    return out
+
+
+def hann_response(distance: np.ndarray) -> np.ndarray:
+    """Power of a Hann-windowed tone at a distance in cells, relative to its peak."""
+    d = np.abs(distance)
+    apart = np.where(d == 1, np.nan, 1 - d * d)
+    return np.where(d == 1, 0.25, (np.sinc(d) / apart) ** 2)
+
+
+def reach(distance: np.ndarray) -> np.ndarray:
+    """Share of a path's power that is counted at a distance in cells: all within one cell, then
+    what the Hann window passes at most."""
+    d = np.abs(distance)
+    flank = np.where(d < 2, hann_response(d), 0.0)
+    return np.where(d <= 1, 1.0, np.maximum(flank, hann_envelope(np.maximum(d, 2.0))))
+
+
+class Places(NamedTuple):
+    """Paths or estimates in the terms of `Detections`.
+
+    Attributes
+    ----------
+    range, velocity : (K,) [m], [m/s]
+    cells : of both [m], [m/s]
+    span : of unambiguous velocities [m/s]
+    """
+
+    range: np.ndarray
+    velocity: np.ndarray
+    cells: tuple[float, float]
+    span: float
+
+    @classmethod
+    def of(cls, paths: PathSet, waveform: Waveform, passes: int) -> Places:
+        """Where a receiver sees paths."""
+        metres = SPEED_OF_LIGHT / passes
+        return cls.at(metres * paths.delay, metres * paths.delay_rate, waveform, passes)
+
+    @classmethod
+    def at(cls, range: np.ndarray, velocity: np.ndarray, waveform: Waveform, passes: int) -> Places:
+        """Where detections or tracks lie."""
+        cells = waveform.range_cell(passes), waveform.velocity_cell(passes)
+        return cls(range, velocity, cells, 2 * waveform.max_velocity(passes))
+
+    def apart(self, range: float, velocity: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distances from a place in range and Doppler cells, velocities modulo the unambiguous
+        span."""
+        off = velocity - self.velocity
+        off -= self.span * np.round(off / self.span)
+        return np.abs(range - self.range) / self.cells[0], np.abs(off) / self.cells[1]
+
+
+def explain(
+    detections: Detections, paths: PathSet, waveform: Waveform, passes: int, cell_gain: float
+) -> Explanation:
+    """Which path caused each detection: the one with the most power at its place.
+
+    A path counts with all its power within one cell in range and in Doppler, and beyond with what
+    its Hann-windowed sidelobes hold at most. The diffuse paths within a cell count together, as the
+    clutter that they are; the strongest of them gives order and face. What lies under `EXPLAINS`
+    of the noise explains nothing. The direction does not count: paths of one cell reach a detection
+    together, and the strongest decides what it says.
+
+    Parameters
+    ----------
+    cell_gain : power over the noise of one channel's cell, of a path of unit power
+    """
+    places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
+    diffuse = paths.kind == PathKind.DIFFUSE
+    count = len(detections)
+    kinds, targets, orders, faces = (
+        np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
+    )
+    out = Explanation(kinds, targets, orders, faces, np.zeros(count, bool))
+    for q in range(count):
+        rows, bins = places.apart(detections.range[q], detections.velocity[q])
+        near = (rows <= 1) & (bins <= 1)
+        here = np.where(diffuse, 0.0, power)
+        here[~diffuse] *= reach(rows[~diffuse]) * np.minimum(
+            reach(bins[~diffuse]) + UNION_FLOOR, 1.0
+        )
+        clutter = np.flatnonzero(near & diffuse)
+        if clutter.size:
+            here[clutter[np.argmax(power[clutter])]] = power[clutter].sum()
+        if not here.size or here.max() < EXPLAINS:
+            continue
+        cause = int(np.argmax(here))
+        out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
+        out.order[q], out.skirt[q] = paths.bounces[cause], not near[cause]
+        met = paths.faces[cause][paths.faces[cause] >= 0]
+        out.face[q] = met[0] if met.size else -1
+    return out

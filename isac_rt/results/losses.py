@@ -1,0 +1,191 @@
+"""Why a UAV in view was found or not: one cause for each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.stats import ncx2
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.schedule import is_latin
+from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
+from isac_rt.receive.maps import UNION_FLOOR
+from isac_rt.results.labels import Places, hann_response
+from isac_rt.scenario.receivers import Receivers
+
+MATCHED_DB = 13.0
+"""SNR under which a coherent matched filter is taken to see nothing: with 13.1 dB it finds a steady
+target nine times in ten at 1e-6 false alarms (Albersheim)."""
+HOPELESS, CERTAIN = 0.1, 0.99
+"""Probabilities of detection in noise alone: under the first a target is noise to the detector,
+over the second chance does not explain that it was missed."""
+SIDELOBE_MARGIN = 4.0
+"""Peaks within this factor of a stronger path's sidelobes are taken for them
+(`cfar.without_sidelobes`)."""
+HANN_LOSS = 1.5
+"""Noise bandwidth of a Hann window in cells."""
+
+
+class Loss(IntEnum):
+    """What became of a UAV in view in one frame; of several that hold, the first."""
+
+    FOUND = 0  # by its own path, within one resolution on all four axes
+    TOO_WEAK = 1  # for a matched filter that is coherent over samples, chirps and antennas
+    NOT_READ = 2  # a PT did not read the data, or misread them, and had nothing clean to look at
+    INACCURATE = 3  # detected by its own path, but farther off than one resolution
+    NOISE = 4  # to a detector that adds the channels' powers
+    MASKED = 5  # by a stronger line of sight, mirror image, leakage, or another UAV's echo
+    CLUTTER = (
+        6  # its cell holds more clutter than noise, those around it raise their background, or
+    )
+    # it was taken for a wall
+    THRESHOLD = 7  # missed by chance: its probability of detection is not near 1
+    OTHER = 8  # none of these
+
+
+LOSSES = tuple(loss.name.lower() for loss in Loss)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How a frame of a link shows a path of unit power (|gain|^2).
+
+    Attributes
+    ----------
+    matched : SNR of a matched filter that is coherent over all samples, chirps and antennas
+    cell : SNR in the cell of one channel of a Hann-windowed range-Doppler map
+    rule : by which a cell of that map stands out of those around it
+    """
+
+    matched: float
+    cell: float
+    rule: CfarRule
+
+    @classmethod
+    def of(
+        cls,
+        waveform: Waveform,
+        antennas: Antennas,
+        settings: Receivers,
+        sent: Transmission,
+        noise_power: float,
+        groups: int,
+    ) -> Sensitivity:
+        """What the link budget says of a frame of which the receiver reads so many groups."""
+        w, chirps = waveform, groups * waveform.num_chirps
+        sample = sent.amplitude**2 / noise_power
+        united = groups == w.num_tx and is_latin(sent.schedule, w.num_tx)
+        united = united and settings.velocity_method != "conventional"
+        looks = antennas.num_tx * antennas.num_rx * (1 if united else groups)
+        per_look = chirps * antennas.num_rx / looks
+        return cls(
+            sample * w.num_samples * chirps * antennas.num_rx,
+            sample * w.window_length * per_look / HANN_LOSS**2,
+            CfarRule.of(settings, looks),
+        )
+
+    def detection_probability(self, snr: float, background: float = 0.0) -> float:
+        """Of a steady path with this SNR in its cell, in noise and a background of so many times
+        its power in the cells around."""
+        degrees, threshold = 2 * self.rule.looks, self.rule.threshold * (1 + background)
+        return float(ncx2.sf(degrees * threshold, degrees, degrees * snr))
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What one UAV's own path amounts to in a frame, over the noise.
+
+    Attributes
+    ----------
+    matched : SNR of the coherent matched filter
+    cell : SNR in its cell of one channel's map
+    clutter : power of the diffuse paths in that cell
+    background : what other paths add to the mean of the cells around it
+    masked : a stronger path covers it
+    """
+
+    matched: float
+    cell: float
+    clutter: float
+    background: float
+    masked: bool
+
+    @classmethod
+    def of(
+        cls, own: int, paths: PathSet, places: Places, waveform: Waveform, sees: Sensitivity
+    ) -> Chance:
+        """Of path number `own`."""
+        w, power = waveform, paths.power
+        half = w.frame_duration / 2
+        life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
+        beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
+        doppler = places.velocity[own] / places.cells[1]
+        off_grid = hann_response(np.array([beat - round(beat), doppler - round(doppler)])).prod()
+        rows, bins = places.apart(places.range[own], places.velocity[own])
+        diffuse = paths.kind == PathKind.DIFFUSE
+        near = diffuse & (rows < 2) & (bins < 2)
+        clutter = power[near] @ (hann_response(rows[near]) * hann_response(bins[near]))
+        others = ~diffuse & (power > power[own])
+        lobes = hann_envelope(rows[others]) * (hann_envelope(bins[others]) + UNION_FLOOR)
+        covers = SIDELOBE_MARGIN * power[others] * lobes >= power[own] * off_grid
+        return cls(
+            float(sees.matched * life * power[own]),
+            float(sees.cell * life**2 * power[own] * off_grid),
+            float(sees.cell * clutter),
+            _background(sees.cell * power, places.range[own] < places.range, rows, bins, sees.rule),
+            bool(covers.any()),
+        )
+
+
+def _background(
+    power: np.ndarray, behind: np.ndarray, rows: np.ndarray, bins: np.ndarray, rule: CfarRule
+) -> float:
+    """What paths add to the greater of the means before and behind a cell, over the noise.
+
+    Parameters
+    ----------
+    power : (K,) in a cell, over the noise; what is over `STRONG` is kept out of the training
+    behind : (K,) bool, farther than the cell
+    rows, bins : (K,) distances in cells
+    """
+    width = rule.guard[1] + rule.training[1] + 0.5
+    along = rows - rule.guard[0] - 0.5
+    trains = (along > 0) & (along <= rule.training[0]) & (bins <= width) & (power < STRONG)
+    cells = rule.training[0] * 2 * width
+    sides = (power[trains & side].sum() for side in (behind, ~behind))
+    return float(max(sides) * HANN_LOSS**2 / cells)
+
+
+def cause_of(
+    hit: bool, own: bool, beside: np.ndarray, chance: Chance, sees: Sensitivity, read: bool
+) -> Loss:
+    """What became of a UAV in view in one frame.
+
+    Parameters
+    ----------
+    hit : found by its own path within one resolution on all axes
+    own : a detection is explained by its own path
+    beside : kinds of the paths that explain the detections within a cell of it
+    chance : what its path amounts to
+    sees : the detector's sensitivity
+    read : the frame held no data, or data that were read
+    """
+    likely = sees.detection_probability(chance.cell)
+    causes = {
+        Loss.FOUND: hit,
+        Loss.TOO_WEAK: chance.matched < 10 ** (MATCHED_DB / 10),
+        Loss.NOT_READ: not read,
+        Loss.INACCURATE: own,
+        Loss.NOISE: likely < HOPELESS,
+        Loss.MASKED: chance.masked or bool(((beside >= 0) & (beside != PathKind.DIFFUSE)).any()),
+        Loss.CLUTTER: chance.clutter > 1
+        or sees.detection_probability(chance.cell, chance.background) < likely / 2
+        or bool((beside == PathKind.DIFFUSE).any()),
+        Loss.THRESHOLD: likely < CERTAIN,
+    }
+    return next((loss for loss, holds in causes.items() if holds), Loss.OTHER)

@@ -1,0 +1,236 @@
+"""What a terminal's detections and tracks were worth over a run: rates, errors, GOSPA, causes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.dataset import MEASURES, Row, errors_of
+from isac_rt.results.losses import LOSSES
+from isac_rt.results.metrics import GOSPA_CUTOFF_M, SymbolCount
+from isac_rt.results.records import KINDS
+
+RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
+"""Shares of a summary that have a numerator and a denominator."""
+ERROR_KEYS = tuple(key for _, key in MEASURES.values())
+FALSE_CAUSES = (*KINDS, "noise")
+"""What a false track is fed by; the last stands for -1."""
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """F frames of one or more links over U UAVs.
+
+    Attributes
+    ----------
+    seen : (F, U) bool, in view and unshadowed; all that follows is of these only
+    hidden : (F, U) bool, in view but shadowed
+    hit : (F, U) bool
+    detected, tracked : (F, U, 4) errors [m, m/s, deg, deg], NaN where there is no estimate
+    loss : (F, U) `Loss`, -1 where it is not seen
+    switched : (F, U) bool, another track follows it than the last that did
+    resumed : (F, U) bool, followed again after frames in view in which no track did
+    gospa : (F, 3) localisation, missed, false [m^2]
+    num_false, num_clutter : (F,) detections
+    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`
+    ghosts : (F, U) those of them that ghosts of each UAV feed
+    """
+
+    seen: np.ndarray
+    hidden: np.ndarray
+    hit: np.ndarray
+    detected: np.ndarray
+    tracked: np.ndarray
+    loss: np.ndarray
+    switched: np.ndarray
+    resumed: np.ndarray
+    gospa: np.ndarray
+    num_false: np.ndarray
+    num_clutter: np.ndarray
+    false_tracks: np.ndarray
+    ghosts: np.ndarray
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], num_uavs: int) -> Sensing:
+        """One link's frames, of `isac_rt.results.dataset.row_of`, in their order."""
+        count = len(rows)
+
+        def column(name: str, dtype: type, width: tuple[int, ...] = (num_uavs,)) -> np.ndarray:
+            return np.array([row[name] for row in rows], dtype).reshape(count, *width)
+
+        def errors(group: str) -> np.ndarray:
+            out = np.full((count, num_uavs, len(MEASURES)), np.nan)
+            for f, row in enumerate(rows):
+                for k, (name, (unit, _)) in enumerate(MEASURES.items()):
+                    e = errors_of(row, group, name)
+                    out[f, :, k] = np.rad2deg(e) if unit == "rad" else e
+            return out
+
+        in_view, shadowed = column("in_view", bool), column("shadowed", bool)
+        parts = ("gospa_localisation", "gospa_missed", "gospa_false")
+        false = [_false_tracks(row["track"], num_uavs) for row in rows]
+        return cls(
+            in_view & ~shadowed,
+            shadowed,
+            column("hit", bool),
+            errors("detected"),
+            errors("tracked"),
+            column("loss", int),
+            *_breaks(rows, in_view & ~shadowed),
+            np.stack([column(name, float, ()) for name in parts], axis=-1),
+            column("num_false", int, ()),
+            column("num_clutter", int, ()),
+            np.array([f for f, _ in false], int).reshape(count, len(FALSE_CAUSES)),
+            np.array([g for _, g in false], int).reshape(count, num_uavs),
+        )
+
+    @staticmethod
+    def pooled(parts: Sequence[Sensing]) -> Sensing:
+        """Several links' frames together."""
+        names = [f.name for f in fields(Sensing)]
+        return Sensing(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+    def block(self) -> dict[str, Any]:
+        """The keys of a terminal or link in `summary.json` that are of its picture."""
+        frames, in_view = len(self.seen), int(self.seen.sum())
+        found = np.isfinite(self.detected[..., 0]) & self.seen
+        followed = np.isfinite(self.tracked[..., 0]) & self.seen
+        false = self.false_tracks.sum(axis=0)
+        return {
+            "hit_rate": share(int(self.hit.sum()), in_view),
+            "matched": share(int(found.sum()), in_view),
+            "matched_tracked": share(int(followed.sum()), in_view),
+            "false_per_frame": share(int(self.num_false.sum()), frames),
+            "clutter_per_frame": share(int(self.num_clutter.sum()), frames),
+            "rmse": _by_axis(self.detected[found], rms),
+            "rmse_tracked": _by_axis(self.tracked[followed], rms),
+            "gospa": self._gospa(),
+            "false_tracks_per_frame": share(int(false.sum()), frames),
+            "false_tracks": {
+                name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
+            },
+            "losses": _counts(self.loss),
+        }
+
+    def targets(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """What became of each UAV, by its name."""
+        return {name: self._target(i) for i, name in enumerate(names)}
+
+    def _target(self, i: int) -> dict[str, Any]:
+        errors = self.detected[self.seen[:, i], i]
+        followed = np.isfinite(self.tracked[self.seen[:, i], i, 0])
+        return {
+            "in_view": int(self.seen[:, i].sum()),
+            "hidden": int(self.hidden[:, i].sum()),
+            "found": int(self.hit[:, i].sum()),
+            "tracked": int(followed.sum()),
+            "switches": int(self.switched[:, i].sum()),
+            "interruptions": int(self.resumed[:, i].sum()),
+            "ghost_tracks": int(self.ghosts[:, i].sum()),
+            "median": _by_axis(np.abs(errors), np.median),
+            "p90": _by_axis(np.abs(errors), lambda e: np.percentile(e, 90)),
+            "losses": _counts(self.loss[:, i]),
+        }
+
+    def _gospa(self) -> dict[str, float | None]:
+        if not len(self.gospa):
+            return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "empty_m"))
+        localisation, missed, false = self.gospa.mean(axis=0)
+        each = GOSPA_CUTOFF_M**2 / 2
+        return {
+            "total_m": float(np.sqrt(localisation + missed + false)),
+            "missed": float(missed / each),
+            "false": float(false / each),
+            "localisation_m": float(np.sqrt(localisation)),
+            "empty_m": float(np.sqrt(each * self.seen.sum(axis=1).mean())),
+        }
+
+
+def _false_tracks(track: Row, num_uavs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Confirmed tracks of a frame that follow no UAV in view: by `FALSE_CAUSES`, and those of
+    ghosts by UAV."""
+    false = np.asarray(track["confirmed"], bool) & (np.asarray(track["uav"]) < 0)
+    kind = np.asarray(track["kind"], int)[false]
+    ghost_of = np.asarray(track["target"], int)[false][kind == PathKind.GHOST]
+    causes = np.where(kind < 0, len(KINDS), kind)
+    return (
+        np.bincount(causes, minlength=len(FALSE_CAUSES)),
+        np.bincount(ghost_of[ghost_of >= 0], minlength=num_uavs),
+    )
+
+
+def _breaks(rows: Sequence[Row], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(F, U) where another track follows a UAV than the last that did, and where one follows it
+    again after frames in view in which none did."""
+    switched, resumed = np.zeros((2, *seen.shape), bool)
+    last: dict[int, int] = {}
+    lost: set[int] = set()
+    for f, row in enumerate(rows):
+        track = row["track"]
+        follows = {int(u): int(k) for u, k in zip(track["uav"], track["id"], strict=True) if u >= 0}
+        for u, k in follows.items():
+            switched[f, u] = last.get(u, k) != k
+            resumed[f, u] = u in lost
+            last[u] = k
+        lost -= follows.keys()
+        lost |= {u for u in last if seen[f, u] and u not in follows}
+    return switched, resumed
+
+
+def rms(errors: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def _by_axis(errors: np.ndarray, measure: Any) -> dict[str, float | None]:
+    """A measure of the errors (n, 4) on each axis that are not NaN, by the fixed keys; null where
+    there are none."""
+    out: dict[str, float | None] = {}
+    for key, column in zip(ERROR_KEYS, errors.reshape(-1, len(ERROR_KEYS)).T, strict=True):
+        known = column[np.isfinite(column)]
+        out[key] = float(measure(known)) if known.size else None
+    return out
+
+
+def _counts(loss: np.ndarray) -> dict[str, int]:
+    return {name: int((loss == i).sum()) for i, name in enumerate(LOSSES)}
+
+
+def share(part: int, whole: int) -> float | None:
+    """A part of a whole; null of nothing."""
+    return part / whole if whole else None
+
+
+def summary_block(
+    role: str | list[str], sensing: Sensing, symbols: SymbolCount | None, duration: float
+) -> dict[str, Any]:
+    """One terminal's (or link's) figures under the fixed keys of `summary.json`; null where one
+    does not apply (`docs/outputs.md` says what each means).
+
+    Parameters
+    ----------
+    duration : from the first frame to the end of the last, pauses and pilots included [s]
+    """
+    c = symbols or SymbolCount()
+    receives = symbols is not None
+    counts = [
+        [c.delay_errors, c.delay_total],
+        [c.dpsk_errors, c.dpsk_total],
+        [c.bit_errors, c.bits_total],
+        [int(sensing.hit.sum()), int(sensing.seen.sum())],
+    ]
+    return {
+        "role": role,
+        "ser_dpsk": share(c.dpsk_errors, c.dpsk_total),
+        "ser_delay": share(c.delay_errors, c.delay_total),
+        "ber": share(c.bit_errors, c.bits_total),
+        "erased": share(c.delay_erased + c.dpsk_erased, c.delay_total + c.dpsk_total),
+        "bits": c.bits_decoded if receives else None,
+        "bit_rate_bps": c.bits_decoded / duration if receives else None,
+        **sensing.block(),
+        "counts": dict(zip(RATES, counts, strict=True)),
+    }

@@ -1,0 +1,144 @@
+"""Which path caused a detection, on path sets made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.types import Detections
+from isac_rt.results.labels import explain, hann_response, owners, reach
+
+WAVEFORM = Waveform()
+RANGE, VELOCITY = WAVEFORM.range_cell(2), WAVEFORM.velocity_cell(2)
+LOUD = 1e6
+"""Power over the noise of a path of unit gain: everything stands out."""
+
+
+def detections(rows) -> Detections:
+    z = np.array(rows, float).reshape(-1, 4)
+    return Detections(
+        range=z[:, 0].copy(),
+        velocity=z[:, 1].copy(),
+        direction=z[:, 2:].copy(),
+        snr=np.ones(len(z)),
+        std=np.ones((len(z), 4)),
+        is_reference=np.zeros(len(z), bool),
+    )
+
+
+def paths(rows, link=("AT", "AT"), **more):
+    """Of (range [m], velocity [m/s], gain, kind, target) each, echoes at the AT."""
+    r, v, gain, kind, target = zip(*rows, strict=True)
+    passes, count = 2 if link[0] == link[1] else 1, len(rows)
+    return make_paths(
+        gain=np.array(gain),
+        delay=np.array(r) * passes / SPEED_OF_LIGHT,
+        delay_rate=np.array(v) * passes / SPEED_OF_LIGHT,
+        departure=np.tile([0.0, 1.0, 0.0], (count, 1)),
+        arrival=np.tile([0.0, 1.0, 0.0], (count, 1)),
+        kind=np.array(kind),
+        target=np.array(target),
+        epoch=0.1,
+        tx=link[0],
+        rx=link[1],
+        target_names=("a", "b", "c"),
+        **more,
+    )
+
+
+def test_the_strongest_path_within_a_cell_wins():
+    """Not the nearest, velocity modulo the unambiguous span, -1 where none is near. The face is the
+    first that the path meets, whether a UAV's point comes before it or not. Planted bugs: the
+    nearest path; the first column of the faces."""
+    span = 2 * WAVEFORM.max_velocity(2)
+    found = paths(
+        [
+            (20.0, 1.0, 1.0, PathKind.TARGET, 0),
+            (20.2, 1.1, 3.0j, PathKind.SPECULAR, -1),
+            (33.0, span + 3.0, 0.2, PathKind.GHOST, 2),
+            (47.0, 0.0, 5.0, PathKind.DIFFUSE, -1),
+        ],
+        bounces=np.array([0, 1, 2, 1]),
+        faces=np.array([[-1, -1, -1], [41, -1, -1], [-1, 17, 5], [8, -1, -1]]),
+        points=np.zeros((4, 3, 3)),
+    )
+    rows = [[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]]
+    kind, target, order, face, skirt = explain(detections(rows), found, WAVEFORM, 2, 100.0)
+    assert kind.tolist() == [PathKind.SPECULAR, PathKind.GHOST, -1, PathKind.TARGET]
+    assert target.tolist() == [-1, 2, -1, 0]
+    assert order.tolist() == [1, 2, -1, 0]
+    assert face.tolist() == [41, 17, -1, -1]
+    assert not skirt.any()
+
+
+@pytest.mark.parametrize(("scatterers", "kind"), [(3, PathKind.TARGET), (5, PathKind.DIFFUSE)])
+def test_scatterers_of_a_cell_count_together(scatterers, kind):
+    """Each a quarter of the UAV's power. Planted bug: each scatterer by itself."""
+    echo = (20.0, 1.0, 1.0, PathKind.TARGET, 1)
+    wall = [(20.0 + 0.03 * k, 1.0, 0.5, PathKind.DIFFUSE, -1) for k in range(scatterers)]
+    beside = [(20.0 + 3 * RANGE, 1.0, 0.9, PathKind.DIFFUSE, -1)] * 9
+    found = explain(
+        detections([[20.0, 1.0, 0, 0]]), paths([echo, *wall, *beside]), WAVEFORM, 2, LOUD
+    )
+    assert found.kind.tolist() == [kind]
+
+
+@pytest.mark.parametrize(("over_noise", "kind"), [(0.3, PathKind.DIFFUSE), (0.2, -1)])
+def test_what_lies_under_the_noise_explains_nothing(over_noise, kind):
+    """Planted bug: any path in the cell explains a false alarm."""
+    wall = paths([(20.0, 1.0, 1.0, PathKind.DIFFUSE, -1)])
+    found = explain(detections([[20.0, 1.0, 0, 0]]), wall, WAVEFORM, 2, over_noise)
+    assert found.kind.tolist() == [kind]
+
+
+def test_skirts_of_strong_paths_are_theirs():
+    """A path 60 dB over the noise of a cell reaches 3.4 cells out on one axis, and not on both: the
+    sidelobe of a Hann window there is 41 dB under its peak. Planted bug: no sidelobes."""
+    strong = paths([(20.0, 1.0, 1.0, PathKind.LEAKAGE, -1)])
+    off = 3.4
+    rows = [
+        [20.0 + off * RANGE, 1.0, 0, 0],
+        [20.0, 1.0 - off * VELOCITY, 0, 0],
+        [20.0 + off * RANGE, 1.0 + off * VELOCITY, 0, 0],
+        [20.0 + 0.9 * RANGE, 1.0, 0, 0],
+    ]
+    found = explain(detections(rows), strong, WAVEFORM, 2, 1e6)
+    assert found.kind.tolist() == [PathKind.LEAKAGE, PathKind.LEAKAGE, -1, PathKind.LEAKAGE]
+    assert found.skirt.tolist() == [True, True, False, False]
+
+
+def test_response_is_that_of_the_window():
+    """Against the sum over 4096 samples of a Hann-windowed tone (discretisation: 1e-6 of the peak);
+    `reach` lies above it everywhere, and on it at 1.5 cells and at the peaks of the sidelobes."""
+    size = 4096
+    n = np.arange(size) + 0.5
+    window = np.sin(np.pi * n / size) ** 2
+    d = np.concatenate([np.linspace(0, 9, 181), [0.31, 1.0, 1.5]])
+    truth = np.array([abs(window @ np.exp(2j * np.pi * x * n / size)) ** 2 for x in d])
+    truth /= window.sum() ** 2
+    assert hann_response(d) == pytest.approx(truth, abs=1e-6)
+    assert (reach(d) >= truth - 1e-6).all()
+    assert reach(np.array([0.7, 1.0])).tolist() == [1.0, 1.0]
+    assert reach(np.array([1.5]))[0] == pytest.approx(truth[-1], abs=1e-6)
+    for lobe in (3, 4, 7):
+        inside = (d > lobe) & (d < lobe + 1)
+        # the amplitude falls within a lobe, so that its peak lies under the bound of its middle
+        assert reach(np.array([lobe + 0.5]))[0] == pytest.approx(truth[inside].max(), rel=0.1)
+
+
+def test_whose_path_it_is():
+    """A UAV's straight echo and the transmitter's line of sight; no ghost, no wall. Planted bugs:
+    ghosts count; the line of sight is nobody's."""
+    names = ["PT1", "c", "AT", "b", "a"]
+    rows = [
+        (20.0, 1.0, 1.0, PathKind.LINE_OF_SIGHT, -1),
+        (30.0, 1.0, 1.0, PathKind.TARGET, 0),
+        (40.0, 1.0, 1.0, PathKind.GHOST, 1),
+        (50.0, 1.0, 1.0, PathKind.SPECULAR, -1),
+        (60.0, 1.0, 1.0, PathKind.TARGET, 2),
+    ]
+    at_pt, at_at = paths(rows, ("AT", "PT1")), paths(rows[1:])
+    assert owners(at_pt.kind, at_pt.target, at_pt, names).tolist() == [2, 4, -1, -1, 1]
+    assert owners(at_at.kind, at_at.target, at_at, names).tolist() == [4, -1, -1, 1]

@@ -1,0 +1,245 @@
+"""How well a path can be seen, against samples and draws; and the order of the causes."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from receiver_cubes import ANTENNAS, Path, cube, frame, known
+
+from isac_rt.frame.cube import Transmission
+from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.cfar import CfarRule
+from isac_rt.receive.maps import power_map
+from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.results.labels import Places
+from isac_rt.results.losses import Chance, Loss, Sensitivity, cause_of
+from isac_rt.scenario.receivers import Receivers
+from isac_rt.world.swarm import Pose
+
+W = Waveform(num_samples=128, num_chirps=24)
+SEES = Sensitivity(1000.0, 10.0, CfarRule.of(Receivers(), 45))
+
+
+def sent(schedule, payload, amplitude=1.0) -> Transmission:
+    return Transmission(
+        name="AT",
+        pose=Pose.at_rest(),
+        antennas=ANTENNAS,
+        schedule=schedule,
+        payload=payload,
+        amplitude=amplitude,
+    )
+
+
+def echo(length, rate, amplitude, others=()):
+    """A path set of an echo of U, and `others` of (length [m], rate [m/s], gain, kind)."""
+    rows = [(length, rate, amplitude, PathKind.TARGET), *others]
+    lengths, rates, gains, kinds = zip(*rows, strict=True)
+    return make_paths(
+        gain=np.array(gains),
+        delay=np.array(lengths) / SPEED_OF_LIGHT,
+        delay_rate=np.array(rates) / SPEED_OF_LIGHT,
+        departure=np.tile([0.0, 1.0, 0.0], (len(rows), 1)),
+        arrival=np.tile([0.0, 1.0, 0.0], (len(rows), 1)),
+        kind=np.array(kinds),
+        target=np.array([0] + [-1] * (len(rows) - 1)),
+        epoch=0.0,
+        tx="AT",
+        rx="AT",
+        target_names=("U",),
+    )
+
+
+def chance_of(paths, sees=SEES, waveform=W) -> Chance:
+    return Chance.of(0, paths, Places.of(paths, waveform, 2), waveform, sees)
+
+
+@pytest.mark.parametrize(("bins", "rows"), [(3.0, 11.0), (3.5, 11.0), (-2.3, 17.4)])
+def test_snr_of_a_cell_is_that_of_the_map(bins, rows):
+    """A tone through the receiver's own transforms, its peak over the mean of noise alone: on a
+    cell, half a cell off, and anywhere. 1 %: noise averaged over 3072 cells and 45 channels, and
+    the range-Doppler coupling within a frame. Planted bugs: one Hann window only; the loss off the
+    grid left out."""
+    w, schedule, payload = frame(waveform=W)
+    amplitude, noise = 0.7, 2.9
+    rate = bins * w.velocity_cell(1)
+    length = rows * w.range_cell(1)
+    # the beat also holds the Doppler: take it off, so that the peak lies where it was asked for
+    length -= float(w.beat_cells(0.0, rate / SPEED_OF_LIGHT, 0.0)) * w.range_cell(1)
+    about = known(w, schedule, payload)
+    tone = cube(w, schedule, payload, [Path(length, rate, amplitude)])
+    alone = cube(w, schedule, payload, [], noise=noise, seed=5)
+    peak, level = (power_map(clean_spectrum(c, about), about) for c in (tone, alone))
+    sees = Sensitivity.of(w, ANTENNAS, Receivers(), sent(schedule, payload), noise, 3)
+    chance = chance_of(echo(length, rate, amplitude), sees, w)
+    assert chance.cell == pytest.approx(peak.max() / level.mean(), rel=0.01)
+    assert sees.rule.looks == 45
+
+
+def test_matched_filter_adds_everything_in_phase():
+    """Energy of the samples over the noise, of half a frame the half. Planted bug: the groups left
+    out."""
+    w, schedule, payload = frame(waveform=W)
+    tone = cube(w, schedule, payload, [Path(7.3, 1.7, 0.7)])
+    sees = Sensitivity.of(w, ANTENNAS, Receivers(), sent(schedule, payload), 2.9, 3)
+    found = chance_of(echo(7.3, 1.7, 0.7), sees, w)
+    energy = float((np.abs(tone.samples) ** 2).sum())
+    assert found.matched == pytest.approx(energy / 2.9, rel=1e-5)
+    half = make_paths(
+        **{
+            name: getattr(echo(7.3, 1.7, 0.7), name)
+            for name in ("gain", "delay", "delay_rate", "departure", "arrival", "kind", "target")
+        },
+        begin=np.zeros(1),
+        epoch=0.0,
+        tx="AT",
+        rx="AT",
+        target_names=("U",),
+    )
+    assert chance_of(half, sees, w).matched == pytest.approx(found.matched / 2)
+    assert chance_of(half, sees, w).cell == pytest.approx(found.cell / 4)
+
+
+def test_fewer_groups_are_not_united():
+    """Two of three groups, and a schedule that sends an antenna twice in a slot: a third of the
+    chirps is added in phase, the rest in power."""
+    w, schedule, payload = frame(waveform=W)
+    whole, part = (
+        Sensitivity.of(w, ANTENNAS, Receivers(), sent(schedule, payload), 1.0, n) for n in (3, 2)
+    )
+    assert (whole.rule.looks, part.rule.looks) == (45, 90)
+    assert part.cell == pytest.approx(whole.cell / 3)
+    assert part.matched == pytest.approx(whole.matched * 2 / 3)
+    same = np.tile(conventional_schedule(1, w.num_chirps, 3), (3, 1))
+    assert Sensitivity.of(w, ANTENNAS, Receivers(), sent(same, payload), 1.0, 3).rule.looks == 135
+
+
+def test_probability_of_detection():
+    """Draws of 45 channels with a steady path. Statistical: 4 deviations of 20,000 draws."""
+    rng, draws = np.random.default_rng(9), 20_000
+    noise = rng.standard_normal((draws, 45, 2)).view(np.complex128)[..., 0] / np.sqrt(2)
+    for snr in (0.5, 0.9, 1.2):
+        seen = (np.abs(noise + np.sqrt(snr)) ** 2).mean(axis=1) > 1.1 * SEES.rule.threshold
+        p = SEES.detection_probability(snr, 0.1)
+        assert seen.mean() == pytest.approx(p, abs=4 * np.sqrt(p * (1 - p) / draws))
+
+
+@pytest.mark.parametrize(
+    ("rows", "bins", "power_db", "kind", "masked"),
+    [
+        (1.3, 0.4, 3.0, PathKind.SPECULAR, True),
+        (1.3, 0.4, -3.0, PathKind.SPECULAR, False),
+        (5.2, 0.0, 40.0, PathKind.LEAKAGE, False),
+        (5.2, 0.0, 50.0, PathKind.LEAKAGE, True),
+        (0.0, 9.3, 40.0, PathKind.GHOST, False),
+        (0.0, 9.3, 50.0, PathKind.GHOST, True),
+        (5.2, 9.3, 70.0, PathKind.GHOST, False),
+        (1.3, 0.4, 3.0, PathKind.DIFFUSE, False),
+    ],
+)
+def test_stronger_paths_mask(rows, bins, power_db, kind, masked):
+    """At 5.2 cells the bound of a Hann window's sidelobes is 52.6 dB down (-10 log10 of (pi d (d^2
+    - 1))^-2), and peaks within 6 dB of it are passed over; along Doppler at 9.3 cells the floor of
+    the resampling, -50 dB, counts. Planted bug: the weaker path masks the stronger one."""
+    gain = 10 ** (power_db / 20)
+    other = 12.7 + rows * 2 * W.range_cell(2), 1.9 + bins * 2 * W.velocity_cell(2), gain, kind
+    assert chance_of(echo(12.7, 1.9, 1.0, [other])).masked is masked
+
+
+def test_clutter_of_a_cell():
+    """Two scatterers at the UAV's place and one half a cell off, whose share is that of the window
+    there, (8 / (3 pi))^2; one three cells off has none."""
+    cell = 2 * W.range_cell(2)
+    walls = [(12.7, 1.9, 0.3, PathKind.DIFFUSE), (12.7, 1.9, 0.4j, PathKind.DIFFUSE)]
+    walls += [
+        (12.7 + cell / 2, 1.9, 0.2, PathKind.DIFFUSE),
+        (12.7 + 3 * cell, 1.9, 9.0, PathKind.DIFFUSE),
+    ]
+    expected = 10.0 * (0.09 + 0.16 + 0.04 * (8 / (3 * np.pi)) ** 2)
+    assert chance_of(echo(12.7, 1.9, 1.0, walls)).clutter == pytest.approx(expected)
+
+
+def test_background_is_that_of_the_map():
+    """Scatterers of random phase behind the guard cells, made through the receiver's transforms:
+    the mean of the training block on their side, averaged over draws, over the noise. 10 %: 40
+    draws of 12 scatterers, and what their lobes leave outside the block. Planted bugs: both sides
+    together; the spread of the Hann windows left out."""
+    w, schedule, payload = frame(waveform=W)
+    about, rng, noise = known(w, schedule, payload), np.random.default_rng(2), 1.0
+    sees = Sensitivity.of(w, ANTENNAS, Receivers(), sent(schedule, payload), noise, 3)
+    rows, bins = 4.5 + 6 * rng.random(12) + 1, rng.uniform(-7, 7, 12)
+    place = 20 * w.range_cell(1), 0.0
+    walls = [
+        (place[0] + r * w.range_cell(1), b * w.velocity_cell(1), 0.03, PathKind.DIFFUSE)
+        for r, b in zip(rows, bins, strict=True)
+    ]
+    level = 0.0
+    for _ in range(40):
+        turns = np.exp(2j * np.pi * rng.random(12))
+        paths = [Path(r, v, g * t) for (r, v, g, _), t in zip(walls, turns, strict=True)]
+        power = power_map(clean_spectrum(cube(w, schedule, payload, paths), about), about)
+        level += power[24:32, 12 - 9 : 12 + 10].mean() / 40
+    alone = power_map(clean_spectrum(cube(w, schedule, payload, [], noise=noise), about), about)
+    found = chance_of(echo(*place, 1.0, walls), sees, w)
+    assert found.background == pytest.approx(level / alone.mean(), rel=0.1)
+
+
+STRONG = {"hit": False, "own": False, "beside": (), "read": True}
+STRONG |= {"matched": 1e4, "cell": 10.0, "clutter": 0.1, "background": 0.0, "masked": False}
+TRUTHS = {
+    Loss.FOUND: {"hit": True},
+    Loss.TOO_WEAK: {"matched": 19.0},
+    Loss.NOT_READ: {"read": False},
+    Loss.INACCURATE: {"own": True},
+    Loss.NOISE: {"cell": 0.4},
+    Loss.MASKED: {"masked": True},
+    Loss.CLUTTER: {"background": 1.3, "cell": 2.0},
+    Loss.THRESHOLD: {"cell": 1.0},
+    Loss.OTHER: {},
+}
+
+
+def judge(**changed) -> Loss:
+    v = STRONG | changed
+    chance = Chance(v["matched"], v["cell"], v["clutter"], v["background"], v["masked"])
+    return cause_of(v["hit"], v["own"], np.array(v["beside"], int), chance, SEES, v["read"])
+
+
+@pytest.mark.parametrize(("first", "second"), list(product(TRUTHS, TRUTHS)))
+def test_of_two_causes_the_first_counts(first, second):
+    """Every cause alone and before every later one. Planted bug: masked asked before noise."""
+    both = TRUTHS[max(first, second)] | TRUTHS[min(first, second)]
+    assert judge(**both) is min(first, second)
+
+
+@pytest.mark.parametrize(
+    ("changed", "loss"),
+    [
+        ({"clutter": 1.1}, Loss.CLUTTER),
+        ({"clutter": 0.9}, Loss.OTHER),
+        ({"background": 1.3}, Loss.OTHER),
+        ({"background": 9.0}, Loss.CLUTTER),
+    ],
+)
+def test_clutter_in_the_cell_or_around_it(changed, loss):
+    """Ten times the noise stands out of a background of 1 + 1.3, and not of 1 + 9."""
+    assert judge(**changed) is loss
+
+
+@pytest.mark.parametrize(
+    ("beside", "loss"),
+    [
+        ([PathKind.DIFFUSE], Loss.CLUTTER),
+        ([PathKind.SPECULAR], Loss.MASKED),
+        ([PathKind.TARGET], Loss.MASKED),
+        ([-1], Loss.OTHER),
+        ([PathKind.DIFFUSE, PathKind.LEAKAGE], Loss.MASKED),
+    ],
+)
+def test_taken_for_something_else(beside, loss):
+    """A detection in the UAV's cell that another path explains."""
+    assert judge(beside=beside) is loss

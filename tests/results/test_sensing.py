@@ -1,0 +1,152 @@
+"""Figures of a picture from rows made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.dataset import MEASURES
+from isac_rt.results.losses import LOSSES, Loss
+from isac_rt.results.sensing import FALSE_CAUSES, Sensing, summary_block
+
+GOSPA = {"gospa_localisation": 0.0, "gospa_missed": 0.0, "gospa_false": 0.0}
+
+
+def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
+    """One frame of two UAVs: errors of detections (range, velocity, azimuth, elevation) [SI, rad],
+    tracks of (id, confirmed, kind, target, followed UAV)."""
+    seen = np.array(seen, bool)
+    out = {"in_view": seen, "shadowed": np.zeros(2, bool), "hit": np.zeros(2, bool)}
+    out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
+    table = np.array(tracks, int).reshape(-1, 5)
+    out["track"] = dict(zip(("id", "confirmed", "kind", "target", "uav"), table.T, strict=True))
+    for k, name in enumerate(MEASURES):
+        truth = np.array([17.3, -2.9])
+        out[f"truth_{name}"] = truth
+        off = np.array([np.nan if e is None else e[k] for e in errors])
+        out[f"detected_{name}"] = truth + off
+        follows = np.isin([0, 1], table[:, 4])
+        out[f"tracked_{name}"] = np.where(follows, truth + 0.01 * (k + 1), np.nan)
+    return out | more
+
+
+def test_errors_of_each_uav_and_of_all():
+    """Of UAV 0 errors of 1, -3, 2 and 10 cm and one without a direction, of UAV 1 one of 7 m/s;
+    what is out of view counts nowhere. Planted bugs: the median of signed errors; angles in
+    radians; all UAVs pooled."""
+    cm = [(0.01 * x, 0.0, np.deg2rad(x), 0.0) for x in (1, -3, 2, 10)]
+    rows = [row(errors=(e, None)) for e in cm]
+    rows += [row(errors=((0.02, 0.1, np.nan, np.nan), (0.0, 7.0, 0.0, 0.0)))]
+    rows += [row(seen=(0, 0), errors=((9.0, 9.0, 1.0, 1.0), None))]
+    s = Sensing.of(rows, 2)
+    one, two = s.targets(["U1", "U2"]).values()
+    assert one["in_view"] == 5
+    assert one["median"]["range_m"] == pytest.approx(0.02)
+    # linear between the order statistics 1, 2, 2, 3, 10 cm: 3 + 0.6 (10 - 3)
+    assert one["p90"]["range_m"] == pytest.approx(0.072)
+    assert one["median"]["azimuth_deg"] == pytest.approx(2.5)
+    assert two["median"]["velocity_mps"] == pytest.approx(7.0)
+    block = s.block()
+    squares = [1e-4, 9e-4, 4e-4, 1e-2, 4e-4, 0.0]
+    assert block["rmse"]["range_m"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert block["matched"] == pytest.approx(6 / 10)
+
+
+def test_counts_add_up():
+    """Hits of the losses, by UAV and together; false detections and clutter by frame."""
+    kinds = [(Loss.FOUND, Loss.MASKED), (Loss.FOUND, -1), (Loss.NOISE, Loss.CLUTTER)]
+    rows = [
+        row(seen=(1, b >= 0), loss=np.array([a, b]), hit=np.array([a == 0, b == 0]), num_false=k)
+        for k, (a, b) in enumerate(kinds)
+    ]
+    s = Sensing.of(rows, 2)
+    block, targets = s.block(), s.targets(["U1", "U2"])
+    assert block["losses"] == dict.fromkeys(LOSSES, 0) | {
+        "found": 2,
+        "masked": 1,
+        "noise": 1,
+        "clutter": 1,
+    }
+    assert block["hit_rate"] == pytest.approx(2 / 5)
+    assert sum(block["losses"].values()) == sum(t["in_view"] for t in targets.values()) == 5
+    assert [sum(t["losses"].values()) for t in targets.values()] == [3, 2]
+    assert block["false_per_frame"] == pytest.approx(1.0)
+
+
+def test_hidden_is_not_in_view():
+    """In the field of view but behind the city."""
+    rows = [row(shadowed=np.array([True, False])), row()]
+    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    assert (one["in_view"], one["hidden"], two["in_view"], two["hidden"]) == (1, 1, 2, 0)
+
+
+def test_gospa_is_the_root_of_its_parts():
+    """Frame 1: localisation 0.5 m^2, one missed; frame 2: two false ones. c = 5 m. Planted bug:
+    missed and false swapped."""
+    rows = [
+        row(gospa_localisation=0.5, gospa_missed=12.5),
+        row(seen=(0, 0), gospa_false=25.0),
+    ]
+    found = Sensing.of(rows, 2).block()["gospa"]
+    assert found["missed"] == pytest.approx(0.5)
+    assert found["false"] == pytest.approx(1.0)
+    assert found["localisation_m"] == pytest.approx(0.5)
+    assert found["total_m"] == pytest.approx(np.sqrt((13.0 + 25.0) / 2))
+    parts = found["localisation_m"] ** 2 + 12.5 * (found["missed"] + found["false"])
+    assert found["total_m"] ** 2 == pytest.approx(parts)
+    assert found["empty_m"] == pytest.approx(np.sqrt((2 * 12.5 + 0) / 2))
+
+
+def test_false_tracks_by_cause():
+    """Confirmed ones that follow nobody: a wall, noise, two ghosts of UAV 1, a second track of UAV
+    0. Planted bugs: tentative tracks count; the one that follows counts."""
+    ghost, target = int(PathKind.GHOST), int(PathKind.TARGET)
+    tracks = [
+        (1, 1, target, 0, 0),
+        (2, 1, int(PathKind.DIFFUSE), -1, -1),
+        (3, 0, int(PathKind.SPECULAR), -1, -1),
+        (4, 1, -1, -1, -1),
+        (5, 1, ghost, 1, -1),
+        (6, 1, ghost, 1, -1),
+        (7, 1, target, 0, -1),
+    ]
+    s = Sensing.of([row(tracks=tracks), row()], 2)
+    block = s.block()
+    expected = {"diffuse": 0.5, "noise": 0.5, "ghost": 1.0, "target": 0.5}
+    assert block["false_tracks"] == dict.fromkeys(FALSE_CAUSES, 0.0) | expected
+    assert block["false_tracks_per_frame"] == pytest.approx(2.5)
+    assert [t["ghost_tracks"] for t in s.targets(["U1", "U2"]).values()] == [0, 2]
+
+
+def test_switches_and_interruptions():
+    """UAV 0 by track 5, out of view for a frame, by 5, lost for two frames, by 5, by 8 beside which
+    5 goes on, by 5. Planted bugs: a pause out of view is an interruption; a new track's first frame
+    is a switch."""
+    follow = [5, None, 5, 0, 0, 5, 8, 5]
+    rows = [
+        row(seen=(k is not None, 1), tracks=[(k, 1, 1, 0, 0)] if k else [(5, 1, 1, 0, -1)])
+        for k in follow
+    ]
+    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    assert (one["switches"], one["interruptions"], one["tracked"]) == (2, 1, 5)
+    assert (two["switches"], two["interruptions"], two["tracked"]) == (0, 0, 0)
+
+
+def test_links_pool_frame_by_frame():
+    """Rates over the frames of both; a switch is counted within its link only."""
+    one = Sensing.of([row(tracks=[(5, 1, 1, 0, 0)], num_clutter=4)], 2)
+    two = Sensing.of([row(tracks=[(6, 1, 1, 0, 0)])] * 3, 2)
+    both = Sensing.pooled([one, two])
+    assert both.block()["clutter_per_frame"] == pytest.approx(1.0)
+    assert both.block()["matched_tracked"] == pytest.approx(4 / 8)
+    assert both.targets(["U1", "U2"])["U1"]["switches"] == 0
+
+
+def test_nothing_is_null():
+    """No frame at all: shares and errors are null, counts are zero."""
+    block = summary_block("active", Sensing.of((), 2), None, 1.0)
+    for key in ("hit_rate", "matched", "false_per_frame", "false_tracks_per_frame", "ser_dpsk"):
+        assert block[key] is None
+    assert block["gospa"] == dict.fromkeys(block["gospa"])
+    assert block["losses"] == dict.fromkeys(LOSSES, 0)

@@ -1,0 +1,82 @@
+"""Tables of the report: what they say of a made-up run, and that none is wider than the page."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+from fake_run import fake_run
+
+from isac_rt.views.report import false_table, gospa_table, loss_table, target_table
+
+
+@pytest.fixture(scope="module")
+def summary():
+    return fake_run().summary
+
+
+def row(table, *names):
+    (found,) = (r for r in table.rows if tuple(r[: len(names)]) == names)
+    return dict(zip(table.columns, found, strict=True))
+
+
+def test_who_saw_what(summary):
+    """PT1 had U1 in view in six frames of seven and found it in all but frame 5, 6.37 cm off; the
+    AT hears four. Planted bugs: found and tracked swapped; the median of another axis."""
+    table = target_table(summary)
+    at_pt = row(table, "AT to PT1", "U1")
+    assert (at_pt["In view"], at_pt["Found"], at_pt["Tracked"]) == ("6", "5", "6")
+    assert at_pt["Range [m]"] == "0.064 / 0.064"
+    assert at_pt["Velocity [m/s]"] == "0.13 / 0.13"
+    assert row(table, "AT to AT", "U1")["In view"] == "3"
+    assert {r[1] for r in table.rows} == {"AT", "U1"}
+
+
+def test_why_not(summary):
+    """Causes that never were have no column."""
+    table = loss_table(summary)
+    assert table.columns == ("Link", "UAV", "Found", "Inaccurate")
+    assert row(table, "AT to PT1", "U1") == {
+        "Link": "AT to PT1",
+        "UAV": "U1",
+        "Found": "5",
+        "Inaccurate": "1",
+    }
+
+
+def test_picture(summary):
+    """In frame 4 the track of U1 follows nobody in view."""
+    gospa, false = gospa_table(summary), false_table(summary)
+    assert row(gospa, "AT to PT1")["Localisation [m]"] == "0.3"
+    assert row(gospa, "AT to PT1")["False"] == "0.143"
+    assert row(false, "AT to PT1") == {
+        "False tracks per frame": "AT to PT1",
+        "All": "0.143",
+        "Target": "0.143",
+    }
+
+
+def test_summaries_of_earlier_versions_have_none(summary):
+    old = copy.deepcopy(summary)
+    for block in old["links"].values():
+        for key in ("gospa", "false_tracks", "targets"):
+            del block[key]
+    for table in (gospa_table, false_table, target_table, loss_table):
+        assert not table(old).rows
+
+
+def test_tables_fit_the_page(summary):
+    """With every cause and every figure at its longest. A letter of the tables is 7.5 px wide at
+    most on average, a cell has 22 px of padding; the page has 1200 px and more than the 62 rem of
+    the text only for what scrolls. Planted bug: one table of targets and causes."""
+    full = copy.deepcopy(summary)
+    for block in full["links"].values():
+        block["false_tracks"] = dict.fromkeys(block["false_tracks"], 12.3456)
+        for target in block["targets"].values():
+            target["losses"] = dict.fromkeys(target["losses"], 1234)
+            target["median"] = target["p90"] = dict.fromkeys(target["median"], 0.00012345)
+    for table in (gospa_table, false_table, target_table, loss_table):
+        found = table(full)
+        cells = zip(found.columns, *found.rows, strict=True)
+        width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
+        assert width < 1200, table.__name__
