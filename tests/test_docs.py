@@ -111,6 +111,7 @@ ELSEWHERE = {
     "targets.UAV.median",
     "targets.UAV.p90",
     "targets.UAV.losses",
+    "wall",
     "cost_model",
     "links.LINK.kept_per_frame",
     "blocks",
@@ -119,7 +120,7 @@ ELSEWHERE = {
     "feedback",
 }
 """Keys whose own keys are names, or explained with another key."""
-AT_TIMES = {"checked"}
+AT_TIMES = {"checked", "by_set"}
 """Keys that only some runs write."""
 
 
