@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
