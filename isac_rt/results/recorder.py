@@ -231,5 +231,6 @@ def kept_of_paths(frames: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
             "left_out_db": decibels(max(row["left_out"] for row in rows)),
             "plane_error_rad": max(row["plane_error"] for row in rows),
             "straight_error_rad": max(row["straight_error"] for row in rows),
+            "turning_error_rad": max(row["turning_error"] for row in rows),
         }
     return out

@@ -130,6 +130,8 @@ class Use:
     left_out : largest power left out of one range cell over the noise of a cell (linear)
     plane, straight : kept paths with a plane wavefront, without acceleration
     plane_error, straight_error : bounds of their phase errors [rad]
+    turning_error : bound of the phase by which directions turn within the frame, which is not
+        modelled [rad]
     """
 
     found: int
@@ -142,6 +144,7 @@ class Use:
     straight: int
     plane_error: float
     straight_error: float
+    turning_error: float
 
 
 @dataclass(frozen=True, kw_only=True)

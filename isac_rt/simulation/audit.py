@@ -10,6 +10,7 @@ are those that Sionna's own solver finds with `CHECK_RAYS`.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -33,10 +34,11 @@ from isac_rt.simulation.plan import (
     MATTERS_DB,
     decisions,
     extent,
+    flight_of_light,
     frame_reach,
     mechanisms,
     missed_paths,
-    standing,
+    next_slot_delay,
 )
 from isac_rt.simulation.setup import Frame, Setup
 from isac_rt.simulation.simulate import stage_seconds
@@ -69,7 +71,7 @@ class Item:
     modelled, left_out : in words
     estimate : of the error, None where there is none
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative",
-        "paths/frame" or "of the power radiated"
+        "paths/frame", "of the power radiated" or "of a path's amplitude"
     link : "TX->RX", or "all"
     seconds : per frame, None where it has no time of its own
     """
@@ -112,7 +114,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
     trace: list[float] = []
-    phases: dict[str, float] = {}
+    light, late, short_lived = 0.0, 0.0, 0
     for frame in frames:
         poses, found = setup.find(frame)
         trace += _seconds_after(setup, frame)
@@ -121,15 +123,16 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
             paths = found[link].select(found[link].power > 0)
-            for what, value in standing(paths, setup.antennas, setup.waveform, fastest).items():
-                phases[what] = max(phases.get(what, 0.0), value)
+            light = max(light, flight_of_light(paths, setup.waveform, fastest))
+            late = max(late, _late(setup, paths, last.noise_power(link)))
+            short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
     stages = stage_seconds(last, setup, receive)
     tracing = float(np.mean(trace))
     items = [_tracing_item(setup, frames, tracing)]
     items += _scene_items(setup)
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link, stages.get(link))
-    items += [Item(what, "no", "always", value, "rad") for what, value in phases.items()]
+    items += _standing_items(setup, light, late, short_lived / len(frames))
     seconds = {
         "trace": tracing,
         "synthesis": sum(s["synthesis"] for s in stages.values()),
@@ -145,6 +148,32 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         "items": [asdict(item) for item in items],
         "seconds_per_frame": seconds,
     }
+
+
+def _next_slot(setup: Setup) -> float:
+    """`next_slot_delay` of the run's blocks [s]."""
+    blocks = [b for b in setup.timetable.blocks.values() if b is not None] or [0]
+    return next_slot_delay(setup.waveform, blocks)
+
+
+def _late(setup: Setup, paths: PathSet, noise_power: float) -> float:
+    """Power of the paths whose chirps reach the next slot, over the noise of a cell."""
+    power = float(paths.power[paths.delay >= _next_slot(setup)].sum())
+    return power * setup.plan.cell_noise_gain() / noise_power
+
+
+def _standing_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
+    """Lines of what no run models: phases [rad], power over the noise of a cell, paths a frame."""
+    limit = f"paths longer than {_next_slot(setup) * SPEED_OF_LIGHT:.0f} m"
+    out = [
+        Item("motion during the flight of light", "no", "always", light, "rad"),
+        Item("chirps that reach the next slot", "no", limit, decibels(late), "dB"),
+    ]
+    if short_lived:
+        said = f"{short_lived:.3g} paths a frame begin or end in whole chirps"
+        share = 1 / (2 * setup.waveform.num_chirps)
+        out.append(Item("births and deaths", said, "half a chirp", share, "of a path's amplitude"))
+    return out
 
 
 def _seconds_after(setup: Setup, frame: int) -> list[float]:
@@ -266,6 +295,14 @@ def _link_items(
             "rad",
             name,
         ),
+        Item(
+            "directions in a frame",
+            "as at mid-frame",
+            "that they turn",
+            PHASE_MARGIN * max(use.turning_error for use in uses),
+            "rad",
+            name,
+        ),
         Item("synthesis", method.name, "rounding of the grid", error, "relative", name, seconds),
     ]
     if "receive" in at:
@@ -323,6 +360,8 @@ def _errors(
         "plane_bound_rad": use.plane_error,
         "flight_rad": _flight_error(setup, frame.number, kept),
         "straight_bound_rad": use.straight_error,
+        "turning_rad": _turning_error(setup, frame.number, kept),
+        "turning_bound_rad": use.turning_error,
         "synthesis": _synthesis_error(setup, frame, link, level),
     }
 
@@ -369,9 +408,7 @@ def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
     """Largest phase by which the kept delays differ at the ends of the frame from those over the
     true positions there [rad]."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
-    # clutter by way of a mirror flies like a farther scatterer: one bounce is the worse case
-    there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
-    moving = kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
+    moving = _with_chains(kept)
     if not len(moving):
         return 0.0
     drift = []
@@ -382,12 +419,48 @@ def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
     return float(2 * np.pi * setup.waveform.effective_carrier * error.max())
 
 
-def delays(paths: PathSet, poses: dict[str, Pose], city: CityMesh) -> np.ndarray:
-    """(K,) delays of the same chains and scatterers with the bodies elsewhere [s]."""
+def _with_chains(kept: PathSet) -> PathSet:
+    """The paths whose delays `delays` finds elsewhere too. Clutter by way of a mirror flies like a
+    farther scatterer: one bounce is the worse case."""
+    there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
+    return kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
+
+
+def _turning_error(setup: Setup, frame: int, kept: PathSet) -> float:
+    """Largest phase by which elements see a kept path change otherwise than the centroids within
+    the frame [rad]: every transmit element with the first and the last receive element, where the
+    bodies are at the ends of the frame and as they are turned there."""
+    reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
+    moving = _with_chains(kept)
+    if not len(moving):
+        return 0.0
+    antennas, lags = setup.antennas, []
+    for t in (0.0, -reach, reach):
+        poses = setup.swarm.poses(epoch + t)
+        centre = delays(moving, poses, setup.city)
+        tx = poses[kept.tx].to_world(antennas.tx_positions)
+        rx = poses[kept.rx].to_world(antennas.rx_positions[[0, -1]])
+        pairs = itertools.product(tx, rx)
+        lags.append([delays(moving, poses, setup.city, pair) - centre for pair in pairs])
+    error = np.abs(np.array(lags[1:]) - np.array(lags[0]))
+    return float(2 * np.pi * setup.waveform.effective_carrier * error.max())
+
+
+def delays(
+    paths: PathSet,
+    poses: dict[str, Pose],
+    city: CityMesh,
+    elements: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """(K,) delays of the same chains and scatterers with the bodies elsewhere [s], between two of
+    their `elements` (3,), (3,) about the centroids."""
     local = {
         name: replace(pose, position=pose.position - city.origin) for name, pose in poses.items()
     }
     start, end = local[paths.tx], local[paths.rx]
+    if elements is not None:
+        start = replace(start, position=start.position + elements[0])
+        end = replace(end, position=end.position + elements[1])
     out = np.zeros(len(paths))
     scattered = paths.kind == PathKind.DIFFUSE
     points = paths.points[scattered, 0] - city.origin if scattered.any() else np.zeros((0, 3))

@@ -19,8 +19,10 @@ whatever the phases, on average. Chains of walls that no ray met are missed
 the odd ones only; as their rays know nothing of each other, a b / m are missed by both (Lincoln and
 Petersen's estimate [1]_, which is low where some paths are much harder to find than others).
 
-What is not modelled whatever the budget (`standing`): directions that turn within a frame, jerk,
-motion during the flight of light.
+What is not modelled whatever the budget: directions that turn within a frame (`turning_bound`, no
+part of ``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, chirps that
+reach the next slot (`next_slot_delay`). But in `Exact` paths are born and die in whole chirps: half
+a chirp of the frame's P at either end, 1/(2 P) of the path's amplitude.
 
 References
 ----------
@@ -29,6 +31,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -224,6 +227,7 @@ class Plan:
             straight=int(straight.sum()),
             plane_error=float(plane_error[plane].max(initial=0.0)),
             straight_error=float(straight_error[straight].max(initial=0.0)),
+            turning_error=float(turning_bound(kept, self.antennas, w, self.swarm).max(initial=0.0)),
         )
         left = replace(
             kept,
@@ -278,7 +282,7 @@ def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.nd
         np.linalg.norm(positions, axis=1).max()
         for positions in (antennas.tx_positions, antennas.rx_positions)
     ]
-    k = 2 * np.pi * (waveform.carrier_frequency + waveform.bandwidth) / SPEED_OF_LIGHT
+    k = 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
     out = np.zeros(len(paths))
     for r, radius in zip(reach, (paths.tx_radius, paths.rx_radius), strict=True):
         out += k * r**2 / (2 * radius) * (1 + r / radius)
@@ -290,34 +294,71 @@ def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.nd
 def straight_bound(paths: PathSet, waveform: Waveform) -> np.ndarray:
     """(K,) bound of the phase error of leaving the acceleration out, at the ends of the frame
     [rad]."""
-    highest = waveform.carrier_frequency + waveform.bandwidth
-    return np.pi * highest * np.abs(paths.delay_accel) * frame_reach(waveform) ** 2
+    return np.pi * _highest(waveform) * np.abs(paths.delay_accel) * frame_reach(waveform) ** 2
 
 
-def standing(
-    paths: PathSet, antennas: Antennas, waveform: Waveform, speed: float
-) -> dict[str, float]:
-    """Phase errors of what is not modelled in any run, estimated [rad]: {what: largest over the
-    paths}.
+def turning_bound(
+    paths: PathSet, antennas: Antennas, waveform: Waveform, swarm: Swarm
+) -> np.ndarray:
+    r"""(K,) bound of the phase error of directions that stay as they are at mid-frame, at the
+    farthest elements and the ends of the frame [rad].
+
+    Where a wavefront of radius R comes nearer or turns by the way v t of its source and of the
+    body, the delay of an element at r changes by :math:`r\,v t/(R - v t - r)` at most beside that
+    of the centroid. A body that turns itself moves its elements by so much.
+    """
+    t, k = frame_reach(waveform), 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
+    poses = [swarm.poses(paths.epoch + later) for later in (0.0, -t, t)]
+    way = {
+        name: t * (float(np.linalg.norm(p.velocity)) + t * float(np.linalg.norm(p.acceleration)))
+        for name, p in poses[0].items()
+    }
+    targets = np.array([*(way[name] for name in paths.target_names), 0.0])[paths.target]
+    ends = (
+        (paths.tx, paths.rx, antennas.tx_positions, paths.tx_radius),
+        (paths.rx, paths.tx, antennas.rx_positions, paths.rx_radius),
+    )
+    out = np.zeros(len(paths))
+    for own, other, positions, radius in ends:
+        here, *then = (p[own].to_world(positions) for p in poses)
+        r = float(np.linalg.norm(positions, axis=1).max())
+        flown = way[own] + np.where(paths.target >= 0, targets, way[other])
+        flown = np.where(paths.kind == PathKind.DIFFUSE, way[own], flown)
+        room = radius - flown - r
+        # beside the body itself a direction may turn to the opposite one
+        out += k * np.where(room > flown / 2, r * flown / np.maximum(room, flown / 2), 2 * r)
+        out += k * max(float(np.linalg.norm(at - here, axis=1).max()) for at in then)
+    return np.where(paths.kind == PathKind.LEAKAGE, 0.0, out)
+
+
+def flight_of_light(paths: PathSet, waveform: Waveform, speed: float) -> float:
+    """Phase by which bodies move while light is on its way, estimated for the longest path [rad].
 
     Parameters
     ----------
     speed : of the fastest body [m/s]
     """
     k = 2 * np.pi * waveform.carrier_frequency / SPEED_OF_LIGHT
-    t = frame_reach(waveform)
-    r = max(
-        np.linalg.norm(positions, axis=1).max()
-        for positions in (antennas.tx_positions, antennas.rx_positions)
-    )
-    nearest = np.minimum(paths.tx_radius, paths.rx_radius)
-    finite = nearest[np.isfinite(nearest)]
-    turning = float((k * r * speed * t / finite).max(initial=0.0))
-    flight = float((k * speed * paths.delay).max(initial=0.0))
-    return {
-        "directions that turn within the frame": turning,
-        "motion during the flight of light": flight,
-    }
+    return float((k * speed * paths.delay).max(initial=0.0))
+
+
+def next_slot_delay(waveform: Waveform, blocks: Iterable[int]) -> float:
+    """Delay [s] from which on a chirp of the last block in use, late by its data, passes the filter
+    of the first block's chirp of the next slot; methods of synthesis leave that out.
+
+    Parameters
+    ----------
+    blocks : first resource block of each transmitter
+    """
+    w, first = waveform, list(blocks)
+    apart = max(first) + w.num_groups - 1 - min(first)
+    data = w.num_delay_symbols * w.delay_step
+    return w.slot_duration - apart * w.group_spacing - data - w.filter_transition / w.slope
+
+
+def _highest(waveform: Waveform) -> float:
+    """Highest frequency of the chirp [Hz]."""
+    return waveform.carrier_frequency + waveform.bandwidth
 
 
 def missed_paths(only_even: float, only_odd: float, both: float) -> float:

@@ -208,6 +208,24 @@ def test_births_and_deaths_of_fast_methods_are_whole_chirps():
     assert relative(synthesise(w, links, Gridded()), truth) < GRIDDED_ERROR
 
 
+@pytest.mark.parametrize("method", [Direct(), Gridded()])
+def test_a_birth_within_a_chirp_costs_half_a_chirp_at_most(method):
+    """What the plan says: 1/(2 P) of a path's amplitude. Planted bug: lives judged at the start of
+    a chirp."""
+    w, worst = SMALL, 0.0
+    for share in np.linspace(0.03, 0.97, 9):
+        rng = np.random.default_rng(6)
+        born = (4 + share) * w.slot_duration - w.frame_duration / 2
+        one = paths(w, rng, 1, begin=np.array([born]), end=np.inf, reach=0.4)
+        links = [(sender(w, rng), one)]
+        off = np.abs(synthesise(w, links, method) - synthesise(w, links, Exact()))
+        whole = np.abs(synthesise(w, links, Exact()))[:, :, -1:].sum(axis=3)  # of the last chirp
+        off = np.where(off > 0.1 * whole[..., None] / w.num_samples, off, 0.0)
+        worst = max(worst, float((off.sum(axis=(2, 3)) / (whole[..., 0] * w.num_chirps)).max()))
+    assert worst <= 1.03 / (2 * w.num_chirps)  # the middle sample is no exact middle
+    assert worst > 0.6 / (2 * w.num_chirps)
+
+
 def tone(w, *, delay=0.3, method, **change):
     """One unmodulated path of gain 1 through one sender without array offset."""
     rng = np.random.default_rng(2)

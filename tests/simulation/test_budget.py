@@ -133,6 +133,7 @@ def test_estimates_bound_the_truth_and_exceed_it_by_ten_at_most_in_nine_of_ten()
             pairs = [
                 (items["wavefronts", link], row["plane_rad"]),
                 (items["flight in a frame", link], row["flight_rad"]),
+                (items["directions in a frame", link], row["turning_rad"]),
             ]
             if row["left_out_db"] is not None and not row["missed_chains"]:
                 pairs.append((10 ** (items["paths", link] / 20), 10 ** (row["left_out_db"] / 20)))

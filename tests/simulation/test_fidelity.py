@@ -15,17 +15,21 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
+from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.tones import sources
 from isac_rt.simulation.plan import (
     Plan,
     faintest,
     frame_reach,
     missed_paths,
+    next_slot_delay,
     plane_bound,
     straight_bound,
+    turning_bound,
 )
 from isac_rt.simulation.setup import plan_of as plan_of_scenario
-from isac_rt.simulation.setup import swarm_of, timetable_of
+from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
 
 SCENES = Path(__file__).parents[2] / "scenes"
 K_MIDDLE = 2 * np.pi * 77.32e9 / SPEED_OF_LIGHT  # of the middle of the sweep [rad/m]
@@ -129,6 +133,128 @@ def test_flight_taken_as_straight_errs_by_no_more_than_its_bound():
         bound = float(straight_bound(one, w)[0])
         assert truth <= bound * 1.01 + 1e-4  # the jerk, which is not in the bound
         assert bound <= 10 * truth + 1e-3
+
+
+def near_pass(seed: int) -> Scenario:
+    """Three bodies that pass within metres of one another, two of them on curves."""
+    rng = np.random.default_rng(seed)
+    swarm = {}
+    for name, role, y, look in (
+        ("A", "active", 0.0, 1),
+        ("P", "passive", 5.0, -1),
+        ("U", "target", 2.5, 1),
+    ):
+        steps = rng.normal(0, 1, (3, 3)) * [1.0, 1.0, 0.3] * rng.uniform(0.5, 1.6)
+        places = np.array([rng.uniform(-1.5, 1.5), y, 40.0]) + np.cumsum(steps, axis=0) - steps[0]
+        swarm[name] = {
+            "role": role,
+            "rcs": {"model": "constant"},
+            "waypoints": [
+                {"time_s": t, "position_m": p.tolist()}
+                for t, p in zip((-0.07, 0.004, 0.09), places, strict=True)
+            ],
+        }
+        if name != "A":  # which looks where it flies to, and so turns
+            swarm[name]["boresight"] = [0, look, 0]
+    tree = {
+        "swarm": swarm,
+        "frames": 2,
+        "modulation": {"acquisition_frames": 1},
+        "array": {"element_pattern": "isotropic", "element_gain_dbi": 0, "rx_x": 5, "tx_z": 3},
+        "radio": {"chirps_per_frame": 120},
+        "receivers": {"min_range_m": 0.0},
+    }
+    return Scenario.model_validate(tree)
+
+
+@pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
+def test_directions_turn_by_no_more_than_their_bound():
+    """Truth: distances of every pair of elements where bodies and elements are at the ends of the
+    frame, against those of the centroids. Near passes, bodies that turn; echoes, reflections and
+    lines of sight. Planted bugs: one end of two; the speed of the fastest body for the sum of two;
+    the bodies' own turning left out."""
+    kinds, close = set(), []
+    for seed in range(14):
+        setup = prepare(near_pass(seed))
+        reach, epoch, a = frame_reach(setup.waveform), setup.timetable.epoch(0), setup.antennas
+        lags = []
+        for t in (0.0, -reach, reach):
+            p = setup.swarm.poses(epoch + t)
+
+            def way(tx, rx, body, p=p, a=a):
+                """Elements' ways less the centroids'."""
+                first = p[tx].position + np.vstack([np.zeros(3), p[tx].to_world(a.tx_positions)])
+                last = p[rx].position + np.vstack([np.zeros(3), p[rx].to_world(a.rx_positions)])
+                if body is None:
+                    length = np.linalg.norm(first[:, None] - last[None], axis=2)
+                else:
+                    there, back = (
+                        np.linalg.norm(e - p[body].position, axis=1) for e in (first, last)
+                    )
+                    length = there[:, None] + back
+                return length - length[0, 0]
+
+            lags.append(way)
+        for (tx, rx), paths in setup.find(0)[1].items():
+            bound = turning_bound(paths, a, setup.waveform, setup.swarm)
+            for k, (kind, target) in enumerate(zip(paths.kind, paths.target, strict=True)):
+                if kind == PathKind.LEAKAGE:
+                    assert bound[k] == 0
+                    continue
+                body = paths.target_names[target] if target >= 0 else None
+                now, *then = (way(tx, rx, body) for way in lags)
+                truth = K_MIDDLE * max(np.abs(at - now).max() for at in then)
+                assert truth <= bound[k], (seed, kind)
+                kinds.add(int(kind))
+                close.append(bound[k] / truth)
+    assert kinds == {PathKind.LINE_OF_SIGHT, PathKind.TARGET}
+    assert np.median(close) < 4  # velocities are rarely across, and elements not in line with them
+
+
+@pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
+@pytest.mark.parametrize("moving", ["A", "U"])
+def test_an_echo_beside_a_terminal_turns_by_a_radian(moving):
+    """3.5 m ahead and 28 m/s across, by hand: k (r_tx + r_rx) v t / R, 1.2 rad. Planted bugs: the
+    terminal's own flight left out; the target's left out."""
+    across = {"velocity_mps": [28.0, 0, 0]}
+    swarm = {
+        "A": {"role": "active", "position_m": [0, 0, 40], "boresight": [0, 1, 0]},
+        "U": {"role": "target", "position_m": [0, 3.5, 40]},
+    }
+    swarm[moving] |= across
+    tree = {"swarm": swarm, "frames": 4, "propagation": {"leakage": {"enabled": False}}}
+    setup = prepare(Scenario.model_validate(tree))
+    paths = setup.find(0)[1]["A", "A"]
+    half = setup.waveform.frame_duration / 2
+    spacing = 0.5774 * SPEED_OF_LIGHT / 77e9
+    reach = spacing * (np.hypot(16 / 3, 8 / 3) + np.hypot(77 / 15, 28 / 15))  # from the centroids
+    expected = K_MIDDLE * reach * 28.0 * half / 3.5
+    assert expected == pytest.approx(1.2, abs=0.1)
+    found = turning_bound(paths, setup.antennas, setup.waveform, setup.swarm)
+    assert found == pytest.approx([expected], rel=0.08)  # room and the top of the sweep on top
+
+
+def test_the_last_block_reaches_the_next_slot_where_it_is_said_to():
+    """Truth: every pair of blocks of two transmitters, every tenth symbol, against the filter.
+    Planted bugs: the groups of the last transmitter left out; the data's delay left out (1023 for
+    767 m with all blocks in use)."""
+    w = plan_of().waveform
+    assert next_slot_delay(w, [0, 16]) * SPEED_OF_LIGHT == pytest.approx(
+        767.5 - 0.4e6 / w.slope * SPEED_OF_LIGHT, abs=0.1
+    )
+    for blocks in ([0], [2, 9], [13, 5, 0]):
+        expected = next_slot_delay(w, blocks)
+        sent = [b + m for b in blocks for m in range(3)]
+        heard = np.inf
+        for late in np.linspace(-0.3, 0.3, 25) * w.group_spacing:
+            symbols = np.arange(0, w.num_delay_symbols + 1, 32) * w.delay_step
+            apart = np.array(
+                [[w.slot_duration + (b - f) * w.group_spacing for b in sent] for f in sent]
+            )
+            beat = w.slope * (expected + late + symbols - apart[..., None])
+            if (filter_gain(w, beat) > 0).any():
+                heard = min(heard, late)
+        assert 0 <= heard < 0.6 / 24 * w.group_spacing + 1e-12
 
 
 @pytest.mark.parametrize("limit", [0.0, 2.9, 41.0])
