@@ -121,6 +121,10 @@ class Timetable:
             Link(a, p) for a in active for p in passive if (a, p) not in self.refused
         ]
 
+    def holds(self, link: Link, frame: int) -> bool:
+        """Whether the roles of a frame have a link, even where its own terminal skips the frame."""
+        return link in self._links(frame, own=True)
+
     @cached_property
     def all_links(self) -> list[Link]:
         """Every link that is received at some time, in the order of first use."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.model import Propagation
@@ -19,11 +20,13 @@ def make_propagation(
     city: CityMesh,
     waveform: Waveform,
     knot_spacing: float = 0.0,
+    floor: NoiseFloor | None = None,
 ) -> Propagation:
     """The model that a scenario asks for. `ray_traced` starts the JIT back end.
 
     Rays search for chains of walls from knots that are at most `knot_spacing` of flight apart [m];
-    0: from where a terminal is (`legs.chains`).
+    0: from where a terminal is (`legs.chains`). With `floor` scatterers of the
+    clutter field are merged where noise covers them.
     """
     model: Propagation = free
     if propagation.model == "ray_traced":
@@ -33,7 +36,7 @@ def make_propagation(
         from isac_rt.propagation.raytrace import RayTracer
 
         model = RayTracer(
-            propagation, clutter, swarm, free, city, waveform.carrier_frequency, knot_spacing
+            propagation, clutter, swarm, free, city, waveform.carrier_frequency, knot_spacing, floor
         )
     if clutter.model == "rayleigh":
         return RayleighClutter(model, free, clutter, waveform)

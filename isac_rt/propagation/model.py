@@ -26,12 +26,15 @@ class Census:
     ----------
     scatterers : in sight of a transmitter at some time of the run
     scatterer_cells : of the whole mesh, among which those were
+    merged : by link the scatterers that are left where noise covers others; those of a link that is
+        not named are all
     mirrors : by terminal the number of its mirrors, the share of its power that they send on and
         the share that all others would
     """
 
     scatterers: int | None = None
     scatterer_cells: int | None = None
+    merged: dict[str, int] | None = None
     mirrors: dict[str, dict[str, float]] | None = None
 
 

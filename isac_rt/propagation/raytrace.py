@@ -35,6 +35,7 @@ import sionna.rt as rt
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.field import ClutterField
+from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
@@ -79,6 +80,7 @@ class RayTracer:
         city: CityMesh,
         carrier: float,
         knot_spacing: float = 0.0,
+        floor: NoiseFloor | None = None,
     ) -> None:
         self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
         self._free, self._city, self._terminals = free, city, swarm.terminals
@@ -93,7 +95,9 @@ class RayTracer:
         self.two_bounces: TwoBounces | None = None
         """The same scatterers by way of mirrors."""
         if clutter.model == "field":
-            self.field = ClutterField.plan(clutter, swarm, city, scene, wavelength, free.seed)
+            self.field = ClutterField.plan(
+                clutter, swarm, city, scene, wavelength, free.seed, floor
+            )
             if clutter.mirrors:
                 self.two_bounces = TwoBounces.plan(
                     self.field, city, wavelength, free.seed, clutter.mirrors
@@ -113,9 +117,12 @@ class RayTracer:
 
     def census(self) -> Census:
         """Scatterers and mirrors, as they were planned for the whole run."""
+        if self.field is None:
+            return Census()
         return Census(
-            None if self.field is None else len(self.field.cells),
-            None if self.field is None else self.field.num_candidates,
+            len(self.field.cells),
+            self.field.num_candidates,
+            {str(link): len(some.cells) for link, some in self.field.merged.items()},
             None if self.two_bounces is None else self.two_bounces.census(),
         )
 

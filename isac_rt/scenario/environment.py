@@ -229,9 +229,10 @@ class Clutter(Node):
     """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
     paths, the same power in all, and take longer."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
-    """Error of the mean clutter power in a range cell of 4 m that nine of ten cells keep to [dB],
-    for `field`. A smaller error takes more scatterers. The default is far below the fluctuation of
-    clutter itself."""
+    """Error that nine of ten cells keep to [dB], for `field`: of the mean clutter power in a range
+    cell of 4 m, and of noise plus mean clutter in a range-Doppler cell, under whose noise
+    scatterers are merged. A smaller error takes more scatterers. The default is far below the
+    fluctuation of clutter itself."""
     cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """Largest area that one scatterer stands for, per metre of distance to the nearest terminal's
     flight [m^2/m], for `field`. null, the default: what `max_error_db` asks for."""

@@ -109,6 +109,15 @@ class Receivers(Node):
         """Whether the detector predicts clutter from a city's mesh."""
         return self.clutter_detector in ("map", "angle_doppler")
 
+    def looks_by_beam(self, own: bool) -> bool:
+        """Whether the antennas are added in phase at an active terminal (`own`) or at a passive
+        one, so that paths far below the noise of one antenna are seen."""
+        if self.refinement == "joint":
+            return True
+        if own:
+            return self.clutter_detector in ("angle_doppler", "sample_matrix")
+        return self.symbol_decision == "beams"
+
 
 class Tracking(Node):
     """The Kalman filters, and when a track begins and ends."""

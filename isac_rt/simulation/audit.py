@@ -21,10 +21,13 @@ import numpy as np
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.clutter.cells import Density, error_for
+from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.store import CachedPropagation
+from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
 from isac_rt.results.metrics import decibels
 from isac_rt.results.records import Use
@@ -70,8 +73,8 @@ class Item:
     what : is modelled
     modelled, left_out : in words
     estimate : of the error, None where there is none
-    unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "relative",
-        "paths/frame", "of the power radiated" or "of a path's amplitude"
+    unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "dB of noise
+        and clutter", "relative", "paths/frame", "of the power radiated" or "of a path's amplitude"
     link : "TX->RX", or "all"
     seconds : per frame, None where it has no time of its own
     """
@@ -231,6 +234,10 @@ def _scene_items(setup: Setup) -> list[Item]:
         said, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
         error = record["clutter_error_db"]
         out.append(Item("clutter field", said, f"{hidden} {why}", error, "dB of a cell's mean"))
+        for link, left in record["merged"].items():
+            covered = f"{count - left} merged under noise or out of sight"
+            kept, unit = f"{left} scatterers", "dB of noise and clutter"
+            out.append(Item("clutter of the link", kept, covered, error, unit, link))
         out.append(_mirrors_item(record["mirrors"]))
     return out
 
@@ -358,6 +365,8 @@ def _errors(
         "missed_strongest": float((full.power[missed] * ratio).max(initial=0.0)),
         "plane_rad": _plane_error(setup, frame, link, found.select(heard & ~weak)),
         "plane_bound_rad": use.plane_error,
+        "clutter_db": _clutter_error(setup, frame, link),
+        "clutter_bound_db": error_for(Density.of(setup.scenario.clutter).per_metre),
         "flight_rad": _flight_error(setup, frame.number, kept),
         "straight_bound_rad": use.straight_error,
         "turning_rad": _turning_error(setup, frame.number, kept),
@@ -402,6 +411,36 @@ def _plane_error(setup: Setup, frame: Frame, link: Link, raw: PathSet) -> float:
         exact = change / (np.sqrt(radius[:, None] ** 2 + change) + radius[:, None])
         total += np.abs(exact + along).max(axis=1)
     return float(k * total.max())
+
+
+def _clutter_error(setup: Setup, frame: Frame, link: Link) -> float:
+    """Error of mean noise plus clutter that nine of ten range-Doppler cells keep to, of those that
+    hold clutter [dB]: scatterers merged against all."""
+    tracer = tracer_of(setup)
+    if tracer is None or tracer.field is None or link not in tracer.field.merged:
+        return 0.0
+    level = setup.plan.cell_noise_gain() / frame.noise_power(link)
+    origin, epoch = setup.city.origin, setup.timetable.epoch(frame.number)
+    start, end = (
+        replace(frame.poses[name], position=frame.poses[name].position - origin) for name in link
+    )
+    state, cells, powers = LinkState(link, epoch, start, end), [], []
+    for field in (tracer.field.whole(), tracer.field):
+        seen = field.seen(state)
+        heard = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
+        motion = seen.length[heard] / SPEED_OF_LIGHT, seen.rate[heard] / SPEED_OF_LIGHT
+        cells.append(resolution_cell(setup.waveform, *motion))
+        powers.append(level * (seen.magnitude * state.elements(setup.antennas, seen))[heard] ** 2)
+    _, number = np.unique(np.concatenate(cells), return_inverse=True)
+    count = number.max(initial=-1) + 1
+    if not count:
+        return 0.0
+    every, some = (
+        np.bincount(part, power, count)
+        for part, power in zip(np.split(number, [len(cells[0])]), powers, strict=True)
+    )
+    error = np.abs(10 * np.log10((1 + some) / (1 + every)))
+    return float(np.quantile(error, 0.9))
 
 
 def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:

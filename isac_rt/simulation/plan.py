@@ -31,6 +31,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -61,7 +62,8 @@ MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
 beyond, `Auto`."""
 
-
+MOST_SPREAD = 24
+"""Instants of a run at which its clutter is held against its noise."""
 REACH_MARGIN_M = 1.0
 """What the mesh reaches farther, for accelerations within a frame."""
 
@@ -137,6 +139,21 @@ class Plan:
     def synthesis_error(self) -> float:
         """Relative RMS error that the samples may have."""
         return GRIDDED_ERROR if self.preset == "fastest" else self.accuracy.synthesis_error
+
+    def spread_frames(self) -> list[int]:
+        """Frames that show how the run changes: as few as are a metre of flight apart, evenly, and
+        `MOST_SPREAD` at most."""
+        frames = self.timetable.frames
+        poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(frames)]
+        way = max(
+            sum(
+                float(np.linalg.norm(b[name].position - a[name].position))
+                for a, b in itertools.pairwise(poses)
+            )
+            for name in self.swarm.terminals
+        )
+        count = min(frames, MOST_SPREAD, int(np.ceil(way)) + 1)
+        return np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist()
 
     @cached_property
     def longest_delay(self) -> float:
@@ -405,8 +422,9 @@ def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
     -------
     record : area of a scatterer over its distance [m] and the error of the mean power that this
         brings, None without a field; faces traced; faces beyond the reach of all links and frames
-        (`Plan.mesh_radius`); scatterers in sight of a transmitter, None without a field, and cells
-        of the whole mesh among which they were; by terminal the mirrors of two-bounce clutter and
+        (`Plan.mesh_radius`); scatterers in sight of a transmitter, None without a field, cells of
+        the whole mesh among which they were, and by link what is left of them where noise covers
+        the rest; by terminal the mirrors of two-bounce clutter and
         the shares of its power that they and all others send on, None without mirrors
     """
     area = Density.of(clutter).per_metre if clutter.model == "field" else None

@@ -25,6 +25,7 @@ from isac_rt.frame.schedule import Schedule, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_propagation
+from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
@@ -51,6 +52,10 @@ from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
+
+BY_BEAM = 10.0
+"""How much deeper than a single antenna a receiver is taken to see that adds its antennas in phase
+(of 45 channels 10 to 16 dB)."""
 
 
 @dataclass(frozen=True)
@@ -201,11 +206,7 @@ class Setup:
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
-        noise, rise = self.scenario.noise, noise_rise(self.scenario.clutter)
-        if noise.model == "link_budget":
-            return rise * thermal_noise_power(noise, self.waveform)
-        amplitude = self.reference.reference_amplitude(poses, link)
-        return rise * noise_power(noise, self.waveform, amplitude)
+        return _noise_power(self.scenario, self.waveform, self.reference, poses, link)
 
     def frame(self, number: int) -> Frame:
         """Trace a frame; what it sends is by the usual schedule."""
@@ -338,6 +339,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
     )
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    floor = noise_floor(scenario, plan, free)
     make = partial(
         make_propagation,
         scenario.propagation,
@@ -347,13 +349,15 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         city,
         waveform,
         plan.max_untraced,
+        floor,
     )
     if store is None or scenario.propagation.model == "free_space":
         propagation = make()
     else:
         digest = city_digest(scenario.city, scenario.folder)
         content = path_content(scenario.model_dump(mode="json"), digest)
-        propagation = CachedPropagation(make, store, json.dumps([content, city.num_faces]))
+        about = [content, city.num_faces, "" if floor is None else floor.record()]
+        propagation = CachedPropagation(make, store, json.dumps(about))
     setup = Setup(
         scenario,
         waveform,
@@ -372,6 +376,47 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     setup = _connected(setup)
     warn_of_unseen(setup.coverage)
     return replace(setup, seconds=Seconds.of_process() - begin)
+
+
+def _noise_power(
+    scenario: Scenario,
+    waveform: Waveform,
+    reference: FreeSpace,
+    poses: dict[str, Pose],
+    link: Link,
+) -> float:
+    noise, rise = scenario.noise, noise_rise(scenario.clutter)
+    if noise.model == "link_budget":
+        return rise * thermal_noise_power(noise, waveform)
+    amplitude = reference.reference_amplitude(poses, link)
+    return rise * noise_power(noise, waveform, amplitude)
+
+
+def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFloor | None:
+    """What noise covers of each link's clutter; None where scatterers are not to be merged: links
+    that are found out in the run, mirrors, which bring clutter to other cells, and the preset
+    everything."""
+    clutter, timetable = scenario.clutter, plan.timetable
+    wanted = clutter.model == "field" and scenario.propagation.model == "ray_traced"
+    if not wanted or clutter.mirrors or scenario.access.establish or plan.preset == "everything":
+        return None
+    frames = plan.spread_frames()
+    times = np.array([timetable.epoch(frame) for frame in frames])
+    poses = [plan.swarm.poses(time) for time in times]
+    sets = [scenario.receivers, *(one.receivers for one in scenario.compare.values())]
+    over_noise = {}
+    for link in timetable.all_links:
+        by_beam = any(receivers.looks_by_beam(link.own) for receivers in sets)
+        gain = plan.cell_noise_gain() * (BY_BEAM if by_beam else 1.0)
+        over_noise[link] = np.array(
+            [
+                gain / _noise_power(scenario, plan.waveform, reference, pose, link)
+                if timetable.holds(link, frame)
+                else 0.0
+                for frame, pose in zip(frames, poses, strict=True)
+            ]
+        )
+    return NoiseFloor(plan.waveform, plan.antennas, plan.longest_delay, times, over_noise)
 
 
 def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:

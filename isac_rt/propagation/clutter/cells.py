@@ -83,19 +83,24 @@ class Cells:
     area : (N,) float32 of the cell [m^2]
     amplitude : (N,) complex64, circular Gaussian of unit power
     face : (N,) int32 face of the city's mesh
+    code : (N,) uint64 halvings of the face that lead to the cell: 1, then a bit for each
+    clock : (N,) exponential of rate `area` [1/m^2]: of any set of cells, each has the least with
+        the probability that is its share of the set's area
     """
 
     points: np.ndarray
     area: np.ndarray
     amplitude: np.ndarray
     face: np.ndarray
+    code: np.ndarray
+    clock: np.ndarray
 
     def __len__(self) -> int:
         return self.area.size
 
     def select(self, which: np.ndarray) -> Cells:
         """The cells that a mask or an index array chooses."""
-        return Cells(self.points[which], self.area[which], self.amplitude[which], self.face[which])
+        return Cells(*(part[which] for part in vars(self).values()))
 
 
 def cut(
@@ -133,8 +138,9 @@ def cut(
             f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
         )
     rows, codes, areas, triangles = (part[:count] for part in leaves)
-    point, amplitude = _draw(splitmix64(state[rows], codes), triangles)
-    return Cells(point, areas.astype(np.float32), amplitude, face[rows].astype(np.int32))
+    point, amplitude, clock = _draw(splitmix64(state[rows], codes), triangles)
+    own = face[rows].astype(np.int32)
+    return Cells(point, areas.astype(np.float32), amplitude, own, codes, clock / areas)
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:
@@ -237,13 +243,13 @@ def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
     return state
 
 
-def _draw(state: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point, uniform in each triangle (N, 3, 3), and a complex Gaussian amplitude of unit
-    power."""
-    words = np.arange(4, dtype=np.uint64)[:, None]
+def _draw(state: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A point, uniform in each triangle (N, 3, 3), a complex Gaussian amplitude of unit power, and
+    an exponential of unit mean."""
+    words = np.arange(5, dtype=np.uint64)[:, None]
     uniform = ((splitmix64(state, words) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
     root, share = np.sqrt(uniform[0])[:, None], uniform[1][:, None]
     a, b, c = np.moveaxis(triangles, 1, 0)
     point = (1 - root) * a + root * ((1 - share) * b + share * c)
     amplitude = np.sqrt(-np.log(uniform[2])) * np.exp(2j * np.pi * uniform[3])
-    return point, amplitude.astype(np.complex64)
+    return point, amplitude.astype(np.complex64), -np.log(uniform[4])

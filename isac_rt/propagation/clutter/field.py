@@ -30,17 +30,21 @@ Trans. Antennas Propag. 55(1),
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import comb
 from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
+from scipy.spatial import cKDTree
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.jit import jit
-from isac_rt.propagation.clutter.cells import Cells, Density, cut
+from isac_rt.propagation.clutter.cells import Cells, Density, cut, error_for
+from isac_rt.propagation.clutter.merging import NoiseFloor, allowed_area, merge, resolution_cell
 from isac_rt.propagation.clutter.penumbra import Facets
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight
 from isac_rt.propagation.legs.bodies import Bodies
@@ -51,7 +55,7 @@ from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.swarm import Swarm
+from isac_rt.world.swarm import Pose, Swarm
 
 TABLE = 4097
 """Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines
@@ -120,15 +124,31 @@ class Rows(NamedTuple):
     magnitude: np.ndarray
 
 
+class Scatterers(NamedTuple):
+    """Those that a link sees, and from where."""
+
+    cells: Cells
+    sight: Sight
+
+
 class ClutterField:
-    """The scatterers of one run. All links and frames see the same ones; `plan` makes
-    it."""
+    """The scatterers of one run, the same in all frames; `plan` makes it.
+
+    All links see the same ones, but for those which are `merged` where a link's noise covers them.
+    """
 
     def __init__(
-        self, city: CityMesh, cells: Cells, sight: Sight, wavelength: float, num_candidates: int
+        self,
+        city: CityMesh,
+        cells: Cells,
+        sight: Sight,
+        wavelength: float,
+        num_candidates: int,
+        merged: Mapping[Link, Scatterers] | None = None,
     ) -> None:
         self._city, self.sight = city, sight
         self.cells = cells
+        self.merged = merged or {}
         self.num_candidates = num_candidates
         """Cells of the whole city, those that are never in sight included."""
         self.surfaces = surfaces(city, wavelength)
@@ -143,9 +163,10 @@ class ClutterField:
         scene: mi.Scene,
         wavelength: float,
         seed: int,
+        floor: NoiseFloor | None = None,
     ) -> ClutterField:
         """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
-        place of its flight."""
+        place of its flight; merge what the noise of each link covers, if `floor` says."""
         flights = {
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin)
             for name in swarm.terminals
@@ -154,7 +175,8 @@ class ClutterField:
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
-        candidates = cut(city, scatters, places, Density.of(clutter), seed)
+        density = Density.of(clutter)
+        candidates = cut(city, scatters, places, density, seed)
         shadows = Shadows(scene)
         kept = shadows.ever_sees(
             _kept_places([flights[name] for name in swarm.transmitters]),
@@ -162,22 +184,98 @@ class ClutterField:
             city.normals[candidates.face],
         )
         cells = candidates.select(np.flatnonzero(kept))
-        facets = Facets(cells.points, city.normals[cells.face], cells.area)
-        sight = Sight(shadows, flights, facets, wavelength)
-        return cls(city, cells, sight, wavelength, len(candidates))
+        sight = Sight(shadows, flights, facets_of(cells, city), wavelength)
+        field = cls(city, cells, sight, wavelength, len(candidates))
+        return field if floor is None else field._covered(floor, swarm, density, places)
+
+    def of(self, link: Link) -> Scatterers:
+        """What a link sees."""
+        return self.merged.get(link, Scatterers(self.cells, self.sight))
+
+    def whole(self) -> ClutterField:
+        """The same field with nothing merged."""
+        return self._with({})
+
+    def _with(self, merged: Mapping[Link, Scatterers]) -> ClutterField:
+        whole = self._city, self.cells, self.sight, self._wavelength, self.num_candidates
+        return ClutterField(*whole, merged)
+
+    def _covered(
+        self, floor: NoiseFloor, swarm: Swarm, density: Density, places: np.ndarray
+    ) -> ClutterField:
+        """The same field, merged where noise covers it (`merging`)."""
+        cells, sight, city = self.cells, self.sight, self._city
+        finest = np.maximum(
+            density.smallest, density.per_metre * cKDTree(places).query(cells.points)[0]
+        )
+        error = 10 ** (error_for(density.per_metre) / 10) - 1
+        poses = {
+            name: [in_local(swarm.trajectories[name].pose(t), city.origin) for t in floor.times]
+            for name in dict.fromkeys(name for link in floor.over_noise for name in link)
+        }
+        seen = {
+            name: sight.from_places(np.array([pose.position for pose in of]))
+            for name, of in poses.items()
+        }
+        ever = {name: sight.ever(_kept_places([sight.flights[name]])) for name in poses}
+        merged = {}
+        for link, over_noise in floor.over_noise.items():
+            limit = np.full(len(cells), np.inf)
+            for k in np.flatnonzero(over_noise):
+                state = LinkState(link, floor.times[k], poses[link.tx][k], poses[link.rx][k])
+                share = (seen[link.tx][k] & seen[link.rx][k]).astype(np.float32)
+                ways = self._ways(cells, share, state)
+                power = over_noise[k] * (ways.magnitude * state.elements(floor.antennas, ways)) ** 2
+                delay = ways.length / SPEED_OF_LIGHT
+                cell = resolution_cell(floor.waveform, delay, ways.rate / SPEED_OF_LIGHT)
+                some = (power > 0) & (delay < floor.longest_delay)
+                index = ways.index[some]
+                area = allowed_area(
+                    power[some], cell[some], cells.area[index], finest[index], error
+                )
+                limit[index] = np.minimum(limit[index], area)
+            some = np.flatnonzero(ever[link.tx] & ever[link.rx])
+            some = merge(cells.select(some), limit[some])
+            flights = {name: sight.flights[name] for name in link}
+            own = Sight(sight.shadows, flights, facets_of(some, city), self._wavelength)
+            merged[link] = Scatterers(some, own)
+        return self._with(merged)
 
     @property
     def nbytes(self) -> int:
         """Memory of the scatterers and of what is remembered of their sight."""
-        return sum(a.nbytes for a in vars(self.cells).values()) + self.sight.nbytes
+        every = [(self.cells, self.sight), *self.merged.values()]
+        return sum(a.nbytes for cells, _ in every for a in vars(cells).values()) + sum(
+            sight.nbytes for _, sight in every
+        )
 
     def seen(self, state: LinkState, bodies: Bodies | None = None) -> Seen:
         """What is in sight of both ends of a link, poses in local coordinates; in the shadows of
         `bodies`, if given."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
-        share = self.sight.share(tx, start, state.epoch)
+        cells, sight = self.of(state.link)
+        share = sight.share(tx, start, state.epoch)
         if not own:
-            share = share * self.sight.share(rx, end, state.epoch)
+            share = share * sight.share(rx, end, state.epoch)
+        found = self._ways(cells, share, state)
+        if bodies is not None:
+            points = cells.points[found.index]
+            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, (tx,))
+            back = (
+                there
+                if own
+                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, (rx,))
+            )
+            found.magnitude[:] *= there * back
+        lit = found.magnitude > 0
+        if lit.all():
+            return found
+        parts = {id(a): a[lit] for a in vars(found).values()}
+        return Seen(*(parts[id(a)] for a in vars(found).values()))
+
+    def _ways(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
+        """What cells do of which both ends see shares (N,) that are not 0."""
+        own, start, end = state.link.own, state.start, state.end
         index = np.flatnonzero(share).astype(np.int32)
         count = index.size
         radius, departure = np.empty(count), np.empty((count, 3))
@@ -192,34 +290,32 @@ class ClutterField:
             index=index,
             magnitude=np.empty(count, np.float32),
         )
-        c, rows, motion = self.cells, Rows(*vars(found).values()), (start.motion(), end.motion())
+        rows, motion = Rows(*vars(found).values()), (start.motion(), end.motion())
+        c = cells
         _advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
-        if bodies is not None:
-            points = self.cells.points[index]
-            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, (tx,))
-            back = (
-                there
-                if own
-                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, (rx,))
-            )
-            found.magnitude[:] *= there * back
-        lit = found.magnitude > 0
-        if lit.all():
-            return found
-        parts = {id(a): a[lit] for a in vars(found).values()}
-        return Seen(*(parts[id(a)] for a in vars(found).values()))
+        return found
 
     def paths(self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None) -> PathSet:
         """The link's paths; poses, points and bodies in local coordinates."""
-        seen = self.seen(state, bodies)
+        seen, cells = self.seen(state, bodies), self.of(state.link).cells
         return state.paths(
             seen,
-            self.cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
+            cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
             PathKind.DIFFUSE,
             bounces=1,
-            points=self.cells.points[seen.index][:, None],
-            faces=self.cells.face[seen.index][:, None],
+            points=cells.points[seen.index][:, None],
+            faces=cells.face[seen.index][:, None],
         )
+
+
+def facets_of(cells: Cells, city: CityMesh) -> Facets:
+    """Where cells lie and how they are turned."""
+    return Facets(cells.points, city.normals[cells.face], cells.area)
+
+
+def in_local(pose: Pose, origin: np.ndarray) -> Pose:
+    """A pose in local coordinates."""
+    return replace(pose, position=pose.position - origin)
 
 
 def _kept_places(flights: Sequence[Flight]) -> np.ndarray:

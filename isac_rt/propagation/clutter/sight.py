@@ -143,6 +143,14 @@ class Sight:
             out[near.index] = np.abs(some)
         return out
 
+    def from_places(self, places: np.ndarray) -> np.ndarray:
+        """(K, N) bool what is seen from places (K, 3), by rays alone."""
+        return self.shadows.all_seen(places, self._facets.points, self._facets.normals)
+
+    def ever(self, places: np.ndarray) -> np.ndarray:
+        """(N,) bool what is seen from any of places (K, 3), by rays alone."""
+        return self.shadows.ever_sees(places, self._facets.points, self._facets.normals)
+
     def _near(self, name: str, knot: int) -> _Nearby:
         """The crossings that matter about a knot, as one list."""
         flight = self.flights[name]

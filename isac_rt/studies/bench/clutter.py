@@ -68,7 +68,7 @@ def _tracer(setup: Setup) -> RayTracer:
 def _field(setup: Setup) -> ClutterField:
     field = _tracer(setup).field
     assert field is not None
-    return field
+    return field.whole()
 
 
 def _scene(**clutter: Any) -> Scenario:

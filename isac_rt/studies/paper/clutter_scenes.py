@@ -133,7 +133,7 @@ class Scenes:
         assert isinstance(tracer, RayTracer)
         assert isinstance(expectation, MeshExpectation)
         assert tracer.field is not None
-        self.field, self.expectation = tracer.field, expectation
+        self.field, self.expectation = tracer.field.whole(), expectation
         self.amplitude = transmit_amplitude(scene.noise)
         self.noise = thermal_noise_power(scene.noise, self.setup.waveform)
         self.epoch = self.setup.waveform.frame_duration / 2
