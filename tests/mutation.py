@@ -36,7 +36,11 @@ ROOT = Path(__file__).parent.parent
 TESTS_OF = {
     "frame/waveform.py": "test_waveform test_ifsignal",
     "frame/payload.py": "test_payload test_receive_data",
-    "frame/antennas.py": "test_arrays test_ifsignal",
+    "frame/antennas.py": "test_arrays test_view test_ifsignal",
+    "frame/timetable.py": "test_timetable test_randomness",
+    "randomness.py": "test_randomness test_noise",
+    "scenario/swarm.py": "test_swarm",
+    "world/swarm.py": "test_swarm",
     "signal/direct.py": "test_ifsignal",
     "signal/exact.py": "test_ifsignal",
     "signal/tones.py": "test_ifsignal test_hard_signal",
@@ -65,7 +69,7 @@ TESTS_OF = {
     "propagation/clutter/mirrors.py": "test_two_bounces",
     "propagation/clutter/penumbra.py": "test_penumbra",
     "propagation/clutter/sight.py": "test_penumbra test_clutter_field test_clutter_coherence",
-    "propagation/ways.py": "test_propagation test_raytrace_scenes",
+    "propagation/ways.py": "test_ways test_propagation test_raytrace_scenes",
     "propagation/clutter/resampled.py": "test_raytrace_scenes test_clutter_field",
     "propagation/legs/reflection.py": "test_mirrors test_chains test_raytrace_scenes",
     "propagation/pathset.py": "test_propagation test_ifsignal",
@@ -73,7 +77,19 @@ TESTS_OF = {
     "propagation/legs/diffraction.py": "test_diffraction",
     "propagation/legs/direct.py": "test_shadow_edges test_diffraction",
     "propagation/legs/edges.py": "test_shadow_edges test_diffraction",
-    "terminal/expectation.py": "test_clutter_field",
+    "terminal/expectation.py": "test_clutter_field test_two_bounces",
+    "terminal/filter.py": "test_filter test_tracking",
+    "terminal/tracker.py": "test_association test_handover test_tracking",
+    "terminal/terminal.py": "test_handover test_terminal test_profile_decision",
+    "terminal/ghosts.py": "test_ghost_images test_ghosts",
+    "access/protocol.py": "test_access_stages test_access_protocol",
+    "access/synchronise.py": "test_access_synchronise test_access_answers",
+    "access/connect.py": "test_access_answers test_access_run",
+    "access/feedback.py": "test_access_feedback test_access_answers",
+    "access/fall_back.py": "test_access_answers test_fall_back",
+    "access/identify.py": "test_access_ook",
+    "access/ook.py": "test_access_ook",
+    "access/dma.py": "test_access_dma",
     "receive/active.py": "test_receive_detection",
     "receive/cfar.py": "test_receive_detection",
     "receive/clutter/filter.py": "test_clutter_filter",
@@ -101,7 +117,8 @@ TESTS_OF = {
     "receive/clutter/angle_doppler.py": "test_clutter_detectors",
     "receive/clutter/sample_matrix.py": "test_clutter_detectors",
 }
-"""Modules of the signal, the propagation and the receivers, and the tests that stand for each."""
+"""Modules of the signal, the propagation, the receivers, the terminals, access and flights, and the
+tests that stand for each."""
 LIMIT = 400
 """Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by
 then has been noticed."""
@@ -328,11 +345,11 @@ class Record:
     seconds: dict[str, float]
 
     @staticmethod
-    def made(copy: Copy, kept: Path | None) -> Record:
-        """Of the unchanged copy, from a file or by running all tests of the map."""
+    def made(copy: Copy, kept: Path | None, files: list[str]) -> Record:
+        """Of the unchanged copy, from a file or by running all tests of some modules."""
         out = kept or copy.folder / "record.json"
         if not out.exists():
-            names = sorted({name for names in TESTS_OF.values() for name in names.split()})
+            names = sorted({name for file in files for name in TESTS_OF[file].split()})
             command = [
                 sys.executable,
                 "-m",
@@ -404,13 +421,13 @@ def _functions(source: str) -> list[tuple[str, int, int]]:
     return found
 
 
-def sampled(count: int, seed: int, copy: Copy) -> list[Mutant]:
-    """So many mutants, the modules in turn, so that small ones are not forgotten, in an order that
-    leaves any first part a sample too."""
+def sampled(count: int, seed: int, copy: Copy, files: list[str]) -> list[Mutant]:
+    """So many mutants of some modules, the modules in turn, so that small ones are not forgotten,
+    in an order that leaves any first part a sample too."""
     rng = random.Random(seed)
     pools = {
         file: [m for m in mutants_of(file, copy.source(file)) if not excused(m, copy.source(file))]
-        for file in TESTS_OF
+        for file in files
     }
     for pool in pools.values():
         rng.shuffle(pool)
@@ -619,7 +636,7 @@ def main() -> int:
         "--only",
         default="",
         metavar="WORDS",
-        help="of the sample, the files with these words in their name",
+        help="sample the files with one of these in their name alone (parts of it, with commas)",
     )
     parser.add_argument(
         "--record", type=Path, help="which tests call which function; made if it is not there"
@@ -633,12 +650,10 @@ def main() -> int:
     if arguments.sample:
         with tempfile.TemporaryDirectory() as folder:
             copy = Copy(Path(folder))
-            mutants = sampled(arguments.sample, arguments.seed, copy)
-            if arguments.only:
-                mutants = [m for m in mutants if arguments.only in m.file]
-            return check_sample(
-                mutants, copy, Record.made(copy, arguments.record), arguments.report
-            )
+            files = [f for f in TESTS_OF if any(word in f for word in arguments.only.split(","))]
+            mutants = sampled(arguments.sample, arguments.seed, copy, files)
+            record = Record.made(copy, arguments.record, files)
+            return check_sample(mutants, copy, record, arguments.report)
     parser.print_help()
     return 2
 
