@@ -64,6 +64,16 @@ def test_every_message_comes_back_and_single_errors_are_caught():
         book.encode(Message(1, 19))
 
 
+@pytest.mark.parametrize("count", range(1, 34))
+def test_fields_are_as_wide_as_they_must_be(count):
+    """The least number of bits, one at least, in which so many are told apart; of senders and of
+    blocks alike, and the parity. Planted bug: one more at powers of two."""
+    width = next(bits for bits in range(1, 9) if 2**bits >= count)
+    assert Codebook(count, 19).widths == (width, 5)
+    assert Codebook(5, count).widths == (3, width)
+    assert Codebook(5, count).num_bits == 3 + width + 1
+
+
 def test_the_mask_says_on_off_and_then_the_bits():
     w = Waveform(num_samples=64, num_chirps=21)
     mask = keyed(w, np.array([1, 0, 1]))
