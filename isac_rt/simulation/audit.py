@@ -40,7 +40,6 @@ from isac_rt.simulation.plan import (
     flight_of_light,
     frame_reach,
     mechanisms,
-    missed_paths,
     next_slot_delay,
 )
 from isac_rt.simulation.setup import Frame, Setup
@@ -190,11 +189,11 @@ def _seconds_after(setup: Setup, frame: int) -> list[float]:
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
-    """Estimate of the paths of a frame over `MATTERS_DB` that are missed, all links together, from
-    some frames."""
+    """Paths of a frame over `MATTERS_DB` that are missed, all links together, as some frames let
+    it be expected (`isac_rt.simulation.plan`)."""
     tracer = tracer_of(setup)
     assert tracer is not None
-    only, both = [0, 0], 0
+    alone = 0
     for frame in frames:
         poses, found = setup.find(frame)
         when, links = setup.timetable.epoch(frame), list(found)
@@ -203,10 +202,8 @@ def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
             level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
             here = [half[link] for half in halves]
             here = [paths.select(paths.power > level * 10 ** (MATTERS_DB / 10)) for paths in here]
-            alone = [int((~present(here[k], here[1 - k])).sum()) for k in (0, 1)]
-            both += len(here[0]) - alone[0]
-            only = [a + b for a, b in zip(only, alone, strict=True)]
-    return missed_paths(only[0], only[1], both) / len(frames)
+            alone += sum(int((~present(here[k], here[1 - k])).sum()) for k in (0, 1))
+    return alone / len(frames)
 
 
 def _tracing_item(setup: Setup, frames: Sequence[int], seconds: float) -> Item:

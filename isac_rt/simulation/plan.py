@@ -14,19 +14,16 @@ Left out. Paths the IF filter stops in every group, chirp and symbol are left ou
 Ghosts and paths of the city so weak that all that are left out of one range cell together stay
 ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
 whatever the phases, on average. Chains of walls that no ray met are missed
-(`isac_rt.propagation.legs.chains`); those that are met are placed without error. Of the paths over
-`MATTERS_DB` that the even or the odd knots alone find, m are found by both, a by the even and b by
-the odd ones only; as their rays know nothing of each other, a b / m are missed by both (Lincoln and
-Petersen's estimate [1]_, which is low where some paths are much harder to find than others).
+(`isac_rt.propagation.legs.chains`); those that are met are placed without error. As many paths over
+`MATTERS_DB` are taken to be missed as only one half of the knots finds, the even or the odd ones:
+the second half of the rays adds half of that number, and what all further rays would add is taken
+for twice as much as that. Chances of being met are spread over decades, so that rules for equal
+chances (capture and recapture) state a tenth of the truth and less.
 
 What is not modelled whatever the budget: directions that turn within a frame (`turning_bound`, no
 part of ``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, chirps that
 reach the next slot (`next_slot_delay`). But in `Exact` paths are born and die in whole chirps: half
 a chirp of the frame's P at either end, 1/(2 P) of the path's amplitude.
-
-References
-----------
-.. [1] G. A. F. Seber, "The Estimation of Animal Abundance", 2nd ed., 1982, section 3.1.
 """
 
 from __future__ import annotations
@@ -376,12 +373,6 @@ def next_slot_delay(waveform: Waveform, blocks: Iterable[int]) -> float:
 def _highest(waveform: Waveform) -> float:
     """Highest frequency of the chirp [Hz]."""
     return waveform.carrier_frequency + waveform.bandwidth
-
-
-def missed_paths(only_even: float, only_odd: float, both: float) -> float:
-    """Paths that two searches which know nothing of each other both missed, from how many either
-    found alone and both found (module docstring)."""
-    return only_even * only_odd / max(both, 1.0)
 
 
 def decisions(plan: Plan) -> dict[str, Any]:

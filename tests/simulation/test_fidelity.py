@@ -22,7 +22,6 @@ from isac_rt.simulation.plan import (
     Plan,
     faintest,
     frame_reach,
-    missed_paths,
     next_slot_delay,
     plane_bound,
     straight_bound,
@@ -358,14 +357,3 @@ def test_knots_lie_as_far_apart_as_the_plan_says():
     limits = {"everything": 0.0, "fastest": 4.0}
     for preset, limit in limits.items():
         assert plan_of("munich_swarm.yaml", f"accuracy.preset={preset}").max_untraced == limit
-
-
-def test_what_two_searches_missed_is_as_much_as_said():
-    """Truth: 4000 frames of 30 paths each, which two searches find with chances of 0.9 and 0.7,
-    independently: 0.03 of the paths are missed. Tolerance: 4 sigma of the count. Planted bug: the
-    paths found by both counted twice."""
-    rng = np.random.default_rng(17)
-    even, odd = rng.random((2, 4000 * 30)) < np.array([[0.9], [0.7]])
-    counts = (even & ~odd).sum(), (odd & ~even).sum(), (even & odd).sum()
-    missed = int((~even & ~odd).sum())
-    assert missed_paths(*map(float, counts)) == pytest.approx(missed, abs=4 * np.sqrt(missed))
