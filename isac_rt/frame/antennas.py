@@ -7,6 +7,7 @@ own centroid, which is the body's position.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from isac_rt.scenario.radio import Array
 PatternModel = Literal["isotropic", "sector", "cosine"]
 
 
+@lru_cache(maxsize=64)
 def l_shape(num_x: int, num_z: int, spacing: float, step_x: int = 1, step_z: int = 1) -> np.ndarray:
     """Elements of an L (num_x + num_z - 1, 3) [m] about their centroid.
 
@@ -27,7 +29,9 @@ def l_shape(num_x: int, num_z: int, spacing: float, step_x: int = 1, step_z: int
     x = np.concatenate([np.arange(num_x)[::-1] * step_x, np.zeros(num_z - 1)])
     z = np.concatenate([np.zeros(num_x), np.arange(1, num_z) * step_z])
     positions = spacing * np.stack([x, np.zeros_like(x), z], axis=1)
-    return positions - positions.mean(axis=0)
+    positions -= positions.mean(axis=0)
+    positions.setflags(write=False)
+    return positions
 
 
 def unit_vector(cosines: npt.ArrayLike) -> np.ndarray:

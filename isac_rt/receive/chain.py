@@ -20,7 +20,7 @@ from isac_rt.receive.joint.neighbours import refine_jointly
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, LatinUnion
 from isac_rt.receive.omp import Omp
-from isac_rt.receive.pursuit import Pursuit
+from isac_rt.receive.pursuit import BySchedule, Pursuit
 from isac_rt.receive.sense import Cfar, Detector
 from isac_rt.receive.symbols.beams import ByBeams
 from isac_rt.receive.symbols.powers import ByPowers
@@ -37,7 +37,7 @@ FILTERS: dict[str, Callable[[Receivers], ClutterFilter | None]] = {
     "runs": lambda settings: ClutterFilter(settings.clutter_run_cells),
 }
 CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
-    "auto": Cfar,
+    "auto": BySchedule,
     "latin_union": partial(Cfar, doppler=LatinUnion()),
     "conventional": partial(Cfar, doppler=Conventional()),
     "omp": partial(Cfar, doppler=Omp()),

@@ -28,6 +28,8 @@ from isac_rt.receive.maps import slow_window
 
 # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
 HALF_WIDTH = 3
+STENCILS = 0.2, 0.08, 0.03
+"""Half widths of the stencils on which a peak of the likelihood is fitted [cells, bins]."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
 
@@ -214,7 +216,9 @@ def _hann_ratio(three: np.ndarray) -> float:
     return float(offset if after >= before else -offset)
 
 
-def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int = 3) -> Estimate:
+def refine(
+    local: LocalSpectra, delay: float, delay_rate: float, steps: Sequence[float] = STENCILS
+) -> Estimate:
     """Maximise the summed power by fitted paraboloids on shrinking stencils (cells and Doppler
     bins)."""
     w = local.waveform
@@ -226,7 +230,7 @@ def refine(local: LocalSpectra, delay: float, delay_rate: float, iterations: int
     def split(b: float, d: float) -> tuple[float, float]:
         return (b - d * (w.sampled_duration / w.frame_duration)) * delay_unit, d * rate_unit
 
-    for step in (0.2, 0.08, 0.03)[:iterations]:
+    for step in steps:
         at = np.array([-step, 0.0, step])
         grid = np.log(
             [[max(local.power(*split(beat + i, doppler + j)), 1e-300) for j in at] for i in at]

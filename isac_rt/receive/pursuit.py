@@ -9,34 +9,43 @@ sparse sampling go with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.cfar import CfarRule, first_row
+from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, peaks, without_sidelobes
 from isac_rt.receive.estimate import (
+    STENCILS,
     Estimate,
     LocalSpectra,
     direction_cosines,
-    hann_response,
     refine,
     start_point,
 )
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import LATIN_UNION, LatinUnion, power_map
-from isac_rt.receive.sense import Cfar, Sensed, describe
+from isac_rt.receive.maps import LATIN_UNION, UNION_FLOOR, LatinUnion, power_map
+from isac_rt.receive.omp import Omp, sparse_enough
+from isac_rt.receive.sense import Cfar, Sensed, describe, doppler_of, window_gain
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
-REACH = 24
-"""Range rows on each side in which a path is taken out; Hann's lobes are 90 dB down there."""
-CYCLES = 3
-"""Times that the paths about a new one are estimated again, each with the others taken out."""
+FARTHEST_REACH = 24
+"""Range rows on each side in which the strongest paths are taken out; Hann's lobes are 90 dB down
+there."""
+LEAST, FELT = 0.01, 0.1
+"""Of the noise in a cell: what a path leaves in it below the first is not taken out, and below the
+second not felt by another path."""
+CYCLES, SETTLED, SETTLED_STD = 6, 2e-3, 0.25
+"""Most times that the paths which a new one touches are estimated again, each with the others taken
+out, and the move that ends it, in cells and bins and in deviations."""
 LEFT_OVER_DB = 35.0
 """What is this far under a path found before, within `NEAR` rows and bins of it, is what its
 removal left."""
 NEAR = (3, 4)
+CLOSE = STENCILS[1:]
+"""Of the estimates after the first."""
 
 
 @dataclass(frozen=True)
@@ -49,85 +58,212 @@ class Pursuit(Cfar):
         self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
     ) -> Sensed:
         paths, snr, power = pursue(spectra, known, self.settings)
-        level = self.rule(known).detect(power)[1]
-        return Sensed(paths, describe(paths, snr, known), power, level)
+        above, level = self.rule(known).detect(power)
+        sparse = None
+        if not known.full:
+            noise = float(np.median(power)) / window_gain(known)
+            sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, known)
+        return Sensed(paths, describe(paths, snr, known), power, level, sparse)
+
+
+@dataclass(frozen=True)
+class BySchedule(Cfar):
+    """The CFAR on the map that the schedule asks for, and `Pursuit` where slow time is sampled
+    sparsely: there the map has sidelobes at all velocities. On the grid the paper's OMP."""
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        if isinstance(doppler_of(known), Omp) and not self.estimator.on_grid:
+            return Pursuit(self.settings, self.estimator).sense(spectra, known, clutter)
+        return super().sense(spectra, known, clutter)
+
+
+@dataclass
+class _Path:
+    """A path that was found: its estimate, its power on the map when it was, and what of it is
+    taken out: rows [first, last), and the elements' delays [cells]."""
+
+    estimate: Estimate
+    power: float
+    snr: float
+    rows: tuple[int, int] = (0, 0)
+    sent: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heard: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def pursue(
     spectra: np.ndarray, known: Known, settings: Receivers
 ) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
-    """Paths of a frame from cleaned spectra, in the order in which they were found, their SNR on
-    the map that was left, and the map (rows, P) before anything was taken out.
+    """Paths of a frame from cleaned spectra, their SNR on the map in which they were found, and the
+    map (rows, P) before anything was taken out.
+
+    In each round the peaks that are no sidelobes of stronger ones are estimated and taken out, the
+    strongest first. Then they and the paths that they touch are estimated again, each with the
+    others out: the orthogonal step. A map is made once a round, and a path costs by those that it
+    touches and not by all.
 
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) from `clean_spectrum`; not changed
     """
-    w, left = known.waveform, spectra.copy()
+    left, floor = spectra.copy(), sidelobe_floor(known)
     rule, first = CfarRule.of(settings, known.channels), first_row(settings, known.range_cell)
     power = power_map(left, known)
     whole = power.copy()
+    noise = max(float(np.median(power)), 1e-30)
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder
-    found: list[Estimate] = []
-    snr: list[float] = []
+    found: list[_Path] = []
     while len(found) < settings.max_detections:
         above, level = rule.detect(power)
         above[:first] = False
         above &= power > taken
-        if not above.any():
+        rows, bins = peaks(power, above, (1, 1))
+        keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
+        rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
+        if not rows.size:
             break
-        row, column = divmod(int(np.where(above, power, 0).argmax()), power.shape[1])
-        local = LocalSpectra(left, known, row)
-        estimate = refine(local, *start_point(power, row, column, w))
-        found.append(estimate)
-        snr.append(float(power[row, column] / level[row, column]))
-        rows = np.arange(max(row - NEAR[0], 0), min(row + NEAR[0] + 1, len(power)))
-        columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % w.num_chirps
-        block = np.ix_(rows, columns)
-        taken[block] = np.maximum(taken[block], power[row, column] * 10 ** (-LEFT_OVER_DB / 10))
-        changed = _take_out(left, estimate, known)
-        _fit_again(left, found, known)
-        power[changed] = power_map(left[:, :, changed], known)
-    return found, np.array(snr), whole
+        new = []
+        for row, column in zip(rows.tolist(), bins.tolist(), strict=True):
+            peak = float(power[row, column])
+            local = LocalSpectra(left, known, row)
+            estimate = refine(local, *start_point(power, row, column, known.waveform))
+            new.append(_Path(estimate, peak, peak / float(level[row, column])))
+            _take_out(left, new[-1], known, noise)
+            _mark(taken, row, column, peak)
+        found += new
+        _fit_again(left, found, len(new), known, noise)
+        if len(found) < settings.max_detections:
+            power = power_map(left, known)
+    return [f.estimate for f in found], np.array([f.snr for f in found]), whole
 
 
-def _fit_again(spectra: np.ndarray, found: list[Estimate], known: Known) -> None:
-    """Estimate the last path and those within its rows once more, each with the others taken out:
-    the orthogonal step. In place."""
+def sidelobe_floor(known: Known) -> float:
+    """Share of a path's power that its removal by the Doppler transform alone may leave in any bin
+    of its row: the resampling's, or in a sparse sampling the highest sidelobes of antennas' random
+    slots, ln P / S with S chirps each, as far as they agree."""
+    if known.full:
+        return UNION_FLOOR
+    least = min(int(sent.sum()) for sent in known.sent_by)
+    return float(np.log(known.waveform.num_chirps) / least)
+
+
+def _mark(taken: np.ndarray, row: int, column: int, peak: float) -> None:
+    """Raise, in place, the power about a peak under which a cell holds its remainder."""
+    rows = np.arange(max(row - NEAR[0], 0), min(row + NEAR[0] + 1, len(taken)))
+    columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % taken.shape[1]
+    block = np.ix_(rows, columns)
+    taken[block] = np.maximum(taken[block], peak * 10 ** (-LEFT_OVER_DB / 10))
+
+
+def _fit_again(
+    spectra: np.ndarray, found: list[_Path], count: int, known: Known, noise: float
+) -> None:
+    """Estimate the last `count` paths and those that they touch once more, each with the others
+    taken out; in place. A path that nothing touches stays as it is."""
     w = known.waveform
-    place = [float(w.beat_cells(e.delay, e.delay_rate).mean()) for e in found]
-    near = [k for k in range(len(found)) if abs(place[k] - place[-1]) < 2 * NEAR[0]]
-    for _ in range(CYCLES if len(near) > 1 else 0):
+    power = np.array([f.power for f in found])
+    rate = 1 / (w.frame_duration * w.effective_carrier)
+    place = np.array(
+        [
+            [w.beat_cells(f.estimate.delay, f.estimate.delay_rate).mean() for f in found],
+            [f.estimate.delay_rate / rate for f in found],
+        ]
+    )
+    rows, bins = np.abs(place[:, :, None] - place[:, None, :])
+    bins = np.minimum(bins % w.num_chirps, -bins % w.num_chirps)
+    lobes = hann_envelope(np.maximum(rows - 1, 0)) * (
+        hann_envelope(np.maximum(bins - 1, 0)) + sidelobe_floor(known)
+    )
+    touches = np.minimum(power[:, None], power) * lobes > FELT * noise
+    np.fill_diagonal(touches, False)
+    fresh = np.arange(len(found)) >= len(found) - count
+    near = np.flatnonzero((touches & (fresh | fresh[:, None])).any(axis=1))
+    for cycle in range(CYCLES):
+        moved = []
         for k in near:
-            _take_out(spectra, found[k], known, back=True)
-            row = min(max(round(place[k]), 0), spectra.shape[2] - 1)
+            path, before = found[k], found[k].estimate
+            _add(spectra, path, known, 1.0)
+            row = min(max(round(float(place[0, k])), 0), spectra.shape[2] - 1)
             local = LocalSpectra(spectra, known, row)
-            found[k] = refine(local, found[k].delay, found[k].delay_rate)
-            _take_out(spectra, found[k], known)
+            path.estimate = refine(local, before.delay, before.delay_rate, CLOSE)
+            if cycle == 0:
+                _take_out(spectra, path, known, noise)
+            else:  # where it comes from it does not change any more
+                _add(spectra, path, known, -1.0)
+            move = np.array(
+                [
+                    (path.estimate.delay - before.delay) / w.delay_step,
+                    (path.estimate.delay_rate - before.delay_rate) / rate,
+                ]
+            )
+            deviation = 0.55 / np.sqrt(path.snr * known.channels)
+            moved.append(np.abs(move).max() > max(SETTLED, SETTLED_STD * deviation))
+        near = near[moved]
 
 
-def _take_out(
-    spectra: np.ndarray, estimate: Estimate, known: Known, *, back: bool = False
-) -> slice:
-    """Subtract a path in place from the rows that it reaches, or put it `back`; returns the rows.
-    The template is that of `LocalSpectra` with each element's own delay."""
-    w, e, schedule = known.waveform, estimate, known.schedule
-    beat = w.beat_cells(e.delay, e.delay_rate, known.times)
-    cycles = w.phase(e.delay + e.delay_rate * known.times, w.window_middle)
+def _take_out(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> None:
+    """Subtract a path in place from the rows in which it is felt. The template is that of
+    `LocalSpectra` with each element's own delay."""
+    w, e = known.waveform, path.estimate
     middle = round(float(w.beat_cells(e.delay, e.delay_rate).mean()))
-    rows = np.arange(max(middle - REACH, 0), min(middle + REACH + 1, spectra.shape[2]))
+    # of Hann's lobes, 1 / (pi d^3)^2; a row for migration
+    lobe = (max(path.power / (LEAST * noise), 1.0) / np.pi**2) ** (1 / 6)
+    reach = int(min(np.ceil(lobe) + 3, FARTHEST_REACH))
+    path.rows = max(middle - reach, 0), min(middle + reach + 1, spectra.shape[2])
     direction = np.nan_to_num(direction_cosines(e, known))
-    heard, sent = (
+    path.heard, path.sent = (
         element_delays(positions, direction, known.radius(e.delay))[0] / w.delay_step
         for positions in (known.antennas.rx_positions, known.antennas.tx_positions)
     )
-    sent = sent * (known.passes == 2)
-    for m in range(len(spectra)):
-        turn = np.exp(
-            2j * np.pi * (cycles[m] - rows[:, None] * (w.window_length / 2 / w.num_samples))
-        )
+    path.sent = path.sent * (known.passes == 2)
+    _add(spectra, path, known, -1.0)
+
+
+def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
+    """Add a path times `sign` to the rows in which it was taken out, in place."""
+    w, e = known.waveform, path.estimate
+    cycles = w.phase(e.delay + e.delay_rate * known.times, w.window_middle)
+    _add_template(
+        spectra,
+        path.rows,
+        sign * e.channels,
+        np.ascontiguousarray(known.schedule),
+        w.beat_cells(e.delay, e.delay_rate, known.times),
+        np.exp(2j * np.pi * cycles),
+        path.sent,
+        path.heard,
+        (float(w.window_length), float(w.num_samples)),
+    )
+
+
+@jit
+def _add_template(spectra, rows, channels, schedule, beat, turn, sent, heard, window):
+    """spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] `hann_response`(beat + sent + heard - i)
+    exp(-j pi i length / size), tx the antenna of the chirp, for i in [*rows)."""
+    length, size = window
+    share = length / size
+    num_chirps = spectra.shape[3]
+    near, sine, cosine = np.empty(num_chirps), np.empty(num_chirps), np.empty(num_chirps)
+    factor = np.empty(num_chirps, np.complex128)
+    for m in range(spectra.shape[0]):
         for rx in range(spectra.shape[1]):
-            shape = hann_response(w, beat[m] + sent[schedule[m]] + heard[rx] - rows[:, None])
-            path = (e.channels[schedule[m], rx] * shape * turn).astype(np.complex64)
-            spectra[m, rx, rows] += path if back else -path
-    return slice(int(rows[0]), int(rows[-1]) + 1)
+            for p in range(num_chirps):
+                tx = schedule[m, p]
+                near[p] = (beat[m, p] + sent[tx] + heard[rx] - rows[0]) * share
+                sine[p], cosine[p] = np.sin(np.pi * near[p]), np.cos(np.pi * near[p])
+                factor[p] = channels[tx, rx] * turn[m, p] * (length / 2)
+            for i in range(rows[1] - rows[0]):
+                c, s = np.cos(np.pi * share * i), np.sin(np.pi * share * i)
+                angle = np.pi * share * (rows[0] + i)
+                back = complex(np.cos(angle), -np.sin(angle))
+                line = spectra[m, rx, rows[0] + i]
+                for p in range(num_chirps):
+                    d = near[p] - i * share
+                    if abs(abs(d) - 1.0) < 1e-6:
+                        shape = 0.5
+                    elif abs(d) < 1e-9:
+                        shape = 1.0
+                    else:
+                        shape = (sine[p] * c - cosine[p] * s) / (np.pi * d * (1.0 - d * d))
+                    line[p] += factor[p] * back * shape

@@ -22,11 +22,13 @@ class Receivers(Node):
     """How terminals detect targets and decode data."""
 
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
-    """How velocities are found. `omp`: orthogonal matching pursuit on the grid, the paper's for
-    sparse sampling. `pursuit`: the same off the grid, path by path. `latin_union`: all groups as
-    one uniform sampling, where there are as many as transmit antennas. `conventional`: the DFT over
-    each antenna's equally spaced chirps, which divides the unambiguous velocity by their number.
-    `auto`, the default: by the schedule and the groups received."""
+    """How velocities are found. `latin_union`: all groups as one uniform sampling, where there are
+    as many as transmit antennas. `conventional`: the DFT over each antenna's equally spaced chirps,
+    which divides the unambiguous velocity by their number. `pursuit`: path by path, each taken out
+    whole off the grid, so that its sidelobes hide no weaker ones. `omp`: orthogonal matching
+    pursuit on the grid, the paper's for sparse sampling. `auto`, the default: `latin_union` where
+    all groups are received, `conventional` where the schedule is, else `pursuit`, or with
+    `refinement: grid` `omp`."""
     refinement: Literal["grid", "local", "joint"] = "local"
     """How finely a detection is placed. `grid`: the middle of its range and Doppler cell, the
     paper's. `local`, the default: maximum likelihood about each peak, at little cost. `joint`: all

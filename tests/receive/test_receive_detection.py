@@ -655,7 +655,7 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     beat = 101.3 + 7.7 * w.sampled_duration / w.frame_duration
     for off in ([0.31, -0.22], [-0.17, -0.35]):
         hill = Hill(w, (beat + off[0], 7.7 + off[1]), np.array(bend))
-        found = refine(hill, *start, iterations=1)
+        found = refine(hill, *start, steps=(0.2,))
         assert found.delay_rate / rate_unit == pytest.approx(7.7 + off[1], abs=1e-6)
         there = (
             w.slope * found.delay + found.delay_rate * w.effective_carrier
@@ -663,10 +663,10 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
         assert there == pytest.approx(beat + off[0], abs=1e-6)
         assert found.channels.tolist() == [[found.delay, found.delay_rate]]
     valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
-    found = refine(valley, *start, iterations=1)
+    found = refine(valley, *start, steps=(0.2,))
     assert valley.power(found.delay, found.delay_rate) > valley.power(*start)
     for far in ([4.3, -5.1], [-2.9, 3.7]):
-        found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, iterations=1)
+        found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, steps=(0.2,))
         there = (
             w.slope * found.delay + found.delay_rate * w.effective_carrier
         ) * w.sampled_duration
