@@ -3,6 +3,10 @@ cannot."""
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
 import pytest
 
 from isac_rt.runtime import RuntimeProblem, choose_backend
@@ -29,3 +33,20 @@ def _backend(request: pytest.FixtureRequest) -> None:
         from isac_rt.runtime import activate
 
         activate()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """Makes a file system of its own with room for so many kB; skips where none can be mounted."""
+    disk = tmp_path / "disk"
+
+    def mounted(kilobytes: int) -> Path:
+        disk.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(disk)]
+        if subprocess.run(command, check=False, capture_output=True).returncode:
+            pytest.skip("no disk can be mounted here")
+        return disk
+
+    yield mounted
+    if disk.is_mount():
+        subprocess.run(["umount", "-l", str(disk)], check=True)

@@ -7,12 +7,14 @@ import importlib.metadata
 import json
 import platform
 import subprocess
+import sys
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from isac_rt.scenario.file import to_yaml
+from isac_rt.scenario.file import ScenarioWarning, to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.world.area import city_digest, file_digest
 
@@ -62,8 +64,30 @@ def _versions() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Python's version and that of every package that a result depends on."""
+    """Python's version and the installed one of every package that a result depends on: the same
+    in every process, for keys."""
     return dict(_versions())
+
+
+def versions_in_use() -> dict[str, str]:
+    """The same, with what a loaded module says of itself where that is another version; each such
+    difference is warned of once."""
+    found = versions()
+    for name, installed in found.items():
+        stated = getattr(sys.modules.get(name.replace("-", ".")), "__version__", installed)
+        if stated != installed:
+            found[name] = f"{installed} (in use: {stated})"
+            _warn_of(name, found[name])
+    return found
+
+
+@lru_cache
+def _warn_of(name: str, version: str) -> None:
+    said = (
+        f"{name} {version}: another copy than the installed one is loaded; look at PYTHONPATH, "
+        "and start anew after an upgrade"
+    )
+    warnings.warn(ScenarioWarning(said), stacklevel=2)
 
 
 @lru_cache(maxsize=1)
@@ -137,7 +161,7 @@ def provenance(scenario: Scenario) -> dict[str, str | int]:
         "title": f"isac_rt: {scenario.name}",
         "scenario": to_yaml(scenario),
         "seed": scenario.seed,
-        "versions": json.dumps(versions()),
+        "versions": json.dumps(versions_in_use()),
         "commit": commit(),
         "platform": f"{platform.system()} {platform.machine()}",
         "Conventions": "CF-1.11",

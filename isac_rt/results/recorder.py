@@ -13,7 +13,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.results.dataset import Row, dataset_of, row_of
 from isac_rt.results.metrics import SymbolCount, decibels
-from isac_rt.results.provenance import versions
+from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord
 from isac_rt.results.sensing import Sensing, summary_block
 from isac_rt.scenario.tree import Scenario
@@ -140,7 +140,7 @@ class Recorder:
                 if (judged := self._sparsity(link))
             }
             or None,
-            "versions": versions(),
+            "versions": versions_in_use(),
         }
 
     def blocks(self) -> dict[str, Any]:

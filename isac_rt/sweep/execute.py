@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,8 +34,7 @@ WORKER_BYTES = 1.5e9
 receivers at work."""
 LOST_AFTER = 5
 """Workers that a point may take with it before it is left to do."""
-PASSES = 2
-"""Times that a point is tried which the machine did not let end."""
+DEADLY = f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
 PATIENCE = 2
 """Windows of points in a row that the machine did not let end: then the sweep stops."""
 ROOM = 1_000_000
@@ -321,16 +321,17 @@ class _Runner:
         self._left: dict[str, tuple[Point, str]] = {}
         self._in_a_row = 0
         self._troubled: set[str] = set()
+        self._numbers = count()
 
     def run(self) -> None:
         """Until every point is done, failed or left."""
-        points = pending(self._plan, self._outcomes, self._retry_failed)
-        for _ in range(PASSES):
-            self._pass(points)
-            points = iter([point for point, _ in self._left.values()])
-            if not self._left or self._stuck:
-                break
-            self._left, self._in_a_row = {}, 0
+        self._pass(pending(self._plan, self._outcomes, self._retry_failed))
+        again = [point for point, why in self._left.values() if why != DEADLY]
+        if again and not self._stuck:
+            for point in again:
+                del self._left[point.key]
+            self._in_a_row = 0
+            self._pass(iter(again))
         if self._left:
             (point, why), *_ = self._left.values()
             raise PointsLeft(
@@ -399,17 +400,20 @@ class _Runner:
         self._active[point.key] = point
         good = self._troubled and [w for w in self._client.nthreads() if w not in self._troubled]
         rather = {"workers": good, "allow_other_workers": True} if good else {}
-        task = f"point-{point.key}"
+        task = f"point-{point.key}-{next(self._numbers)}"  # never one that may be forgotten
         queue.add(self._client.submit(run_job, job, key=task, pure=False, **rather))
 
     def _finish(self, future: Any, queue: Any) -> None:
         from distributed import CancelledError
 
-        key = future.key.removeprefix("point-")
-        point = self._active.pop(key)
-        if future.cancelled() or future.status == "lost":
-            self._active[key] = point
+        if future.cancelled():
             raise CancelledError("its tasks are gone")
+        key = future.key.split("-")[1]
+        point = self._active.pop(key)
+        if future.status == "lost":  # its worker died before its word was heard
+            future.release()
+            self._submit(point, queue)
+            return
         ended = Ended("left", _of_worker(future)) if future.status == "error" else future.result()
         future.release()
         if ended.status == "left":
@@ -433,5 +437,5 @@ def _of_worker(future: Any) -> str:
     """What took a worker's task down."""
     problem = future.exception()
     if type(problem).__name__ == "KilledWorker":
-        return f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
+        return DEADLY
     return _words(problem)

@@ -3,11 +3,13 @@ that are torn, another's or no one's."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sqlite3
 import subprocess
 import sys
+from collections import deque
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -16,11 +18,14 @@ import pytest
 from test_fall_back import scenario as dense_scenario
 
 from isac_rt.cli.cli import main
+from isac_rt.cli.interruption import Terminated
 from isac_rt.results.files import open_results
 from isac_rt.results.provenance import run_content
 from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
+from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
+from isac_rt.simulation.setup import prepare
 from isac_rt.storage import ARRAY, checksum, pack, unpack
 
 ROOT = Path(__file__).parents[2]
@@ -88,6 +93,77 @@ def test_a_stopped_run_goes_on_to_the_same_bits(name, tmp_path):
     assert_equal_results(again, whole)
     entries = list(Resume(tmp_path, run_content(scenario, 2)).entries())
     assert len(entries) == scenario.frames - 1
+
+
+def differences(a, b, at=""):
+    """Places at which two objects differ, whatever they are made of."""
+    if a is b or callable(a):
+        return
+    if isinstance(a, np.ndarray):
+        if a.dtype != b.dtype or a.shape != b.shape or a.tobytes() != b.tobytes():
+            yield at
+    elif isinstance(a, dict):
+        if a.keys() != b.keys():
+            yield f"{at}: keys"
+        for key in a.keys() & b.keys():
+            yield from differences(a[key], b[key], f"{at}[{key}]")
+    elif isinstance(a, list | tuple | deque):
+        if len(a) != len(b):
+            yield f"{at}: length"
+        for i, (one, other) in enumerate(zip(a, b, strict=False)):
+            yield from differences(one, other, f"{at}[{i}]")
+    elif hasattr(a, "__dict__"):
+        for name, value in vars(a).items():
+            yield from differences(value, vars(b)[name], f"{at}.{name}")
+    elif not (a == b or (a != a and b != b)):
+        yield at
+
+
+def counted(value, step=1):
+    """Give every count of an object, and of what it holds, a number of its own."""
+    for name, held in vars(value).items():
+        if type(held) is int:
+            step += 1
+            setattr(value, name, held + 1000 * step)
+        elif type(held) is dict and held and all(type(v) is int for v in held.values()):
+            setattr(value, name, {k: v + 77 * i for i, (k, v) in enumerate(held.items(), 1)})
+
+
+def test_everything_that_is_carried_over_is_taken_up(tmp_path):
+    """Every attribute of every receiver, tracker, track, score and schedule after four frames,
+    counts made different from each other and from nothing. Planted bugs: a count of the score, the
+    time of a tracker, the next track's number, the repaired slips, or the feedback forgotten."""
+    scenario = dense_scenario(frames=5).model_copy(
+        update={"compare": {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking())}}
+    )
+    setup = prepare(scenario)
+
+    def begin():
+        return simulate._Run.begin(scenario, setup, 1, simulate.standard_terminal)
+
+    resume = Resume(tmp_path, "content", every=1e9)
+    first, second = begin(), begin()
+    with pytest.raises(Stopped):
+        first.fly(stopping_at(4), 1, resume)
+    listeners = [first.own, *first.compared.values()]
+    for one in listeners:
+        for observer in one.observers.values():
+            for part in (observer, observer.scorer.score, observer.terminal):
+                counted(part)
+            counted(observer.terminal.tracker)
+    assert resume.append(first.memory())
+    assert second.restore(resume) == 4
+    first.kept = second.kept
+    for run in (first, second):
+        run.clock.seconds.clear()
+        run.clock.begun = 0.0
+    assert list(differences(first, second)) == []
+    assert {"frames", "hits", "feedback"} <= {
+        name
+        for observer in first.own.observers.values()
+        for part in (observer, observer.scorer.score)
+        for name in vars(part)
+    }
 
 
 def test_a_run_with_all_but_its_last_frame_kept_hears_that_one_alone(tmp_path, monkeypatch):
@@ -337,6 +413,62 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
     Resume(tmp_path / "out", "another").append(1)
     assert main([*other, "--restart"]) == 0
     assert open_results(tmp_path / "out").summary["seed"] == 77
+
+
+@pytest.mark.parametrize(
+    ("problem", "status", "said"),
+    [
+        (MemoryError(), 2, "MemoryError: there is no more memory"),
+        (OSError(errno.EIO, "Input/output error"), 2, "Input/output error"),
+        (SystemError("a library's"), 1, "SystemError: a library's (this is a fault"),
+        (Terminated(signal.SIGHUP), 129, "interrupted"),
+    ],
+)
+def test_whatever_ends_a_run_keeps_what_is_done(
+    tmp_path, monkeypatch, capsys, problem, status, said
+):
+    """One message, the exit code, where the frames are; the next call goes on. Planted bug: said
+    on Ctrl-C only."""
+    (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
+    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    hear = simulate._Observer.hear
+
+    def broken(self, frame, *rest):
+        if frame.number == 3:
+            raise problem
+        return hear(self, frame, *rest)
+
+    command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
+    with monkeypatch.context() as once:
+        once.setattr(simulate._Observer, "hear", broken)
+        assert main(command) == status
+    shown = capsys.readouterr().err
+    assert said in shown and "keeps the frames so far" in shown and "Traceback" not in shown
+    assert main(command) == 0
+    assert "going on after" in capsys.readouterr().err
+
+
+def test_a_run_on_a_full_disk_goes_on_once_there_is_room(tmp_path, small_disk, monkeypatch, capsys):
+    """A real one, which is full when the frames are kept (a warning), and when the results are
+    written (exit 2, one message, no half file): then the same command goes on to the same bits.
+    Planted bug: the kept frames removed when no more can be."""
+    (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=5)))
+    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    monkeypatch.setattr("isac_rt.views.report.write_report", lambda *_: None)
+    disk = small_disk(64)
+    out = disk / "out"
+    command = ["run", str(tmp_path / "scene.yaml"), "--out", str(out)]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert said.count("cannot write") == 1 and "No space left" in said and "make room" in said
+    assert "not kept (database or disk is full)" in said and "Traceback" not in said
+    assert [p.name for p in out.iterdir()] == [FILE] and "keeps the frames so far" in said
+    subprocess.run(["mount", "-o", "remount,size=40m", str(disk)], check=True)
+    assert main(command) == 0
+    assert "going on after" in capsys.readouterr().err
+    assert_equal_results(open_results(out), simulate.run(dense_scenario(frames=5)))
 
 
 @pytest.mark.slow

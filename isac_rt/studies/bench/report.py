@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.results.provenance import versions
+from isac_rt.results.provenance import versions_in_use
 from isac_rt.studies.bench import STAGES, command
 
 Row = Mapping[str, Any]
@@ -43,7 +43,7 @@ def machine() -> dict[str, Any]:
         "processor": model or platform.machine(),
         "cores": os.cpu_count(),
         "platform": platform.platform(),
-        "versions": versions(),
+        "versions": versions_in_use(),
     }
 
 

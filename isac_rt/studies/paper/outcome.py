@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from isac_rt.results.files import write_figure
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.results.provenance import commit, versions
+from isac_rt.results.provenance import commit, versions_in_use
 from isac_rt.storage import write_whole
 
 Judgement = Literal["holds", "holds under a condition", "does not hold"]
@@ -167,7 +167,7 @@ def write(outcome: Outcome, folder: str | Path) -> list[Path]:
         "verdicts": [asdict(v) for v in outcome.verdicts],
         "settings": dict(outcome.settings),
         "files": [file.name for file in written],
-        "versions": versions(),
+        "versions": versions_in_use(),
         "commit": commit(),
     }
     written.append(folder / f"{outcome.name}.json")

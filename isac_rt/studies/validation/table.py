@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from isac_rt.results.provenance import commit, program_fingerprint, versions
+from isac_rt.results.provenance import commit, program_fingerprint, versions_in_use
 from isac_rt.storage import write_whole
 from isac_rt.studies.validation.case import Measured
 
@@ -40,7 +40,7 @@ def as_data(verdicts: Sequence[Measured]) -> dict[str, object]:
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "program": program_fingerprint(),
         "commit": commit(),
-        "versions": versions(),
+        "versions": versions_in_use(),
         "passed": sum(v.passed is True for v in verdicts),
         "failed": sum(v.passed is False for v in verdicts),
         "left_out": sum(v.passed is None for v in verdicts),
