@@ -638,8 +638,6 @@ CHANGES = {
     "receiver_preset": "paper",
     "compare": {"runs": {"receivers": {"clutter_filter": "runs"}}},
     "tracking": {"confirm_hits": 2},
-    "receiver_preset": "paper",
-    "compare": {"other": {"preset": "paper"}},
 }
 """One change of each part of a scenario."""
 
