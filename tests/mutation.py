@@ -218,6 +218,11 @@ class _Finder(ast.NodeVisitor):
         for statement in node.body:  # not the annotations, nor the defaults and decorators
             self.visit(statement)
 
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        for statement in node.body:  # methods alone: what a class sets is a default or a name
+            if isinstance(statement, ast.FunctionDef):
+                self.visit(statement)
+
     def visit_If(self, node: ast.If) -> None:
         for statement in [*node.body, *node.orelse]:
             self.visit(statement)

@@ -445,8 +445,10 @@ def test_each_scatterer_against_an_oracle(name):
 # ---- what a terminal expects of it
 
 
-def expectation(city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
-    """A terminal's own copy of the mesh and its pose; isotropic elements of 0 dBi."""
+def expectation(
+    city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), pattern="isotropic", gain_dbi=0.0
+):
+    """A terminal's own copy of the mesh and its pose."""
     from isac_rt.terminal.expectation import make_expectation
 
     tree = {
@@ -460,7 +462,7 @@ def expectation(city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
             }
         },
         "city": {"source": "canyon"},
-        "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
+        "array": {"element_pattern": pattern, "element_gain_dbi": gain_dbi},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
         "clutter": {"model": "field"},
     }
@@ -477,12 +479,13 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
     wrong level, a wrong velocity, and a mesh whose faces lie off along their normals: all points of
     a face agree on how far, by the distance to the moved points. Planted bugs: amplitude for power;
     a level in amplitudes' decibels; the velocity's error with the other sign; the face's error
-    taken along the ray."""
+    taken along the ray; elements left out; the mesh's origin left out."""
     from isac_rt.terminal.expectation import Mistakes
 
     city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
+    city = replace(city, origin=np.array([310.7, -120.3, 41.9]))
     at, speed, amplitude = np.array([1.3, 28.3, 2.1]), np.array([3.7, -8.1, 1.9]), 0.37
-    copy, pose = expectation(city, speed, at)
+    copy, pose = expectation(city, speed, at + city.origin)
     plain = copy.clutter("A", pose, 0.0, amplitude)
     truth = amplitude**2 * lambertian_wall(at, at, 0.43)
     assert abs(10 * np.log10(plain.power.sum() / truth)) < 0.02  # as for the field
@@ -493,6 +496,10 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
         plain.departure, plain.arrival
     )
     assert plain.delay_rate * C == pytest.approx(-2 * towards @ speed, rel=0, abs=1e-9)
+    directive, _ = expectation(city, speed, at + city.origin, "cosine", 10 * np.log10(4))
+    cosines = 4 * plain.departure[:, 1]  # 4 cos(angle) of an element of 6 dBi, there and back
+    heard, ahead = directive.clutter("A", pose, 0.0, amplitude), cosines > 0
+    assert heard.power == pytest.approx((cosines**2 * plain.power)[ahead], rel=1e-6, abs=0)
     error = (0.31, -0.17, 0.23)
     wrong = copy.clutter("A", pose, 0.0, amplitude, Mistakes(velocity=error, level_db=3.1))
     assert wrong.power == pytest.approx(10**0.31 * plain.power, rel=1e-6, abs=0)

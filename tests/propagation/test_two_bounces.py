@@ -534,8 +534,9 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
 def test_what_a_terminal_expects_of_mirrors():
     """A terminal's copy of the mesh: the total power it expects by way of the mirrors within 0.2 dB
     of the field's (two draws of points of 5,000 cells), and what errors of the mesh do to its
-    delays, mirror and facet moved along their normals (second order 1e-7 m). Planted bug: the
-    mirror's error left out."""
+    delays, mirror and facet moved along their normals (second order 1e-7 m), and the directions in
+    which both ways leave and come. Planted bugs: the mirror's error left out; the departure taken
+    for the arrival."""
     tree = {
         "frames": 40,
         "swarm": {"A": {"role": "active", "position_m": [0.3, -1.1, 0.9]}},
@@ -576,5 +577,13 @@ def test_what_a_terminal_expects_of_mirrors():
         rows = slice(begin, begin + len(face))
         assert np.abs(C * wrong.delay[rows] - length).max() < 1e-7
         assert np.abs(C * (wrong.delay - right.delay)[rows]).max() > 1e-5
+        place = copy._field.cells.points[part.seen.index]
+        straight = (place - pose.position) / np.linalg.norm(place - pose.position, axis=1)[:, None]
+        still = pose.position - 2 * (n @ pose.position - part.mirror.offset) * n
+        bent = (place - still) / np.linalg.norm(place - still, axis=1)[:, None]
+        bent = bent - 2 * (bent @ n)[:, None] * n  # from the terminal to where it meets the mirror
+        ends = (bent, straight) if part.before else (straight, bent)
+        for found, truth in zip((right.departure, right.arrival), ends, strict=True):
+            assert np.abs(found[rows] - pose.to_body(truth)).max() < 1e-9
         begin = rows.stop
     assert begin == len(right)
