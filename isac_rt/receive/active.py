@@ -53,7 +53,9 @@ class ActiveReceiver:
         if self.refiner is not None and isinstance(cube, IFCube):
             detections = self.refiner(cube.samples, known, detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
-        return Reception.undecoded(cube.waveform, detections, picture, found.sparse)
+        return Reception.undecoded(
+            cube.waveform, detections, picture, found.sparse, found.correction
+        )
 
 
 def receive_active(

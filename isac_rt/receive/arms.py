@@ -53,6 +53,14 @@ def arm(antennas: Antennas, axis: int, passes: int = 2) -> Channels:
 
 
 @lru_cache(maxsize=32)
+def all_channels(antennas: Antennas) -> Channels:
+    """Every virtual channel of an echo."""
+    a = antennas
+    t, r = (i.ravel() for i in np.indices((a.num_tx, a.num_rx)))
+    return Channels(t, r, a.tx_positions[t] + a.rx_positions[r])
+
+
+@lru_cache(maxsize=32)
 def both_arms(antennas: Antennas) -> Channels:
     """Both arms of the virtual L of an echo; their common corner once."""
     x, z = arm(antennas, 0), arm(antennas, 2)

@@ -22,20 +22,21 @@ from isac_rt.receive.estimate import (
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, Conventional, LatinUnion, doppler_bins, slow_window
 from isac_rt.receive.omp import Omp, sparse_enough
-from isac_rt.receive.types import Detections, ExpectedClutter, Maps
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Maps
 from isac_rt.scenario.receivers import Receivers
 
 
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`: see `Reception`."""
+    its background (`CfarRule.detect`). `sparse`, `correction`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
     power: np.ndarray
     level: np.ndarray
     sparse: bool | None = None
+    correction: Correction | None = None
 
 
 class Detector(Protocol):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,7 @@ class Detections:
     snr : (Q,) linear, of the range-Doppler cell after accumulation over antennas
     std : (Q, 4) standard deviations of range, velocity, u_x, u_z
     is_reference : (Q,) bool, the line of sight at a PT
+    starts : (Q,) bool, whether it may start a track; the others only carry on one. By default all
 
     Examples
     --------
@@ -73,9 +74,12 @@ class Detections:
     snr: np.ndarray
     std: np.ndarray
     is_reference: np.ndarray
+    starts: np.ndarray = field(default_factory=lambda: np.ones(0, bool))
 
     def __post_init__(self) -> None:
-        for a in (self.range, self.velocity, self.direction, self.snr, self.std, self.is_reference):
+        if self.starts.size != self.range.size:
+            object.__setattr__(self, "starts", np.ones(self.range.size, bool))
+        for a in vars(self).values():
             a.setflags(write=False)
 
     def __len__(self) -> int:
@@ -170,6 +174,8 @@ class Reception:
         schedule, whether the scene is sparse enough for OMP (`isac_rt.receive.omp.sparse_enough`);
         False advises the transmitter to fall back from a pseudo-random schedule to a conventional
         one (`isac_rt.access.fall_back`). None elsewhere
+    correction : what the frame's clutter says of the own velocity and of the level that the
+        terminal expects; None where a detector does not ask
     """
 
     detections: Detections
@@ -186,6 +192,7 @@ class Reception:
     soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
     confidence_looks: int = 0
     sparse: bool | None = None
+    correction: Correction | None = None
 
     @classmethod
     def undecoded(
@@ -194,6 +201,7 @@ class Reception:
         detections: Detections,
         maps: Maps | None = None,
         sparse: bool | None = None,
+        correction: Correction | None = None,
     ) -> Reception:
         """A reception whose data, if it carried any, were not read.
 
@@ -218,6 +226,7 @@ class Reception:
             reference_power=float("nan"),
             maps=maps,
             sparse=sparse,
+            correction=correction,
         )
 
     def without_reference(self) -> Reception:
@@ -273,3 +282,30 @@ class ExpectedClutter:
         """Several kinds of clutter as one."""
         names = [f.name for f in fields(ExpectedClutter)]
         return ExpectedClutter(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a frame says of the terminal's own mistakes.
+
+    Attributes
+    ----------
+    level : natural logarithm of the factor on all expected powers
+    velocity : (3,) to be added to the terminal's velocity, body axes [m/s]
+    """
+
+    level: float
+    velocity: np.ndarray
+
+    def then(self, further: Correction) -> Correction:
+        """Both together, `further` found after this one was applied."""
+        return Correction(self.level + further.level, self.velocity + further.velocity)
+
+    def apply(self, clutter: ExpectedClutter) -> ExpectedClutter:
+        """The clutter as it is expected after the correction."""
+        closing = (clutter.departure + clutter.arrival) @ self.velocity
+        return replace(
+            clutter,
+            delay_rate=clutter.delay_rate - closing / SPEED_OF_LIGHT,
+            power=clutter.power * np.exp(self.level),
+        )

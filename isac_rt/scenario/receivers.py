@@ -11,7 +11,8 @@ from isac_rt.scenario.node import Node, Positive, Problem
 
 COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
-    "clutter_channels": ("clutter_detector", ("angle_doppler", "sample_matrix")),
+    "clutter_channels": ("clutter_detector", ("sample_matrix",)),
+    "birth_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "clutter_run_cells": ("clutter_filter", ("runs",)),
     "cluster_cells": ("velocity_method", ("auto", "omp", "latin_union", "conventional")),
 }
@@ -43,6 +44,10 @@ class Receivers(Node):
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""
+    birth_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
+    """Probability that noise alone is taken in one cell for a detection that may start a track, for
+    `clutter_detector: angle_doppler`; at most `false_alarm_rate`, by which detections carry on the
+    tracks that there are. null, the default: every detection may start one."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
     """Cells in range and in Doppler on each side of a cell that are left out when its background is
     measured, so that a target does not raise its own threshold. The default covers the main lobe of
@@ -70,13 +75,14 @@ class Receivers(Node):
     runs`. The default lies below the 40 cells that the paper's clutter has at least."""
     clutter_detector: Literal["cfar", "map", "angle_doppler", "sample_matrix"] = "cfar"
     """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
-    `map`: the clutter power that the city's mesh predicts. `angle_doppler`: the antennas are
-    filtered with the clutter's covariance, as mesh and own velocity predict it. `sample_matrix`:
-    the same with the covariance of the cells around. `map` and `angle_doppler` first correct the
-    own velocity and the clutter's level by the frame."""
+    `map`: the clutter power that the city's mesh predicts. `angle_doppler`: all antennas are added
+    in phase towards every direction, and filtered with the clutter's covariance where mesh and own
+    velocity predict clutter. `sample_matrix`: the antennas are filtered with the covariance of the
+    cells around. `map` and `angle_doppler` first correct the own velocity and the clutter's level
+    by the frame."""
     clutter_channels: Literal["arms", "joint"] = "arms"
-    """Antennas that are filtered together, for `angle_doppler` and `sample_matrix`: each arm of the
-    virtual L by itself (`arms`, the default), or both at once (`joint`, several times slower)."""
+    """Antennas that are filtered together, for `sample_matrix`: each arm of the virtual L by itself
+    (`arms`, the default), or both at once (`joint`, several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """An active terminal processes one frame in so many; the others only carry data. By default it
     processes all."""
@@ -97,6 +103,12 @@ class Receivers(Node):
                 "has no meaning with velocity_method pursuit, which finds paths off the grid; set "
                 "refinement to local or joint, or change velocity_method",
             )
+        if self.false_alarm_rates[1] > self.false_alarm_rate:
+            yield Problem(
+                (("birth_false_alarm_rate",), ("false_alarm_rate",)),
+                f"is more than false_alarm_rate = {self.false_alarm_rate:g}: every detection may "
+                "start a track then; leave it out, or lower it",
+            )
         for key, (other, values) in COUNTS_WITH.items():
             value, default = getattr(self, key), type(self).model_fields[key].default
             if value != default and getattr(self, other) not in values:
@@ -105,6 +117,11 @@ class Receivers(Node):
                     f"has no meaning with {other} {getattr(self, other)}, only with "
                     f"{' or '.join(values)}; leave it out, or change {other}",
                 )
+
+    @property
+    def false_alarm_rates(self) -> tuple[float, float]:
+        """Of a detection, and of one that may start a track."""
+        return self.false_alarm_rate, self.birth_false_alarm_rate or self.false_alarm_rate
 
     @property
     def needs_mesh(self) -> bool:

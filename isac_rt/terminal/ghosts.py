@@ -52,6 +52,53 @@ class Walls:
         normals = self.city.normals[faces]
         return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
 
+    @cached_property
+    def _faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces of the mirrors one after the other, where each mirror's begin, and the lowest and
+        highest corner of each (2, W, 3), world coordinates."""
+        plane = self.city.plane_of_face
+        order = np.argsort(plane, kind="stable")
+        mine = plane[self.mirrors[0]]
+        begin, end = (np.searchsorted(plane[order], mine, side) for side in ("left", "right"))
+        members = [order[a:b] for a, b in zip(begin, end, strict=True)]
+        corners = self.city.corners + self.city.origin
+        bounds = [(corners[m].min(axis=(0, 1)), corners[m].max(axis=(0, 1))) for m in members]
+        first = np.concatenate([[0], np.cumsum(end - begin)])
+        faces = np.concatenate([*members, np.zeros(0, int)])
+        return faces, first, np.array(bounds).reshape(-1, 2, 3).swapaxes(0, 1)
+
+    def near(self, own: Pose, reach: float) -> np.ndarray:
+        """Numbers of the mirrors of which something may lie within reach [m] and in front."""
+        low, high = self._faces[2]
+        p, forward = own.position, own.rotation[:, 1]
+        away = np.maximum(np.maximum(low - p, p - high), 0.0)
+        ahead = np.where(forward > 0, high - p, low - p) @ forward
+        return np.flatnonzero(((away**2).sum(axis=1) < reach**2) & (ahead > 0))
+
+    def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
+        """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""
+        low, high = self._faces[2]
+        return ((points >= low[mirrors] - edge) & (points <= high[mirrors] + edge)).all(axis=1)
+
+    def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
+        """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
+        `edge` of it."""
+        faces, first, _ = self._faces
+        count = first[mirrors + 1] - first[mirrors]
+        which = np.repeat(np.arange(mirrors.size), count)
+        at = np.arange(which.size) - np.repeat(np.cumsum(count) - count - first[mirrors], count)
+        face = faces[at]
+        point, normal = points[which] - self.city.origin, self.city.normals[face]
+        inside = np.ones(which.size, bool)
+        for k in range(3):
+            a, b = self.city.corners[face, k], self.city.corners[face, (k + 1) % 3]
+            inward = np.cross(normal, b - a)
+            height = (inward * (point - a)).sum(axis=1)
+            inside &= height >= -edge * np.linalg.norm(inward, axis=1)
+        out = np.zeros(mirrors.size, bool)
+        out[which[inside]] = True
+        return out
+
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Faces (n,) that the open segment between two points (3,) crosses."""
         a, b, c = np.moveaxis(self.city.corners, 1, 0)

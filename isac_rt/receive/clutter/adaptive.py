@@ -71,12 +71,21 @@ def beams_of(channels: Channels, known: Known, axes: tuple[int, ...]) -> Beams:
     for axis, values in zip(axes, grid, strict=True):
         cosines[:, axis] = values.ravel()
     cosines = cosines[(cosines**2).sum(axis=1) <= 1]
-    covariance = k**2 * np.cov(channels.places[:, list(axes)].T, bias=True).reshape(
+    steer = channels.steering(cosines, known).astype(np.complex64)
+    return Beams(cosines, steer, *scanned(channels, k, limit, axes))
+
+
+def scanned(
+    channels: Channels, wavenumber: float, limit: float, axes: tuple[int, ...] = (0, 2)
+) -> tuple[tuple[float, ...], float]:
+    """Sides of the scanned directions over the correlation length, and their area over the
+    correlation area; see `Beams`."""
+    covariance = wavenumber**2 * np.cov(channels.places[:, list(axes)].T, bias=True).reshape(
         len(axes), len(axes)
     )
     sides = tuple(2 * limit * float(np.sqrt(covariance[i, i])) for i in range(len(axes)))
     area = float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance))) if len(axes) == 2 else 0.0
-    return Beams(cosines, channels.steering(cosines, known).astype(np.complex64), sides, area)
+    return sides, area
 
 
 def expected_count(t: np.ndarray, beams: Beams) -> np.ndarray:
@@ -93,11 +102,12 @@ def scan_threshold(beams: tuple[Beams, ...], false_alarm_rate: float) -> float:
 
     The largest of one scan is below t with probability exp(-`expected_count`).
     """
-    return _threshold(tuple((b.lengths, b.area) for b in beams), false_alarm_rate)
+    return threshold_of(tuple((b.lengths, b.area) for b in beams), false_alarm_rate)
 
 
 @lru_cache(maxsize=64)
-def _threshold(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
+def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
+    """`scan_threshold` of scans of such lengths and areas (`scanned`)."""
     grid = np.arange(0, 200, 0.01)
     nothing = np.zeros((0, 3)), np.zeros((0, 0))
     density = np.zeros_like(grid)

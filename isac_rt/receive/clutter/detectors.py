@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
 from isac_rt.receive.arms import Channels, arm, both_arms
-from isac_rt.receive.cfar import CfarRule, first_row, strong_lobes, strongest_peaks
+from isac_rt.receive.cfar import first_row, strongest_peaks, without_sidelobes
 from isac_rt.receive.clutter.adaptive import Beams, Scan, beams_of, scan_threshold
 from isac_rt.receive.clutter.correction import fit
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
@@ -24,7 +23,7 @@ from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, accumulate, channel_maps
 from isac_rt.receive.sense import Sensed, describe
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import Correction, ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
 QUIET = 0.3
@@ -43,19 +42,21 @@ class Judged:
     Attributes
     ----------
     ratio : (rows, P) statistic over its threshold; above 1 is a detection
+    sure : (rows, P) statistic over the threshold from which on a detection may start a track
     level : (rows, P) power of a channel that counts as background
     cosines : (rows, P, 2) direction in which a filter found most, NaN where the detector does not
         look at directions
     """
 
     ratio: np.ndarray
+    sure: np.ndarray
     level: np.ndarray
     cosines: np.ndarray
 
     @classmethod
     def everywhere(cls, ratio: np.ndarray, level: np.ndarray) -> Judged:
-        """The verdict of a detector that does not look at directions."""
-        return cls(ratio, level, np.full((*ratio.shape, 2), np.nan))
+        """The verdict of a detector that does not look at directions and has one threshold."""
+        return cls(ratio, ratio, level, np.full((*ratio.shape, 2), np.nan))
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,13 @@ class ClutterDetector:
     ) -> Sensed:
         """Detections in cleaned spectra of echoes."""
         maps = channel_maps(spectra, known)
-        power, judged = accumulate(maps), self.judge([maps], known, clutter)[0]
-        ratio = judged.ratio.copy()
-        ratio[: first_row(self.settings, known.range_cell)] = 0
+        power, correction = accumulate(maps), None
+        if clutter is not None and self.fitted:
+            correction = correct(power, known, clutter)
+            clutter = correction.apply(clutter)
+        judged = replace(self, fitted=False).judge([maps], known, clutter)[0]
+        ratio, first = judged.ratio.copy(), first_row(self.settings, known.range_cell)
+        ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
         found, towards = [], judged.cosines[rows, bins]
         for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
@@ -117,7 +122,11 @@ class ClutterDetector:
         for i, cosines in enumerate(towards):
             if np.isfinite(cosines).all():
                 direction[i] = cosines if on_grid else near_beam(found[i], known, cosines)
-        return Sensed(found, replace(detections, direction=direction), power, judged.level)
+        starts = judged.sure[rows, bins] > 1
+        if first:
+            starts &= ~in_skirt(rows, bins, power, first)
+        detections = replace(detections, direction=direction, starts=starts)
+        return Sensed(found, detections, power, judged.level, correction=correction)
 
     def expectation(
         self, powers: list[np.ndarray], known: Known, clutter: ExpectedClutter | None
@@ -129,12 +138,10 @@ class ClutterDetector:
                 f"receivers.clutter_detector {self.settings.clutter_detector} needs the clutter "
                 "that the mesh predicts; give it, or use cfar"
             )
-        rows = len(powers[0])
-        expected = expected_power(clutter, known, rows, self.taper)
-        noise = [noise_level(power, expected, known.channels) for power in powers]
         if self.fitted:
-            clutter = fit(powers[0], noise[0], clutter, known).apply(clutter)
-            expected = expected_power(clutter, known, rows, self.taper)
+            clutter = correct(powers[0], known, clutter).apply(clutter)
+        expected = expected_power(clutter, known, len(powers[0]), self.taper)
+        noise = [noise_level(power, expected, known.channels) for power in powers]
         return clutter, expected, noise
 
     def scans(self, known: Known) -> list[tuple[Channels, Beams]]:
@@ -145,25 +152,16 @@ class ClutterDetector:
         ]
         return [(channels, beams_of(channels, known, axes)) for channels, axes in sets]
 
-    def directed(
-        self, parts: list[tuple[Scan, Beams]], level: np.ndarray, *, held_up: bool
-    ) -> Judged:
-        """Scans added, over their threshold; `held_up`: by the energy that the filter leaves around
-        a cell, the greater of both sides in range, where that is more than predicted."""
+    def directed(self, parts: list[tuple[Scan, Beams]], level: np.ndarray) -> Judged:
+        """Scans added, over their threshold."""
         total = np.fft.fftshift(np.sum([scan.peak for scan, _ in parts], axis=0), axes=1)
         limit = scan_threshold(tuple(b for _, b in parts), self.settings.false_alarm_rate)
         ratio = total / limit
-        if held_up:
-            left = np.fft.fftshift(np.mean([scan.energy for scan, _ in parts], axis=0), axes=1)
-            found = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
-            rule = CfarRule.of(self.settings, 1)
-            around = rule.background(left, ~(found | strong_lobes(left)))
-            ratio = ratio / np.maximum(around, 1.0)
         cosines = np.zeros((*ratio.shape, 2))
         for scan, beams in parts:
             # each arm's beams lie along its own axis, so that the sum puts the two together
             cosines += np.fft.fftshift(beams.cosines[scan.beam][..., [0, 2]], axes=1)
-        return Judged(ratio, level, cosines)
+        return Judged(ratio, ratio, level, cosines)
 
 
 class BeamSpectra(LocalSpectra):
@@ -199,7 +197,24 @@ def near_beam(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarr
         )
         power = np.abs(channels.steering(tried, known).conj() @ values) ** 2
         best = tried[power.argmax()][[0, 2]]
+    period = 2 * np.pi / (known.wavenumber * known.antennas.spacing)
+    best = best - period * np.round(best / period)
     return best if (best**2).sum() <= 1 else np.full(2, np.nan)
+
+
+def correct(power: np.ndarray, known: Known, clutter: ExpectedClutter) -> Correction:
+    """What the frame says of the terminal's own velocity and of the level that it expects."""
+    expected = expected_power(clutter, known, len(power))
+    return fit(power, noise_level(power, expected, known.channels), clutter, known)
+
+
+def in_skirt(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
+    """Which cells hold no more than the lobes of the strongest path before the row `first`: the
+    transmitter's leakage."""
+    row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)
+    pairs = [(np.array([row, r]), np.array([column, b])) for r, b in zip(rows, bins, strict=True)]
+    kept = [without_sidelobes(*pair, power, power.shape[1], UNION_FLOOR)[1] for pair in pairs]
+    return ~np.array(kept, bool)
 
 
 def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> float:

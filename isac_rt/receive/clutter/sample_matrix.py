@@ -34,7 +34,7 @@ class SampleMatrix(ClutterDetector):
             power = accumulate(maps)
             noise = noise_level(power, None, known.channels)
             found = [(sampled(maps, c, b, noise, guard), b) for c, b in scans]
-            out.append(self.directed(found, np.full_like(power, noise), held_up=False))
+            out.append(self.directed(found, np.full_like(power, noise)))
         return out
 
 

@@ -1,0 +1,412 @@
+r"""All virtual channels of a cell coherently, over all directions, and whitened where clutter is.
+
+A cell's channels x are matched with the steering vector a(u) of every direction,
+
+.. math:: T(u) = |a^H R^{-1} x|^2 / (a^H R^{-1} a),
+
+R their covariance under noise and clutter, in units of the noise (see
+`isac_rt.receive.clutter.adaptive`). Where hardly any clutter is expected R = 1 and all channels
+take part, and a bound on the sum over the lines of the array spares most cells the search. Where
+clutter is expected and the plain search finds something, R is summed over the scatterers about the
+cell, for the channels of both arms.
+
+Every line of channels along an axis answers to one direction cosine, and its phase against the
+others to the other one, so that the search is separable: with F_l the spectrum of line l along X
+and G_l along Z,
+
+.. math:: a^H y = \sum_l e^{jkz_lu_z} F_l(u_x) + \sum_l e^{jkx_lu_x} G_l(u_z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
+from isac_rt.receive.arms import Channels, all_channels, both_arms
+from isac_rt.receive.clutter.power import REACH, Taper, cells_of, range_power, slow_power
+from isac_rt.receive.known import Known
+from isac_rt.receive.types import ExpectedClutter
+
+DIRECTIONS = 32
+"""Values of each direction cosine that are searched; the peak between them is interpolated."""
+FINE = 32
+"""Entries per cell of the tables of responses."""
+LEAST_WEIGHT = 1e-3
+"""Scatterers weaker in a cell than this share of the noise are left out of its covariance."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of an array along one axis.
+
+    Attributes
+    ----------
+    members : of each line the numbers of its channels
+    spectra : of each line (G, n) complex64, exp(+j k v u) along it
+    turns : (lines, G) complex64, exp(+j k v u) of its place on the other axis
+    """
+
+    members: tuple[np.ndarray, ...]
+    spectra: tuple[np.ndarray, ...]
+    turns: np.ndarray
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a set of channels is searched for directions.
+
+    Attributes
+    ----------
+    channels : Channels
+    cosines : (G,) values of each direction cosine
+    along_x, along_z : Lines
+    inside : (G, G) bool, directions (u_x, u_z) of the unit disc
+    """
+
+    channels: Channels
+    cosines: np.ndarray
+    along_x: Lines
+    along_z: Lines
+    inside: np.ndarray
+
+    @classmethod
+    def of(cls, channels: Channels, wavenumber: float, limit: float) -> Search:
+        """Directions within `limit` on both axes."""
+        u = limit * (2 * np.arange(DIRECTIONS) + 1 - DIRECTIONS) / DIRECTIONS
+        places = channels.places[:, [0, 2]]
+        # channels that share their place on one axis with more than `least` others make a line
+        x, z = places.T
+        longest = [_sizes(z), _sizes(x)]
+        on_x = longest[0] >= longest[1]
+        make = []
+        for axis, some in ((0, on_x), (1, ~on_x)):
+            rows = [
+                np.flatnonzero(some & (np.abs(places[:, 1 - axis] - c) < 1e-9))
+                for c in np.unique(np.round(places[some, 1 - axis], 9))
+            ]
+            spectra = [
+                np.exp(1j * wavenumber * np.outer(u, places[r, axis])).astype(np.complex64)
+                for r in rows
+            ]
+            turns = [np.exp(1j * wavenumber * u * places[r[0], 1 - axis]) for r in rows]
+            shape = len(rows), DIRECTIONS
+            make.append(
+                Lines(tuple(rows), tuple(spectra), np.array(turns, np.complex64).reshape(shape))
+            )
+        return cls(channels, u, make[0], make[1], np.add.outer(u**2, u**2) <= 1)
+
+    def lines(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Spectra of the lines along X and Z (lines, G, S) of channels (L, S)."""
+        out = []
+        for lines in (self.along_x, self.along_z):
+            made = [s @ x[m] for m, s in zip(lines.members, lines.spectra, strict=True)]
+            out.append(np.array(made, np.complex64).reshape(len(made), DIRECTIONS, x.shape[1]))
+        return out[0], out[1]
+
+
+def _sizes(values: np.ndarray) -> np.ndarray:
+    """Of each value how many are equal to it."""
+    return (np.abs(values[:, None] - values) < 1e-9).sum(axis=1)
+
+
+@lru_cache(maxsize=8)
+def searches(antennas: Antennas, wavenumber: float) -> tuple[Search, Search]:
+    """The search over all channels, and over those of both arms."""
+    limit = antennas.view_limit
+    return (
+        Search.of(all_channels(antennas), wavenumber, limit),
+        Search.of(both_arms(antennas), wavenumber, limit),
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """The largest statistic of some cells and where it lies.
+
+    Attributes
+    ----------
+    cell : (S,) flat numbers of the cells
+    peak : (S,) T over the directions
+    cosines : (S, 2) its direction
+    """
+
+    cell: np.ndarray
+    peak: np.ndarray
+    cosines: np.ndarray
+
+
+def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
+    """Cells whose T against noise alone can be `least` or more.
+
+    Parameters
+    ----------
+    maps : (L_tx, L_rx, rows, P) complex64 of `channel_maps`
+    noise : mean power of a cell of one channel
+    """
+    c = search.channels
+    x = maps.reshape(-1, maps.shape[2] * maps.shape[3])
+    along_x, along_z = search.lines(x[c.tx * maps.shape[1] + c.rx])
+    scale = 1 / (len(c) * noise)
+    bound = np.zeros(x.shape[1], np.float32)
+    for line in (*along_x, *along_z):
+        _add_largest(line, bound)
+    cell = np.flatnonzero(bound**2 * scale >= least)
+    peak, cosines = _best(
+        np.ascontiguousarray(along_x[:, :, cell].transpose(2, 0, 1)),
+        np.ascontiguousarray(along_z[:, :, cell].transpose(2, 0, 1)),
+        np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32),
+        search,
+    )
+    return Found(cell, peak, cosines)
+
+
+def search_white(
+    x: np.ndarray, R: np.ndarray, cell: np.ndarray, search: Search, least: float
+) -> Found:
+    """The largest T of cells with covariances; exact where it can be `least` or more, else a bound.
+
+    Parameters
+    ----------
+    x : (S, L) channels in units of the noise's amplitude
+    R : (S, L, L) covariances in units of the noise
+    cell : (S,) their numbers
+    """
+    y = np.linalg.solve(R, x[..., None])[..., 0]
+    # a^H R^-1 a is L^2 / a^H R a at least, by Cauchy and Schwarz
+    peak, cosines = _whitened(y, denominators(R, search) / len(search.channels) ** 2, search)
+    some = np.flatnonzero(peak >= least)
+    exact = 1 / denominators(np.linalg.inv(R[some]), search)
+    peak[some], cosines[some] = _whitened(y[some], exact, search)
+    return Found(cell, peak, cosines)
+
+
+def _whitened(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
+    """Largest |a^H y|^2 times a scale (S, G, G), and its direction."""
+    along_x, along_z = search.lines(np.ascontiguousarray(y.T))
+    return _best(
+        np.ascontiguousarray(along_x.transpose(2, 0, 1)),
+        np.ascontiguousarray(along_z.transpose(2, 0, 1)),
+        scale.astype(np.float32),
+        search,
+    )
+
+
+def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:
+    """a^H Q a of all directions: (S, G, G) from matrices Q (S, L, L).
+
+    Within the lines along an axis it depends on one cosine alone; what couples an X with a Z line
+    is a product of both spectra.
+    """
+    X, Z = search.along_x, search.along_z
+    out = np.zeros((len(matrix), DIRECTIONS, DIRECTIONS), np.float32)
+    for lines, axis in ((X, 2), (Z, 1)):
+        for i, (m, a) in enumerate(zip(lines.members, lines.spectra, strict=True)):
+            for j, (n, b) in enumerate(zip(lines.members, lines.spectra, strict=True)):
+                block = np.einsum(
+                    "gm,smn,gn->sg", a, matrix[:, m][:, :, n], b.conj(), optimize=True
+                )
+                turn = lines.turns[i] * lines.turns[j].conj()
+                both = block[:, :, None] * turn if axis == 2 else turn[:, None] * block[:, None, :]
+                out += both.real
+    for m, a, turn_z in zip(X.members, X.spectra, X.turns, strict=True):
+        for n, b, turn_x in zip(Z.members, Z.spectra, Z.turns, strict=True):
+            block = (a @ matrix[:, m][:, :, n]) @ b.conj().T
+            out += 2 * (block * turn_x.conj()[:, None] * turn_z).real
+    return np.maximum(out, 1e-6)
+
+
+def _best(
+    along_x: np.ndarray, along_z: np.ndarray, scale: np.ndarray, search: Search
+) -> tuple[np.ndarray, np.ndarray]:
+    """The largest statistic over the directions and where, interpolated."""
+    peak = np.zeros(len(along_x), np.float32)
+    place = np.zeros((len(along_x), 2), np.float32)
+    turns = search.along_x.turns, search.along_z.turns
+    _search(along_x, along_z, *turns, search.inside, scale, peak, place)
+    u = search.cosines
+    return peak, u[0] + place * (u[1] - u[0])
+
+
+@jit(fast=True)
+def _add_largest(line, bound):
+    """bound[s] += max_g |line[g, s]|."""
+    largest = np.zeros(bound.size, np.float32)
+    for g in range(line.shape[0]):
+        for s in range(bound.size):
+            power = line[g, s].real ** 2 + line[g, s].imag ** 2
+            largest[s] = max(largest[s], power)
+    for s in range(bound.size):
+        bound[s] += np.sqrt(largest[s])
+
+
+@jit(fast=True)
+def _search(along_x, along_z, turn_z, turn_x, inside, scale, peak, place):
+    """Largest |a^H y|^2 times the scale of each cell, and its place in steps of the grid.
+
+    A row of directions whose lines even in phase would not reach the best so far is passed over.
+    """
+    size = inside.shape[0]
+    for s in range(along_x.shape[0]):
+        norm = scale[min(s, scale.shape[0] - 1)]
+        highest, most = norm.max(), np.float32(0.0)
+        for j in range(size):
+            total = np.float32(0.0)
+            for k in range(turn_x.shape[0]):
+                total += np.sqrt(along_z[s, k, j].real ** 2 + along_z[s, k, j].imag ** 2)
+            most = max(most, total)
+        best, at_x, at_z = np.float32(0.0), 0, 0
+        for i in range(size):
+            total = most
+            for k in range(turn_z.shape[0]):
+                total += np.sqrt(along_x[s, k, i].real ** 2 + along_x[s, k, i].imag ** 2)
+            if total * total * highest <= best:
+                continue
+            for j in range(size):
+                if inside[i, j]:
+                    power = _power(along_x, along_z, turn_z, turn_x, s, i, j) * norm[i, j]
+                    if power > best:
+                        best, at_x, at_z = power, i, j
+        peak[s], place[s, 0], place[s, 1] = best, at_x, at_z
+        for axis in range(2):
+            if 0 < (at_x, at_z)[axis] < size - 1:
+                i, j = (at_x - 1, at_z) if axis == 0 else (at_x, at_z - 1)
+                k, m = (at_x + 1, at_z) if axis == 0 else (at_x, at_z + 1)
+                before = _power(along_x, along_z, turn_z, turn_x, s, i, j) * norm[i, j]
+                after = _power(along_x, along_z, turn_z, turn_x, s, k, m) * norm[k, m]
+                _between(before, best, after, s, axis, peak, place)
+
+
+@jit(fast=True, inline=True)
+def _power(along_x, along_z, turn_z, turn_x, s, i, j):
+    """|a^H y|^2 in one direction."""
+    re, im = np.float32(0.0), np.float32(0.0)
+    for k in range(turn_z.shape[0]):
+        a, b = along_x[s, k, i], turn_z[k, j]
+        re += a.real * b.real - a.imag * b.imag
+        im += a.real * b.imag + a.imag * b.real
+    for k in range(turn_x.shape[0]):
+        a, b = along_z[s, k, j], turn_x[k, i]
+        re += a.real * b.real - a.imag * b.imag
+        im += a.real * b.imag + a.imag * b.real
+    return re * re + im * im
+
+
+@jit(fast=True, inline=True)
+def _between(before, middle, after, s, axis, peak, place):
+    """Vertex of the parabola through the logarithms of three neighbours."""
+    low = np.log(max(before, np.float32(1e-20)) / middle)
+    high = np.log(max(after, np.float32(1e-20)) / middle)
+    curve = low + high
+    if curve < 0:
+        offset = min(max(np.float32(0.5) * (low - high) / curve, np.float32(-0.5)), np.float32(0.5))
+        place[s, axis] += offset
+        peak[s] *= np.exp(
+            np.float32(0.5) * (high - low) * offset + np.float32(0.5) * curve * offset * offset
+        )
+
+
+@dataclass(frozen=True)
+class Bucketed:
+    """Expected scatterers sorted by the cell that they lie in.
+
+    Attributes
+    ----------
+    start : where those of each cell (row, bin) begin; the rows begin `REACH` before the first
+    beat, doppler : of each scatterer, off the middle of its cell
+    power : over the noise of a cell of one channel, before the responses
+    steer : (K, L) complex64
+    tables : responses in range and Doppler at offsets of 0, 1/FINE, ... cells
+    shape : (L, L) of the taper over directions
+    num_bins : P
+    """
+
+    start: np.ndarray
+    beat: np.ndarray
+    doppler: np.ndarray
+    power: np.ndarray
+    steer: np.ndarray
+    tables: tuple[np.ndarray, np.ndarray]
+    shape: np.ndarray
+    num_bins: int
+
+    @classmethod
+    def of(
+        cls, clutter: ExpectedClutter, known: Known, search: Search, noise: float, taper: Taper
+    ) -> Bucketed:
+        """The scatterers that some cell holds; `noise` of a cell of one channel."""
+        w = known.waveform
+        beat, doppler = cells_of(clutter, w)
+        tables = _tables(w, taper)
+        strongest = tables[0].max() * tables[1].max()
+        rows = w.num_delay_symbols + 2 * REACH
+        row = np.round(beat).astype(np.int64) + REACH
+        heard = (row >= 0) & (row < rows) & (clutter.power * strongest > LEAST_WEIGHT * noise)
+        clutter, beat, doppler, row = clutter.select(heard), beat[heard], doppler[heard], row[heard]
+        column = np.round(doppler).astype(np.int64)
+        bucket = row * w.num_chirps + column % w.num_chirps
+        order = np.argsort(bucket, kind="stable")
+        places = search.channels.places
+        apart = (places[:, None] - places) * known.wavenumber / (2 * np.pi) * taper.cosine
+        return cls(
+            np.searchsorted(bucket[order], np.arange(rows * w.num_chirps + 1)),
+            (beat - row + REACH)[order].astype(np.float32),
+            (doppler - column)[order].astype(np.float32),
+            (clutter.power / noise)[order].astype(np.float32),
+            search.channels.steering(clutter.arrival[order], known).astype(np.complex64),
+            tables,
+            (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32),
+            w.num_chirps,
+        )
+
+    def covariances(self, rows: np.ndarray, bins: np.ndarray) -> np.ndarray:
+        """(S, L, L) complex64 of noise and clutter in cells, Doppler in FFT order, in units of the
+        noise."""
+        size = self.steer.shape[1]
+        parts = np.zeros((2, rows.size, size, size), np.float32)
+        scatterers = self.start, self.beat, self.doppler, self.power, self.steer
+        _covariances(rows + REACH, bins, scatterers, self.tables, self.num_bins, parts)
+        return (parts[0] + 1j * parts[1]) * self.shape + np.eye(size, dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _tables(waveform: Waveform, taper: Taper) -> tuple[np.ndarray, np.ndarray]:
+    """Responses in range and in Doppler at offsets of 0, 1/FINE, ... up to REACH + 1 cells."""
+    offset = np.arange((REACH + 1) * FINE + 2) / FINE
+    return (
+        range_power(waveform, offset, taper.range_cells).astype(np.float32),
+        slow_power(waveform, offset, taper.doppler_bins).astype(np.float32),
+    )
+
+
+@jit(fast=True)
+def _covariances(rows, bins, scatterers, tables, num_bins, parts):
+    """Sum of the scatterers about each cell, real and imaginary part."""
+    start, beat, doppler, power, steer = scatterers
+    size = steer.shape[1]
+    re, im = np.empty(size, np.float32), np.empty(size, np.float32)
+    for c in range(rows.size):
+        for i in range(-REACH, REACH + 1):
+            row = rows[c] + i
+            if row < 0 or row >= (start.size - 1) // num_bins:
+                continue
+            for j in range(-REACH, REACH + 1):
+                bucket = row * num_bins + (bins[c] + j) % num_bins
+                for s in range(start[bucket], start[bucket + 1]):
+                    at_r = abs(i + beat[s]) * FINE
+                    at_d = abs(j + doppler[s]) * FINE
+                    weight = power[s] * tables[0][int(at_r + 0.5)] * tables[1][int(at_d + 0.5)]
+                    if weight < LEAST_WEIGHT:
+                        continue
+                    root = np.sqrt(weight)
+                    for k in range(size):
+                        re[k], im[k] = steer[s, k].real * root, steer[s, k].imag * root
+                    for k in range(size):
+                        a, b = re[k], im[k]
+                        for m in range(size):
+                            parts[0, c, k, m] += a * re[m] + b * im[m]
+                            parts[1, c, k, m] += b * re[m] - a * im[m]
