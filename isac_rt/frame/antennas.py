@@ -132,3 +132,17 @@ def antennas_of(a: Array, waveform: Waveform) -> Antennas:
         pattern=a.element_pattern,
         half_view=np.deg2rad(a.field_of_view_deg) / 2,
     )
+
+
+def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarray:
+    """Resolution of range [m], velocity [m/s], u_x and u_z (4,).
+
+    The array's is wavelength over aperture: that of the virtual array (transmit times receive
+    elements of an arm) for an echo (passes = 2), of the receive array alone for one pass.
+    """
+    across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
+    up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
+    step = waveform.wavelength / antennas.spacing
+    return np.array(
+        [waveform.range_cell(passes), waveform.velocity_cell(passes), step / across, step / up]
+    )

@@ -12,7 +12,6 @@ from scipy.special import betaincinv
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import Payload
-from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Reception
 from isac_rt.world.swarm import Pose
 
@@ -51,20 +50,6 @@ def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
         velocity += float(outward @ (uav.velocity - at.velocity)) / float(np.linalg.norm(outward))
     azimuth, elevation = np.arctan2(body[0], body[1]), np.arcsin(np.clip(body[2], -1, 1))
     return Truth(length, velocity, float(body[0]), float(body[2]), float(azimuth), float(elevation))
-
-
-def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarray:
-    """Resolution of range [m], velocity [m/s], u_x and u_z (4,).
-
-    The array's is wavelength over aperture: that of the virtual array (transmit times receive
-    elements of an arm) for an echo (passes = 2), of the receive array alone for one pass.
-    """
-    across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
-    up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
-    step = waveform.wavelength / antennas.spacing
-    return np.array(
-        [waveform.range_cell(passes), waveform.velocity_cell(passes), step / across, step / up]
-    )
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, azimuth_elevation
+from isac_rt.frame.antennas import Antennas, azimuth_elevation, resolutions
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
@@ -27,7 +27,6 @@ from isac_rt.results.metrics import (
     Truth,
     count_symbols,
     gospa,
-    resolutions,
     truth_of,
     within_view,
 )

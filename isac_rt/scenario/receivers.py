@@ -157,6 +157,19 @@ class Tracking(Node):
     drop_misses: Annotated[int, Field(ge=1)] = 8
     """Frames without a detection in a row after which a confirmed track ends. The default bridges
     short shadows."""
+    drop_after_s: Positive | None = None
+    """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s].
+    null, the default: only `drop_misses` counts."""
+    births: Literal["all", "unexplained"] = "all"
+    """Detections that start tracks at an active terminal. `all`, the default. `unexplained`: not
+    those where the city's mesh shows the terminal itself by one or two walls, nor those at the edge
+    of the view, and no track is confirmed that is a wall's image of a nearer one or lies behind a
+    wall."""
+
+    @property
+    def needs_mesh(self) -> bool:
+        """Whether births are held against a city's mesh."""
+        return self.births == "unexplained"
 
     def problems(self) -> Iterator[Problem]:
         if self.confirm_hits > self.confirm_window:
@@ -188,9 +201,21 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         },
         "tracking": {},
     },
+    "city": {
+        "receivers": {
+            "velocity_method": "auto",
+            "refinement": "local",
+            "symbol_decision": "powers",
+            "clutter_filter": "none",
+            "clutter_detector": "angle_doppler",
+            "false_alarm_rate": 1e-4,
+            "birth_false_alarm_rate": 1e-6,
+        },
+        "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
+    },
 }
 """What each preset says of `receivers` and `tracking`; of the rest it says nothing."""
-Preset = Literal["paper", "plain"]
+Preset = Literal["paper", "plain", "city"]
 
 
 class ReceiverSet(Node):

@@ -69,8 +69,8 @@ class Scenario(Node):
     """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
     receiver_preset: Preset | None = None
     """Settings of `receivers` and `tracking` by name, which the keys stated there override.
-    `paper`: the paper's to the letter. `plain`: better estimates, no knowledge of the city. null,
-    the default: `plain`."""
+    `paper`: the paper's to the letter. `plain`: better estimates, no knowledge of the city. `city`:
+    the mesh and the own motion tell clutter from targets. null, the default: `plain`."""
     receivers: Receivers = Receivers()
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
@@ -319,18 +319,21 @@ class Scenario(Node):
                 "add them or set clutter.model to none",
             )
         traced = self.propagation.model == "ray_traced" and self.city is not None
-        compared = (
-            (("compare", name, "receivers"), s.receivers) for name, s in self.compare.items()
-        )
-        for key, receivers in [(("receivers",), self.receivers), *compared]:
-            if receivers.needs_mesh and not traced:
-                detector = (*key, "clutter_detector")
+        sets: dict[Key, Scenario | ReceiverSet] = {(): self}
+        sets |= {("compare", name): one for name, one in self.compare.items()}
+        for above, one in sets.items():
+            if one.receivers.needs_mesh and not traced:
+                detector = (*above, "receivers", "clutter_detector")
                 yield Problem(
                     (detector, ("propagation", "model"), ("city",)),
-                    f"{receivers.clutter_detector} predicts clutter from a city's mesh: it needs "
-                    "propagation.model ray_traced and a city; "
+                    f"{one.receivers.clutter_detector} predicts clutter from a city's mesh: it "
+                    "needs propagation.model ray_traced and a city; "
                     f"add them or set {dotted(detector)} to cfar or sample_matrix",
                 )
+            if one.tracking.needs_mesh and self.city is None:
+                births = (*above, "tracking", "births")
+                said = f"{one.tracking.births} needs a city; add one or set {dotted(births)} to all"
+                yield Problem((births, ("city",)), said)
 
     def _set_problems(self) -> Iterator[Problem]:
         for name, one in self.compare.items():

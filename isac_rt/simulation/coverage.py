@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.cfar import first_row
-from isac_rt.results.metrics import resolutions
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.world.swarm import Swarm
 

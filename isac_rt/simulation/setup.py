@@ -49,6 +49,7 @@ from isac_rt.simulation.preflight import (
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
 from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
+from isac_rt.terminal.ghosts import Walls
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -197,6 +198,11 @@ class Setup:
     @property
     def schedule(self) -> Schedule:
         return self.timetable.schedule
+
+    @cached_property
+    def walls(self) -> Walls:
+        """The city as terminals hold births and tracks against it."""
+        return Walls(self.city)
 
     @cached_property
     def coverage(self) -> Coverage:

@@ -51,7 +51,8 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     """
     s = settings or setup.scenario
     if link.own:
-        return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking)
+        walls = setup.walls if s.tracking.needs_mesh else None
+        return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
     return PassiveTerminal(
         setup.waveform,
         setup.antennas,

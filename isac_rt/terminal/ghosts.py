@@ -30,6 +30,8 @@ SMALLEST_WALL = 20.0
 """Area of a plane's faces together [m^2] below which it is not taken for a mirror."""
 DEVIATIONS = 3.0
 """How many standard deviations a track may be off."""
+MEETING = 1e-9
+"""How far off its faces a wave may meet a mirror, for rounding [m]."""
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
@@ -116,12 +118,6 @@ class Walls:
             (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
         )
 
-    def reflects(self, face: int, start: np.ndarray, end: np.ndarray) -> bool:
-        """Whether the segment from a mirror image to an end (3,) goes through one of the faces in
-        the face's plane."""
-        plane = self.city.plane_of_face
-        return bool((plane[self.blocking(start, end)] == plane[face]).any())
-
 
 @dataclass(frozen=True)
 class Suspicion:
@@ -160,8 +156,8 @@ def suspicion(
         reference, which itself is not suspected
     own : its pose
     walls : the mesh
-    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `metrics.resolutions`; of one pass at
-        a passive terminal
+    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of
+        `frame.antennas.resolutions`; of one pass at a passive terminal
     velocity_period : span of velocities that the Doppler tells apart [m/s]
     """
     count = len(tracks)
@@ -261,16 +257,16 @@ def reflections(
 def _images(body: np.ndarray, end: np.ndarray, walls: Walls) -> list[tuple[int, np.ndarray]]:
     """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,), world
     coordinates, with the walls' faces."""
-    out = []
-    for face, n, d in zip(*(a.tolist() if a.ndim == 1 else a for a in walls.mirrors), strict=True):
-        if (n @ body[:3] - d) * (n @ end[:3] - d) <= 0:
-            continue  # the wall stands between the two
-        image = np.concatenate(
-            [body[:3] - 2 * (n @ body[:3] - d) * n, body[3:] - 2 * (n @ body[3:]) * n]
-        )
-        if walls.reflects(face, end[:3], image[:3]):
-            out.append((face, image))
-    return out
+    faces, normals, offsets = walls.mirrors
+    behind, before = normals @ body[:3] - offsets, normals @ end[:3] - offsets
+    some = np.flatnonzero(behind * before > 0)  # else the wall stands between the two
+    n, behind, before = normals[some], behind[some], before[some]
+    places = body[:3] - 2 * behind[:, None] * n
+    met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
+    boxed = walls.bounded(some, met, MEETING)
+    shown = np.flatnonzero(boxed)[walls.holds(some[boxed], met[boxed], MEETING)]
+    motions = body[3:] - 2 * (n @ body[3:])[:, None] * n
+    return [(int(faces[some[k]]), np.concatenate([places[k], motions[k]])) for k in shown]
 
 
 def _apart(body: np.ndarray, end: np.ndarray) -> tuple[float, float]:

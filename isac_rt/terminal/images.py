@@ -9,15 +9,69 @@ buildings is not asked for: an image that is not there only forbids births in a 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from isac_rt.terminal.ghosts import Walls
+from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.types import Detections
+from isac_rt.terminal.ghosts import Walls, suspicion
+from isac_rt.terminal.tracker import Tracker
 from isac_rt.world.swarm import Pose
 
 EDGE = 0.3
 """How far beyond the edge of a face a reflection is still taken for possible [m]: the planes of a
 corner need not meet exactly."""
 LEAST_RANGE = 1.0
+BESIDE_CELLS = 1.5
+"""Off an image by no more cells of range and of rate than these, a detection is taken for it."""
+WELL_INSIDE = 0.95
+"""Share of the view's largest cosines within which a direction is no alias of one outside."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What an active terminal does not take for a UAV.
+
+    Attributes
+    ----------
+    walls : the mesh
+    antennas : Antennas
+    waveform : Waveform
+    """
+
+    walls: Walls
+    antennas: Antennas
+    waveform: Waveform
+
+    def births(self, detections: Detections, own: Pose) -> Detections:
+        """The same detections; none starts a track that may be an image of the terminal or an alias
+        from beyond the view."""
+        d, w = detections, self.waveform
+        inside = np.abs(d.direction) < WELL_INSIDE * self.antennas.view_limit
+        starts = d.starts & inside.all(axis=1)
+        if starts.any():
+            shown = own_images(own, self.walls, float(d.range[starts].max()) + 1)
+            off = np.column_stack([d.range, d.velocity])[:, None] - shown
+            off[..., 1] -= self._period * np.round(off[..., 1] / self._period)
+            allowed = BESIDE_CELLS * np.array([w.range_cell(2), w.velocity_cell(2)])
+            starts &= ~(np.abs(off) < allowed).all(axis=-1).any(axis=1)
+        return replace(d, starts=starts)
+
+    def remove_ghosts(self, tracker: Tracker, new: set[int], own: Pose) -> None:
+        """Take out the tracks, among those `new` to be confirmed, that a wall explains."""
+        confirmed = {t.id for t in tracker.tracks if t.confirmed} & new
+        if not confirmed:
+            return
+        tracks, cells = tracker.snapshot(own), resolutions(self.waveform, self.antennas, 2)
+        suspect = suspicion(tracks, own, self.walls, cells, self._period).suspect
+        out = confirmed & set(tracks.ids[suspect].tolist())
+        tracker.tracks = [t for t in tracker.tracks if t.id not in out]
+
+    @property
+    def _period(self) -> float:
+        return 2 * self.waveform.max_velocity(2)
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:

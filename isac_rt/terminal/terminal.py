@@ -23,7 +23,7 @@ from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.receive.types import Detections, ExpectedClutter
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import (
     Gaussian,
@@ -34,6 +34,8 @@ from isac_rt.terminal.filter import (
     update,
     wrapped,
 )
+from isac_rt.terminal.ghosts import Walls
+from isac_rt.terminal.images import Doubts
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet
 from isac_rt.world.swarm import Pose
 
@@ -76,6 +78,9 @@ class TerminalState(IntEnum):
 class ActiveTerminal:
     """The AT: senses with its own echoes and tracks what it finds.
 
+    `walls`, the city's mesh, are needed where tracks start only from what the mesh does not explain
+    (`tracking.births`).
+
     Examples
     --------
     >>> import isac_rt as irt
@@ -94,10 +99,21 @@ class ActiveTerminal:
     """
 
     def __init__(
-        self, waveform: Waveform, antennas: Antennas, receivers: Receivers, tracking: Tracking
+        self,
+        waveform: Waveform,
+        antennas: Antennas,
+        receivers: Receivers,
+        tracking: Tracking,
+        walls: Walls | None = None,
     ) -> None:
         self._receiver = ActiveReceiver.of(antennas, receivers)
         self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
+        self._doubts = None
+        if tracking.births == "unexplained":
+            if walls is None:
+                raise ValueError("tracking.births unexplained needs the walls of a city")
+            self._doubts = Doubts(walls, antennas, waveform)
+        self._correction: Correction | None = None
 
     def step(
         self,
@@ -111,9 +127,19 @@ class ActiveTerminal:
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal
         expects of its mesh there."""
+        if clutter is not None and self._correction is not None:
+            clutter = self._correction.apply(clutter)
         reception = self.receive(cube, payload, clutter, maps)
+        if reception.correction is not None:
+            before = self._correction or Correction(0.0, np.zeros(3))
+            self._correction = before.then(reception.correction)
         self.tracker.predict(time)
-        self.tracker.update(reception.detections, own_pose)
+        if self._doubts is None:
+            self.tracker.update(reception.detections, own_pose)
+        else:
+            new = {track.id for track in self.tracker.tracks if not track.confirmed}
+            self.tracker.update(self._doubts.births(reception.detections, own_pose), own_pose)
+            self._doubts.remove_ghosts(self.tracker, new, own_pose)
         return reception, self.tracker.snapshot(own_pose)
 
     def receive(
@@ -128,11 +154,17 @@ class ActiveTerminal:
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        return self.tracker.memory()
+        found = self._correction
+        return {
+            "tracker": self.tracker.memory(),
+            "correction": None if found is None else [found.level, found.velocity],
+        }
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
-        self.tracker.restore(memory)
+        self.tracker.restore(memory["tracker"])
+        found = memory["correction"]
+        self._correction = None if found is None else Correction(*found)
 
 
 class PassiveTerminal:

@@ -33,6 +33,9 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.world.swarm import Pose
 
+ROUNDING = 1e-9
+"""Of sums of frame intervals [s]."""
+
 
 def assign(cost: np.ndarray) -> list[tuple[int, int]]:
     """Global nearest neighbour: as many pairs (row, column) as the finite costs allow, of the least
@@ -61,6 +64,7 @@ class Track:
     missed : frames since the last detection
     confirmed : M hits in N frames were reached
     detection : row among the frame's detections that updated it, -1: none
+    last : time of the last detection [s]
     """
 
     id: int
@@ -71,6 +75,7 @@ class Track:
     missed: int = 0
     confirmed: bool = False
     detection: int = -1
+    last: float = -np.inf
 
     def memory(self) -> dict[str, Any]:
         """The track as plain numbers and arrays, for `of_memory`."""
@@ -226,8 +231,9 @@ class Tracker:
                     track.state, z[q], R, own, t, velocity_period=self.velocity_period
                 )
                 track.snr, track.detection = float(detections.snr[q]), q
+                track.last = self.time
         self.tracks = [t for t in self.tracks if not self._dead(t)]
-        for q in free:
+        for q in (q for q in free if detections.starts[q]):
             state = birth(
                 z[q],
                 detections.std[q],
@@ -237,6 +243,7 @@ class Tracker:
             )
             if state is not None:
                 track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
+                track.last = self.time
                 track.confirmed = self.settings.confirm_hits == 1
                 self.tracks.append(track)
 
@@ -284,9 +291,11 @@ class Tracker:
         track.confirmed = track.confirmed or sum(track.recent) >= s.confirm_hits
 
     def _dead(self, track: Track) -> bool:
-        """A confirmed track dies of `drop_misses` misses in a row; a tentative one as soon as it
-        can no longer be confirmed within its first `confirm_window` frames."""
+        """A confirmed track dies of `drop_misses` misses in a row, or of `drop_after_s` without a
+        detection; a tentative one as soon as it can no longer be confirmed within its first
+        `confirm_window` frames."""
         s = self.settings
         if track.confirmed:
-            return track.missed >= s.drop_misses
+            late = s.drop_after_s is not None and self.time - track.last > s.drop_after_s - ROUNDING
+            return late or track.missed >= s.drop_misses
         return sum(track.recent) + s.confirm_window - len(track.recent) < s.confirm_hits

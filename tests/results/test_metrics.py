@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
@@ -19,7 +19,6 @@ from isac_rt.results.metrics import (
     binomial_interval,
     count_symbols,
     gospa,
-    resolutions,
     truth_of,
     within_view,
 )

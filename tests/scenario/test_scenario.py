@@ -173,7 +173,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         (
             BASE + "receivers: {clutter_channels: joint}\n",
             "receivers.clutter_channels = joint: has no meaning with clutter_detector cfar, only "
-            "with angle_doppler or sample_matrix",
+            "with sample_matrix",
         ),
         (
             BASE + "receivers: {clutter_filter: zero_doppler, clutter_run_cells: 20}\n",

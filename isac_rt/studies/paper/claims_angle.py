@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from isac_rt.frame.antennas import Antennas, unit_vector
+from isac_rt.frame.antennas import Antennas, resolutions, unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_random_schedule
@@ -14,7 +14,6 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
 from isac_rt.receive import receive_active
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.results.metrics import resolutions
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table

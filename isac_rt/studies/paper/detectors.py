@@ -91,27 +91,24 @@ ALL_WRONG = Mistakes((0.07, 0.07, 0.0), -3.0, 0.1)
 VELOCITY_WRONG = Mistakes(ALL_WRONG.velocity)
 LEVEL_WRONG = Mistakes(level_db=ALL_WRONG.level_db)
 MESH_WRONG = Mistakes(mesh_std=ALL_WRONG.mesh_std)
-PER_ARM = {"clutter_detector": "angle_doppler"}
-JOINT = {"clutter_detector": "angle_doppler", "clutter_channels": "joint"}
+FILTER = {"clutter_detector": "angle_doppler"}
 DETECTORS = {
     "cfar": Detector("CFAR", {}),
     "runs": Detector("CFAR after the paper's filter (runs)", {"clutter_filter": "runs"}),
     "notch": Detector("CFAR after a zero-Doppler notch", {"clutter_filter": "zero_doppler"}),
     "sample": Detector("sample matrix, per arm", {"clutter_detector": "sample_matrix"}),
     "map": Detector("threshold map from the mesh", {"clutter_detector": "map"}),
-    "arms": Detector("mesh and velocity, per arm", PER_ARM),
-    "joint": Detector("mesh and velocity, joint", JOINT),
-    "velocity_wrong": Detector("per arm, velocity 0.1 m/s off", PER_ARM, VELOCITY_WRONG),
-    "level_wrong": Detector("per arm, level 3 dB off", PER_ARM, LEVEL_WRONG),
-    "mesh_wrong": Detector("per arm, mesh 0.1 m off", PER_ARM, MESH_WRONG),
-    "arms_wrong": Detector("per arm, all three off", PER_ARM, ALL_WRONG),
-    "joint_wrong": Detector("joint, all three off", JOINT, ALL_WRONG),
-    "unfitted": Detector("per arm, all three off, not corrected", PER_ARM, ALL_WRONG, fitted=False),
+    "filter": Detector("mesh and velocity", FILTER),
+    "velocity_wrong": Detector("mesh and velocity, velocity 0.1 m/s off", FILTER, VELOCITY_WRONG),
+    "level_wrong": Detector("mesh and velocity, level 3 dB off", FILTER, LEVEL_WRONG),
+    "mesh_wrong": Detector("mesh and velocity, mesh 0.1 m off", FILTER, MESH_WRONG),
+    "filter_wrong": Detector("mesh and velocity, all three off", FILTER, ALL_WRONG),
+    "unfitted": Detector("all three off, not corrected", FILTER, ALL_WRONG, fitted=False),
     "map_wrong": Detector("threshold map, all three off", {"clutter_detector": "map"}, ALL_WRONG),
 }
-LEFT_OUT_QUICK = "joint", "joint_wrong", "sample", "map_wrong"
-BOUNDS = {"bound_arms": "arms", "bound_joint": "joint"}
-"""Detectors without any clutter, of which the better is the bound."""
+LEFT_OUT_QUICK = "sample", "map_wrong"
+BOUNDS = {"bound": "filter"}
+"""Detectors without any clutter."""
 
 
 @dataclass
@@ -378,17 +375,14 @@ others: What the others reach (no claim; stated beside the filter)
 
 def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
     """What is demanded of the filter, by name."""
-    joint = "joint" in found.index and found.pd_strong["joint"] >= found.pd_strong["arms"]
-    best = "joint" if joint else "arms"
-    bound = max((n for n in found.index if n.startswith("bound_")), key=lambda n: found.pd[n])
-    top, limit, threshold_map = found.loc[best], found.loc[bound], found.loc["map"]
-    wrong, raw = found.loc[f"{best}_wrong"], found.loc["unfitted"]
+    top, limit, threshold_map = found.loc["filter"], found.loc["bound"], found.loc["map"]
+    wrong, raw = found.loc["filter_wrong"], found.loc["unfitted"]
     alone = [found.loc[n] for n in ("velocity_wrong", "level_wrong", "mesh_wrong")]
 
     def strong(row: pd.Series) -> str:
         return proportion(round(row.pd_strong * row.n_strong), int(row.n_strong))
 
-    worst = found[~found.index.str.startswith("bound_")].sort_values("rate").iloc[-1]
+    worst = found[~found.index.isin(BOUNDS)].sort_values("rate").iloc[-1]
     quiet = worst.rate <= WORST_RATE and found.false_alarms.min() >= 100
     kept = all(row.pd >= limit.pd - 0.03 and row.pd_strong >= 0.95 for row in (wrong, *alone))
     each = ", ".join(f"{row.detector} alone {row.pd:.4f} and {row.pd_strong:.3f}" for row in alone)
@@ -400,10 +394,10 @@ def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
     rates = {"worst_rate": rate_text(worst), "rate": rate_text(top)}
     both = {"strong": strong(top), "strong_limit": strong(limit)}
     cells = {"speed": SPEED, "level": STRONG_DB}
-    uavs, told = int(top.n_strong + top.n_weak), {"best": best, "top": top}
+    uavs, told = int(top.n_strong + top.n_weak), {"best": "filter", "top": top}
     failed = {"strong": strong(wrong), "rate": rate_text(wrong), "alone": each}
     return (
-        say("false alarms", quiet, best=best, worst=worst, **rates),
+        say("false alarms", quiet, best="filter", worst=worst, **rates),
         say("bound", top.pd >= limit.pd - 0.03, **told, limit=limit, uavs=uavs),
         say("strong", top.pd_strong >= 0.95, **told, **both, **cells),
         say("map", top.pd_strong >= threshold_map.pd_strong + 0.1, **told, map=threshold_map),
@@ -412,7 +406,7 @@ def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
     )
 
 
-DRAWN = "cfar", "notch", "sample", "map", "arms", "arms_wrong", "bound_arms"
+DRAWN = "cfar", "notch", "sample", "map", "filter", "filter_wrong", "bound"
 
 
 def _figure(found: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame) -> Figure:

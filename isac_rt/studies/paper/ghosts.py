@@ -16,13 +16,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import antennas_of, resolutions
 from isac_rt.frame.level import transmit_amplitude
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.randomness import generator
-from isac_rt.results.metrics import resolutions
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
