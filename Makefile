@@ -36,7 +36,8 @@ $(STAMP): requirements.lock pyproject.toml
 	fi; \
 	$$python -c 'import sys; print("setup: Python %d.%d.%d, installing the locked packages into .venv (minutes the first time)" % sys.version_info[:3])'; \
 	$$python -m venv --clear .venv
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
+	@n=0; ( while sleep 10; do n=$$((n + 10)); echo "setup: still installing, $$n s"; done ) & beat=$$!; trap "kill $$beat" EXIT; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
 	@touch $@
 

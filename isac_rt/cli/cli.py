@@ -11,7 +11,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -24,24 +24,27 @@ from isac_rt.cli.interruption import Terminated, say_interrupted
 from isac_rt.runtime import UserError, of_machine
 
 DEBUG = "ISAC_RT_DEBUG"
-COMMANDS = (
-    simulation.run,
-    simulation.plan,
-    simulation.paths,
-    simulation.view,
-    simulation.animate,
-    sweeps.sweep,
-    studies.reproduce,
-    studies.validate,
-    studies.bench,
-    setting_up.doctor,
-    setting_up.new,
-    setting_up.schema,
-)
+COMMANDS: dict[Callable[..., None], str] = {
+    simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
+    simulation.plan: "plan scenes/munich_swarm.yaml --set accuracy.preset=fastest",
+    simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",
+    simulation.view: "view scenes/street_canyon.yaml --out scene.html",
+    simulation.animate: "animate runs/munich --out runs/munich/run.mp4",
+    sweeps.sweep: "sweep scenes/sweeps/canyon_power.yaml --workers 2",
+    studies.reproduce: "reproduce table1 fig8 --quick",
+    studies.validate: "validate --quick --only geometry",
+    studies.bench: "bench synthesis --quick",
+    setting_up.doctor: "doctor",
+    setting_up.new: "new mine.yaml --footprints buildings.geojson",
+    setting_up.schema: "schema > scenario.schema.json",
+}
+"""The commands, each with an example of its use."""
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-for _command in COMMANDS:
-    app.command(help=" ".join(str(_command.__doc__).split()))(_command)
+for _command, _example in COMMANDS.items():
+    app.command(
+        help=" ".join(str(_command.__doc__).split()), epilog=f"Example: isac-rt {_example}"
+    )(_command)
 
 
 def _print_versions(wanted: bool) -> None:

@@ -3,7 +3,11 @@ is markup, so that "range [m]" keeps its unit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -12,6 +16,9 @@ from rich.text import Text
 
 Report = Callable[..., None]
 """`report(done, total, note)` moves a bar; the note is optional."""
+
+EVERY_S, SOON_S = 10.0, 1.0
+"""Where no terminal shows a bar a line comes at least and at most so often [s]."""
 
 
 def out() -> Console:
@@ -57,8 +64,24 @@ def say_table(
     console.print(wide if needs <= console.width else made(False))
 
 
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """Say on stderr what is being done, and the steps of it that the program logs: beside a spinner
+    on a terminal, else in lines (`_Lines`)."""
+    console = err()
+    if not console.is_terminal:
+        with _Lines(what) as lines, _logged(lines.note):
+            yield
+        return
+    with (
+        console.status(Text(what)) as status,
+        _logged(lambda step: status.update(Text(f"{what}: {step}"))),
+    ):
+        yield
+
+
 def with_progress(work: Callable[[Report], Any], what: str, steps: int | None = None) -> Any:
-    """Do `work(report)` with a bar on stderr."""
+    """Do `work(report)` with a bar on stderr, or with lines where there is no terminal."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -68,11 +91,14 @@ def with_progress(work: Callable[[Report], Any], what: str, steps: int | None = 
         TimeRemainingColumn,
     )
 
+    if not err().is_terminal:
+        with _Lines(what, steps) as lines, _logged(lines.note):
+            return work(lines.move)
     columns = (
         TextColumn(what, markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
@@ -83,4 +109,76 @@ def with_progress(work: Callable[[Report], Any], what: str, steps: int | None = 
         def report(done: int, total: int | None, note: str = "") -> None:
             bar.update(task, completed=done, total=total, note=note)
 
-        return work(report)
+        with _logged(lambda step: bar.update(task, note=step)):
+            return work(report)
+
+
+class _Lines:
+    """What is being done, line by line: at once, at the end, and in between at least every
+    `EVERY_S`; steps that are logged less than `SOON_S` after a line wait for the next."""
+
+    def __init__(self, what: str, total: int | None = None) -> None:
+        self._what, self._done, self._total, self._step = what, 0, total, ""
+        self._begun, self._lock = time.monotonic(), threading.Lock()
+        self._ended = threading.Event()
+        self._repeat = threading.Thread(target=self._go_on, daemon=True)
+
+    def __enter__(self) -> _Lines:
+        self._say()
+        self._repeat.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._repeat.join()
+
+    def note(self, step: str) -> None:
+        """A step has begun, or goes on."""
+        if step == self._step:
+            return
+        self._step = step
+        if time.monotonic() - self._said >= SOON_S:
+            self._say()
+
+    def move(self, done: int, total: int | None, note: str = "") -> None:
+        """So much is done; the end is said at once."""
+        self._done, self._total, self._step = done, total, note
+        if done == total:
+            self._say()
+
+    def _go_on(self) -> None:
+        while not self._ended.wait(max(self._said + EVERY_S - time.monotonic(), 0.1)):
+            if time.monotonic() - self._said >= EVERY_S:
+                self._say()
+
+    def _say(self) -> None:
+        with self._lock:
+            self._said = time.monotonic()
+            passed = self._said - self._begun
+            parts = [f"{self._done} of {self._total}"] if self._total else []
+            parts += [self._step] if self._step else []
+            parts += [f"{passed:.0f} s"] if passed >= 1 else []
+            if self._total and 0 < self._done < self._total:
+                left = passed * (self._total - self._done) / self._done
+                parts.append(f"about {left:.0f} s left")
+            said = f"{self._what}: {', '.join(parts)}" if parts else self._what
+            err().print(said, soft_wrap=True)
+
+
+@contextmanager
+def _logged(say: Callable[[str], None]) -> Iterator[None]:
+    """Hand the steps that the program logs to `say`."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            say(record.getMessage())
+
+    logger, handler = logging.getLogger("isac_rt"), Handler(logging.INFO)
+    before = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)

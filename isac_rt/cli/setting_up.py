@@ -8,14 +8,15 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from isac_rt.cli.console import say, say_table
+from isac_rt.cli.console import say, say_table, working
 
 
 def doctor() -> None:
     """Back end, LLVM, memory, threads, and what to install."""
-    from isac_rt import runtime
+    with working("looking at the machine"):
+        from isac_rt import runtime
 
-    checks = runtime.doctor()
+        checks = runtime.doctor()
     rows = [
         (
             Text.assemble(("ok", "green") if check.ok else ("no", "red"), f" {check.name}"),
@@ -44,7 +45,8 @@ def new(
 ) -> None:
     """Write a commented scenario to start from, over a street canyon or over your own buildings,
     and the schema for editors."""
-    from isac_rt.cli.starter import write_starter
+    with working("writing the scenario"):
+        from isac_rt.cli.starter import write_starter
 
-    files, notes = write_starter(file, footprints)
+        files, notes = write_starter(file, footprints)
     say(*files, *notes)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isac_rt.cli.arguments import FrameNumber, InputProblem, Overrides, ScenarioFile, check_frame
-from isac_rt.cli.console import err, out, say, say_table, with_progress
+from isac_rt.cli.console import err, out, say, say_table, with_progress, working
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
 if TYPE_CHECKING:
@@ -57,16 +57,17 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     from isac_rt.results.files import check_folder, save
 
     check_folder(folder)
-    from isac_rt.results.provenance import run_content
-    from isac_rt.simulation import simulate
-    from isac_rt.simulation.resume import Resume
-    from isac_rt.simulation.setup import link_budgets, prepare
+    with working("loading the program"):
+        from isac_rt.results.provenance import run_content
+        from isac_rt.simulation import simulate
+        from isac_rt.simulation.resume import Resume
+        from isac_rt.simulation.setup import link_budgets, prepare
 
     resume = Resume(folder, run_content(loaded, snapshots))
     if restart:
         resume.remove()
     resume.check()
-    with err().status("setting up"):
+    with working("setting up"):
         setup = prepare(loaded)
         budget = link_budgets(setup)
     _say_coverage(asdict(setup.coverage))
@@ -83,10 +84,10 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     if check_budget:
         from isac_rt.simulation.audit import check
 
-        with err().status("measuring what was left out"):
+        with working("measuring what was left out"):
             results.summary["fidelity"]["checked"] = check(setup)
     save(results, folder)
-    with err().status("figures and report"):
+    with working("figures and report"):
         from isac_rt.views.figures import make_figures
         from isac_rt.views.report import write_report
 
@@ -138,6 +139,22 @@ def _say_budget(rows: list[Any]) -> None:
     )
 
 
+_WORDS = (
+    "SER and BER are shares of all data symbols and bits sent; those without a decision are wrong, "
+    "and undecided is their share. Hit rate: UAVs in view and not hidden that were found within a "
+    "cell on every axis. RMSE: of what the UAV's own path explains. GOSPA: one number for tracks "
+    "against truth, worse than nothing above the empty picture. The report has more."
+)
+_PLAN_WORDS = (
+    "Errors are estimates from a few frames. rad: of a path's phase; dB: power left out, over the "
+    "noise of a cell of the range-Doppler map of one antenna; relative: of the samples. A plane "
+    "wavefront turns no phase by its curvature; a straight flight has no acceleration within the "
+    "frame. Too weak: together with all others in its range cell; out of reach: its beat is "
+    "stopped by the IF filter."
+)
+"""What a newcomer asks of the tables."""
+
+
 def _say_summary(results: Results) -> None:
     from isac_rt.views.report import gospa_table, number, per_terminal, rmse_table, side_by_side
 
@@ -165,6 +182,7 @@ def _say_summary(results: Results) -> None:
             causes = ", ".join(f"{number(n)} {cause}" for cause, n in by.items())
             say(f"{name.replace('->', ' to ')}: {total} false tracks a frame, by {causes}")
     seconds = results.summary["timing_s"]
+    out().print(_WORDS)
     spent = f"{number(seconds['total'])} s of processor time, {number(seconds['wall']['total'])} s"
     say(f"paths: {found}; {spent} by the clock")
 
@@ -182,7 +200,7 @@ def plan(
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or ())
-    with ending_soon_after_interrupt(Path()), err().status("tracing a few frames"):
+    with ending_soon_after_interrupt(Path()), working("tracing a few frames"):
         from isac_rt.simulation.audit import make_plan
         from isac_rt.simulation.setup import prepare
 
@@ -213,6 +231,7 @@ def _say_plan(found: dict[str, Any], frames: int) -> None:
         for item in found["items"]
     ]
     say_table(("", "link", "modelled", "left out", "error", "s/frame"), rows, numbers=False)
+    out().print(_PLAN_WORDS)
     settled = {
         "phase error at most [rad]": found["max_phase_error_rad"],
         "weakest [dB under the noise of a cell]": found["weakest_path_db"],
@@ -235,7 +254,7 @@ def paths(
 
     loaded = load(scenario, overrides or ())
     check_frame(loaded, frame)
-    with ending_soon_after_interrupt(out.parent), err().status("tracing"):
+    with ending_soon_after_interrupt(out.parent), working("tracing"):
         from isac_rt.results.provenance import provenance
         from isac_rt.simulation.setup import trace
         from isac_rt.views.interchange import write_ledger
@@ -265,7 +284,7 @@ def view(
 
     loaded = load(scenario, overrides or ())
     check_frame(loaded, frame)
-    with ending_soon_after_interrupt(out.parent), err().status("tracing and drawing"):
+    with ending_soon_after_interrupt(out.parent), working("tracing and drawing"):
         import numpy as np
 
         from isac_rt.simulation.setup import prepare, trace
@@ -310,6 +329,6 @@ def animate(
 
     target = out if out is not None else folder / "run.gif"
     number = names.index(observer) if observer else 0
-    with ending_soon_after_interrupt(folder), err().status("drawing"):
+    with ending_soon_after_interrupt(folder), working("drawing"):
         write_animation(results, target, number, city_of(results.scenario), rate)
     say(target)

@@ -149,7 +149,8 @@ def bench(
         typer.Option(metavar="FILE", help="Only fit accuracy.cost_model to this machine."),
     ] = None,
 ) -> None:
-    """Speed against error, method by method, in floors of the same run."""
+    """Speed against error, method by method. Cost is in floors: one floor is the processor time to
+    fill one cube of samples and transform it once, measured in the same run."""
     if fit is not None:
         return _fit(fit)
     from isac_rt.results.files import check_folder
@@ -176,6 +177,7 @@ def bench(
         for row in found["rows"]
     ]
     say_table(("method", "size", "cost [floors]", "error"), rows)
+    say("one floor: to fill one cube of samples and transform it once, measured in this run")
     if found["commands"]:
         lines = [line.strip("| ").split(" | ") for line in command.markdown(found["commands"])]
         say_table(lines[0], lines[2:])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isac_rt.cli.arguments import InputProblem
-from isac_rt.cli.console import err, say, with_progress
+from isac_rt.cli.console import say, with_progress, working
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _finish(plan: Plan, folder: Path) -> None:
     from isac_rt.sweep import Outcomes, assemble, save_dataset
     from isac_rt.views.figures import make_sweep_figures
 
-    with err().status("dataset and figures"):
+    with working("dataset and figures"):
         dataset = assemble(plan, Outcomes(folder))
         save_dataset(dataset, folder)
         wanted = [(f.quantity, f.against, f.by) for f in plan.sweep.figures]

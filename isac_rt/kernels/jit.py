@@ -11,6 +11,7 @@ Where it cannot be written, every process compiles for itself.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 import shutil
@@ -23,6 +24,7 @@ from typing import Any
 import numba
 from numba.core import caching
 
+_LOG = logging.getLogger(__name__)
 CACHE = "ISAC_RT_CACHE"
 """Variable of the environment: folder of the machine code."""
 KEPT = 8
@@ -127,3 +129,10 @@ class _Implementation(caching.CompileResultCacheImpl):
 
 class _Cache(caching.Cache):
     _impl_class: Any = _Implementation
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The machine code for a signature; None where it is to be compiled, which is logged."""
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            _LOG.info("compiling for this machine, which later runs need not")
+        return found

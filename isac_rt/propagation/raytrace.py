@@ -27,6 +27,7 @@ only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 import copy
+import logging
 from dataclasses import replace
 
 import mitsuba as mi
@@ -68,6 +69,9 @@ MOST_PATHS = 4_000_000
 fewer rays get less room."""
 
 
+_LOG = logging.getLogger(__name__)
+
+
 class RayTracer:
     """Paths of all links of a frame in one city."""
 
@@ -84,17 +88,20 @@ class RayTracer:
     ) -> None:
         self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
         self._free, self._city, self._terminals = free, city, swarm.terminals
+        _LOG.info("handing %s faces to the ray tracer", f"{city.num_faces:,}")
         self._handle = shared_scene(city, carrier)
         self._solver = rt.PathSolver(deterministic=True)
         self._normals, self._offsets = plane_of_each_face(city)
         scene, wavelength = self._handle.scene.mi_scene, free.wavelength
         shadows = Shadows(scene)
+        _LOG.info("finding the edges that cast shadows")
         self._edges = ShadowEdges(city, shadows, wavelength)
         self.field: ClutterField | None = None
         """The scatterers on the city's surfaces."""
         self.two_bounces: TwoBounces | None = None
         """The same scatterers by way of mirrors."""
         if clutter.model == "field":
+            _LOG.info("placing the scatterers of the clutter")
             self.field = ClutterField.plan(
                 clutter, swarm, city, scene, wavelength, free.seed, floor
             )

@@ -11,6 +11,7 @@ are those that Sionna's own solver finds with `CHECK_RAYS`.
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -50,6 +51,7 @@ from isac_rt.world.swarm import Pose
 if TYPE_CHECKING:
     from isac_rt.propagation.raytrace import RayTracer
 
+_LOG = logging.getLogger(__name__)
 PILOT_FRAMES = 5
 FOLLOWED = 2
 """Frames after each pilot frame whose tracing is timed: knots are passed now and then."""
@@ -118,6 +120,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     trace: list[float] = []
     light, late, short_lived = 0.0, 0.0, 0
     for frame in frames:
+        _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, found = setup.find(frame)
         trace += _seconds_after(setup, frame)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
@@ -128,6 +131,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
             light = max(light, flight_of_light(paths, setup.waveform, fastest))
             late = max(late, _late(setup, paths, last.noise_power(link)))
             short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
+    _LOG.info("making the samples of frame %d", frames[-1])
     stages = stage_seconds(last, setup, receive)
     tracing = float(np.mean(trace))
     items = [_tracing_item(setup, frames, tracing)]

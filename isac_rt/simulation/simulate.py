@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import time
 from collections import deque
@@ -30,6 +31,7 @@ from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 
+_LOG = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
@@ -343,6 +345,7 @@ class _Run:
             threadpool_limits(limits=1),
             ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
         ):
+            _LOG.info("tracing and receiving the first frame")
             for number in range(self.restore(resume) if resume else 0, frames):
                 with self.stopwatch.stage("trace"):
                     frame = setup.frame(number)

@@ -189,14 +189,18 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
         )
     limits = Table(("Sees", *_SEES), [(", ".join(names), *row) for row, names in alike.items()])
     farthest = max(seen["links"], key=lambda of: of["max_range_m"])
+    slot, frame, interval = (
+        number(seen[key] * unit)
+        for key, unit in (("slot_s", 1e6), ("frame_s", 1e3), ("frame_interval_s", 1e3))
+    )
     words = (
-        f"A slot lasts {number(1e6 * seen['slot_s'])} us, a frame {number(1e3 * seen['frame_s'])} "
-        f"ms, and one begins every {number(1e3 * seen['frame_interval_s'])} ms. Ranges are one way "
-        "for echoes, the whole way from transmitter to receiver otherwise, and hold with data as "
-        "without; paths of up to twice that range still disturb some chirps. Faster UAVs are seen "
-        "at a wrong velocity. A beam is the width of the array's main lobe ahead; the view reaches "
-        "so far to each side, and directions are unambiguous to "
-        f"{number(farthest['unambiguous_angle_deg'])} deg. Walls in between are not counted here."
+        f"A slot, one chirp of each group, lasts {slot} us, a frame {frame} ms; a frame begins "
+        f"every {interval} ms. Ranges are one way for echoes, the whole way from transmitter to "
+        "receiver otherwise, and hold with data as without; paths of up to twice that range still "
+        "disturb some chirps. Faster UAVs are seen at a wrong velocity. A beam is the width of "
+        "the array's main lobe ahead; the view reaches so far to each side, and directions are "
+        f"unambiguous to {number(farthest['unambiguous_angle_deg'])} deg. Walls in between are "
+        "not counted here."
     )
     rows = [
         (

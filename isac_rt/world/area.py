@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import numpy as np
 from isac_rt.scenario import environment
 from isac_rt.scenario.file import plain_tree
 from isac_rt.world.city import CityMesh, city_files, load_city
+
+_LOG = logging.getLogger(__name__)
 
 
 def city_about(
@@ -45,6 +48,8 @@ def _loaded_city(
     text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]
 ) -> CityMesh:
     tree = environment.City.model_validate(json.loads(text)) if text else None
+    if tree is not None:
+        _LOG.info("reading the city")
     return load_city(tree, folder, carrier, centre)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from fake_run import fake_coverage, fake_records, fake_run, fake_scenario
 from matplotlib.image import imread
 
 import isac_rt.simulation
+from isac_rt.cli import console
 from isac_rt.cli.cli import main
 from isac_rt.frame.level import LinkBudget
 from isac_rt.scenario.file import ScenarioWarning, to_yaml
@@ -216,6 +218,61 @@ def test_help_of_every_command_says_its_options(capsys):
     for name, option in (("run", "--set"), ("sweep", "--retry-failed"), ("bench", "--fit")):
         assert main([name, "--help"]) == 0
         assert option in capsys.readouterr().out
+
+
+def test_where_no_terminal_shows_a_bar_lines_come(capsys, monkeypatch):
+    """At once, for a step that the program logs, at least so often while a native call holds on,
+    and at the end with what is done. Planted bugs: the first line after the first period; nothing
+    between two reports."""
+    monkeypatch.setattr(console, "EVERY_S", 0.4)
+    monkeypatch.setattr(console, "SOON_S", 0.1)
+    said = list[tuple[float, str]]()
+    begin = time.monotonic()
+    monkeypatch.setattr(
+        console.Console,
+        "print",
+        lambda _, text, **__: said.append((time.monotonic() - begin, text)),
+    )
+
+    def work(report):
+        time.sleep(0.2)
+        logging.getLogger("isac_rt.world").info("reading the %s", "city")
+        time.sleep(1.0)
+        report(3, 4)
+        time.sleep(0.5)
+        report(4, 4)
+
+    console.with_progress(work, "frames", 4)
+    times, texts = zip(*said, strict=True)
+    assert texts[0] == "frames: 0 of 4" and times[0] < 0.1
+    assert texts[1] == "frames: 0 of 4, reading the city" and times[1] < 0.35
+    assert max(np.diff(times)) < 0.4 + 0.2  # and the scheduler
+    assert any(re.fullmatch(r"frames: 3 of 4, \d s, about \d s left", text) for text in texts)
+    assert texts[-1].startswith("frames: 4 of 4")
+    said.clear()
+    with console.working("setting up"):
+        time.sleep(0.5)
+    assert [text for _, text in said] == ["setting up", "setting up"]
+    logging.getLogger("isac_rt").info("nobody listens any more")
+    assert len(said) == 2
+
+
+@pytest.mark.parametrize("command", isac_rt.cli.cli.COMMANDS, ids=lambda c: c.__name__)
+def test_help_of_every_command_gives_an_example(command, capsys, monkeypatch):
+    """Of that command, with options that it has and files that there are. Planted bug: an option
+    of another command."""
+    monkeypatch.setenv("COLUMNS", "140")
+    name = command.__name__
+    assert main([name, "--help"]) == 0
+    said = capsys.readouterr().out
+    example = re.search(rf"Example: (isac-rt {name}\b.*)", said)
+    assert example is not None
+    words = example[1].replace("│", " ").split()
+    for word in words[2:]:
+        if word.startswith("--"):
+            assert said.count(word) >= 2, word
+        if word.startswith("scenes/"):
+            assert (Path(__file__).parents[2] / word).exists()
 
 
 def test_version_names_the_program_and_what_is_under_it(capsys):

@@ -3,6 +3,7 @@ areas."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from isac_rt.kernels.jit import jit
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 
+_LOG = logging.getLogger(__name__)
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
 MAX_FACES = 10_000_000
@@ -124,6 +126,7 @@ class CityMesh:
         """
         if not self.num_faces:
             return _read_only(np.zeros(0, dtype=np.int64))
+        _LOG.info("finding the planes of %s faces", f"{self.num_faces:,}")
         order = np.argsort(-self.areas, kind="stable")
         planes = np.empty(self.num_faces, dtype=np.int64)
         planes[order] = _group_planes(
