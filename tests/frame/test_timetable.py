@@ -46,6 +46,19 @@ def test_one_transmitter_names_its_links_by_the_receiver():
     assert t.roles_taken("PT1") == ["passive"]
 
 
+def test_when_frames_begin():
+    """Frame 7 of 0.05 s; the second transmitter 4 blocks of 2 T_d later, its middle half a frame
+    after that. Planted bugs: blocks before the frame; the middle of the first block for all."""
+    second = SECOND.model_copy(update={"resource_block": 4})
+    swarm = {"AT": AT, "B": second, "PT1": PT1}
+    t = timetable(swarm=swarm, frame_interval_s=0.05)
+    later, half = 8 * t.waveform.max_delay, t.waveform.frame_duration / 2
+    assert t.start_time(7) == t.start_time(7, "AT") == pytest.approx(0.35, abs=1e-15)
+    assert t.start_time(7, "B") == pytest.approx(0.35 + later, abs=1e-15)
+    assert t.epoch(7, "B") == pytest.approx(0.35 + later + half, abs=1e-15)
+    assert t.epoch(7) == pytest.approx(0.35 + half, abs=1e-15)
+
+
 def test_a_change_of_roles():
     """From frame 17 on PT1 sends in the AT's blocks, first without data, and the AT listens.
     Planted bugs: the change one frame late; pilots counted from the start only."""

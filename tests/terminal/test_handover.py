@@ -375,7 +375,8 @@ def read(symbols, z, sure=100.0, **changes) -> Reception:
 def test_a_slip_is_repaired_and_the_frame_read_again():
     """Two sure symbols two below the alphabet: the second prediction is two cells shorter, nothing
     else of it changes, and what is returned is the second reading. One that is not decoded changes
-    nothing. Unsure symbols, one alone, and symbols beyond both ends are no evidence. Planted bugs:
+    nothing. Unsure symbols, one alone, and symbols that the move would take
+    beyond the other end are no evidence. Planted bugs:
     the sign; the first reading returned; the state left moved."""
     for again, kept in (
         (read([], sight() - np.array([2 * CELL, 0, 0, 0])), False),
@@ -395,6 +396,7 @@ def test_a_slip_is_repaired_and_the_frame_read_again():
         ([-2], 100.0),
         ([-2, -2], 1.0),
         ([-2, -2, 129, 129], 100.0),
+        ([-2, -2, 126], 100.0),
         ([127, 0], 100.0),
     ):
         pt, told = passive([read(symbols, sight(), sure)], known())

@@ -177,3 +177,17 @@ def test_a_swarm_by_roles_and_its_middle():
     line = Swarm({"T": Uav(role="target", waypoints=tuple(points))}, duration=2.0)
     assert line.middle == pytest.approx([0, 0, 4.0])  # it flies straight on: 0 to 8
     assert Swarm({"T": uavs["T"]}).middle.tolist() == [0, 0, 0]
+
+
+def test_a_waypoint_out_of_order_is_named_with_the_one_before():
+    """The third of three waypoints lies before the second: both places are named, counted from 0.
+    Planted bug: counted from 1."""
+    late = Uav.model_construct(
+        role="target",
+        position_m=None,
+        waypoints=(WAYPOINTS[0], WAYPOINTS[2], WAYPOINTS[1]),
+        resource_block=None,
+    )
+    (problem,) = late.problems()
+    assert problem[0] == (("waypoints", 2, "time_s"), ("waypoints", 1, "time_s"))
+    assert "2.9 s" in problem[1]
