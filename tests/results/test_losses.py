@@ -104,6 +104,13 @@ def test_matched_filter_adds_everything_in_phase():
     assert chance_of(half, sees, w).cell == pytest.approx(found.cell / 4)
 
 
+def test_conventional_velocities_are_not_united():
+    """By choice of the receiver, although the groups sample every antenna in every slot."""
+    w, schedule, payload = frame(waveform=W)
+    settings = Receivers(velocity_method="conventional")
+    assert Sensitivity.of(w, ANTENNAS, settings, sent(schedule, payload), 1.0, 3).rule.looks == 135
+
+
 def test_fewer_groups_are_not_united():
     """Two of three groups, and a schedule that sends an antenna twice in a slot: a third of the
     chirps is added in phase, the rest in power."""
@@ -152,15 +159,41 @@ def test_stronger_paths_mask(rows, bins, power_db, kind, masked):
 
 def test_clutter_of_a_cell():
     """Two scatterers at the UAV's place and one half a cell off, whose share is that of the window
-    there, (8 / (3 pi))^2; one three cells off has none."""
+    there, (8 / (3 pi))^2; those three cells off on either axis have none."""
     cell = 2 * W.range_cell(2)
     walls = [(12.7, 1.9, 0.3, PathKind.DIFFUSE), (12.7, 1.9, 0.4j, PathKind.DIFFUSE)]
     walls += [
         (12.7 + cell / 2, 1.9, 0.2, PathKind.DIFFUSE),
         (12.7 + 3 * cell, 1.9, 9.0, PathKind.DIFFUSE),
+        (12.7, 1.9 + 6.5 * W.velocity_cell(2), 9.0, PathKind.DIFFUSE),
     ]
     expected = 10.0 * (0.09 + 0.16 + 0.04 * (8 / (3 * np.pi)) ** 2)
     assert chance_of(echo(12.7, 1.9, 1.0, walls)).clutter == pytest.approx(expected)
+
+
+def background(*walls) -> float:
+    """Of an echo at the middle of a map, from (rows and bins away, power over the noise) each."""
+    place = 31 * W.range_cell(1), 0.0
+    others = [
+        (place[0] + r * W.range_cell(1), b * W.velocity_cell(1), np.sqrt(p / 10), PathKind.DIFFUSE)
+        for r, b, p in walls
+    ]
+    return chance_of(echo(*place, 1.0, others)).background
+
+
+def test_background_is_the_greater_of_the_two_sides():
+    """Behind and before the cell 4 and 2 times the noise, in 8 x 19 cells each, spread by 2.25; not
+    the guard cells, nor what lies beyond the block on either axis, nor what is so strong that its
+    lobes are kept out. Planted bugs: the sum of the sides; the lesser; no end along Doppler; strong
+    paths in the training."""
+    cells = 8 * 19
+    near, far = (6.2, 3.1, 4.0), (-7.4, -8.2, 2.0)
+    assert background(near) == pytest.approx(4 * 2.25 / cells)
+    assert background(far) == pytest.approx(2 * 2.25 / cells)
+    assert background(near, far, (8.8, 0.0, 1.0)) == pytest.approx(5 * 2.25 / cells)
+    assert background(far, (-4.1, 0.0, 3.0), near) == pytest.approx(5 * 2.25 / cells)
+    for outside in ((3.2, 0.0, 9.0), (12.1, 0.0, 9.0), (6.0, 10.2, 9.0), (6.0, 0.0, 1001.0)):
+        assert background(outside) == 0.0
 
 
 def test_background_is_that_of_the_map():
