@@ -78,7 +78,7 @@ def path_of(receiver: str, uav: str, frame: int, gain: float, kind=None, off=(0.
     return {"gain": gain, "delay": delay, "kind": own if kind is None else kind, "target": target}
 
 
-def pathset(receiver: str, rows: list[dict]):
+def pathset(receiver: str, rows: list[dict], points=None):
     delay = np.array([row["delay"] for row in rows]).reshape(-1, 2)
     ahead = np.tile([0.0, 1.0, 0.0], (len(rows), 1))
     return make_paths(
@@ -88,12 +88,13 @@ def pathset(receiver: str, rows: list[dict]):
         departure=ahead,
         arrival=ahead,
         kind=np.array([row["kind"] for row in rows]),
-        target=np.array([row["target"] for row in rows]),
+        # in another order than the swarm's
+        target=np.array([3 - row["target"] if row["target"] >= 0 else -1 for row in rows]),
         epoch=0.0,
         tx="AT",
         rx=receiver,
-        # in another order than the swarm's
-        target_names=tuple(NAMES),
+        target_names=tuple(NAMES[::-1]),
+        points=None if points is None else np.array(points, float),
     )
 
 
@@ -180,6 +181,8 @@ CASES = {
     "nobody could": (FAINT, [], [], Loss.TOO_WEAK),
     "only coherently": (1.5 * FAINT, [], [], Loss.NOISE),
     "at the threshold": (2.3 * FAINT, [], [], Loss.THRESHOLD),
+    "a wall two cells away": (30, [(90, PathKind.DIFFUSE, (2.2, 0))], [(2.2, 0, 0, 0)], Loss.OTHER),
+    "its own sidelobe": (300, [], [(2.6, 0, 0, 0)], Loss.OTHER),
     "beside a wall": (0.05, WALL, [], Loss.CLUTTER),
     "taken for the wall": (0.05, WALL, [BESIDE], Loss.CLUTTER),
     "a mirror image in its cell": (0.05, [MIRROR], [BESIDE], Loss.MASKED),
@@ -204,6 +207,7 @@ def test_what_became_of_a_uav_at_the_active_terminal(name):
     assert record.hit.tolist() == [expected is Loss.FOUND, False, False, False]
     assert record.target_snr[0] == pytest.approx(MATCHED * gain**2)
     assert np.isnan(record.target_snr[1:]).all()
+    assert (record.target_clutter[0] > 1) == (others is WALL)
     # errors are of detections by the own path within three resolutions
     seen = expected is Loss.FOUND or name == "its detection has no direction"
     seen |= name == "its detection points elsewhere"
@@ -262,8 +266,8 @@ def test_shadowed_or_behind_is_not_in_view():
 
 
 def test_tracks_are_judged_by_what_feeds_them():
-    """Over four frames: a track of U1, one of a wall at U1's place that started before it, a
-    tentative one. While it coasts a track keeps the label of its latest detection; when the wall
+    """Over four frames: a tentative track of U1, one of a wall at U1's place that started before
+    it, one of U1. While it coasts a track keeps the label of its latest detection; when the wall
     feeds the track it follows nobody. Planted bugs: the nearest track follows; the label of the
     frame's first detection; the label of a coasting track forgotten."""
     judge = scorer("AT")
@@ -274,20 +278,21 @@ def test_tracks_are_judged_by_what_feeds_them():
         rows += [path_of("AT", "U1", frame, 60.0, PathKind.DIFFUSE, (7.0, 5.0))]
         places = {"echo": OWN, "wall": (7.0, 5.0, 0.0, 0.0)}
         points = [point("AT", "U1", frame, places[label]) for label in labels]
-        tracks = [(4, True, fed[0], "U1", 0.1), (9, True, fed[1], "U1", 0.9)]
-        tracks += [(11, False, -1, "U1", 0.0)]
+        tracks = [(11, False, fed[1], "U1", 0.0)] * (frame == DATA)
+        tracks += [(4, True, fed[0], "U1", 0.1), (9, True, fed[1], "U1", 0.9)]
         return scored(judge, frame, rows, points, tracks).tracks
 
     first = step(DATA, (1, 0), ["echo", "wall"])
-    assert first.uav.tolist() == [-1, 0, -1]
-    assert first.kind.tolist() == [PathKind.DIFFUSE, PathKind.TARGET, -1]
-    assert first.target.tolist() == [-1, 0, -1]
-    assert step(DATA + 1, (-1, -1), []).uav.tolist() == [-1, 0, -1]
+    assert first.uav.tolist() == [-1, -1, 0]
+    assert first.kind.tolist() == [PathKind.TARGET, PathKind.DIFFUSE, PathKind.TARGET]
+    assert first.target.tolist() == [0, -1, 0]
+    assert step(DATA + 1, (-1, -1), []).uav.tolist() == [-1, 0]
+    assert [label[0] for label in judge.memory()["labels"]] == [4, 9]
     again = scorer("AT")
     again.restore(judge.memory())
     judge = again
-    assert step(DATA + 2, (0, -1), ["echo"]).uav.tolist() == [-1, 0, -1]
-    assert step(DATA + 3, (0, 1), ["echo", "wall"]).uav.tolist() == [0, -1, -1]
+    assert step(DATA + 2, (0, -1), ["echo"]).uav.tolist() == [-1, 0]
+    assert step(DATA + 3, (0, 1), ["echo", "wall"]).uav.tolist() == [0, -1]
 
 
 def test_gospa_is_of_confirmed_tracks_and_uavs_in_view():
@@ -314,3 +319,80 @@ def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     record = scored(judge, DATA, rows, [point("AT", "U1", DATA)], tracks)
     assert record.tracks.kind.tolist() == [PathKind.TARGET]
     assert record.tracks.uav.tolist() == [-1]
+
+
+def test_of_two_tracks_the_one_that_followed_goes_on():
+    """Another track of U1 that is nearer does not take over while the first one lives."""
+    judge = scorer("AT")
+    rows = {f: [path_of("AT", "U1", f, 30.0)] for f in (DATA, DATA + 1)}
+    found = {f: [point("AT", "U1", f)] * 2 for f in rows}
+    scored(judge, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
+    tracks = [(3, True, 0, "U1", 0.0), (7, True, 1, "U1", 0.0)]
+    record = scored(judge, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
+    assert record.tracks.uav.tolist() == [-1, 0]
+    again = scorer("AT")
+    scored(again, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
+    resumed = scorer("AT")
+    resumed.restore(again.memory())
+    record = scored(resumed, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
+    assert record.tracks.uav.tolist() == [-1, 0]
+
+
+def test_a_neighbour_uav_is_not_the_uav():
+    """U2's echo 1.6 cells beside U1's, stronger: the detection there is none of U1, although it
+    lies within three resolutions. Planted bug: any UAV's path will do."""
+    other = path_of("AT", "U1", DATA, 60.0, PathKind.TARGET, (1.6, 0.0)) | {"target": 3}
+    rows = [path_of("AT", "U1", DATA, 3.0), other]
+    record = scored(scorer("AT"), DATA, rows, [point("AT", "U1", DATA, (1.6, 0, 0, 0))])
+    assert record.detection_target.tolist() == [3]
+    assert np.isnan(record.detected.range[0])
+    assert record.loss[0] == Loss.MASKED
+
+
+def test_what_is_outside_the_view_or_bent_is_not_asked_for():
+    """U1 stands 0.1 rad to the side; a path round an edge is none of its own. Planted bugs: a UAV
+    with a path counts wherever it is; bent paths count."""
+    rows = [path_of("AT", "U1", DATA, 30.0)]
+    narrow = replace(ANTENNAS, half_view=0.05)
+    judge = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
+    record = scored(judge, DATA, rows)
+    assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (False, False, -1)
+    pose = SWARM.poses(TIMETABLE.epoch(DATA))["AT"]
+    sent = Transmission(
+        name="AT",
+        pose=pose,
+        antennas=ANTENNAS,
+        schedule=TIMETABLE.schedule,
+        payload=TIMETABLE.payload("AT", DATA),
+    )
+    heard = Heard(Reception.undecoded(W, detections([])), track_set("AT", DATA, []), 1)
+    bent = pathset("AT", rows, np.ones((1, 2, 3)))
+    record = scorer("AT").record(DATA, bent, sent, heard, NOISE)
+    assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (True, True, -1)
+
+
+def test_the_strongest_of_its_paths_is_asked():
+    """A path in two pieces of which one is weak."""
+    rows = [path_of("AT", "U1", DATA, 0.1), path_of("AT", "U1", DATA, 3.0)]
+    record = scored(scorer("AT"), DATA, rows)
+    assert record.target_snr[0] == pytest.approx(9 * MATCHED)
+
+
+def test_streams_and_blocks():
+    """PT1 is sent one group of three: in data frames a third of the energy, in pilots all of it.
+    The truth is that of the AT's own chirps, three blocks later. Planted bugs: all groups always;
+    the group's share in pilots; the first block's time."""
+    uavs = UAVS | {"AT": UAVS["AT"].model_copy(update={"resource_block": 3})}
+    streams = SCENARIO.modulation.model_copy(update={"streams": {"PT1": (1,)}})
+    table = timetable_of(
+        SCENARIO.model_copy(update={"swarm": uavs, "modulation": streams}), W, TIMETABLE.schedule
+    )
+    judge = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
+    sight = {f: [path_of("PT1", "AT", f, 3.0)] for f in (0, DATA)}
+    found = {f: scored(judge, f, paths) for f, paths in sight.items()}
+    assert found[0].target_snr[1] == pytest.approx(9 * MATCHED)
+    assert found[DATA].target_snr[1] == pytest.approx(3 * MATCHED)
+    later = SWARM.poses(TIMETABLE.epoch(DATA) + 3 * 2 * W.max_delay)
+    length = np.linalg.norm(later["AT"].position - later["PT1"].position)
+    # rounding: 45 m in float64; a block later it is 2e-5 m shorter
+    assert found[DATA].truth.range[1] == pytest.approx(length, abs=1e-9)
