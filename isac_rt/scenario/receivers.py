@@ -12,7 +12,7 @@ from isac_rt.scenario.node import Node, Positive, Problem
 COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
     "clutter_channels": ("clutter_detector", ("sample_matrix",)),
-    "birth_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
+    "update_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "clutter_run_cells": ("clutter_filter", ("runs",)),
     "cluster_cells": ("velocity_method", ("auto", "omp", "latin_union", "conventional")),
 }
@@ -44,10 +44,10 @@ class Receivers(Node):
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""
-    birth_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
-    """Probability that noise alone is taken in one cell for a detection that may start a track, for
-    `clutter_detector: angle_doppler`; at most `false_alarm_rate`, by which detections carry on the
-    tracks that there are. null, the default: every detection may start one."""
+    update_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
+    """Probability that noise alone is taken in one cell for a detection that may carry on a track,
+    for `clutter_detector: angle_doppler`; those by `false_alarm_rate`, which is at most as high,
+    may start one too. null, the default: the same rate."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
     """Cells in range and in Doppler on each side of a cell that are left out when its background is
     measured, so that a target does not raise its own threshold. The default covers the main lobe of
@@ -103,11 +103,11 @@ class Receivers(Node):
                 "has no meaning with velocity_method pursuit, which finds paths off the grid; set "
                 "refinement to local or joint, or change velocity_method",
             )
-        if self.false_alarm_rates[1] > self.false_alarm_rate:
+        if self.false_alarm_rates[0] < self.false_alarm_rate:
             yield Problem(
-                (("birth_false_alarm_rate",), ("false_alarm_rate",)),
-                f"is more than false_alarm_rate = {self.false_alarm_rate:g}: every detection may "
-                "start a track then; leave it out, or lower it",
+                (("update_false_alarm_rate",), ("false_alarm_rate",)),
+                f"is less than false_alarm_rate = {self.false_alarm_rate:g}, by which detections "
+                "start tracks; leave it out, or raise it",
             )
         for key, (other, values) in COUNTS_WITH.items():
             value, default = getattr(self, key), type(self).model_fields[key].default
@@ -121,7 +121,7 @@ class Receivers(Node):
     @property
     def false_alarm_rates(self) -> tuple[float, float]:
         """Of a detection, and of one that may start a track."""
-        return self.false_alarm_rate, self.birth_false_alarm_rate or self.false_alarm_rate
+        return self.update_false_alarm_rate or self.false_alarm_rate, self.false_alarm_rate
 
     @property
     def needs_mesh(self) -> bool:
@@ -180,41 +180,40 @@ class Tracking(Node):
             )
 
 
+PLAIN: dict[str, dict[str, Any]] = {
+    "receivers": {
+        "velocity_method": "auto",
+        "refinement": "local",
+        "symbol_decision": "powers",
+        "clutter_filter": "none",
+        "clutter_detector": "cfar",
+        "false_alarm_rate": 1e-6,
+        "update_false_alarm_rate": None,
+    },
+    "tracking": {"drop_after_s": None, "births": "all"},
+}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {
         "receivers": {
+            **PLAIN["receivers"],
             "velocity_method": "omp",
             "refinement": "grid",
-            "symbol_decision": "powers",
             "clutter_filter": "runs",
-            "clutter_detector": "cfar",
         },
-        "tracking": {},
+        "tracking": PLAIN["tracking"],
     },
-    "plain": {
-        "receivers": {
-            "velocity_method": "auto",
-            "refinement": "local",
-            "symbol_decision": "powers",
-            "clutter_filter": "none",
-            "clutter_detector": "cfar",
-        },
-        "tracking": {},
-    },
+    "plain": PLAIN,
     "city": {
         "receivers": {
-            "velocity_method": "auto",
-            "refinement": "local",
-            "symbol_decision": "powers",
-            "clutter_filter": "none",
+            **PLAIN["receivers"],
             "clutter_detector": "angle_doppler",
-            "false_alarm_rate": 1e-4,
-            "birth_false_alarm_rate": 1e-6,
+            "update_false_alarm_rate": 1e-4,
         },
         "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
     },
 }
-"""What each preset says of `receivers` and `tracking`; of the rest it says nothing."""
+"""What each preset says of `receivers` and `tracking`, all of them of the same keys; of the rest
+they say nothing."""
 Preset = Literal["paper", "plain", "city"]
 
 

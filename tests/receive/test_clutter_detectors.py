@@ -159,7 +159,7 @@ def test_detections_and_births_keep_their_rates_in_noise():
     maps = (rng.standard_normal(shape) @ np.array([1, 1j])).astype(np.complex64)
     nothing = ExpectedClutter(*np.zeros((3, 0)), *np.zeros((2, 0, 3)))
     settings = Receivers(
-        clutter_detector="angle_doppler", false_alarm_rate=2e-2, birth_false_alarm_rate=4e-3
+        clutter_detector="angle_doppler", false_alarm_rate=4e-3, update_false_alarm_rate=2e-2
     )
     (judged,) = AngleDoppler(settings).judge([maps], sent, nothing)
     for ratio, rate in ((judged.ratio, 2e-2), (judged.sure, 4e-3)):

@@ -63,7 +63,9 @@ def scenarios():
         "dense": lambda: dense_scenario(frames=7),
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
         "canyon": lambda: load(
-            SCENES / "street_canyon.yaml", ["modulation.acquisition_frames=1"], frames=3
+            SCENES / "street_canyon.yaml",
+            ["modulation.acquisition_frames=1", "receiver_preset=city"],
+            frames=3,
         ),
     }
 

@@ -1,0 +1,124 @@
+"""A terminal's own images over walls by closed forms, and what they keep from becoming a track."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.types import Detections
+from isac_rt.scenario.receivers import Tracking
+from isac_rt.terminal.ghosts import Walls
+from isac_rt.terminal.images import Doubts, own_images
+from isac_rt.terminal.tracker import Tracker
+from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.swarm import Pose, attitude
+
+ORIGIN = np.array([310.7, -120.3, 41.9])
+VELOCITY = np.array([0.6, 5.1, -0.2])
+W = Waveform()
+ANTENNAS = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * W.wavelength)
+
+
+def city(*quads: list[list[float]]) -> Walls:
+    """Walls of four corners each, local coordinates."""
+    faces = [
+        [4 * k + i for i in three] for k in range(len(quads)) for three in ((0, 1, 2), (0, 2, 3))
+    ]
+    corners = np.array(quads, float).reshape(-1, 3)
+    zeros = np.zeros(len(faces), np.int16)
+    return Walls(CityMesh("walls", corners, np.array(faces, np.int32), zeros, (), ORIGIN.copy()))
+
+
+def pose(place: list[float], forward: list[float]) -> Pose:
+    return Pose(ORIGIN + place, VELOCITY, np.zeros(3), attitude(np.array(forward)))
+
+
+WALL = [[11.3, -20.0, -6.0], [11.3, 40.0, -6.0], [11.3, 40.0, 13.0], [11.3, -20.0, 13.0]]
+GROUND = [[-30.0, -20.0, -6.0], [11.3, -20.0, -6.0], [11.3, 40.0, -6.0], [-30.0, 40.0, -6.0]]
+OWN = pose([1.7, -3.1, 4.2], [1.0, 0.0, 0.0])
+
+
+def unique(found: np.ndarray) -> np.ndarray:
+    return np.unique(np.round(found, 9), axis=0)
+
+
+def test_wall_ground_and_their_corner_show_the_terminal():
+    """9.6 m to the wall, 10.2 m to the ground, and straight back from the edge between them,
+    sqrt(9.6^2 + 10.2^2) m. Rates by the velocity's components. Rounding. Planted bugs:
+    the whole way instead of half; the velocity's image turned in one wall only."""
+    d, h, far = 9.6, 10.2, np.hypot(9.6, 10.2)
+    expected = [[d, -0.6], [h, -0.2], [far, (d * -0.6 + h * -0.2) / far]]
+    found = unique(own_images(OWN, city(WALL, GROUND), 100.0))
+    np.testing.assert_allclose(found, unique(np.array(expected)), rtol=0, atol=1e-8)
+
+
+def test_what_is_not_there_shows_nothing():
+    """Without ground there is the wall alone; a wall 1 m away from the foot of the perpendicular
+    shows nothing, nor one behind, nor one beyond the reach. Planted bug: planes without ends."""
+    assert len(unique(own_images(OWN, city(WALL), 100.0))) == 1
+    short = [[x, max(y, -2.1), z] for x, y, z in WALL]
+    assert not len(own_images(OWN, city(short), 100.0))
+    assert not len(own_images(pose([1.7, -3.1, 4.2], [-1.0, 0.0, 0.0]), city(WALL), 100.0))
+    assert not len(own_images(OWN, city(WALL), 9.0))
+
+
+def test_a_sharp_corner_sends_back_the_chord_of_twice_its_angle():
+    """Two walls at 70 degrees, 12 m from their edge: the image by both is turned by 140 degrees
+    about the edge, half the chord away, 12 sin(70) m; its rate is that of the distance to the edge
+    times sin(70). Rounding. Planted bug: planes at right angles alone."""
+    angle, r, mine = np.deg2rad(70.0), 12.0, np.deg2rad(30.0)
+    across = [40 * np.cos(angle), 40 * np.sin(angle)]
+    first = [[0.0, 0.0, -5.0], [40.0, 0.0, -5.0], [40.0, 0.0, 5.0], [0.0, 0.0, 5.0]]
+    second = [[0.0, 0.0, -5.0], [*across, -5.0], [*across, 5.0], [0.0, 0.0, 5.0]]
+    u = np.array([np.cos(mine), np.sin(mine), 0.0])
+    own = pose((r * u + [0, 0, 0.3]).tolist(), (-u).tolist())
+    found = unique(own_images(own, city(first, second), 100.0))
+    np.testing.assert_allclose(
+        found[:, 0], np.sort(r * np.sin([mine, angle - mine, angle])), rtol=0, atol=1e-8
+    )
+    assert found[-1, 1] == pytest.approx(VELOCITY @ u * np.sin(angle), abs=1e-8)
+
+
+def detections(range_: list[float], velocity: list[float], u_x: list[float]) -> Detections:
+    count = len(range_)
+    return Detections(
+        range=np.array(range_),
+        velocity=np.array(velocity),
+        direction=np.column_stack([u_x, np.full(count, 0.1)]),
+        snr=np.full(count, 40.0),
+        std=np.tile([0.01, 0.01, 2e-3, 2e-3], (count, 1)),
+        is_reference=np.zeros(count, bool),
+    )
+
+
+def test_images_and_aliases_start_no_track():
+    """One cell of range off the wall's image and at its rate, also one period of velocities off;
+    two cells off; at the edge of the view. Planted bugs: range alone decides; velocities not
+    folded."""
+    cell, period = W.range_cell(2), 2 * W.max_velocity(2)
+    found = Doubts(city(WALL), ANTENNAS, W).births(
+        detections(
+            [9.6 + cell, 9.6, 9.6 + 2 * cell, 9.6, 30.0],
+            [-0.6, -0.6 + period, -0.6, 1.2, 3.0],
+            [0.2, 0.2, 0.2, 0.2, 0.85],
+        ),
+        OWN,
+    )
+    assert found.starts.tolist() == [False, False, True, True, False]
+
+
+def test_what_may_not_start_a_track_carries_one_on():
+    """Two detections, of which one may start a track; in the next frame none may, and the track is
+    carried on. Without further ones it ends when 0.2 s have passed, at the third frame of 0.07 s.
+    Planted bugs: births of all; frames counted instead of the time."""
+    settings = Tracking(confirm_hits=1, confirm_window=1, drop_after_s=0.2, drop_misses=90)
+    tracker, rest = Tracker(settings, 60.0), Pose(*np.zeros((3, 3)), np.eye(3))
+    for k in range(6):
+        tracker.predict(0.07 * k)
+        both = detections([20.0 + 0.07 * k, 33.0], [1.0, 2.0], [0.1, -0.3])
+        some = both.select(np.arange(2) < (2 if k < 2 else 0))
+        starts = np.array([k == 0, False])[: len(some)]
+        tracker.update(Detections(**{**vars(some), "starts": starts}), rest)
+        assert len(tracker.tracks) == (1 if k < 4 else 0)
