@@ -71,7 +71,7 @@ demo: setup
 mutation: setup
 	@$(BIN)/python tests/mutation.py --planted
 	@$(BIN)/python tests/mutation.py --hard
-	@$(BIN)/python tests/mutation.py --sample 60 --seed 1
+	@$(BIN)/python tests/mutation.py --sample 90 --seed 1
 
 lint: venv
 	@$(BIN)/ruff format --check .

@@ -609,5 +609,31 @@ OF_TESTS = (
         "test_killed::test_versions_stand_in_the_results",
         Bug("results/provenance.py", "return dict(_versions())", 'return {"numpy": "1"}'),
     ),
+    (
+        "test_association::test_the_association_is_the_likeliest_of_all",
+        Bug("terminal/tracker.py", "d2 + log_det, np.inf)", "d2, np.inf)"),
+    ),
+    (
+        "test_handover::test_a_prediction_is_what_its_samples_measure",
+        Bug(
+            "terminal/tracker.py", "velocity_std=report.std[:, 1]", "velocity_std=report.std[:, 0]"
+        ),
+    ),
+    (
+        "test_ghost_images::test_reflections_are_the_images_that_each_end_sees",
+        Bug("terminal/ghosts.py", "*_images(body, start, walls)", "*_images(body, here, walls)"),
+    ),
+    (
+        "test_randomness::test_no_two_receptions_share_their_noise",
+        Bug("simulation/setup.py", '"noise", *link, self.number', '"noise", link.rx, self.number'),
+    ),
+    (
+        "test_view::test_a_body_is_in_view_of_both_ends",
+        Bug("results/metrics.py", "ends.append((active, body))", "pass"),
+    ),
+    (
+        "test_access_stages::test_the_timetable_on_paper",
+        Bug("access/protocol.py", "0.0 if data else n.hold", "n.hold"),
+    ),
 )
 """(file::name of a test of a hard case, a bug with which it fails) (``--hard``)."""

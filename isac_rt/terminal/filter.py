@@ -147,6 +147,8 @@ def singer(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.nda
 
 def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     """A track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
+    if interval == 0:  # the same time again; the powers of the interval in `singer` have no limit
+        return g
     F, Q = singer(interval, acceleration_std)
     return Gaussian(F @ g.mean, _symmetric(F @ g.covariance @ F.T + Q))
 

@@ -84,6 +84,19 @@ def test_a_prediction_is_where_its_samples_fly():
     )
 
 
+def test_the_same_time_again_changes_nothing():
+    """A frame handed over twice. Planted bug: the model's powers of the interval at zero (NaN)."""
+    g = drawn(np.random.default_rng(4), BODY, np.arange(1.0, 10.0))
+    again = predict(g, 0.0, 3.0)
+    assert np.array_equal(again.mean, g.mean) and np.array_equal(again.covariance, g.covariance)
+    soon = predict(g, 1e-9, 3.0)
+    scale = np.sqrt(np.diag(g.covariance))
+    assert (soon.mean - g.mean) / scale == pytest.approx(np.zeros(9), abs=1e-7)
+    assert soon.covariance / np.outer(scale, scale) == pytest.approx(
+        g.covariance / np.outer(scale, scale), abs=1e-7
+    )
+
+
 @pytest.mark.parametrize("missing", [(), (2, 3), (0,), (1, 2)])
 @pytest.mark.parametrize("sender", [None, SENDER])
 def test_an_update_is_the_maximum_of_the_posterior(sender, missing):

@@ -231,6 +231,7 @@ def test_acquiring_tracking_lost():
         TerminalState.LOST,
         TerminalState.TRACKING,
     ]
+    assert [state.value for state in TerminalState] == [0, 1, 2]  # as results keep them
 
 
 def test_the_reference_keeps_a_floor_of_its_error():
