@@ -51,7 +51,7 @@ import isac_rt.results.files
 from isac_rt import storage
 from isac_rt.cli.cli import main
 sys.path.insert(0, {tests!r})
-from fake_run import fake_run
+from fake_run import fake_coverage, fake_run
 import numpy as np
 from isac_rt.simulation.setup import swarm_of
 from isac_rt.world.city.mesh import empty_city
@@ -61,6 +61,7 @@ setup.prepare = lambda s: types.SimpleNamespace(
     city=empty_city("none", np.zeros(3)),
     swarm=swarm_of(s),
     timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),
+    coverage=fake_coverage(s),
 )
 setup.link_budgets = lambda setup: []
 fake.run = lambda s, **_: fake_run(s)
