@@ -260,11 +260,12 @@ class ClutterField:
         found = self._ways(cells, share, state)
         if bodies is not None:
             points = cells.points[found.index]
-            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, (tx,))
+            sent, heard = (bodies.spared([(name,)]) for name in (tx, rx))
+            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, sent)
             back = (
                 there
                 if own
-                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, (rx,))
+                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, heard)
             )
             found.magnitude[:] *= there * back
         lit = found.magnitude > 0

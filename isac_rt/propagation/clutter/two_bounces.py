@@ -220,8 +220,8 @@ class TwoBounces:
         there = np.concatenate([ends[0], points[:, :split]], axis=1)
         back = np.concatenate([points[:, split - 1 :], ends[1]], axis=1)
         part.seen.magnitude[:] *= np.abs(
-            bodies.factor(there, self._wavelength, (state.link.tx,))
-            * bodies.factor(back, self._wavelength, (state.link.rx,))
+            bodies.factor(there, self._wavelength, bodies.spared([(state.link.tx,)]))
+            * bodies.factor(back, self._wavelength, bodies.spared([(state.link.rx,)]))
         )
 
 

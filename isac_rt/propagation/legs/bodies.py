@@ -3,7 +3,7 @@ shadow."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +36,13 @@ class Bodies:
         places = np.array([poses[name].position for name in names]).reshape(-1, 3)
         return cls(names, places, np.array([uavs[name].body_radius_m for name in names]))
 
-    def factor(self, chain: np.ndarray, wavelength: float, spared: Collection[str]) -> np.ndarray:
+    def spared(self, names: Sequence[Collection[str]]) -> np.ndarray:
+        """(R, N) which bodies are at the ends of each of R legs, or echo: a body does not shadow
+        itself."""
+        rows = [[body in of_leg for body in self.names] for of_leg in names]
+        return np.array(rows, bool).reshape(len(rows), len(self.names))
+
+    def factor(self, chain: np.ndarray, wavelength: float, spared: np.ndarray) -> np.ndarray:
         """Amplitude factor of paths past the bodies: the product of `disc` over the bodies and the
         straight parts.
 
@@ -45,8 +51,7 @@ class Bodies:
         chain : (K, B + 2, 3) both ends and the B points between them at which each path is mirrored
             or bent
         wavelength : [m]
-        spared : names of the bodies at the ends and of the one that echoes; a body does not shadow
-            itself
+        spared : (K, N), or (1, N) for all, which bodies leave a path alone
 
         Returns
         -------
@@ -65,7 +70,7 @@ class Bodies:
         points: np.ndarray,
         distance: np.ndarray,
         wavelength: float,
-        spared: Collection[str],
+        spared: np.ndarray,
     ) -> np.ndarray:
         """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,)
         [m]."""
@@ -82,15 +87,17 @@ class Bodies:
         return np.abs(out)
 
     def _shade(
-        self, out, starts, ends, before, total, wavelength: float, spared: Collection[str]
+        self, out, starts, ends, before, total, wavelength: float, spared: np.ndarray
     ) -> None:
         """Multiply `out` by the factors of straight parts that begin `before` along paths of length
         `total`."""
-        for name, place, radius in zip(self.names, self.places, self.radii, strict=True):
-            if name in spared:
+        every = np.broadcast_to(spared, (len(out), len(self.names)))
+        for place, radius, left in zip(self.places, self.radii, every.T, strict=True):
+            if left.all():
                 continue
+            asked = np.flatnonzero(~left)
             path, off, along = _near(
-                starts, ends, before, total, place, radius, wavelength, LIT_REACH
+                asked, starts, ends, before, total, place, radius, wavelength, LIT_REACH
             )
             if path.size:
                 far = np.maximum(
@@ -102,11 +109,11 @@ class Bodies:
 
 
 @jit
-def _near(starts, ends, before, total, place, radius, wavelength, reach):
-    """Paths whose straight part passes the body within its shadow's reach, the distance of its
-    centre, and that along the path."""
+def _near(asked, starts, ends, before, total, place, radius, wavelength, reach):
+    """Paths, of those asked for, whose straight part passes the body within its shadow's reach, the
+    distance of its centre, and that along the path."""
     which, off, along = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for i in range(starts.shape[0]):
+    for i in asked:
         sx, sy, sz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]
         wx, wy, wz = place[0] - starts[i, 0], place[1] - starts[i, 1], place[2] - starts[i, 2]
         square, dot = sx * sx + sy * sy + sz * sz, sx * wx + sy * wy + sz * wz

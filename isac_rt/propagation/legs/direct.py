@@ -33,21 +33,35 @@ def past_edges_and_bodies(
     """Traced legs of all pairs with straight ones that bend (in place of those that are there or
     not), past the swarm's bodies."""
     direct, out = direct_legs(poses, list(legs), edges, bodies, wavelength), {}
-    for pair, found in legs.items():
-        depth = found.faces.shape[1]
-        empty = np.zeros((1, 0), np.int64)
+    empty = np.zeros((1, 0), np.int64)
+    factors = _past_bodies(legs, poses, bodies, wavelength)
+    for (pair, found), factor in zip(legs.items(), factors, strict=True):
+        rest = np.flatnonzero(found.bounces)
+        mirrored = found.select(rest)
+        amplitude = mirrored.amplitude * factor[rest]
         parts = [(*direct[pair], empty, empty)] if pair in direct else []
-        for count in range(1, depth + 1):
-            which = np.flatnonzero(found.bounces == count)
-            legs_here = found.legs.select(which)
-            ends = [np.broadcast_to(poses[name].position, (which.size, 1, 3)) for name in pair]
-            chain = np.concatenate([ends[0], legs_here.points[:, :count], ends[1]], axis=1)
-            amplitude = found.amplitude[which] * bodies.factor(chain, wavelength, pair)
-            parts.append(
-                (amplitude, legs_here, found.faces[which, :count], found.planes[which, :count])
-            )
-        out[pair] = leg_set(parts, depth)
+        parts.append((amplitude, mirrored.legs, mirrored.faces, mirrored.planes))
+        out[pair] = leg_set(parts, found.faces.shape[1])
     return out
+
+
+def _past_bodies(
+    legs: dict[Link, LegSet], poses: dict[str, Pose], bodies: Bodies, wavelength: float
+) -> list[np.ndarray]:
+    """Factors of the bodies for the mirrored legs of each pair."""
+    sizes = [len(found.amplitude) for found in legs.values()]
+    owner, factor = np.repeat(np.arange(len(sizes)), sizes), np.ones(sum(sizes), complex)
+    bounces = np.concatenate([found.bounces for found in legs.values()])
+    points = np.concatenate([found.legs.points for found in legs.values()])
+    starts, ends = (
+        np.array([poses[pair[side]].position for pair in legs])[owner] for side in (0, 1)
+    )
+    spared = bodies.spared(list(legs))[owner]
+    for count in range(1, points.shape[1] + 1):
+        which = np.flatnonzero(bounces == count)
+        stops = starts[which, None], points[which, :count], ends[which, None]
+        factor[which] = bodies.factor(np.concatenate(stops, axis=1), wavelength, spared[which])
+    return np.split(factor, np.cumsum(sizes)[:-1])
 
 
 def direct_legs(
@@ -71,23 +85,22 @@ def direct_legs(
     )
     bends = edges.bends(starts, ends)
     factors = edge_factor(bends.nu)
+    spared, there = bodies.spared(apart), factors != 0
+    straight_on, round_edge = there & (bends.nu <= 0), there & (bends.nu > 0)
+    for which, *between in ((straight_on,), (round_edge, bends.points)):
+        stops = np.stack([stop[which] for stop in (starts, *between, ends)], axis=1)
+        factors[which] *= bodies.factor(stops, wavelength, spared[which])
     out = {}
-    for pair, nu, point, factor in zip(apart, bends.nu, bends.points, factors, strict=True):
-        if factor == 0:
-            continue
-        start, end = poses[pair[0]], poses[pair[1]]
+    for k in np.flatnonzero(there):
+        start, end = (poses[name] for name in apart[k])
         direct = straight(start, end.position[None], end.velocity, end.acceleration)
-        if nu > 0:
-            leg = _bent(start, end, point)
-            chain = np.stack([start.position, point, end.position])[None]
-            factor = factor * np.exp(
-                2j * np.pi * (leg.length - direct.length) / wavelength
-            )  # the detour's phase is in its delay
-        else:
-            leg = replace(direct, points=np.full((1, 1, 3), np.nan))
-            chain = np.stack([start.position, end.position])[None]
+        leg, factor = replace(direct, points=np.full((1, 1, 3), np.nan)), factors[k]
+        if round_edge[k]:
+            leg = _bent(start, end, bends.points[k])
+            # the detour's phase is in its delay
+            factor = factor * np.exp(2j * np.pi * (leg.length - direct.length) / wavelength)
         friis = wavelength / (4 * np.pi * direct.length)
-        out[pair] = friis * factor * bodies.factor(chain, wavelength, pair), leg
+        out[apart[k]] = friis * factor, leg
     return out
 
 

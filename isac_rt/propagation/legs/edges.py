@@ -12,6 +12,7 @@ Import only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,19 +30,22 @@ FLAT = 1e-3
 """Sine of the angle between two faces under which the edge between them is none."""
 
 
-@dataclass(frozen=True)
-class Edges:
+class Edges(NamedTuple):
     """E edges of a mesh at which its surface ends or turns.
 
     Attributes
     ----------
     start, span : (E, 3) first end, and from it to the other [m]
     wings : (E, 2, 3) third corners of the two faces; the same twice where a surface ends
+    middle : (E, 3) [m]
+    half : (E,) half the length [m]
     """
 
     start: np.ndarray
     span: np.ndarray
     wings: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
 
     @classmethod
     def of(cls, city: CityMesh) -> Edges:
@@ -65,7 +69,8 @@ class Edges:
         first, second = np.append(pair, single), np.append(pair + 1, single)
         start = city.vertices[ends[first, 0]]
         wings = city.vertices[np.stack([third[first], third[second]], axis=1)]
-        return cls(start, city.vertices[ends[first, 1]] - start, wings)
+        span = city.vertices[ends[first, 1]] - start
+        return cls(start, span, wings, start + span / 2, np.linalg.norm(span, axis=1) / 2)
 
 
 @dataclass(frozen=True)
@@ -100,10 +105,7 @@ class ShadowEdges:
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
         edges = self._edges
-        found = [
-            _near(edges.start, edges.span, edges.wings, s, e, far)
-            for s, e, far in zip(starts, ends, reach, strict=True)
-        ]
+        found = [_near(edges, s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]
         path = np.repeat(np.arange(count), [len(f[0]) for f in found])
         if not path.size:
             return Bends(nu, points)
@@ -127,9 +129,10 @@ class ShadowEdges:
 
 
 @jit
-def _near(start, span, wings, source, sink, reach):
+def _near(edges, source, sink, reach):
     """Silhouette edges near a path: detours [m] (at most `reach`, shortest first), points on the
     edges, directions away from what they bound."""
+    start, span, wings, middle, halves = edges
     ahead = sink - source
     length = np.sqrt((ahead**2).sum())
     ahead = ahead / length
@@ -138,10 +141,10 @@ def _near(start, span, wings, source, sink, reach):
     )  # half the width of the ellipsoid of all points within reach
     detours, which, where = [0.0 for _ in range(0)], [0 for _ in range(0)], [0.0 for _ in range(0)]
     for i in range(start.shape[0]):
-        mx = start[i, 0] + span[i, 0] / 2 - source[0]
-        my = start[i, 1] + span[i, 1] / 2 - source[1]
-        mz = start[i, 2] + span[i, 2] / 2 - source[2]
-        half = np.sqrt(span[i, 0] ** 2 + span[i, 1] ** 2 + span[i, 2] ** 2) / 2
+        mx = middle[i, 0] - source[0]
+        my = middle[i, 1] - source[1]
+        mz = middle[i, 2] - source[2]
+        half = halves[i]
         along = mx * ahead[0] + my * ahead[1] + mz * ahead[2]
         along = min(max(along, 0.0), length)
         off = (
