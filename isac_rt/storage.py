@@ -6,6 +6,9 @@ or container looks, and is taken away with the next file that is written there.
 
 Data are a tree of words, numbers, lists and mappings as JSON and the bytes of its arrays: reading
 them runs no code. In a file they carry the key under which they are kept and a checksum.
+
+What takes long to prepare is kept in a folder of the user's (`kept`), under a digest of all that it
+depends on, this program included. A file that is bent, cut off or another's is made anew.
 """
 
 from __future__ import annotations
@@ -13,14 +16,18 @@ from __future__ import annotations
 import errno
 import fcntl
 import hashlib
+import importlib.metadata
 import json
 import math
 import os
+import platform
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -35,6 +42,31 @@ BAD_DATA = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeErro
 """What reading data can raise that this package did not write."""
 MOST_BYTES = 4 * 1024**3
 """No file of data is larger than this."""
+KEPT = "ISAC_RT_KEPT"
+"""Variable of the environment: folder of what is `kept`; empty: nothing is."""
+KEPT_BYTES = 1024**3
+LOW_WATER = 0.8
+"""When the limit is passed a folder is brought down to this share of it, so that not every write
+has to look."""
+PACKAGES = (
+    "isac_rt",
+    "numpy",
+    "scipy",
+    "numba",
+    "llvmlite",
+    "drjit",
+    "mitsuba",
+    "sionna-rt",
+    "trimesh",
+    "shapely",
+    "pyproj",
+    "mapbox_earcut",
+    "xarray",
+    "h5netcdf",
+    "h5py",
+    "pydantic",
+)
+"""What a number of a result, or the file that holds it, can depend on."""
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{1,8}\.tmp")
 _UNSYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 """What file systems answer that cannot sync a folder."""
@@ -120,6 +152,106 @@ def load_data(file: Path, key: str) -> Any | None:
         return unpack(tree.decode(), arrays)
     except BAD_DATA:  # sealed, but not by `save_data`
         return None
+
+
+@lru_cache(maxsize=1)
+def program_fingerprint() -> str:
+    """Version of this package and a digest of its source and tables: two runs with the same one
+    were made by the same program."""
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parent
+    for file in sorted(
+        file for file in package.rglob("*") if file.suffix in (".py", ".json")
+    ):  # JSON: costs decide between methods
+        digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes() + b"\0")
+    return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Python's version and the installed one of every package that a result depends on: the same
+    in every process, for keys."""
+    return dict(_versions())
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of data by key with a limit on its size [bytes]; the least recently used go first.
+
+    Several processes may share it: files appear whole, and one that another process takes away is
+    made again.
+    """
+
+    folder: Path
+    suffix: str
+    limit: int
+
+    def get(self, key: str) -> Any | None:
+        """What was kept under a key; None where it is not (or no longer) here."""
+        file = self._file(key)
+        found = load_data(file, key)
+        if found is not None:
+            with suppress(OSError):
+                os.utime(file)
+        return found
+
+    def put(self, key: str, value: Any) -> None:
+        """Keep data under a key; nothing, where the folder cannot be written."""
+        with suppress(OSError, StorageError):
+            save_data(self._file(key), key, value)
+            self._make_room()
+
+    def _file(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}{self.suffix}"
+
+    def _make_room(self) -> None:
+        entries = []
+        for file in self.folder.glob(f"*/*{self.suffix}"):
+            try:
+                status = file.stat()
+            except OSError:
+                continue
+            entries.append((status.st_mtime_ns, status.st_size, file))
+        total = sum(size for _, size, _ in entries)
+        if total <= self.limit:
+            return
+        for _, size, file in sorted(entries, key=lambda e: e[0]):
+            if total <= LOW_WATER * self.limit:
+                break
+            file.unlink(missing_ok=True)
+            total -= size
+
+
+def kept(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
+    """What `make` returns, plain data and arrays, or what it returned in an earlier run for the
+    same `depends_on`, plain data and arrays too."""
+    named = os.environ.get(KEPT)
+    if named is None:
+        try:
+            user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        except RuntimeError:  # a user without a home
+            return make()
+        named = str(user / "isac_rt" / "kept")
+    if not named:
+        return make()
+    store = Store(Path(named), ".data", KEPT_BYTES)
+    tree, arrays = pack([what, depends_on, program_fingerprint(), versions()])
+    key = hashlib.sha256(tree.encode() + b"\n" + arrays).hexdigest()
+    found = store.get(key)
+    if found is None:
+        found = make()
+        store.put(key, found)
+    return found
 
 
 def checksum(key: str, content: bytes) -> str:

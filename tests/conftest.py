@@ -3,6 +3,7 @@ cannot."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from isac_rt.runtime import RuntimeProblem, choose_backend
+from isac_rt.storage import KEPT
+
+os.environ[KEPT] = ""  # tests prepare everything anew, in processes of their own too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -204,3 +204,65 @@ def test_whose_trouble_it_is(problem, expected):
     """Also where a message of the program was made of it. Planted bug: the context not followed."""
     assert of_machine(problem) is expected
     assert of_machine(wrapped(problem, UserError)) is expected
+
+
+def test_what_is_kept_is_found_by_all_that_it_depends_on(tmp_path, monkeypatch):
+    """Made once for each content, by name and program too; made again where the variable is empty
+    or the folder cannot be written. Planted bugs: a key without the name, without the arrays or
+    without the program."""
+    made = []
+
+    def make():
+        made.append(1)
+        return {"a": np.arange(4.0), "n": len(made)}
+
+    monkeypatch.setenv(storage.KEPT, str(tmp_path / "kept"))
+    first = storage.kept("x", ["y", np.arange(3)], make)
+    again = storage.kept("x", ["y", np.arange(3)], make)
+    assert (first["n"], again["n"], len(made)) == (1, 1, 1)
+    assert np.array_equal(again["a"], first["a"])
+    storage.kept("z", ["y", np.arange(3)], make)
+    storage.kept("x", ["y", np.arange(1, 4)], make)
+    storage.kept("x", ["y", np.arange(3.0)], make)
+    assert len(made) == 4
+    monkeypatch.setattr(storage, "program_fingerprint", lambda: "another")
+    assert storage.kept("x", ["y", np.arange(3)], make)["n"] == 5
+    (tmp_path / "file").write_text("")
+    for folder in ("", str(tmp_path / "file" / "below")):
+        monkeypatch.setenv(storage.KEPT, folder)
+        assert storage.kept("x", ["y", np.arange(3)], make)["n"] == len(made)
+
+
+def test_a_store_keeps_to_its_limit_and_lets_the_oldest_go(tmp_path):
+    """Twenty entries of 10 kB in a store of 60 kB: never more than that, the last are there, one
+    that is read again stays. Planted bug: reading does not count as use."""
+    store = storage.Store(tmp_path, ".data", 60_000)
+    keys = [f"{i:02d}" * 8 for i in range(20)]
+    for i, key in enumerate(keys):
+        store.put(key, {"a": np.full(1250, i)})
+        for file in tmp_path.glob("*/*.data"):  # clocks of file systems are coarse
+            os.utime(file, ns=(0, file.stat().st_mtime_ns - 10**9))
+        assert sum(f.stat().st_size for f in tmp_path.glob("*/*.data")) <= 60_000
+        assert store.get(keys[0]) is not None
+    assert store.get(keys[19])["a"][0] == 19
+    assert store.get(keys[5]) is None
+
+
+def test_many_processes_keep_into_one_small_folder(tmp_path):
+    """Four write and read the same twelve keys in a folder that holds five: whatever one finds is
+    right, and none stumbles over what another took away. Planted bug: it must be there when it is
+    taken away."""
+    program = (
+        "import sys, numpy as np; from pathlib import Path; from isac_rt.storage import Store\n"
+        "store = Store(Path(sys.argv[1]), '.data', 500_000)\n"
+        "rng = np.random.default_rng(int(sys.argv[2]))\n"
+        "for k in rng.integers(0, 12, 150):\n"
+        "    found = store.get(f'{k:02d}' * 4)\n"
+        "    assert found is None or (found['a'] == k).all()\n"
+        "    store.put(f'{k:02d}' * 4, {'a': np.full(12_000, k)})\n"
+    )
+    runs = [
+        subprocess.Popen([sys.executable, "-c", program, str(tmp_path), str(i)]) for i in range(4)
+    ]
+    assert [run.wait(60) for run in runs] == [0, 0, 0, 0]
+    assert not list(tmp_path.glob("*/.*.tmp"))

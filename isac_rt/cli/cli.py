@@ -49,7 +49,7 @@ for _command, _example in COMMANDS.items():
 
 def _print_versions(wanted: bool) -> None:
     if wanted:
-        from isac_rt.results.provenance import versions
+        from isac_rt.storage import versions
 
         under = ", ".join(
             f"{name} {number}" for name, number in versions().items() if name != "isac_rt"

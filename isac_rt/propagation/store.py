@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,13 +20,10 @@ from typing import Any
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathSet
-from isac_rt.storage import BAD_DATA, StorageError, load_data, save_data
+from isac_rt.storage import BAD_DATA, Store
 from isac_rt.world.swarm import Pose
 
 SUFFIX = ".paths"
-LOW_WATER = 0.8
-"""When the limit is passed the folder is brought down to this share of it, so that not every write
-has to look."""
 
 
 @dataclass(frozen=True)
@@ -38,43 +33,21 @@ class PathStore:
     folder: Path
     limit: int = 4 * 1024**3
 
+    @property
+    def _store(self) -> Store:
+        return Store(self.folder, SUFFIX, self.limit)
+
     def get(self, key: str) -> tuple[Traced, Census] | None:
         """What was traced for a key, and by what; None where it is not (or no longer) here."""
-        file = self._file(key)
+        data = self._store.get(key)
         try:
-            data = load_data(file, key)
-            if data is None:
-                return None
-            os.utime(file)
-            return _unpack(data)
-        except (OSError, *BAD_DATA):
+            return None if data is None else _unpack(data)
+        except BAD_DATA:
             return None
 
     def put(self, key: str, traced: Traced, census: Census) -> None:
         """Keep what was traced for a key; nothing, where the folder cannot be written."""
-        with suppress(OSError, StorageError):
-            save_data(self._file(key), key, _pack(traced, census))
-            self._make_room()
-
-    def _file(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}{SUFFIX}"
-
-    def _make_room(self) -> None:
-        entries = []
-        for file in self.folder.glob(f"*/*{SUFFIX}"):
-            try:
-                status = file.stat()
-            except OSError:
-                continue
-            entries.append((status.st_mtime_ns, status.st_size, file))
-        total = sum(size for _, size, _ in entries)
-        if total <= self.limit:
-            return
-        for _, size, file in sorted(entries, key=lambda e: e[0]):
-            if total <= LOW_WATER * self.limit:
-                break
-            file.unlink(missing_ok=True)
-            total -= size
+        self._store.put(key, _pack(traced, census))
 
 
 class CachedPropagation:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
 import json
 import platform
 import subprocess
@@ -16,57 +14,8 @@ from typing import Any
 
 from isac_rt.scenario.file import ScenarioWarning, to_yaml
 from isac_rt.scenario.tree import Scenario
+from isac_rt.storage import program_fingerprint, versions
 from isac_rt.world.area import city_digest, file_digest
-
-PACKAGES = (
-    "isac_rt",
-    "numpy",
-    "scipy",
-    "numba",
-    "llvmlite",
-    "drjit",
-    "mitsuba",
-    "sionna-rt",
-    "trimesh",
-    "shapely",
-    "pyproj",
-    "mapbox_earcut",
-    "xarray",
-    "h5netcdf",
-    "h5py",
-    "pydantic",
-)
-"""What a number of a result, or the file that holds it, can depend on."""
-
-
-@lru_cache(maxsize=1)
-def program_fingerprint() -> str:
-    """Version of this package and a digest of its source and tables: two runs with the same one
-    were made by the same program."""
-    digest = hashlib.sha256()
-    package = Path(__file__).resolve().parents[1]
-    for file in sorted(
-        file for file in package.rglob("*") if file.suffix in (".py", ".json")
-    ):  # JSON: costs decide between methods
-        digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes() + b"\0")
-    return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
-
-
-@lru_cache(maxsize=1)
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def versions() -> dict[str, str]:
-    """Python's version and the installed one of every package that a result depends on: the same
-    in every process, for keys."""
-    return dict(_versions())
 
 
 def versions_in_use() -> dict[str, str]:

@@ -337,10 +337,10 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     # the blocks, and with them the reach, are found out in the run where links are established
     radius = np.inf if scenario.access.establish else plan.mesh_radius(swarm.middle)
     carrier = waveform.carrier_frequency
-    city = city_about(swarm.middle, scenario.city, scenario.folder, carrier, radius)
-    check_passage(
-        swarm, timetable, city_about(swarm.middle, scenario.city, scenario.folder, carrier)
-    )
+    digest = city_digest(scenario.city, scenario.folder)
+    about = swarm.middle, scenario.city, scenario.folder, carrier
+    city = city_about(*about, radius, digest)
+    check_passage(swarm, timetable, city_about(*about, digest=digest))
     warn_of_aliases(
         swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
     )
@@ -360,10 +360,9 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     if store is None or scenario.propagation.model == "free_space":
         propagation = make()
     else:
-        digest = city_digest(scenario.city, scenario.folder)
         content = path_content(scenario.model_dump(mode="json"), digest)
-        about = [content, city.num_faces, "" if floor is None else floor.record()]
-        propagation = CachedPropagation(make, store, json.dumps(about))
+        content = json.dumps([content, city.num_faces, "" if floor is None else floor.record()])
+        propagation = CachedPropagation(make, store, content)
     setup = Setup(
         scenario,
         waveform,

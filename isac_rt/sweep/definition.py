@@ -20,13 +20,14 @@ from pydantic import Field, ValidationError, field_validator
 
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import SymbolCount
-from isac_rt.results.provenance import path_content, program_fingerprint, versions
+from isac_rt.results.provenance import path_content
 from isac_rt.results.sensing import RATES, Sensing, summary_block
 from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import load, plain_tree
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
+from isac_rt.storage import program_fingerprint, versions
 from isac_rt.world.area import city_digest, file_digest
 from isac_rt.world.city import CityError
 

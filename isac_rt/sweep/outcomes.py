@@ -20,10 +20,17 @@ from pydantic import BaseModel
 
 from isac_rt.results.files import ResultsError, write_dataset
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.results.provenance import commit, program_fingerprint, versions
+from isac_rt.results.provenance import commit
 from isac_rt.scenario.file import plain_tree
 from isac_rt.scenario.tree import Scenario
-from isac_rt.storage import BAD_DATA, checksum, read_whole, write_whole
+from isac_rt.storage import (
+    BAD_DATA,
+    checksum,
+    program_fingerprint,
+    read_whole,
+    versions,
+    write_whole,
+)
 from isac_rt.sweep.definition import Plan, Point, Sweep, flat_numbers
 
 FILE, DEFINITION = "sweep.nc", "sweep.json"

@@ -13,6 +13,7 @@ import numpy as np
 
 from isac_rt.scenario import environment
 from isac_rt.scenario.file import plain_tree
+from isac_rt.storage import kept
 from isac_rt.world.city import CityMesh, city_files, load_city
 
 _LOG = logging.getLogger(__name__)
@@ -24,6 +25,7 @@ def city_about(
     folder: Path,
     carrier: float,
     radius: float = np.inf,
+    digest: str | None = None,
 ) -> CityMesh:
     """A scenario's city about a place (3,), as far as `radius` [m]; the same object again for equal
     arguments.
@@ -32,9 +34,10 @@ def city_about(
     ----------
     folder : of the scenario
     carrier : at which materials are taken [Hz]
+    digest : `city_digest`, where it is known already
     """
     text = "" if city is None else json.dumps(plain_tree(city), sort_keys=True)
-    digest = city_digest(city, folder)
+    digest = city_digest(city, folder) if digest is None else digest
     return _near_city(radius, text, folder, digest, carrier, tuple(centre.tolist()))
 
 
@@ -50,7 +53,15 @@ def _loaded_city(
     tree = environment.City.model_validate(json.loads(text)) if text else None
     if tree is not None:
         _LOG.info("reading the city")
-    return load_city(tree, folder, carrier, centre)
+    if not digest:  # made from numbers, in less time than it is read
+        return load_city(tree, folder, carrier, centre)
+    return CityMesh.of_plain(
+        kept(
+            "city",
+            [text, digest, carrier, centre],
+            lambda: load_city(tree, folder, carrier, centre).plain(),
+        )
+    )
 
 
 def city_digest(city: environment.City | None, folder: Path) -> str:

@@ -681,7 +681,7 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
     store = PathStore(tmp_path / "paths", limit=int(4.5 * size))
     for i, key in enumerate(["a1", "b2", "c3", "d4"]):
         store.put(key, traced, census)
-        os.utime(store._file(key), (i, i))
+        os.utime(store._store._file(key), (i, i))
     assert store.get("a1") is not None  # touched: now the latest
     store.put("e5", traced, census)
     assert [k for k in ("a1", "b2", "c3", "d4", "e5") if store.get(k) is not None] == [
@@ -689,7 +689,7 @@ def test_the_store_stays_under_its_limit_and_survives_what_others_do(folder, tmp
         "d4",
         "e5",
     ]
-    store._file("d4").write_bytes(store._file("d4").read_bytes()[:200])
+    store._store._file("d4").write_bytes(store._store._file("d4").read_bytes()[:200])
     assert store.get("d4") is None
     (tmp_path / "file").write_text("")
     PathStore(tmp_path / "file" / "below").put("a", traced, census)

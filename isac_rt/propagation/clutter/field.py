@@ -31,9 +31,9 @@ Trans. Antennas Propag. 55(1),
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import comb
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -43,7 +43,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.jit import jit
-from isac_rt.propagation.clutter.cells import Cells, Density, cut, error_for
+from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
 from isac_rt.propagation.clutter.merging import NoiseFloor, allowed_area, merge, resolution_cell
 from isac_rt.propagation.clutter.penumbra import Facets
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight
@@ -53,6 +53,7 @@ from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter
+from isac_rt.storage import kept
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -176,17 +177,35 @@ class ClutterField:
             city.face_material
         ]
         density = Density.of(clutter)
-        candidates = cut(city, scatters, places, density, seed)
         shadows = Shadows(scene)
-        kept = shadows.ever_sees(
-            _kept_places([flights[name] for name in swarm.transmitters]),
-            candidates.points,
-            city.normals[candidates.face],
-        )
-        cells = candidates.select(np.flatnonzero(kept))
+        lookouts = _kept_places([flights[name] for name in swarm.transmitters])
+
+        def found() -> dict[str, Any]:
+            every = cut(city, scatters, places, density, seed)
+            seen = shadows.ever_sees(lookouts, every.points, city.normals[every.face])
+            return {"cells": vars(every.select(np.flatnonzero(seen))), "of": len(every)}
+
+        depends_on = [city.plain(), places, lookouts, asdict(density), seed, MOST_CELLS]
+        had = kept("cells", [*depends_on, mi.variant()], found)
+        cells = Cells(**had["cells"])
         sight = Sight(shadows, flights, facets_of(cells, city), wavelength)
-        field = cls(city, cells, sight, wavelength, len(candidates))
-        return field if floor is None else field._covered(floor, swarm, density, places)
+        field = cls(city, cells, sight, wavelength, had["of"])
+        if floor is None:
+            return field
+        poses = {
+            name: [in_local(swarm.trajectories[name].pose(t), city.origin) for t in floor.times]
+            for name in dict.fromkeys(name for link in floor.over_noise for name in link)
+        }
+        states = [[(*p.motion(), *p.rotation) for p in some] for some in poses.values()]
+        depends_on += [vars(cells), wavelength, floor.record(), list(poses), np.array(states)]
+        merged = kept(
+            "merged",
+            [*depends_on, mi.variant()],
+            lambda: field._covered(floor, poses, density, places),
+        )
+        return field._with(
+            {link: field._own(link, Cells(**merged[str(link)])) for link in floor.over_noise}
+        )
 
     def of(self, link: Link) -> Scatterers:
         """What a link sees."""
@@ -200,19 +219,26 @@ class ClutterField:
         whole = self._city, self.cells, self.sight, self._wavelength, self.num_candidates
         return ClutterField(*whole, merged)
 
+    def _own(self, link: Link, cells: Cells) -> Scatterers:
+        """Cells that a link alone sees."""
+        flights = {name: self.sight.flights[name] for name in link}
+        facets = facets_of(cells, self._city)
+        return Scatterers(cells, Sight(self.sight.shadows, flights, facets, self._wavelength))
+
     def _covered(
-        self, floor: NoiseFloor, swarm: Swarm, density: Density, places: np.ndarray
-    ) -> ClutterField:
-        """The same field, merged where noise covers it (`merging`)."""
-        cells, sight, city = self.cells, self.sight, self._city
+        self,
+        floor: NoiseFloor,
+        poses: dict[str, list[Pose]],
+        density: Density,
+        places: np.ndarray,
+    ) -> dict[str, dict[str, np.ndarray]]:
+        """The cells of each link, merged where noise covers them (`merging`); `poses` at the
+        instants of `floor`, local."""
+        cells, sight = self.cells, self.sight
         finest = np.maximum(
             density.smallest, density.per_metre * cKDTree(places).query(cells.points)[0]
         )
         error = 10 ** (error_for(density.per_metre) / 10) - 1
-        poses = {
-            name: [in_local(swarm.trajectories[name].pose(t), city.origin) for t in floor.times]
-            for name in dict.fromkeys(name for link in floor.over_noise for name in link)
-        }
         seen = {
             name: sight.from_places(np.array([pose.position for pose in of]))
             for name, of in poses.items()
@@ -235,11 +261,8 @@ class ClutterField:
                 )
                 limit[index] = np.minimum(limit[index], area)
             some = np.flatnonzero(ever[link.tx] & ever[link.rx])
-            some = merge(cells.select(some), limit[some])
-            flights = {name: sight.flights[name] for name in link}
-            own = Sight(sight.shadows, flights, facets_of(some, city), self._wavelength)
-            merged[link] = Scatterers(some, own)
-        return self._with(merged)
+            merged[str(link)] = vars(merge(cells.select(some), limit[some]))
+        return merged
 
     @property
     def nbytes(self) -> int:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -63,9 +63,10 @@ class NoiseFloor:
     over_noise: Mapping[Link, np.ndarray]
 
     def record(self) -> str:
-        """All of it that is not in a scenario's waveform and antennas, as text."""
+        """All of it, as text."""
         links = {str(link): factors.tolist() for link, factors in self.over_noise.items()}
-        return json.dumps([self.longest_delay, self.times.tolist(), links])
+        instruments = asdict(self.waveform), asdict(self.antennas)
+        return json.dumps([*instruments, self.longest_delay, self.times.tolist(), links])
 
 
 def resolution_cell(waveform: Waveform, delay: np.ndarray, rate: np.ndarray) -> np.ndarray:

@@ -29,8 +29,7 @@ from scipy import special, stats
 
 from isac_rt.randomness import generator
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.results.provenance import program_fingerprint, versions
-from isac_rt.storage import load_data, save_data
+from isac_rt.storage import load_data, program_fingerprint, save_data, versions
 from isac_rt.studies.paper.outcome import Progress
 
 Counts = Mapping[str, tuple[np.ndarray, int]]

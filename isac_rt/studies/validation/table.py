@@ -8,8 +8,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from isac_rt.results.provenance import commit, program_fingerprint, versions_in_use
-from isac_rt.storage import write_whole
+from isac_rt.results.provenance import commit, versions_in_use
+from isac_rt.storage import program_fingerprint, write_whole
 from isac_rt.studies.validation.case import Measured
 
 STATES = {True: "passes", False: "FAILS", None: "left out"}

@@ -5,18 +5,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isac_rt.kernels.jit import jit
+from isac_rt.storage import kept
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 
 _LOG = logging.getLogger(__name__)
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
+FACES_KEPT = 3000
+"""The planes of fewer faces are found in less time than it takes to read them."""
 MAX_FACES = 10_000_000
 MAX_COORDINATE = 1e8
 """Farther out float64 places no corner to a wavelength's phase, and no map has it. [m]"""
@@ -126,6 +130,12 @@ class CityMesh:
         """
         if not self.num_faces:
             return _read_only(np.zeros(0, dtype=np.int64))
+        if self.num_faces < FACES_KEPT:
+            return _read_only(self._planes())
+        depends_on = [self.vertices, self.faces, self.plane_tolerance]
+        return _read_only(kept("planes", depends_on, self._planes))
+
+    def _planes(self) -> NDArray[np.int64]:
         _LOG.info("finding the planes of %s faces", f"{self.num_faces:,}")
         order = np.argsort(-self.areas, kind="stable")
         planes = np.empty(self.num_faces, dtype=np.int64)
@@ -135,7 +145,7 @@ class CityMesh:
             self.plane_offsets[order],
             self.plane_tolerance,
         )
-        return _read_only(planes)
+        return planes
 
     def within(self, radius: float) -> CityMesh:
         """The faces that come as near to the origin as `radius` [m], whole; this very city if all
@@ -158,6 +168,17 @@ class CityMesh:
             materials=tuple(self.materials[i] for i in materials),
             num_beyond=self.num_beyond + int((~near).sum()),
         )
+
+    def plain(self) -> dict[str, Any]:
+        """All of it as plain data and arrays, for `of_plain`."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return own | {"materials": [asdict(material) for material in self.materials]}
+
+    @classmethod
+    def of_plain(cls, own: dict[str, Any]) -> CityMesh:
+        """The city that `plain` took apart."""
+        materials = tuple(Material(**material) for material in own["materials"])
+        return cls(**own | {"materials": materials, "notes": tuple(own["notes"])})
 
     def bounds(self) -> NDArray[np.float64]:
         """(2, 3) lowest and highest local coordinates; zeros for an empty city. [m]"""
