@@ -607,7 +607,7 @@ OF_TESTS = (
     ),
     (
         "test_killed::test_versions_stand_in_the_results",
-        Bug("results/provenance.py", "return dict(_versions())", 'return {"numpy": "1"}'),
+        Bug("storage.py", "return dict(_versions())", 'return {"numpy": "1"}'),
     ),
     (
         "test_association::test_the_association_is_the_likeliest_of_all",
