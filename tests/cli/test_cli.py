@@ -200,6 +200,9 @@ def test_titles_keep_their_units_on_the_screen(
     words = set(said.split())
     for word in ("Elevation", "Undecided", "processed", "received", "AT"):
         assert word in words, word
+    assert "GOSPA" in words
+    assert "AT to PT1: of 13 UAVs in view 11 found, 2 inaccurate" in said
+    assert "AT to PT1: 0.143 false tracks a frame, by 0.143 target" in said
     if columns is not None:
         tables = [t for t in said.splitlines() if not t.startswith(("paths:", "results in"))]
         assert max(map(len, tables)) <= columns
