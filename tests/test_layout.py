@@ -107,6 +107,26 @@ def test_no_file_imports_itself_by_way_of_others():
     TopologicalSorter(graph).prepare()  # raises CycleError with the files
 
 
+@pytest.mark.parametrize("path", MODULES, ids=ids)
+def test_nothing_that_is_read_can_be_code(path: Path):
+    """Planted bug: `import pickle` in simulation/resume.py."""
+    tree = ast.parse(path.read_text())
+    used = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in [getattr(node, "module", None) or "", *(a.name for a in node.names)]
+    }
+    called = {
+        node.func.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    assert not used & {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
+    assert not called & {"eval", "exec", "compile"}
+    assert "allow_pickle=True" not in path.read_text()
+
+
 def test_importing_the_package_starts_no_ray_tracer():
     """Planted bug: `import drjit` in isac_rt/__init__.py."""
     program = (

@@ -25,12 +25,10 @@ from isac_rt.storage import BAD_DATA, checksum, pack, unpack
 FILE = "resume.sqlite"
 EARLIER = "unfinished.frames"
 """What earlier versions wrote, which is not read."""
-TABLES = (
-    "BEGIN",
-    "CREATE TABLE IF NOT EXISTS run (digest TEXT PRIMARY KEY)",
-    "CREATE TABLE IF NOT EXISTS entry "
-    "(id INTEGER PRIMARY KEY, tree TEXT, arrays BLOB, checksum TEXT)",
-)
+TABLES = {
+    "run": "(digest TEXT PRIMARY KEY)",
+    "entry": "(id INTEGER PRIMARY KEY, tree TEXT, arrays BLOB, checksum TEXT)",
+}
 EVERY = 5.0
 """Least time between two entries: what a stop can cost, beside the frame at work. [s]"""
 
@@ -116,8 +114,9 @@ class Resume:
         seal = checksum(self._digest, tree.encode() + arrays)
         try:
             with self._open("rwc") as database, database:
-                for command in TABLES:
-                    database.execute(command)
+                database.execute("BEGIN")
+                for name, columns in TABLES.items():
+                    database.execute(f"CREATE TABLE IF NOT EXISTS {name} {columns}")
                 database.execute("INSERT OR IGNORE INTO run VALUES (?)", (self._digest,))
                 if database.execute("SELECT digest FROM run").fetchall() != [(self._digest,)]:
                     raise sqlite3.IntegrityError("it is another run's")
@@ -147,9 +146,12 @@ class Resume:
             return ""
         try:
             with self._open("rw") as database:
-                if not database.execute("SELECT name FROM sqlite_master").fetchall():
+                made = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master") if sql}
+                if not made:
                     return ""  # killed before its first entry was there
-                ((digest,),) = database.execute("SELECT digest FROM run").fetchall()
+                if made != {f"CREATE TABLE {name} {columns}" for name, columns in TABLES.items()}:
+                    return None  # a view might never end
+                ((digest,),) = database.execute("SELECT digest FROM run").fetchmany(2)
                 return digest
         except (sqlite3.Error, ValueError):
             return None

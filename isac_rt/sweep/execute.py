@@ -227,6 +227,8 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             dashboard_address=None,
             silence_logs=50,
         )
+        number = len(cluster.workers)
+        cluster.adapt(minimum=number, maximum=number)  # one that could not start again is replaced
         client = Client(cluster)
         try:
             yield client

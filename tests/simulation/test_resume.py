@@ -332,6 +332,15 @@ def test_a_file_that_is_no_database_is_not_taken_away(tmp_path):
     assert resume.append("one") and list(resume.entries()) == ["one"]
 
 
+def test_a_database_of_other_tables_is_not_asked(tmp_path):
+    """A view without end in a table's place. Planted bug: the tables not looked at."""
+    endless = "WITH RECURSIVE n(digest) AS (SELECT 1 UNION ALL SELECT 1 FROM n) SELECT * FROM n"
+    with closing(sqlite3.connect(tmp_path / FILE)) as database, database:
+        database.execute(f"CREATE VIEW run AS {endless}")
+    with pytest.raises(ResumeError, match="damaged"):
+        Resume(tmp_path, "content").check()
+
+
 def test_what_cannot_be_kept_does_not_end_the_run_nor_take_away_what_was(tmp_path):
     """A database that is full: a warning, the entries before it stay, the next follows once there
     is room, and the run that goes on is the same. Planted bug: the file removed."""

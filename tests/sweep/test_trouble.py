@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -335,3 +336,45 @@ def test_a_sweep_on_a_full_disk_goes_on_once_there_is_room(folder, small_disk):
     assert again.returncode == 0, said
     assert {f: f.stat().st_mtime_ns for f in stamps} == stamps and status(out).done == 12
     same(open_sweep(out), open_sweep(folder / "calm"))
+
+
+@pytest.mark.slow
+def test_a_point_that_takes_its_workers_with_it_is_left(folder):
+    """Not condemned: the others are done, and it is said."""
+    plan, out = plan_of(folder), folder / "out"
+    deadly = list(plan.points())[2].key
+    program = f"""
+import os, sys
+from isac_rt.sweep import execute, load_sweep, run_sweep
+from distributed.diagnostics.plugin import WorkerPlugin
+simulate = execute._simulate
+class Deadly(WorkerPlugin):
+    def setup(self, worker):
+        from isac_rt.sweep import execute
+        simulate = execute._simulate
+        execute._simulate = lambda job: os._exit(9) if job.key == {deadly!r} else simulate(job)
+client = execute._client
+from contextlib import contextmanager
+@contextmanager
+def deadly(*a):
+    with client(*a) as made:
+        made.register_plugin(Deadly())
+        yield made
+execute._client = deadly
+if __name__ == "__main__":
+    try:
+        run_sweep(load_sweep({str(folder / "sweep.yaml")!r}), {str(out)!r}, workers=2)
+    except execute.PointsLeft as left:
+        print(left)
+"""
+    (folder / "program.py").write_text(program)
+    done = subprocess.run(
+        [sys.executable, str(folder / "program.py")],
+        capture_output=True,
+        text=True,
+        timeout=400,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    assert "5 workers in turn died" in done.stdout, done.stderr
+    found = status(out)
+    assert (found.done, found.failed) == (11, 0)
