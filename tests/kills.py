@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parents[1]), *map(str, Path(__file__).parent.glob("*/"))]
@@ -114,9 +115,8 @@ def worker(port: int) -> None:
 
 def warm_up(folder: Path) -> None:
     """Load and compile here what all forks need, and have them draw two figures instead of all."""
-    import distributed  # noqa: F401  # for the forks
-
-    import isac_rt.sweep  # noqa: F401  # for the forks
+    for module in ("distributed", "isac_rt.sweep"):
+        import_module(module)
     from isac_rt.results.files import save
     from isac_rt.scenario.file import load
     from isac_rt.simulation import simulate

@@ -55,6 +55,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     asked = [s for s in ENDING if signal.getsignal(s) is not signal.SIG_IGN]
     defaults = [signal.signal(s, _terminated) for s in asked]
     threading.Thread(target=wait, daemon=True).start()
+    hook, sys.unraisablehook = sys.unraisablehook, _unraised
     try:
         yield
     except BaseException as problem:
@@ -62,6 +63,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
             _say_kept(kept)
         raise
     finally:
+        sys.unraisablehook = hook
         signal.set_wakeup_fd(before)
         for number, default in zip(asked, defaults, strict=True):
             signal.signal(number, default)
@@ -70,6 +72,13 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
 
 def _terminated(number: int, *_: Any) -> None:
     raise Terminated(number)
+
+
+def _unraised(what: Any) -> None:
+    """A stop that Python cannot raise where it is, as while an object is taken away: `wait` ends
+    the process."""
+    if not issubclass(what.exc_type, KeyboardInterrupt | Terminated):
+        sys.__unraisablehook__(what)
 
 
 def say_interrupted() -> None:

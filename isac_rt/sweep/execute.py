@@ -34,7 +34,6 @@ WORKER_BYTES = 1.5e9
 receivers at work."""
 LOST_AFTER = 5
 """Workers that a point may take with it before it is left to do."""
-DEADLY = f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
 PATIENCE = 2
 """Windows of points in a row that the machine did not let end: then the sweep stops."""
 ROOM = 1_000_000
@@ -328,12 +327,9 @@ class _Runner:
     def run(self) -> None:
         """Until every point is done, failed or left."""
         self._pass(pending(self._plan, self._outcomes, self._retry_failed))
-        again = [point for point, why in self._left.values() if why != DEADLY]
-        if again and not self._stuck:
-            for point in again:
-                del self._left[point.key]
-            self._in_a_row = 0
-            self._pass(iter(again))
+        if self._left and not self._stuck:
+            again, self._left, self._in_a_row = self._left, {}, 0
+            self._pass(iter([point for point, _ in again.values()]))
         if self._left:
             (point, why), *_ = self._left.values()
             raise PointsLeft(
@@ -439,5 +435,5 @@ def _of_worker(future: Any) -> str:
     """What took a worker's task down."""
     problem = future.exception()
     if type(problem).__name__ == "KilledWorker":
-        return DEADLY
+        return f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
     return _words(problem)
