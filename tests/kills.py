@@ -54,7 +54,7 @@ seed: 7
 HOW = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
-def forked(work: Callable[[], object], log: Path) -> int:
+def forked(work: Callable[[], int | None], log: Path) -> int:
     """Process number of a fork that does some work and ends with its status."""
     pid = os.fork()
     if pid:
@@ -65,7 +65,7 @@ def forked(work: Callable[[], object], log: Path) -> int:
     os.dup2(out, 2)
     status = 99
     try:
-        status = int(work() or 0)  # type: ignore[call-overload]
+        status = int(work() or 0)
     finally:
         sys.stderr.flush()
         os._exit(status)
