@@ -152,6 +152,7 @@ EXCUSED = [
     ("signal/gridded.py", "lag[:, 1]", "and of one offset"),
     ("signal/separable.py", "* fast) % 2)", "whole turns, one or two"),
     ("access/dma.py", "since)) % 2.0", "whole turns, one or two"),
+    ("access/ook.py", "total * (samples", "energies that are compared with each other"),
     ("propagation/clutter/penumbra.py", "LIFT / side", "a quotient by a sign"),
     ("propagation/legs/images.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
     ("receive/omp.py", "support] = -2", "less than any modulus, as -1 is"),

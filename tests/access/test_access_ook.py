@@ -162,6 +162,33 @@ def test_hot_chirps_follow_the_closed_form():
     assert within(hot[1], chirps, detected)
 
 
+def test_a_chirp_is_hot_by_its_strongest_cell_over_the_others():
+    """Spectra made by hand: every antenna's cells at power 1 but for one, which is 0.3 % under and
+    over the threshold in two chirps. Planted bugs: the cell itself in the mean; one cell more or
+    less in it; antennas not added."""
+    rx, cells = 3, 64
+    limit = hot_threshold(rx, cells)
+    spectra = np.ones((1, rx, 2, cells), complex)
+    spectra[0, :, 0, 17], spectra[0, :, 1, 17] = np.sqrt([0.997 * limit, 1.003 * limit])
+    assert hot_chirps(np.fft.ifft(spectra, axis=-1)).tolist() == [1]
+    spectra[0, 0, 1, 17] = 1  # one antenna of three without
+    assert hot_chirps(np.fft.ifft(spectra, axis=-1)).tolist() == [0]
+
+
+def test_energies_are_over_the_stretch_that_is_off():
+    """Impulses, flat over cells, of power 4 while the sender is off and 8, 20 and 6 during the
+    bits, on two antennas and in two groups alike: 2, 5 and 1.5 times the noise, at the cell that
+    the first stretch tells. Planted bugs: another stretch for the noise; bits a stretch late."""
+    powers, each = [1.0, 4.0, 8.0, 20.0, 6.0], 3
+    samples = np.zeros((2, 2, 5 * each + 1, 32), complex)
+    for i, power in enumerate(powers):
+        samples[:, :, i * each : (i + 1) * each, 0] = np.sqrt(power)
+    samples[:, :, :each] += np.sqrt(50 / 32) * tone(9.25, 32)
+    got = read(samples.astype(np.complex64), 3)
+    assert got.found and got.cell == 9.25
+    assert got.energy == pytest.approx([2.0, 5.0, 1.5], rel=1e-5)
+
+
 def test_enough_hot_chirps_and_no_more():
     """The smallest count whose binomial tail is within the rate. Planted bug: one chirp less."""
     for chirps, rate in ((12, 1e-3), (57, 1e-4), (120, 1e-6)):

@@ -92,6 +92,7 @@ def test_body_axes_and_back():
     """A body that looks east has south to its right; and any vector comes back from its axes.
     Planted bug: one way's matrix not transposed."""
     pose = Pose.at_rest((0, 0, 9), (1, 0, 0))
+    assert pose.motion().tolist() == [[0, 0, 9], [0, 0, 0], [0, 0, 0]]
     assert pose.to_body(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])) == pytest.approx(
         np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     )
