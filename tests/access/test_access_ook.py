@@ -162,6 +162,16 @@ def test_hot_chirps_follow_the_closed_form():
     assert within(hot[1], chirps, detected)
 
 
+@pytest.mark.parametrize("cells", [4, 64, 1024])
+def test_the_hot_threshold_of_one_antenna_is_a_closed_form(cells):
+    """An exponential over the mean of the n - 1 others exceeds t with (1 + t/(n-1))^-(n-1), and one
+    of n cells does so in 1 % of the chirps, as if they were independent. Planted bugs: n others;
+    the rate of one cell."""
+    one = 1 - 0.99 ** (1 / cells)
+    t = (cells - 1) * (one ** (-1 / (cells - 1)) - 1)
+    assert hot_threshold(1, cells) == pytest.approx(t, rel=1e-6)
+
+
 def test_a_chirp_is_hot_by_its_strongest_cell_over_the_others():
     """Spectra made by hand: every antenna's cells at power 1 but for one, which is 0.3 % under and
     over the threshold in two chirps. Planted bugs: the cell itself in the mean; one cell more or

@@ -12,6 +12,7 @@ from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.radio import Modulation, Radio
+from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.swarm import RoleChange, Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import timetable_of
@@ -57,6 +58,16 @@ def test_when_frames_begin():
     assert t.start_time(7, "B") == pytest.approx(0.35 + later, abs=1e-15)
     assert t.epoch(7, "B") == pytest.approx(0.35 + later + half, abs=1e-15)
     assert t.epoch(7) == pytest.approx(0.35 + half, abs=1e-15)
+
+
+def test_snapshots_are_spread_from_the_first_to_the_last():
+    """Of 12 frames of which every second is processed, 3 of them before the data: 4, 6, 8 and 10;
+    halfway between 6 and 8 is rounded to even, the third of them.
+    Planted bugs: the last left out; frames without data; more than asked for."""
+    t = timetable(frames=12, receivers=Receivers(active_every_frames=2))
+    chosen = {1: {4}, 2: {4, 10}, 3: {4, 8, 10}, 4: {4, 6, 8, 10}, 9: {4, 6, 8, 10}}
+    assert {count: t.snapshots(count) for count in chosen} == chosen
+    assert timetable(frames=12).snapshots(2) == {3, 11}
 
 
 def test_a_change_of_roles():

@@ -16,7 +16,7 @@ from receiver_cubes import ANTENNAS
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Reception
-from isac_rt.receive.types import Detections, ExpectedClutter, no_detections
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, no_detections
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.terminal import (
@@ -464,3 +464,36 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     pt, _ = passive()
     assert pt.tracker.velocity_period == pytest.approx(2 * period)
     assert at.tracker.velocity_period == pytest.approx(period)
+
+
+def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():
+    """A first frame says 2 dB more and 0.3 m/s to the right, a second 0.5 dB less and 0.2 m/s
+    ahead: the third is handed clutter with both, each point's rate by the velocity along both of
+    its directions, at a kept terminal as well. A frame that says nothing changes nothing. Planted
+    bugs: the last correction alone; the same frame's; velocities with the other sign; forgotten
+    over a stop."""
+    ahead, right = np.array([[0.0, 1.0, 0.0]]), np.array([[0.6, 0.8, 0.0]])
+    clutter = ExpectedClutter(
+        np.array([1e-7, 2e-7]),
+        np.array([1e-8, -2e-8]),
+        np.array([1e-12, 3e-12]),
+        np.concatenate([ahead, ahead]),
+        np.concatenate([ahead, right]),
+    )
+    first = Correction(0.2 * np.log(10), np.array([0.3, 0.0, 0.0]))
+    second = Correction(-0.05 * np.log(10), np.array([0.0, 0.2, 0.0]))
+    told = Told([heard(correction=c) for c in (first, None, second, None)])
+    at: Any = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+    for k in range(4):
+        if k == 3:
+            kept, at = at.memory(), ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+            at.restore(kept)
+        vars(at)["receive"] = told  # in place of the method
+        at.step(EMPTY, None, OWN, 1e-6 * k, clutter=clutter)
+    c = 299_792_458.0
+    for k, (decibels, x, y) in enumerate([(0, 0, 0), (2, 0.3, 0), (2, 0.3, 0), (1.5, 0.3, 0.2)]):
+        handed = told.handed[k][1]
+        assert handed.power == pytest.approx(10 ** (decibels / 10) * clutter.power, abs=0)
+        more = -np.array([2 * y, 0.6 * x + 1.8 * y]) / c
+        assert handed.delay_rate - clutter.delay_rate == pytest.approx(more, abs=1e-20)
+        assert np.array_equal(handed.delay, clutter.delay)
