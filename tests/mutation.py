@@ -104,6 +104,7 @@ TESTS_OF = {
     "receive/arms.py": "test_receive_detection test_clutter_detectors",
     "receive/chain.py": "test_receive_detection test_receive_schemes",
     "receive/joint/fit.py": "test_receive_joint",
+    "receive/joint/moments.py": "test_receive_joint",
     "receive/symbols/phases.py": "test_receive_joint",
     "receive/joint/neighbours.py": "test_receive_joint",
     "receive/symbols/beams.py": "test_receive_beams",

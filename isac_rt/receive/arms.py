@@ -75,9 +75,10 @@ def both_arms(antennas: Antennas) -> Channels:
 def element_delays(
     positions: np.ndarray, direction: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of elements (E, 3) against the centroid for a spherical wave [s], (E,), and its
-    derivative with respect to u_x, u_z (2, E)."""
+    """Delay of elements (E, 3) against the centroid for spherical waves from directions (..., 2)
+    [s], (..., E), and its derivative with respect to u_x, u_z (2, ..., E)."""
     place = positions[:, [0, 2]]
-    along = place @ direction
+    along = direction @ place.T
+    axes = place.T.reshape(2, *(1,) * (along.ndim - 1), -1)
     delay = (-along + ((positions**2).sum(axis=1) - along**2) / (2 * radius)) / SPEED_OF_LIGHT
-    return delay, (-(1 + along / radius) * place.T) / SPEED_OF_LIGHT
+    return delay, (-(1 + along / radius) * axes) / SPEED_OF_LIGHT

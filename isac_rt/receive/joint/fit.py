@@ -22,6 +22,7 @@ import numpy as np
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.arms import element_delays
+from isac_rt.receive.joint.moments import Moments, tone_sums
 from isac_rt.receive.known import Known
 
 PARAMETERS = 4  # delay, delay rate, u_x, u_z
@@ -29,6 +30,8 @@ LARGEST_STEP = np.array([0.3, 0.3, 0.03, 0.03])
 """Of one iteration: cells, Doppler bins, direction cosines."""
 SETTLED = 1e-2
 """A step under this share of the standard deviation ends the iteration."""
+NEAR_CELLS = 12
+"""Paths farther apart in beat are fitted at once, but each by its own curvature."""
 
 
 @dataclass(frozen=True)
@@ -152,83 +155,46 @@ def _sensitivity(
     return constant, slope
 
 
-def _moments(samples: np.ndarray, known: Known, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
+def _moments(moments: Moments, tone: _Tone) -> tuple[np.ndarray, np.ndarray]:
     """Sums of s T* and n s T* over each chirp, n from its middle: two of (M, rx, P)."""
-    w = known.waveform
-    n = np.arange(w.num_samples) - (w.num_samples - 1) / 2
-    zeroth, first = np.empty((2, *tone.phase.shape), np.complex128)
-    ramps = np.exp(
-        -2j * np.pi * np.outer(tone.receiver_delay * w.slope * w.sample_interval, n)
-    ).astype(np.complex64)
-    for m in range(len(samples)):
-        cycles = tone.common_frequency[m][:, None] * n + (tone.curvature * n**2)
-        template = np.exp(-2j * np.pi * (cycles % 1.0).astype(np.float32))
-        lever = template * n.astype(np.float32)
-        for rx in range(samples.shape[1]):
-            part = samples[m, rx] * ramps[rx]
-            zeroth[m, rx] = np.einsum("pn,pn->p", part, template)
-            first[m, rx] = np.einsum("pn,pn->p", part, lever)
-        zeroth[m] *= known.phases[m].conj()
-        first[m] *= known.phases[m].conj()
+    w = moments.known.waveform
+    ramp = tone.receiver_delay * w.slope * w.sample_interval
+    zeroth, first = moments.of(tone.common_frequency, tone.curvature, ramp)
     back = np.exp(-2j * np.pi * tone.phase)
     return zeroth * back, first * back
 
 
-def match_chirps(samples: np.ndarray, known: Known, path: JointPath) -> np.ndarray:
+def match_chirps(moments: Moments, path: JointPath) -> np.ndarray:
     """(M, P) the chirps against a path's signal, summed over their samples and the receivers in
     phase."""
-    tone = _tone(known, path)
-    return (_moments(samples, known, tone)[0] * tone.amplitude.conj()).sum(axis=1)
+    tone = _tone(moments.known, path)
+    return (_moments(moments, tone)[0] * tone.amplitude.conj()).sum(axis=1)
 
 
-def tone_sums(offset: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums over n = -(N-1)/2 .. (N-1)/2 of 1, n and n^2 times exp(j 2 pi x n), x in cycles per
-    sample below a half in magnitude; the first and the last are real, the second imaginary
-    (returned without its j)."""
-    x = np.where(np.abs(offset) < 1e-2 / size, 1e-2 / size, offset)  # the series takes over there
-    s, c = np.sin(np.pi * size * x), np.cos(np.pi * size * x)
-    t, k = np.sin(np.pi * x), np.cos(np.pi * x)
-    sum0 = s / t
-    sum1 = -(size * c * t - s * k) / (2 * t**2)
-    sum2 = -((1 - size**2) * s / (4 * t) - k * (size * c * t - s * k) / (2 * t**3))
-    small, second, fourth = (
-        np.abs(offset) < 1e-2 / size,
-        size * (size**2 - 1) / 12,
-        size * (size**2 - 1) * (3 * size**2 - 7) / 240,
-    )
-    y = 2 * np.pi * offset
-    sum0 = np.where(small, size - second * y**2 / 2, sum0)
-    sum1 = np.where(small, second * y, sum1)
-    sum2 = np.where(small, second - fourth * y**2 / 2, sum2)
-    return sum0, sum1, sum2
+def _cross(known: Known, of: _Tone, at: _Tone) -> np.ndarray:
+    """Sums of T_of T_at* times 1, n, n^2 over each chirp, (3, M, rx, P); the difference of their
+    curvatures (0.003 cycles) is left out."""
+    out = np.empty((3, *of.phase.shape), np.complex128)
+    size = float(known.waveform.num_samples)
+    tone_sums(of.frequency - at.frequency, of.phase - at.phase, size, out)
+    return out
 
 
-def _cross(known: Known, of: _Tone, at: _Tone) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of T_of T_at* times 1, n, n^2 over each chirp; the difference of their curvatures (0.003
-    cycles) is left out."""
-    sums = tone_sums(of.frequency - at.frequency, known.waveform.num_samples)
-    turn = np.exp(2j * np.pi * (of.phase - at.phase))
-    return sums[0] * turn, 1j * sums[1] * turn, sums[2] * turn
-
-
-def fit(
-    samples: np.ndarray, known: Known, paths: list[JointPath], iterations: int = 4
-) -> list[JointPath]:
+def fit(moments: Moments, paths: list[JointPath], iterations: int = 4) -> list[JointPath]:
     """Gauss-Newton from near estimates of all paths; amplitudes of the start are not used.
 
     Parameters
     ----------
-    samples : (M, L_rx, P, N)
-    known : Known
+    moments : of the frame's samples
     paths : within half a cell of their truths
 
     Returns
     -------
     paths : in the same order
     """
-    paths = _with_amplitudes(samples, known, paths)
+    known, paths = moments.known, _with_amplitudes(moments, paths)
     for _ in range(iterations):
-        gradient, gram, left = _normal_equations(samples, known, paths)
+        gradient, gram, left = _normal_equations(moments, paths)
         covariance = np.linalg.inv(gram)
         step = covariance @ gradient
         paths = [
@@ -244,11 +210,12 @@ def fit(
     ]
 
 
-def _with_amplitudes(samples: np.ndarray, known: Known, paths: list[JointPath]) -> list[JointPath]:
+def _with_amplitudes(moments: Moments, paths: list[JointPath]) -> list[JointPath]:
     """The least-squares amplitudes of paths whose other parameters are given."""
+    known = moments.known
     count = known.antennas.num_tx if known.passes == 1 else 1
     paths = [replace(p, amplitude=np.ones(count, complex)) for p in paths]
-    gradient, gram, _ = _normal_equations(samples, known, paths)
+    gradient, gram, _ = _normal_equations(moments, paths)
     size = PARAMETERS + 2 * count
     amplitudes = np.concatenate([np.arange(PARAMETERS, size) + i * size for i in range(len(paths))])
     step = np.linalg.solve(gram[np.ix_(amplitudes, amplitudes)], gradient[amplitudes]).reshape(
@@ -261,35 +228,64 @@ def _with_amplitudes(samples: np.ndarray, known: Known, paths: list[JointPath]) 
 
 
 def _normal_equations(
-    samples: np.ndarray, known: Known, paths: list[JointPath]
+    moments: Moments, paths: list[JointPath]
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Gradient and Gram matrix of the scaled parameters, path by path, and the noise power that the
-    paths leave."""
+    paths leave. The Gram matrix is left 0 between paths more than `NEAR_CELLS` apart: what they
+    leave in each other's sums is in the gradient."""
+    known = moments.known
     tones = [_tone(known, p) for p in paths]
     size, cells = tones[0].constant.shape[0], tones[0].phase.size
     gradient, gram = np.zeros(size * len(paths)), np.zeros((size * len(paths),) * 2)
-    explained = 0.0
+    seen, left, first = _residuals(moments, tones)
+    beats = [float(t.common_frequency.mean()) for t in tones]
+    near = NEAR_CELLS / known.waveform.num_samples
     for k, at in enumerate(tones):
-        zeroth, first = _moments(samples, known, at)
         own = slice(k * size, (k + 1) * size)
-        c0, c1 = at.constant.reshape(size, cells), at.slope.reshape(size, cells)
-        seen = zeroth.copy()
-        for j, of in enumerate(tones):
-            G0, G1, G2 = (g.ravel() for g in _cross(known, of, at))
-            zeroth = zeroth - of.amplitude * G0.reshape(zeroth.shape)
-            first = first - of.amplitude * G1.reshape(first.shape)
-            d0, d1 = of.constant.reshape(size, cells), of.slope.reshape(size, cells)
+        c0, c1 = (v.reshape(size, cells) for v in (at.constant, at.slope))
+        for j in range(k + 1):
+            if abs(beats[k] - beats[j]) > near:
+                continue
+            G0, G1, G2 = _cross(known, tones[j], at).reshape(3, cells)
+            d0, d1 = (v.reshape(size, cells) for v in (tones[j].constant, tones[j].slope))
             block = c0.conj() @ (G0 * d0 + G1 * d1).T + c1.conj() @ (G1 * d0 + G2 * d1).T
             gram[own, j * size : (j + 1) * size] = block.real
-        gradient[own] = (c0.conj() @ zeroth.ravel() + c1.conj() @ first.ravel()).real
-        explained += float((at.amplitude.conj() * (seen + zeroth)).real.sum())
-    total = float(np.vdot(samples, samples).real)
-    left = max(total - explained, 1e-12 * total) / samples.size
-    return gradient, gram, left
+            gram[j * size : (j + 1) * size, own] = block.real.T
+        gradient[own] = (c0.conj() @ left[k].ravel() + c1.conj() @ first[k].ravel()).real
+    return gradient, gram, _noise(moments, tones, seen, left)
+
+
+def _noise(
+    moments: Moments, tones: list[_Tone], seen: list[np.ndarray], left: list[np.ndarray]
+) -> float:
+    """Power of a sample that all tones leave."""
+    explained = sum(
+        float((t.amplitude.conj() * (s + z)).real.sum())
+        for t, s, z in zip(tones, seen, left, strict=True)
+    )
+    return max(moments.energy - explained, 1e-12 * moments.energy) / moments.size
+
+
+def _residuals(
+    moments: Moments, tones: list[_Tone]
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Of each tone the zeroth moments of the samples, and the zeroth and the first of what all
+    tones leave."""
+    known, size = moments.known, moments.known.waveform.num_samples
+    seen, first = (list(one) for one in zip(*(_moments(moments, t) for t in tones), strict=True))
+    left = [z - size * t.amplitude for z, t in zip(seen, tones, strict=True)]
+    for k, at in enumerate(tones):
+        for j, of in enumerate(tones[:k]):
+            G0, G1, _ = _cross(known, of, at)
+            left[k] = left[k] - of.amplitude * G0
+            first[k] = first[k] - of.amplitude * G1
+            left[j] = left[j] - at.amplitude * G0.conj()
+            first[j] = first[j] - at.amplitude * G1.conj()
+    return seen, left, first
 
 
 def residual_channels(
-    samples: np.ndarray, known: Known, paths: list[JointPath], offsets: np.ndarray
+    moments: Moments, paths: list[JointPath], offsets: np.ndarray
 ) -> Iterator[tuple[JointPath, np.ndarray, np.ndarray, float]]:
     """What the paths of a fit leave about each of them, channel by channel.
 
@@ -305,16 +301,15 @@ def residual_channels(
     counts : samples per amplitude of the path
     noise : power of a sample that all paths leave
     """
+    known = moments.known
     w, num_tx = known.waveform, known.antennas.num_tx
     tones = [_tone(known, p) for p in paths]
-    left = _normal_equations(samples, known, paths)[2]
+    seen, residuals, _ = _residuals(moments, tones)
+    left = _noise(moments, tones, seen, residuals)
     # a bin is one turn per frame
     turns = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
     sent = np.array([mine.sum() for mine in known.sent_by]) * w.num_samples
-    for path, at in zip(paths, tones, strict=True):
-        residual = _moments(samples, known, at)[0]
-        for of in tones:
-            residual = residual - of.amplitude * _cross(known, of, at)[0]
+    for path, residual in zip(paths, residuals, strict=True):
         channels = np.empty((len(offsets), num_tx, residual.shape[1]), np.complex128)
         for tx, mine in enumerate(known.sent_by):
             turned = np.where(mine, turns, 0.0)

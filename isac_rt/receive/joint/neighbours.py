@@ -22,6 +22,7 @@ from isac_rt.receive.joint.fit import (
     residual_channels,
     units,
 )
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Detections
 
@@ -49,17 +50,18 @@ def refine_jointly(
     if not order.size:
         return d, np.full(len(d), np.nan)
     start = [_path(known, d, i) for i in order]
-    paths = fit(samples, known, start)
+    moments = Moments(samples, known)
+    paths = fit(moments, start)
     parent = list(range(len(paths)))
     if not all(_near(known, p, s) for p, s in zip(paths, start, strict=True)):
         # two detections of one path: the fit has no single answer
         return d, np.full(len(d), np.nan)
     for _ in range(MAX_HIDDEN):
-        found = _hidden(samples, known, paths)
+        found = _hidden(moments, paths)
         if found is None:
             break
         beside, other = found
-        trial = fit(samples, known, [*paths, other], iterations=8)
+        trial = fit(moments, [*paths, other], iterations=8)
         if not _credible(known, trial, [*paths, paths[beside]]):
             break
         paths, parent = trial, [*parent, parent[beside]]
@@ -96,11 +98,10 @@ def _credible(known: Known, paths: list[JointPath], near: list[JointPath]) -> bo
     return power[-1] > beside * 10 ** (-WEAKEST_DB / 10) and power[-1] < beside * 10
 
 
-def _hidden(
-    samples: np.ndarray, known: Known, paths: list[JointPath]
-) -> tuple[int, JointPath] | None:
+def _hidden(moments: Moments, paths: list[JointPath]) -> tuple[int, JointPath] | None:
     """The surest path that the residual of a fit holds about one of its paths, with that path's
     number."""
+    known = moments.known
     limit = known.antennas.view_limit
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -109,7 +110,7 @@ def _hidden(
     sums = 1 if known.passes == 2 else known.antennas.num_tx
     level = gammainccinv(sums, FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
     for k, (path, channels, counts, noise) in enumerate(
-        residual_channels(samples, known, paths, DOPPLER_OFFSETS)
+        residual_channels(moments, paths, DOPPLER_OFFSETS)
     ):
         # (direction, offset), a sum of `sums` exponentials in noise
         power = _beams(known, path, channels, grid) / noise
@@ -132,9 +133,7 @@ def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray
 
     def steer(positions: np.ndarray) -> np.ndarray:
         own = element_delays(positions, path.direction, radius)[0]
-        return np.exp(
-            turn * (np.array([element_delays(positions, u, radius)[0] for u in grid]) - own)
-        )
+        return np.exp(turn * (element_delays(positions, grid, radius)[0] - own))
 
     beams = channels @ steer(a.rx_positions).conj().T  # (offset, L_tx, G)
     if known.passes == 2:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from isac_rt.receive.joint.fit import JointPath, fit, match_chirps, rate_bin
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 
 FARTHEST = 1.5
@@ -52,8 +53,9 @@ def decide_phases(
     """
     phases = None
     for _ in range(ROUNDS):
-        path = fit(samples, known, [path])[0]
-        matched = match_chirps(samples, known, path)
+        moments = Moments(samples, known)
+        path = fit(moments, [path])[0]
+        matched = match_chirps(moments, path)
         found = _decide(known, matched * known.phases, order)
         if found is None:
             break
