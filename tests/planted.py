@@ -141,8 +141,8 @@ OF_CASES = {
     ),
     "conducting corner": Bug(
         "propagation/legs/images.py",
-        "planes = edges_in_any_order(self._city.plane_of_face[part.faces], part.legs.points)",
-        "planes = self._city.plane_of_face[part.faces]",
+        "keep = one_of_each_chain(owned, part.faces, good)",
+        "keep = np.flatnonzero(good)",
     ),
     "reflection of a slab": Bug(
         "propagation/legs/reflection.py",
