@@ -66,7 +66,7 @@ test: setup
 	@$(BIN)/python -m pytest -q --durations=10 --numprocesses 2 --dist loadfile
 
 demo: setup
-	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm
+	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm --set compare.paper.preset=paper
 
 mutation: setup
 	@$(BIN)/python tests/mutation.py --planted

@@ -115,7 +115,7 @@ def test_covariance_is_the_sum_over_single_scatterers():
 @pytest.mark.parametrize("white", [False, True])
 def test_search_finds_the_largest_statistic_over_directions(white: bool):
     """T(u) by its definition on a grid four times as fine, for coloured and for white noise, with a
-    wave in every cell. Parabolas between 32 directions, axis by axis, are within 12 %
+    wave in every cell. What lies between 32 directions is found to 6 % and never exceeded
     (discretisation). Planted bugs: spectra conjugated; the turn of the other axis left out; the
     denominator's product of an X and a Z line once instead of twice."""
     w, rng, count = Waveform(), np.random.default_rng(3), 6
@@ -145,7 +145,8 @@ def test_search_finds_the_largest_statistic_over_directions(white: bool):
     weighted = a.conj() @ np.linalg.inv(R)
     T = np.abs(weighted @ x.T) ** 2 / (weighted * a).sum(axis=1).real[:, None]
     assert np.array_equal(found.cell, np.arange(count))
-    np.testing.assert_allclose(found.peak, T.max(axis=0), rtol=0.12)
+    np.testing.assert_allclose(found.peak, T.max(axis=0), rtol=0.06)
+    assert (found.peak <= 1.005 * T.max(axis=0)).all()  # the grid's own loss
     assert np.abs(found.cosines - grid[T.argmax(axis=0)][:, [0, 2]]).max() < 0.03
 
 

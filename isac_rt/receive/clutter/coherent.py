@@ -66,6 +66,7 @@ class Search:
     cosines : (G,) values of each direction cosine
     along_x, along_z : Lines
     inside : (G, G) bool, directions (u_x, u_z) of the unit disc
+    wavenumber : [rad/m]
     """
 
     channels: Channels
@@ -73,6 +74,7 @@ class Search:
     along_x: Lines
     along_z: Lines
     inside: np.ndarray
+    wavenumber: float
 
     @classmethod
     def of(cls, channels: Channels, wavenumber: float, limit: float) -> Search:
@@ -98,7 +100,11 @@ class Search:
             make.append(
                 Lines(tuple(rows), tuple(spectra), np.array(turns, np.complex64).reshape(shape))
             )
-        return cls(channels, u, make[0], make[1], np.add.outer(u**2, u**2) <= 1)
+        return cls(channels, u, make[0], make[1], np.add.outer(u**2, u**2) <= 1, wavenumber)
+
+    def steering(self, cosines: np.ndarray) -> np.ndarray:
+        """(S, L) exp(-j k v.u) of directions (S, 2)."""
+        return np.exp(-1j * self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T))
 
     def lines(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X and Z (lines, G, S) of channels (L, S)."""
@@ -162,6 +168,11 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
         np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32),
         search,
     )
+    # a parabola may overshoot: what counts is the statistic itself in its direction
+    some = np.flatnonzero(peak >= least)
+    a = search.steering(cosines[some])
+    y = np.stack([x[i][cell[some]] for i in c.tx * maps.shape[1] + c.rx], axis=1)
+    peak[some] = scale * np.abs((a.conj() * y).sum(axis=1)) ** 2
     return Found(cell, peak, cosines)
 
 
@@ -180,8 +191,11 @@ def search_white(
     # a^H R^-1 a is L^2 / a^H R a at least, by Cauchy and Schwarz
     peak, cosines = _whitened(y, denominators(R, search) / len(search.channels) ** 2, search)
     some = np.flatnonzero(peak >= least)
-    exact = 1 / denominators(np.linalg.inv(R[some]), search)
-    peak[some], cosines[some] = _whitened(y[some], exact, search)
+    inverse = np.linalg.inv(R[some])
+    peak[some], cosines[some] = _whitened(y[some], 1 / denominators(inverse, search), search)
+    a = search.steering(cosines[some])
+    norm = np.einsum("si,sij,sj->s", a.conj(), inverse, a, optimize=True).real
+    peak[some] = np.abs((a.conj() * y[some]).sum(axis=1)) ** 2 / norm
     return Found(cell, peak, cosines)
 
 
@@ -357,7 +371,7 @@ class Bucketed:
             (beat - row + REACH)[order].astype(np.float32),
             (doppler - column)[order].astype(np.float32),
             (clutter.power / noise)[order].astype(np.float32),
-            search.channels.steering(clutter.arrival[order], known).astype(np.complex64),
+            np.exp(-1j * (known.wavenumber * clutter.arrival[order] @ places.T).astype(np.float32)),
             tables,
             (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32),
             w.num_chirps,
