@@ -19,6 +19,7 @@ and G_l along Z,
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -33,7 +34,9 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 
 DIRECTIONS = 32
-"""Values of each direction cosine that are searched; the peak between them is interpolated."""
+"""Values of each direction cosine that are searched; the peak between them is sought from there."""
+CLIMBED = 0.3, 0.12
+"""Steps, in those of the grid, by which the peak between them is climbed."""
 FINE = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
@@ -103,8 +106,9 @@ class Search:
         return cls(channels, u, make[0], make[1], np.add.outer(u**2, u**2) <= 1, wavenumber)
 
     def steering(self, cosines: np.ndarray) -> np.ndarray:
-        """(S, L) exp(-j k v.u) of directions (S, 2)."""
-        return np.exp(-1j * self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T))
+        """(..., L) complex64 exp(-j k v.u) of directions (..., 2)."""
+        turns = self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T)
+        return np.exp(-1j * turns.astype(np.float32))
 
     def lines(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X and Z (lines, G, S) of channels (L, S)."""
@@ -168,11 +172,13 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
         np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32),
         search,
     )
-    # a parabola may overshoot: what counts is the statistic itself in its direction
     some = np.flatnonzero(peak >= least)
-    a = search.steering(cosines[some])
     y = np.stack([x[i][cell[some]] for i in c.tx * maps.shape[1] + c.rx], axis=1)
-    peak[some] = scale * np.abs((a.conj() * y).sum(axis=1)) ** 2
+
+    def statistic(a: np.ndarray) -> np.ndarray:
+        return scale * np.abs((a.conj() * y[:, None]).sum(axis=-1)) ** 2
+
+    peak[some], cosines[some] = _climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
 
 
@@ -193,10 +199,32 @@ def search_white(
     some = np.flatnonzero(peak >= least)
     inverse = np.linalg.inv(R[some])
     peak[some], cosines[some] = _whitened(y[some], 1 / denominators(inverse, search), search)
-    a = search.steering(cosines[some])
-    norm = np.einsum("si,sij,sj->s", a.conj(), inverse, a, optimize=True).real
-    peak[some] = np.abs((a.conj() * y[some]).sum(axis=1)) ** 2 / norm
+
+    def statistic(a: np.ndarray) -> np.ndarray:
+        norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
+        return np.abs((a.conj() * y[some, None]).sum(axis=-1)) ** 2 / norm
+
+    peak[some], cosines[some] = _climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
+
+
+def _climbed(
+    statistic: Callable[[np.ndarray], np.ndarray], cosines: np.ndarray, search: Search
+) -> tuple[np.ndarray, np.ndarray]:
+    """The largest statistic near directions (S, 2), and where: a parabola between grid points may
+    overshoot and lie beside the peak, and what counts is the statistic itself.
+
+    `statistic` of steering vectors (S, 9, L) is (S, 9).
+    """
+    peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
+    around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(9, 2)
+    for part in CLIMBED:
+        step = part * (search.cosines[1] - search.cosines[0])
+        tried = cosines[:, None] + step * around
+        values = statistic(search.steering(tried))
+        best = values.argmax(axis=1)
+        peak, cosines = values[each, best], tried[each, best]
+    return peak, cosines
 
 
 def _whitened(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
