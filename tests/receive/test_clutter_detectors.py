@@ -146,7 +146,7 @@ def test_search_finds_the_largest_statistic_over_directions(white: bool):
     T = np.abs(weighted @ x.T) ** 2 / (weighted * a).sum(axis=1).real[:, None]
     assert np.array_equal(found.cell, np.arange(count))
     np.testing.assert_allclose(found.peak, T.max(axis=0), rtol=0.06)
-    assert (found.peak <= 1.005 * T.max(axis=0)).all()  # the grid's own loss
+    assert (found.peak <= 1.03 * T.max(axis=0)).all()  # the grid's own loss
     assert np.abs(found.cosines - grid[T.argmax(axis=0)][:, [0, 2]]).max() < 0.03
 
 
