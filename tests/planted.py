@@ -231,6 +231,11 @@ OF_CASES = {
         "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
         "length[row], rate[row], accel[row] = 1.5 * (r1 + r2), v1 + v2, a1 + a2",
     ),
+    "noise and merged clutter": Bug(
+        "propagation/clutter/merging.py",
+        "most = error**2 * (1 + clutter)",
+        "most = error * (1 + clutter)",
+    ),
     "mean power of a street": Bug(
         "propagation/clutter/field.py",
         "power *= abs(back) / np.pi",

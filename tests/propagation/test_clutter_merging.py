@@ -128,18 +128,20 @@ def test_merged_amplitudes_are_gaussian_and_places_are_drawn_by_area():
 
 
 def test_allowed_areas_are_those_of_the_rule():
-    """By hand. Three cells: clutter of a third of the noise in a hundred parts, where the area
-    grows by (1 + C)/C to the 4/3; of nine times in two, each more than a sixth; and one faint
-    scatterer that would be the whole cell. Planted bugs: C over 1 + C; no limit for one alone."""
-    power = np.concatenate([np.full(100, 1 / 300), [4.0, 5.0], [0.004]])
-    cell = np.concatenate([np.full(100, 7), [9, 9], [2]])
+    """By hand. Four cells: clutter of a third of the noise in a hundred parts, where the area
+    grows by (1 + C)/C to the 4/3; of nine times in two, each more than a sixth; one faint
+    scatterer that would be the whole cell; and one of 0.8 of the noise, which 1/sqrt(n) limits.
+    Planted bugs: C over 1 + C; no limit for one alone; no limit by the number in a cell."""
+    power = np.concatenate([np.full(100, 1 / 300), [4.0, 5.0], [0.004], [0.8]])
+    cell = np.concatenate([np.full(100, 7), [9, 9], [2], [3]])
     area = np.full(power.size, 1.7)
-    found = allowed_area(power, cell, area, np.full(power.size, 2.1), 0.1)
+    found = allowed_area(power, cell, area, np.full(power.size, 2.1), 0.2)
     assert found[:100] == pytest.approx(2.1 * 4 ** (4 / 3), rel=1e-12)
     assert found[100:102] == pytest.approx([1.7 * 9 / 6 / p for p in (4.0, 5.0)], rel=1e-12)
-    most = 42.0 * 0.1**2 * 1.004
+    most = 42.0 * 0.2**2 * 1.004
     assert found[102] == pytest.approx(1.7 * most / 0.004, rel=1e-12)
     assert found[102] < 2.1 * (1.004 / 0.004) ** (4 / 3)
+    assert found[103] == pytest.approx(1.7 * 4.0 * 0.2**2 * 1.8**2 / 0.8 / 0.8, rel=1e-12)
 
 
 def test_resolution_cells_are_those_of_the_waveform():

@@ -8,11 +8,11 @@ stays what `clutter.max_error_db` allows as long as
 .. math:: A \le A_0\,((1 + C)/C)^{4/3},
 
 A_0 the area that the surface is cut to. That says how the clutter is spread over cells on average;
-a faint cell with one scatterer instead of many shows all of it or nothing. So no scatterer holds
-more than q(1 + C) times the noise: n of them in a cell err by the share 1/sqrt(n) of C, which is at
-most sqrt(q) of noise plus clutter, and q follows from the square of the error allowed. Nor does one
-hold more than a sixth of a cell's clutter where that is over the noise: fewer would fix the cell's
-level by a single draw.
+a cell with n scatterers at random errs by the share 1/sqrt(n) of C, so that none may hold more
+than s(1 + C)^2/C of the noise, nor more than q(1 + C), since a faint cell with one scatterer
+instead of many shows all of it or nothing; s and q go with the square of the error allowed. Nor
+does one hold more than a sixth of a cell's clutter where that is over the noise: fewer would fix
+the cell's level by a single draw.
 
 The two halves of a cell merge while their joint area keeps the least of these limits over all
 scatterers that they hold and all instants of the run. What is merged has the coherent sum of the
@@ -38,9 +38,11 @@ from isac_rt.propagation.clutter.cells import Cells
 ONE = np.uint64(1)
 FEWEST = 6
 """Scatterers of a cell whose clutter is over the noise."""
+ALL_ERR = 4.0
+"""s over the square of the error that nine of ten cells keep to: what merges stays near, mostly in
+the same cell."""
 ONE_ERRS = 42.0
-"""The power q of one scatterer over the square of the error that nine of ten cells keep to: most
-cells are faint, and what merges stays near."""
+"""q over the square of the error: most cells are faint."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,10 @@ def allowed_area(
     """
     _, number = np.unique(cell, return_inverse=True)
     clutter = np.bincount(number, power)[number]
-    most = ONE_ERRS * error**2 * (1 + clutter)
+    over = (1 + clutter) / clutter
+    most = error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)
     most = np.where(clutter > 1, np.minimum(most, clutter / FEWEST), most)
-    return np.minimum(finest * ((1 + clutter) / clutter) ** (4 / 3), area * most / power)
+    return np.minimum(finest * over ** (4 / 3), area * most / power)
 
 
 def merge(cells: Cells, limit: np.ndarray) -> Cells:
