@@ -81,6 +81,7 @@ TESTS_OF = {
     "terminal/filter.py": "test_filter test_tracking",
     "terminal/tracker.py": "test_association test_handover test_tracking",
     "terminal/terminal.py": "test_handover test_terminal test_profile_decision",
+    "terminal/images.py": "test_images",
     "terminal/ghosts.py": "test_ghost_images test_ghosts",
     "access/protocol.py": "test_access_stages test_access_protocol",
     "access/synchronise.py": "test_access_synchronise test_access_answers",
@@ -116,6 +117,7 @@ TESTS_OF = {
     "receive/clutter/detectors.py": "test_clutter_detectors",
     "receive/clutter/threshold_map.py": "test_clutter_detectors test_clutter_fit",
     "receive/clutter/angle_doppler.py": "test_clutter_detectors",
+    "receive/clutter/coherent.py": "test_clutter_detectors",
     "receive/clutter/sample_matrix.py": "test_clutter_detectors",
 }
 """Modules of the signal, the propagation, the receivers, the terminals, access and flights, and the
