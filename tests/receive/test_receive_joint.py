@@ -322,6 +322,19 @@ def test_velocity_errors_are_those_stated_where_decisions_err(snr_db: float, ref
     assert np.abs(off).max() < 5
 
 
+def test_sure_transitions_add_nothing_to_the_velocities():
+    """At 10 dB a sample no transition errs and the prediction, half a bin unsure, is forgotten: the
+    deviation is that of one path. Planted bug: a series of the loss that ends too soon (0.1)."""
+    w = Waveform(num_samples=128, num_chirps=48)
+    w, schedule, payload = frame(8, waveform=w)
+    clean = samples(w, schedule, payload, FEW, np.array(LOS), 1)
+    std = 0.5 * w.velocity_cell(1)
+    first = replace(predicted(np.array(LOS), w), velocity_std=np.full(1, std))
+    cube = noisy(w, schedule, clean, 10.0, 3)
+    d = receive_passive(cube, FEW, Receivers(), 8, first, True).detections
+    assert d.std[0, 1] < 0.005 * w.velocity_cell(1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [2, 1])
 def test_receivers_stay_within_one_decibel_of_the_bound(passes: int):

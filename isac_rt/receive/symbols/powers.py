@@ -27,6 +27,9 @@ from isac_rt.receive.types import Detections, Prediction
 EXTRA_CELLS = 4
 WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do not vote on the symbol
 
+GATHERED = 0.6
+"""Share of the spread of phases that lie anywhere, below which the spread of transitions about
+their symbols is their error: wrapping hides a tenth of it at most."""
 
 Decision = Callable[
     [np.ndarray, list[tuple[float, np.ndarray]], Waveform], tuple[np.ndarray, np.ndarray]
@@ -231,9 +234,18 @@ def transition_noise(symbols: Symbols) -> float:
     return float(np.sqrt((1 + 1 / (2 * g)) / (symbols.looks * g)))
 
 
+def transition_error(symbols: Symbols, order: int) -> float:
+    """RMS phase error of a transition [rad]: what noise gives, or what is seen where the phases
+    gather and clutter in the other cells makes the noise look stronger."""
+    anywhere, seen = np.pi / order / np.sqrt(3), symbols.phase_spread
+    noise = transition_noise(symbols)
+    return min(noise, seen) if seen < GATHERED * anywhere else noise
+
+
 def transition_error_rate(symbols: Symbols, order: int) -> float:
-    """Share of the transitions that noise is expected to have turned to a neighbouring symbol."""
-    return float(special.erfc(np.pi / order / (np.sqrt(2) * transition_noise(symbols))))
+    """Share of the transitions that are expected to have turned to a neighbouring symbol."""
+    error = max(transition_error(symbols, order), 1e-9)
+    return float(special.erfc(np.pi / order / (np.sqrt(2) * error)))
 
 
 def velocity_spread(
@@ -244,12 +256,13 @@ def velocity_spread(
     Two things are in it. A wrong transition turns the rest of its chain by 2 pi/D: over n chirps
     with an error rate q the phase walks, and the slope of a walk has the variance 6 q n / (5 D^2)
     in squared turns per chain, over M L_tx chains. And decisions take up part of what the predicted
-    velocity is off: of a phase error that noise of RMS s hides, rounding to symbols keeps only 1 +
-    2 sum_k (-1)^(k+1) exp(-(k D s)^2 / 2), and loses the rest.
+    velocity is off: a phase error moves their mean by all but the density of the noise, wrapped to
+    2 pi/D, at the edge between two symbols, times 2 pi/D.
     """
-    w, k = waveform, np.arange(1, 30)
+    w, step = waveform, 2 * np.pi / order
     rate = transition_error_rate(symbols, order)
     walk = 1.2 * rate * w.num_chirps / (w.num_tx * order) ** 2 / len(symbols.raw)
-    kept = np.exp(-((k * order * transition_noise(symbols)) ** 2) / 2)
-    lost = float(1 + 2 * ((-1.0) ** k * kept).sum())
+    error = min(max(transition_error(symbols, order), 1e-9), 4 * step)  # beyond, all is lost
+    edges = (np.arange(-30, 30) + 0.5) * step / error
+    lost = float(np.exp(-(edges**2) / 2).sum()) * step / (error * np.sqrt(2 * np.pi))
     return float(np.hypot(np.sqrt(walk) * w.velocity_cell(1), lost * prediction.velocity_std[0]))
