@@ -25,6 +25,10 @@ from isac_rt.receive.omp import Omp, sparse_enough
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Maps
 from isac_rt.scenario.receivers import Receivers
 
+MIXED = 0.1
+"""Power of other paths over its own from which a detection starts no track, beside what noise
+adds: the range of a mixed cell wanders from frame to frame."""
+
 
 @dataclass(frozen=True)
 class Sensed:
@@ -125,14 +129,20 @@ def describe(
     estimates: list[Estimate], snr: np.ndarray, known: Known, *, on_grid: bool = False
 ) -> Detections:
     """Detections in ranges, velocities and direction cosines; what lies outside the field of view
-    has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam."""
+    has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam.
+
+    What a single wave does not explain, such as a wall, carries on a track and starts none.
+    """
     count = len(estimates)
     direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
+    others = np.zeros(count)
     limit = known.antennas.view_limit
     for i, e in enumerate(estimates):
         u = direction_cosines(e, known, on_grid=on_grid)
         direction[i] = [v if abs(v) <= limit else np.nan for v in u]
-        std[i] = standard_deviations(snr[i], excess(e, u, snr[i], known), known)
+        others[i] = excess(e, u, snr[i], known)
+        std[i] = standard_deviations(snr[i], others[i], known)
+    noise = 1 / (np.asarray(snr, float) * np.sqrt(known.channels))
     return Detections(
         range=np.array([e.delay for e in estimates]) * known.metres,
         velocity=np.array([e.delay_rate for e in estimates]) * known.metres,
@@ -140,6 +150,7 @@ def describe(
         snr=np.asarray(snr, float),
         std=std,
         is_reference=np.zeros(count, bool),
+        starts=others <= MIXED + noise,
     )
 
 

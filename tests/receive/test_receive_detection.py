@@ -517,13 +517,14 @@ def test_two_paths_in_a_cell_are_not_stated_as_sure_as_one(passes: int):
     from the nearer of the two over its deviations. Nine in ten are within 3 of range and
     velocity and within 4 of direction (before: 9 to 20 rms); pairs from one direction, of which the
     channels tell nothing, leave 4 rms. One path alone keeps its deviations: within 1.5 of 1 rms (30
-    frames: 0.13). Planted bugs: what the wave
+    frames: 0.13), and may start a track; of pairs, whose second is down to 10 dB weaker, fewer than 0.6 may. Planted bugs: what the wave
     leaves not counted to the noise; without the pull."""
     w, schedule, payload = frame(waveform=Waveform(num_samples=128, num_chirps=48))
     six = replace(ANTENNAS, rx_x=3, rx_z=4)
     sent, rng = known(w, schedule, payload, six, passes), np.random.default_rng(9)
     cell = np.array([w.range_cell(passes), w.velocity_cell(passes)])
     off: dict[int, list[float]] = {1: [], 2: []}
+    starts: dict[int, list[bool]] = {1: [], 2: []}
     for count in (1, 2):
         for seed in range(30 * count):
             first = np.array([rng.uniform(8, 50), rng.uniform(-15, 15)])
@@ -545,10 +546,12 @@ def test_two_paths_in_a_cell_are_not_stated_as_sure_as_one(passes: int):
                 found = np.array([d.range[0], d.velocity[0], *d.direction[0]])
                 errors = [((found - p) / d.std[0]) ** 2 for p in places]
                 off[count].append(min(errors, key=np.sum))
+                starts[count].append(bool(d.starts[0]))
     one, two = (np.sqrt(np.mean(off[count], axis=0)) for count in (1, 2))
     assert (one < 1.5).all() and len(off[1]) > 25
     assert (two < 4).all() and len(off[2]) > 50
     assert (np.quantile(off[2], 0.9, axis=0) < [9, 9, 16, 16]).all()
+    assert np.mean(starts[1]) > 0.9 and np.mean(starts[2]) < 0.6
 
 
 def test_the_active_terminal_reports_no_symbols():
