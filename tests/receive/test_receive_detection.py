@@ -517,7 +517,8 @@ def test_two_paths_in_a_cell_are_not_stated_as_sure_as_one(passes: int):
     from the nearer of the two over its deviations. Nine in ten are within 3 of range and
     velocity and within 4 of direction (before: 9 to 20 rms); pairs from one direction, of which the
     channels tell nothing, leave 4 rms. One path alone keeps its deviations: within 1.5 of 1 rms (30
-    frames: 0.13), and may start a track; of pairs, whose second is down to 10 dB weaker, fewer than 0.6 may. Planted bugs: what the wave
+    frames: 0.13), and may start a track; of pairs, whose second
+    is down to 10 dB weaker, fewer than 0.6 may. Planted bugs: what the wave
     leaves not counted to the noise; without the pull."""
     w, schedule, payload = frame(waveform=Waveform(num_samples=128, num_chirps=48))
     six = replace(ANTENNAS, rx_x=3, rx_z=4)

@@ -63,9 +63,9 @@ def test_every_frame_is_synthesised_once_for_all_sets(monkeypatch):
 
 
 def test_listeners_give_no_advice():
-    """By pursuit the own receivers judge no scene; those compared find it dense, and still the
+    """By the union the own receivers judge no scene; those compared find it dense, and still the
     random schedule is sent. Planted bug: the advice of all sets is taken."""
-    settings = {"receivers": {"velocity_method": "pursuit"}}
+    settings = {"receivers": {"velocity_method": "latin_union"}}
     omp = {"receivers": {"velocity_method": "omp"}}
     scenario = dense_scenario(frames=4, **settings, compare={"omp": omp})
     found = simulate.run(scenario)

@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from isac_rt import storage
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.results import provenance
-from isac_rt.results.provenance import PACKAGES, UNSEEN_BY_PATHS, path_content, run_content
+from isac_rt.results.provenance import UNSEEN_BY_PATHS, path_content, run_content
 from isac_rt.scenario.file import ScenarioWarning, load
+from isac_rt.storage import PACKAGES
 from isac_rt.studies.paper import montecarlo
 from isac_rt.sweep.definition import ground_of, load_sweep, paths_key, point_key
 from isac_rt.world.swarm import Pose
@@ -51,7 +53,7 @@ def folder(tmp_path) -> Path:
 
 def keys(folder: Path) -> dict[str, str]:
     """Every key that holds the program and the scenario's files."""
-    provenance._versions.cache_clear()
+    storage._versions.cache_clear()
     montecarlo._folder.set(folder)
     scenario, point = load(folder / "s.yaml"), next(load_sweep(folder / "w.yaml").points())
     return {
@@ -66,7 +68,7 @@ def keys(folder: Path) -> dict[str, str]:
 @pytest.fixture(autouse=True)
 def fresh():
     yield
-    provenance._versions.cache_clear()
+    storage._versions.cache_clear()
     montecarlo._folder.set(None)
 
 
@@ -95,24 +97,24 @@ def test_a_package_in_use_that_is_not_the_installed_one_is_said_once(monkeypatch
     Planted bug: the module not looked at."""
     import scipy
 
-    assert provenance.versions_in_use() == provenance.versions()
+    assert provenance.versions_in_use() == storage.versions()
     monkeypatch.setattr(scipy, "__version__", "0.1")
     with pytest.warns(ScenarioWarning, match=r"scipy .*in use: 0\.1.*PYTHONPATH") as said:
         found = [provenance.versions_in_use() for _ in range(3)]
     assert len(said) == 1 and found[0] == found[2]
-    assert found[0].pop("scipy") == f"{provenance.versions()['scipy']} (in use: 0.1)"
-    assert found[0].items() <= provenance.versions().items()
+    assert found[0].pop("scipy") == f"{storage.versions()['scipy']} (in use: 0.1)"
+    assert found[0].items() <= storage.versions().items()
 
 
 def test_the_program_is_every_source_and_table(tmp_path, monkeypatch):
     """A line, a name, a file more or less in any room; notes beside them are none of it. Planted
     bug: tables left out."""
     package = tmp_path / "isac_rt"
-    for name in ("signal/if.py", "signal/costs.json", "results/provenance.py"):
+    for name in ("signal/if.py", "signal/costs.json", "storage.py"):
         (package / name).parent.mkdir(parents=True, exist_ok=True)
         (package / name).write_text(name)
-    monkeypatch.setattr(provenance, "__file__", str(package / "results" / "provenance.py"))
-    fingerprint = provenance.program_fingerprint.__wrapped__
+    monkeypatch.setattr(storage, "__file__", str(package / "storage.py"))
+    fingerprint = storage.program_fingerprint.__wrapped__
     seen = [fingerprint()]
     (package / "signal" / "notes.md").write_text("x")
     assert fingerprint() == seen[0]
@@ -122,7 +124,7 @@ def test_the_program_is_every_source_and_table(tmp_path, monkeypatch):
         lambda: (package / "signal" / "if.py").rename(package / "signal" / "of.py"),
         lambda: (package / "new.py").touch(),
         lambda: (package / "new.py").rename(package / "signal" / "new.py"),
-        lambda: (package / "results" / "provenance.py").unlink(),
+        lambda: (package / "storage.py").unlink(),
     ):
         change()
         seen.append(fingerprint())
