@@ -373,8 +373,8 @@ class _Run:
         with self.stopwatch.stage("receive"):
             maps = frame.number in self.snapshots
             heard = self.own.observers[link].hear(frame, cube, maps)
-        others = self.compared.values()
-        return [heard, *(s.observers[link].hear(frame, cube, False) for s in others)]
+            others = self.compared.values()
+            return [heard, *(s.observers[link].hear(frame, cube, False) for s in others)]
 
     def collect(self, frame: Frame, jobs: Jobs) -> None:
         """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
