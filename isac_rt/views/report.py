@@ -381,7 +381,9 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         false_tracks=false_table(s),
         targets=target_table(s),
         losses=loss_table(s),
-        budget=row_table(json.loads(d.attrs["link_budget"])),
+        budget=row_table(
+            [row | {"link": _link(row["link"])} for row in json.loads(d.attrs["link_budget"])]
+        ),
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]
         ),
