@@ -67,7 +67,8 @@ def test_summaries_of_earlier_versions_have_none(summary):
 
 def test_tables_fit_the_page(summary):
     """With every cause and every figure at its longest. A letter of the tables is 7.5 px wide at
-    most on average, a cell has 22 px of padding; the page has 1200 px, 74 rem. Planted bug: one table of targets and causes."""
+    most on average, a cell has 22 px of padding; the page has 1200 px, 74 rem.
+    Planted bug: one table of targets and causes."""
     full = copy.deepcopy(summary)
     for block in full["links"].values():
         block["false_tracks"] = dict.fromkeys(block["false_tracks"], 12.3456)
