@@ -63,7 +63,7 @@ def check_memory(antennas: Antennas, timetable: Timetable) -> None:
             f"the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are "
             "free; lower radio.samples_per_chirp, radio.chirps_per_frame, array.rx_x, array.rx_z "
             "or frames"
-        )
+        ) from MemoryError()
 
 
 def check_flights(swarm: Swarm, timetable: Timetable) -> None:

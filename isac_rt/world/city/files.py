@@ -59,7 +59,7 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
                 f"{path.name}: a file of {size / 1e9:.3g} GB takes about "
                 f"{factor * size / 1e9:.3g} GB of memory to read, "
                 f"{free / 1e9:.3g} GB are free; simplify it, or cut out what is near the swarm"
-            )
+            ) from MemoryError()
         if size > MAX_BYTES:
             raise CityError(
                 f"{path.name}: a file of {size / 1e9:.3g} GB, more than the "
