@@ -384,7 +384,8 @@ def test_an_empty_mesh_is_refused(tmp_path):
 
 def test_a_mesh_too_large_for_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
     """A sparse file of 2 GB against 1 GB free; a file that is large but fits is read. It is the
-    machine's trouble and not that of a sweep's point. Written against: no look at the size (not to be planted: the reader takes the memory)."""
+    machine's trouble and not that of a sweep's point. Written against: no look at the size (not to
+    be planted: the reader takes the memory)."""
     from isac_rt.world.city import files
 
     with (tmp_path / "m.ply").open("wb") as out:
