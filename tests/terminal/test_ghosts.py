@@ -318,12 +318,10 @@ def test_a_track_has_its_own_detections_explanation():
 @pytest.mark.slow
 def test_the_street_has_ghosts_and_the_test_finds_them():
     """Three flights: every ghost track has a wall and an order, more than half of them are suspect
-    at either terminal, and no UAV's track is lost."""
+    at the passive terminal, and no UAV's track is lost. At the active one a ghost is two waves in
+    one cell, which start no track."""
     tracks = run(True, 20260, lambda _done, _all: None).tables["tracks"]
     ghosts = tracks[tracks.what == "ghost"]
     assert len(ghosts) and (ghosts.order > 0).all() and (ghosts.face >= 0).all()
-    assert (ghosts.groupby("terminal").suspect.mean() > 0.5).all() and set(ghosts.terminal) == {
-        "active",
-        "passive",
-    }
+    assert set(ghosts.terminal) == {"passive"} and ghosts.suspect.mean() > 0.5
     assert not tracks[tracks.what == "uav"].suspect.any()
