@@ -28,29 +28,9 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parents[1]), *map(str, Path(__file__).parent.glob("*/"))]
 
-SCENE = """
-name: tiny
-frames: 6
-radio: {samples_per_chirp: 64, chirps_per_frame: 12, bandwidth_hz: 320e6}
-array: {element_pattern: isotropic, element_gain_dbi: 0, rx_x: 3, rx_z: 3}
-propagation: {leakage: {enabled: false}}
-noise: {model: snr, snr_db: 3}
-modulation: {acquisition_frames: 2, pilot_every_frames: null}
-swarm:
-  A: {role: active, position_m: [0.3, 0.2, 50], velocity_mps: [0.7, 1.1, 0],
-      boresight: [0, 1, 0], rcs: {model: constant}}
-  P1: {role: passive, position_m: [-1.9, 5.3, 50.7], velocity_mps: [0.2, -0.9, 0],
-       boresight: [0, -1, 0], rcs: {model: constant}}
-"""
-SWEEP = """
-name: demo
-scenario: base.yaml
-axes:
-  snr: {key: noise.snr_db, values: [-31, -9.5, 12]}
-  order: {key: modulation.dpsk_order, values: [2, 8]}
-repetitions: 4
-seed: 7
-"""
+TINY = import_module("test_sweep")
+SCENE = TINY.BASE.replace("frames: 3", "frames: 6")
+SWEEP = TINY.SWEEP.replace("repetitions: 2", "repetitions: 4")
 HOW = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 

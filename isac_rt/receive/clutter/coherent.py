@@ -84,10 +84,9 @@ class Search:
         """Directions within `limit` on both axes."""
         u = limit * (2 * np.arange(DIRECTIONS) + 1 - DIRECTIONS) / DIRECTIONS
         places = channels.places[:, [0, 2]]
-        # channels that share their place on one axis with more than `least` others make a line
+        # a channel belongs to the longer of the two lines through it
         x, z = places.T
-        longest = [_sizes(z), _sizes(x)]
-        on_x = longest[0] >= longest[1]
+        on_x = _sizes(z) >= _sizes(x)
         make = []
         for axis, some in ((0, on_x), (1, ~on_x)):
             rows = [
