@@ -1,13 +1,14 @@
 # make demo   sets up what is missing and runs the main scenario
 # make test   sets up what is missing and runs the tests
 # make setup  only sets up .venv (and a libLLVM for the ray tracer); quick when it is done already
+# make notebook  opens the notebooks in Jupyter Lab;  make notebooks  runs them anew
 # make mutation  plants errors and sees whether anything notices (an hour; docs/validation.md)
 # make lint   checks style and types;  make lock  renews requirements.lock;  make clean  removes what was built
 
 .DEFAULT_GOAL := setup
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
-.PHONY: setup venv backend test demo mutation lint lock clean
+.PHONY: setup venv backend test demo notebook notebooks mutation lint lock clean
 
 BIN := .venv/bin
 STAMP := .venv/.setup-done
@@ -67,6 +68,13 @@ test: setup
 
 demo: setup
 	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm --set compare.paper.preset=paper
+
+notebook: setup
+	@$(BIN)/jupyter lab notebooks
+
+# the .ipynb files hold what the sources, .py files, show
+notebooks: setup
+	@cd notebooks && PATH="../$(BIN):$$PATH" jupytext --quiet --to ipynb --execute *.py
 
 mutation: setup
 	@$(BIN)/python tests/mutation.py --planted

@@ -14,6 +14,19 @@ def test_there_are_notebooks():
     assert len(SOURCES) >= 7
 
 
+@pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)
+def test_what_jupyter_opens_is_in_step(source):
+    """The .ipynb file has the cells of its source, every one run without an error (`make
+    notebooks`). Planted bug: a cell changed in one of them."""
+    jupytext = pytest.importorskip("jupytext")
+    expected, found = jupytext.read(source), jupytext.read(source.with_suffix(".ipynb"))
+    for one, other in zip(expected.cells, found.cells, strict=True):
+        assert (one.cell_type, one.source) == (other.cell_type, other.source)
+        if other.cell_type == "code":
+            assert other.execution_count is not None
+            assert all(output.output_type != "error" for output in other.outputs)
+
+
 @pytest.mark.sionna
 @pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)
 def test_a_notebook_runs(source, monkeypatch):
