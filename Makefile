@@ -74,7 +74,7 @@ notebook: setup
 
 # the .ipynb files hold what the sources, .py files, show
 notebooks: setup
-	@cd notebooks && PATH="../$(BIN):$$PATH" jupytext --quiet --to ipynb --execute *.py
+	@cd notebooks && PATH="../$(BIN):$$PATH" PYTHONWARNINGS=ignore::UserWarning jupytext --quiet --to ipynb --set-kernel python3 --execute *.py
 
 mutation: setup
 	@$(BIN)/python tests/mutation.py --planted

@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # From paths to the IF signal, term by term
-# One target, one chirp after the other. A path of delay $\\tau(t)$ gives, after mixing with the
+# One target, one chirp after the other. A path of delay $\tau(t)$ gives, after mixing with the
 # reference chirp,
-# $f_c\\tau + \\alpha\\tau(u-\\tau/2)$ cycles, $u$ the time since the chirp began. The paper keeps a
+# $f_c\tau + \alpha\tau(u-\tau/2)$ cycles, $u$ the time since the chirp began. The paper keeps a
 # part of this; here the terms
 # are added one by one until nothing is left.
 
