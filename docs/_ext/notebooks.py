@@ -37,9 +37,7 @@ def write(app: Any) -> None:
         notebook = nbformat.read(path, as_version=4)
         with_frames(notebook, path.stem, Path(app.srcdir) / "generated" / "views")
         exporter = MarkdownExporter(exclude_input_prompt=True, exclude_output_prompt=True)
-        text, resources = exporter.from_notebook_node(
-            notebook, resources={"unique_key": path.stem}
-        )
+        text, resources = exporter.from_notebook_node(notebook, resources={"unique_key": path.stem})
         (folder / f"{path.stem}.md").write_text(text, encoding="utf-8")
         for name, data in resources["outputs"].items():
             (folder / name).write_bytes(data)
