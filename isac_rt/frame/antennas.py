@@ -1,4 +1,5 @@
-"""L-shaped arrays in the body frame, element patterns, and the antenna schedules of TDM-MIMO.
+"""Arrays in the body frame, L-shaped or with their elements anywhere in a plane, and element
+patterns.
 
 Body frame: X to the right, Y along the boresight, Z up. Each of the two arrays is given about its
 own centroid, which is the body's position.
@@ -8,15 +9,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.scenario.radio import Array
 
 PatternModel = Literal["isotropic", "sector", "cosine"]
+Places = tuple[tuple[float, float], ...]
+"""Elements of an array by (x, z) in its plane [m], from any origin."""
+
+SAME_PLACE_M = 1e-6
+"""Elements nearer than this along an axis do not tell directions along it."""
 
 
 @lru_cache(maxsize=64)
@@ -29,6 +35,16 @@ def l_shape(num_x: int, num_z: int, spacing: float, step_x: int = 1, step_z: int
     x = np.concatenate([np.arange(num_x)[::-1] * step_x, np.zeros(num_z - 1)])
     z = np.concatenate([np.zeros(num_x), np.arange(1, num_z) * step_z])
     positions = spacing * np.stack([x, np.zeros_like(x), z], axis=1)
+    positions -= positions.mean(axis=0)
+    positions.setflags(write=False)
+    return positions
+
+
+@lru_cache(maxsize=64)
+def centred(places: Places) -> np.ndarray:
+    """Elements (L, 3) [m] in the body frame about their centroid."""
+    x, z = np.array(places, float).reshape(-1, 2).T
+    positions = np.stack([x, np.zeros_like(x), z], axis=1)
     positions -= positions.mean(axis=0)
     positions.setflags(write=False)
     return positions
@@ -55,45 +71,100 @@ def azimuth_elevation(cosines: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 class Antennas:
     """The transmit and receive arrays of a terminal and the pattern of their elements.
 
+    Both are an L each, or `placed` element by element.
+
     Attributes
     ----------
-    tx_x, tx_z, rx_x, rx_z : elements along each arm, the corner counted in both
-    spacing : distance of neighbouring receive elements d_a [m]; transmit elements stand rx_x (rx_z)
-        of these apart, so that an echo sees a gapless virtual L
+    tx_x, tx_z, rx_x, rx_z : elements along each arm of an L, the corner counted in both
+    spacing : distance of an L's neighbouring receive elements d_a [m]; transmit elements stand rx_x
+        (rx_z) of these apart, so that an echo sees a gapless virtual L
+    tx_places, rx_places : elements of any two arrays in the plane, in place of the L's; None: the
+        L's
     gain : power gain of an element on boresight (linear); with ``isotropic`` everywhere
     pattern : "isotropic"; "sector": `gain` inside the field of view, nothing outside;
         "cosine": gain * cos(angle)^q in the front hemisphere, q = gain/2 - 1 so that it radiates
         its own power, and at least 0
     half_view : half of the field of view per axis [rad]; what lies outside has no place in the
         estimates (for "sector" nothing is sent or received there)
+
+    Examples
+    --------
+    Two transmit elements four receive elements apart: a row of eight virtual ones.
+
+    >>> a = Antennas.placed([(0, 0), (0.008, 0)], [(0.002 * i, 0) for i in range(4)])
+    >>> (1e3 * a.virtual_positions[:, 0]).round(3).tolist()
+    [-7.0, -5.0, -3.0, -1.0, 1.0, 3.0, 5.0, 7.0]
     """
 
-    tx_x: int
-    tx_z: int
-    rx_x: int
-    rx_z: int
-    spacing: float
+    tx_x: int = 1
+    tx_z: int = 1
+    rx_x: int = 1
+    rx_z: int = 1
+    spacing: float = 0.0
+    tx_places: Places | None = None
+    rx_places: Places | None = None
     gain: float = 1.0
     pattern: PatternModel = "isotropic"
     half_view: float = np.pi / 3
 
+    @classmethod
+    def placed(cls, tx: npt.ArrayLike, rx: npt.ArrayLike, **element: Any) -> Antennas:
+        """Arrays with their elements at (x, z) (L_tx, 2) and (L_rx, 2) [m]; `element`: gain, pattern
+        and half_view.
+
+        Raises
+        ------
+        ValueError  If these are no two lists of finite places, one at least in each.
+        """
+        places = {}
+        for name, value in (("tx", tx), ("rx", rx)):
+            array = np.asarray(value, float)
+            if array.ndim != 2 or array.shape[1] != 2 or not array.size:
+                raise ValueError(f"{name}: needs places (x, z) of (L, 2) numbers, not {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name}: places must be finite numbers [m]")
+            places[name] = tuple((float(x), float(z)) for x, z in array)
+        return cls(tx_places=places["tx"], rx_places=places["rx"], **element)
+
+    @property
+    def is_l(self) -> bool:
+        """Whether both arrays are an L, whose arms can be looked at one by one."""
+        return self.tx_places is None and self.rx_places is None
+
     @property
     def num_tx(self) -> int:
-        return self.tx_x + self.tx_z - 1
+        return self.tx_x + self.tx_z - 1 if self.tx_places is None else len(self.tx_places)
 
     @property
     def num_rx(self) -> int:
-        return self.rx_x + self.rx_z - 1
+        return self.rx_x + self.rx_z - 1 if self.rx_places is None else len(self.rx_places)
 
     @property
     def tx_positions(self) -> np.ndarray:
         """(num_tx, 3) [m] body frame, about the centroid."""
+        if self.tx_places is not None:
+            return centred(self.tx_places)
         return l_shape(self.tx_x, self.tx_z, self.spacing, self.rx_x, self.rx_z)
 
     @property
     def rx_positions(self) -> np.ndarray:
         """(num_rx, 3) [m] body frame, about the centroid."""
+        if self.rx_places is not None:
+            return centred(self.rx_places)
         return l_shape(self.rx_x, self.rx_z, self.spacing)
+
+    @property
+    def virtual_positions(self) -> np.ndarray:
+        """(num_tx num_rx, 3) [m] of an echo's virtual channels, transmit element by transmit
+        element: the sums of both ends' places."""
+        return (self.tx_positions[:, None] + self.rx_positions[None]).reshape(-1, 3)
+
+    def observes(self, passes: int) -> tuple[bool, bool]:
+        """Whether directions along X and along Z can be told at all: the channels of an echo
+        (passes = 2), or the receive elements for one pass, do not all stand at one place there."""
+        places = self.virtual_positions if passes == 2 else self.rx_positions
+        span = np.ptp(places, axis=0)
+        return bool(span[0] > SAME_PLACE_M), bool(span[2] > SAME_PLACE_M)
 
     @property
     def view_limit(self) -> float:
@@ -134,15 +205,46 @@ def antennas_of(a: Array, waveform: Waveform) -> Antennas:
     )
 
 
+CASCADE_HZ = 76.8e9
+"""Frequency at whose half wavelengths TI's cascade board places its elements."""
+_CASCADE_RX = (11, 12, 13, 14, 50, 51, 52, 53, 46, 47, 48, 49, 0, 1, 2, 3)
+_CASCADE_TX = (11, 10, 9, 32, 28, 24, 20, 16, 12, 8, 4, 0)
+_CASCADE_TX_UP = (6, 4, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def ti_cascade() -> tuple[Places, Places]:
+    """Transmit (12) and receive (16) elements of TI's 4-chip cascade board MMWCAS-RF (x, z) [m], in
+    the order of its channels.
+
+    References
+    ----------
+    .. [1] Texas Instruments, "mmWave cascade imaging radar RF evaluation module user's guide",
+       SWRU553; the numbers are those of TI's MATLAB examples (`module_params.m`).
+    """
+    half = SPEED_OF_LIGHT / CASCADE_HZ / 2
+    tx = zip(_CASCADE_TX, _CASCADE_TX_UP, strict=True)
+    return tuple((half * x, half * z) for x, z in tx), tuple((half * x, 0.0) for x in _CASCADE_RX)
+
+
 def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarray:
     """Resolution of range [m], velocity [m/s], u_x and u_z (4,).
 
     The array's is wavelength over aperture: that of the virtual array (transmit times receive
-    elements of an arm) for an echo (passes = 2), of the receive array alone for one pass.
+    elements of an arm) for an echo (passes = 2), of the receive array alone for one pass. It is
+    beyond all angles along an axis that the array does not observe.
     """
+    cells = [waveform.range_cell(passes), waveform.velocity_cell(passes)]
+    if not antennas.is_l:
+        places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+        return np.array([*cells, *(waveform.wavelength / _aperture(places[:, i]) for i in (0, 2))])
     across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
     up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
     step = waveform.wavelength / antennas.spacing
-    return np.array(
-        [waveform.range_cell(passes), waveform.velocity_cell(passes), step / across, step / up]
-    )
+    return np.array([*cells, step / across, step / up])
+
+
+def _aperture(along: np.ndarray) -> float:
+    """Length [m] of an array with elements at `along` (L,): from the first to the last and one mean
+    step more, which is n d of a filled row; next to nothing where all stand at one place."""
+    steps = np.unique(np.round(along / SAME_PLACE_M)).size - 1
+    return float(np.ptp(along) * (steps + 1) / steps) if steps else SAME_PLACE_M
