@@ -109,8 +109,9 @@ class Antennas:
 
     @classmethod
     def placed(cls, tx: npt.ArrayLike, rx: npt.ArrayLike, **element: Any) -> Antennas:
-        """Arrays with their elements at (x, z) (L_tx, 2) and (L_rx, 2) [m]; `element`: gain, pattern
-        and half_view.
+        """Arrays with their elements at (x, z), (L_tx, 2) and (L_rx, 2) [m].
+
+        `element`: gain, pattern and half_view.
 
         Raises
         ------
@@ -120,7 +121,9 @@ class Antennas:
         for name, value in (("tx", tx), ("rx", rx)):
             array = np.asarray(value, float)
             if array.ndim != 2 or array.shape[1] != 2 or not array.size:
-                raise ValueError(f"{name}: needs places (x, z) of (L, 2) numbers, not {array.shape}")
+                raise ValueError(
+                    f"{name}: needs places (x, z) of (L, 2) numbers, not {array.shape}"
+                )
             if not np.isfinite(array).all():
                 raise ValueError(f"{name}: places must be finite numbers [m]")
             places[name] = tuple((float(x), float(z)) for x, z in array)
