@@ -3,7 +3,9 @@
     python tests/mutation.py --planted [WORDS]     the bug of each case of `isac-rt validate`
                                                    (WORDS: parts of "group: name", with commas)
     python tests/mutation.py --hard [WORDS]        the bugs of planted.py, against their tests
-    python tests/mutation.py --sample 90 --seed 1  sampled sign, factor, index and unit errors
+    python tests/mutation.py --sample 90 --seed 1  sampled sign, factor, index and unit errors, and
+                                                   in the rooms that keep and count (BOOKS)
+                                                   conditions turned over and things left out
 
 Both work on a copy in a temporary folder. --planted takes about ten minutes. --sample first runs
 the tests once to see which of them call which function (--record FILE keeps that for the next
@@ -119,9 +121,27 @@ TESTS_OF = {
     "receive/clutter/angle_doppler.py": "test_clutter_detectors",
     "receive/clutter/coherent.py": "test_clutter_detectors",
     "receive/clutter/sample_matrix.py": "test_clutter_detectors",
+    "storage.py": "test_storage",
+    "propagation/store.py": "test_keys test_sweep",
+    "simulation/resume.py": "test_resume",
+    "simulation/simulate.py": "test_resume test_simulate",
+    "sweep/definition.py": "test_sweep test_keys",
+    "sweep/execute.py": "test_sweep test_trouble",
+    "sweep/outcomes.py": "test_sweep test_trouble",
+    "results/provenance.py": "test_keys test_results",
+    "results/labels.py": "test_labels test_scoring",
+    "results/losses.py": "test_losses test_scoring",
+    "results/metrics.py": "test_metrics test_view",
+    "results/scoring.py": "test_scoring",
+    "results/sensing.py": "test_sensing",
+    "results/records.py": "test_results test_resume",
+    "results/recorder.py": "test_results test_resume",
 }
-"""Modules of the signal, the propagation, the receivers, the terminals, access and flights, and the
-tests that stand for each."""
+"""Modules of the signal, the propagation, the receivers, the terminals, access and flights, of what
+is kept and of scores, and the tests that stand for each."""
+BOOKS = ("storage.py", "propagation/store.py", "simulation/", "sweep/", "results/")
+"""Rooms that keep and count: there is little arithmetic in them, and what can be wrong is a
+condition, or something that is left out."""
 LIMIT = 400
 """Seconds for a planted bug's case, and the least for the tests of one mutant; who does not end by
 then has been noticed."""
@@ -191,8 +211,24 @@ class Mutant:
         return source[: self.start] + self.new + source[self.start + len(self.old) :]
 
 
+TURNED: dict[type[ast.cmpop], tuple[str, str]] = {
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+}
+"""Comparisons and what says the contrary."""
+
+
 class _Finder(ast.NodeVisitor):
-    """All places of a module where a sign, a factor, an index or a unit can be wrong."""
+    """All places of a module where a sign, a factor, an index or a unit can be wrong; in `BOOKS`
+    also a condition, or an entry or a call left out."""
 
     def __init__(self, file: str, source: str) -> None:
         self.file, self.source, self.found = file, source, list[Mutant]()
@@ -200,6 +236,7 @@ class _Finder(ast.NodeVisitor):
         for line in source.splitlines(keepends=True):
             self._lines.append(self._lines[-1] + len(line))
         self._index = False
+        self._books = file.startswith(BOOKS)
 
     def _at(self, line: int, column: int) -> int:
         return self._lines[line - 1] + len(
@@ -229,8 +266,52 @@ class _Finder(ast.NodeVisitor):
                 self.visit(statement)
 
     def visit_If(self, node: ast.If) -> None:
-        for statement in [*node.body, *node.orelse]:
-            self.visit(statement)
+        for part in [*([node.test] if self._books else []), *node.body, *node.orelse]:
+            self.visit(part)
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        if self._books and len(node.ops) == 1 and (pair := TURNED.get(type(node.ops[0]))):
+            begin = self._at(node.left.end_lineno or 0, node.left.end_col_offset or 0)
+            end = self._at(node.comparators[0].lineno, node.comparators[0].col_offset)
+            place = self.source.find(pair[0], begin, end)
+            if place >= 0:
+                self._add(node, "condition", place, *pair)
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        if self._books:
+            old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+            begin = self._at(node.values[0].end_lineno or 0, node.values[0].end_col_offset or 0)
+            end = self._at(node.values[1].lineno, node.values[1].col_offset)
+            self._add(node, "condition", self.source.index(old, begin, end), old, new)
+        self.generic_visit(node)
+
+    def visit_Dict(self, node: ast.Dict) -> None:
+        self._leave_out(node, [k or v for k, v in zip(node.keys, node.values, strict=True)])
+        self.generic_visit(node)
+
+    def visit_List(self, node: ast.List) -> None:
+        if isinstance(node.ctx, ast.Load) and not self._index:
+            self._leave_out(node, node.elts)
+        self.generic_visit(node)
+
+    def _leave_out(self, whole: ast.expr, parts: list[ast.expr]) -> None:
+        """One of several entries, up to the next."""
+        if not self._books or len(parts) < 2:
+            return
+        begins = [self._at(part.lineno, part.col_offset) for part in parts]
+        if isinstance(whole, ast.Dict):
+            begins = [b - 2 * (k is None) for b, k in zip(begins, whole.keys, strict=True)]
+        last = self._at(whole.end_lineno or 0, whole.end_col_offset or 0) - 1
+        for part, begin, end in zip(parts, begins, [*begins[1:], last], strict=True):
+            self._add(part, "left out", begin, self.source[begin:end], "")
+
+    def visit_Expr(self, node: ast.Expr) -> None:
+        if self._books and isinstance(node.value, ast.Call):
+            begin = self._at(node.lineno, node.col_offset)
+            end = self._at(node.end_lineno or 0, node.end_col_offset or 0)
+            self._add(node, "left out", begin, self.source[begin:end], "None")
+        self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         signs = {
@@ -251,6 +332,8 @@ class _Finder(ast.NodeVisitor):
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
         if isinstance(node.op, ast.USub) and not self._index:
             self._add(node, "sign", self._at(node.lineno, node.col_offset), "-", "+")
+        if isinstance(node.op, ast.Not) and self._books:
+            self._add(node, "condition", self._at(node.lineno, node.col_offset), "not ", "")
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:

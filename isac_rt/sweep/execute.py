@@ -8,6 +8,7 @@ killed takes nothing with it that was finished.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import platform
@@ -191,6 +192,21 @@ def default_workers() -> int:
 
 
 @contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    """Without what some loggers say short of a crash: a lost scheduler is one message of ours, and
+    none of theirs with a traceback. Dask sets their levels when it is loaded."""
+    loggers = [logging.getLogger(name) for name in names]
+    before = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
+@contextmanager
 def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at an address, or of a cluster of our own with one thread a
     worker."""
@@ -201,9 +217,8 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         "distributed.scheduler.allowed-failures": LOST_AFTER,
         "distributed.worker.daemon": True,
         "distributed.comm.timeouts.connect": f"{CONNECT_S}s",
-        "distributed.logging.distributed": "critical",
     }
-    with dask.config.set(quiet):
+    with dask.config.set(quiet), _silent("distributed", "distributed.client"):
         if scheduler is not None:
             try:
                 client = Client(scheduler, timeout=CONNECT_S)

@@ -379,3 +379,32 @@ if __name__ == "__main__":
     assert "5 workers in turn died" in done.stdout, done.stderr
     found = status(out)
     assert found.failed == 0 and found.done < 12 and Outcomes(out).read(deadly) is None
+
+
+MORTAL = """
+import asyncio, os, signal
+from distributed import Scheduler
+
+async def serve():
+    async with Scheduler(host="127.0.0.1", port=0, dashboard_address=":0") as made:
+        print(made.address, flush=True)
+        while not made.tasks:
+            await asyncio.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+asyncio.run(serve())
+"""
+
+
+def test_a_scheduler_that_is_killed_is_one_message(folder):
+    """It dies as soon as it has points: exit 1, and after the progress nothing but what to do.
+    Planted bug: Dask's own log left as it is, which shows how its reconnection failed."""
+    plan_of(folder, SWEEP)
+    mortal = subprocess.Popen([sys.executable, "-c", MORTAL], stdout=subprocess.PIPE, text=True)
+    address = mortal.stdout.readline().strip()
+    client = start_client(folder, folder / "out", "--scheduler", address)
+    assert client.wait(timeout=300) == 1
+    assert mortal.wait() == -9
+    progress, said = client.stderr.read().strip().splitlines()
+    assert progress.startswith("points") and said.startswith("the scheduler was lost")
+    assert said.endswith("0 of 12 points are done and kept: start the same command again to go on")
