@@ -22,6 +22,9 @@ from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord
 Row = dict[str, Any]
 """A frame, or an observer in it, as numbers, arrays and further rows by name."""
 DIMENSIONLESS = "1"
+COMPONENTS = ("x", "y", "z", "v_x", "v_y", "v_z")
+ROW_SIZES = {"axis": 3, "component": 6, "component_2": 6}
+"""Of the dimensions of a row that are as long without rows."""
 SYMBOLS = ("delay", "dpsk", "bit")
 MEASURES = {
     "range": ("m", "range_m"),
@@ -44,8 +47,8 @@ def errors_of(values: xr.Dataset | Row, group: str, name: str) -> np.ndarray:
 
 class Column(NamedTuple):
     """How an array of the dataset is made: from which attribute (or by which function) of an
-    `ObserverRecord` or a `PathSet`, over which dimensions beside frame and observer, and with which
-    value where an observer did not receive."""
+    `ObserverRecord` or a `PathSet`, over which dimensions beside frame and observer (or beside a
+    row), and with which value where an observer did not receive (or a row is shorter)."""
 
     dtype: type
     units: str
@@ -257,6 +260,18 @@ TRACKS: dict[str, Column] = {
     "u_x": _number("direction cosine along the body's X axis", "tracks.u_x", float),
     "u_z": _number("direction cosine along the body's Z axis", "tracks.u_z", float),
     "confirmed": _number("the track is confirmed", "tracks.confirmed", bool),
+    "state": _number(
+        "position [m] and velocity [m/s] relative to the observer, world axes",
+        "tracks.state",
+        float,
+        dims=("component",),
+    ),
+    "covariance": _number(
+        "covariance of the state [m^2, m^2/s, m^2/s^2]",
+        "tracks.covariance",
+        float,
+        dims=("component", "component_2"),
+    ),
     "kind": _number(
         "kind of the path that explains its latest detection, -1: none", "tracks.kind", np.int8
     ),
@@ -302,6 +317,21 @@ PATHS: dict[str, Column] = {
     "bounces": _number("interactions with the city", "bounces", np.int16),
     "begin": Column(float, "s", "start of the path's life since the middle of the frame", "begin"),
     "end": Column(float, "s", "end of the path's life since the middle of the frame", "end"),
+    "points": Column(
+        float,
+        "m",
+        "interaction points in world axes, NaN where there is none",
+        "points",
+        ("bounce", "axis"),
+        np.nan,
+    ),
+    "faces": _number(
+        "face of the city mesh at each point, -1 where there is none",
+        "faces",
+        np.int32,
+        dims=("bounce",),
+        missing=-1,
+    ),
 }
 """Columns of the path ledger, read off a `PathSet`."""
 RAGGED = (
@@ -315,6 +345,19 @@ RAGGED = (
 def read(columns: Mapping[str, Column], record: object) -> Row:
     """The values of a record by name."""
     return {name: column.read(record) for name, column in columns.items()}
+
+
+def stacked(parts: Sequence[np.ndarray], column: Column) -> np.ndarray:
+    """The rows of all parts, one after the other, their further axes widened to the longest."""
+    count = sum(len(part) for part in parts)
+    least = tuple(ROW_SIZES.get(dim, 0) for dim in column.dims)
+    tails = zip(least, *(part.shape[1:] for part in parts), strict=True)
+    out = np.full((count, *map(max, tails)), column.missing, column.dtype)
+    at = 0
+    for part in parts:
+        out[(slice(at, at + len(part)), *map(slice, part.shape[1:]))] = part
+        at += len(part)
+    return out
 
 
 def row_of(record: FrameRecord) -> Row:
@@ -381,6 +424,8 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
         ("symbol", SYMBOLS, "kind of symbol"),
         ("axis", "xyz", "world axis: east, north, up"),
         ("body_axis", ("right", "boresight", "up"), "body axis"),
+        ("component", COMPONENTS, "component of a track's state, world axes"),
+        ("component_2", COMPONENTS, "the same, of its covariance's columns"),
     ):
         put(name, [name], np.array(list(words), object), DIMENSIONLESS, meaning)
     put("role", ["uav"], np.array(roles, object), DIMENSIONLESS, "role of the UAV at the start")
@@ -428,9 +473,9 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
             meaning = f"position along the dimension {along}"
             put(f"{prefix}_{along}", [dim], where, DIMENSIONLESS, meaning)
         for name, column in columns.items():
-            parts: list[np.ndarray] = [np.asarray(row[name], column.dtype) for _, _, row in some]
-            values = np.concatenate([np.zeros(0, column.dtype), *parts], dtype=column.dtype)
-            put(f"{prefix}_{name}", [dim], values, column.units, column.meaning)
+            parts = [np.asarray(row[name], column.dtype) for _, _, row in some]
+            values = stacked(parts, column)
+            put(f"{prefix}_{name}", [dim, *column.dims], values, column.units, column.meaning)
     _put_maps(put, [(i, j, row["maps"]) for i, j, row in present if "maps" in row], len(labels))
     numbers = {
         "carrier_hz": w.carrier_frequency,

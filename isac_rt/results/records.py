@@ -41,6 +41,8 @@ class TrackTable:
     Attributes
     ----------
     id, range, velocity, u_x, u_z, confirmed : number, estimates [m, m/s], whether confirmed
+    state, covariance : (K, 6), (K, 6, 6) position and velocity relative to the observer, world axes
+        [m, m/s]
     kind, target : of the path that explains the latest detection that updated it: `PathKind` and
         index of the UAV involved, -1: none
     uav : index of the UAV in view that it follows (`isac_rt.results.scoring`), -1: none
@@ -52,6 +54,8 @@ class TrackTable:
     u_x: np.ndarray
     u_z: np.ndarray
     confirmed: np.ndarray
+    state: np.ndarray
+    covariance: np.ndarray
     kind: np.ndarray
     target: np.ndarray
     uav: np.ndarray

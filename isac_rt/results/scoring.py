@@ -218,6 +218,8 @@ class Scorer:
             u_x=tracks.direction[:, 0],
             u_z=tracks.direction[:, 1],
             confirmed=tracks.confirmed,
+            state=tracks.mean,
+            covariance=tracks.covariance,
             kind=kind,
             target=target,
             uav=follows,

@@ -22,7 +22,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column
+from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
 from isac_rt.results.files import ResultsError, write_dataset
 from isac_rt.results.records import KINDS
 from isac_rt.storage import write_whole
@@ -56,13 +56,6 @@ def write_ledger(
     ------
     isac_rt.storage.StorageError  If the file cannot be written.
     """
-    depth = max((p.faces.shape[1] for p in paths.values()), default=0)
-    shapes = {"points": (0, depth, 3), "faces": (0, depth)}
-
-    def padded(a: np.ndarray, fill: float) -> np.ndarray:
-        missing = [(0, 0), (0, depth - a.shape[1]), (0, 0)][: a.ndim]
-        return np.pad(a, missing, constant_values=fill)
-
     curvature = "radius of curvature of the wavefront at the"
     columns = {
         "transmitter": _names("transmitting terminal", "tx"),
@@ -76,25 +69,12 @@ def write_ledger(
         ),
         "tx_radius": Column(float, "m", f"{curvature} transmitter", "tx_radius"),
         "rx_radius": Column(float, "m", f"{curvature} receiver", "rx_radius"),
-        "points": Column(
-            float,
-            "m",
-            "interaction points in world axes, NaN where there is none",
-            lambda p: padded(p.points, np.nan),
-        ),
-        "faces": Column(
-            np.int32,
-            DIMENSIONLESS,
-            "face of the city mesh at each point, -1 where there is none",
-            lambda p: padded(p.faces, -1),
-        ),
     }
     out: dict[str, xr.Variable] = {}
     for name, column in columns.items():
-        parts: list[np.ndarray] = [np.asarray(column.read(p), column.dtype) for p in paths.values()]
-        values = np.concatenate([np.zeros(shapes.get(name, 0), column.dtype), *parts])
+        values = stacked([np.asarray(column.read(p), column.dtype) for p in paths.values()], column)
         about = {"units": column.units, "long_name": column.meaning}
-        out[name] = xr.Variable(("path", "bounce", "axis")[: values.ndim], values, about)
+        out[name] = xr.Variable(("path", *column.dims), values, about)
     uavs = next((p.target_names for p in paths.values() if p.target_names), ())
     for name, dim, names, meaning in (
         ("kind_name", "kind", KINDS, "name of each kind of path"),

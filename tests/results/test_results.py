@@ -19,12 +19,13 @@ from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import ResultsError, check_folder, open_results, save
 from isac_rt.results.records import KINDS
 from isac_rt.runtime import UserError
-from isac_rt.scenario.file import to_yaml
+from isac_rt.scenario.file import load, to_yaml
 from isac_rt.simulation import simulate
 from isac_rt.storage import StorageError
 from isac_rt.views.interchange import write_ledger
 from isac_rt.views.report import write_report
 
+CANYON = Path(__file__).parents[2] / "scenes" / "street_canyon.yaml"
 TERMINAL_KEYS = {
     "counts",
     "role",
@@ -122,6 +123,10 @@ def test_what_was_recorded_is_found_by_name(run):
     ]
     for k, kind in enumerate(KINDS):
         assert d.path_count.sel(kind=kind).values[4, here["observer"]] == (o.paths.kind == k).sum()
+    tracks = (d.track_frame.values == 4) & (d.track_observer.values == here["observer"])
+    assert np.array_equal(d.track_covariance.values[tracks], o.tracks.covariance)
+    away = records[4].poses["U1"].position - records[4].poses["PT1"].position
+    assert np.abs(d.track_state.sel(component=["x", "y", "z"])[tracks] - away).max() < 0.0214
     assert set(d.path_frame.values) == {2}
     rows = d.path_observer.values == here["observer"]
     ledger = records[2].observers["PT1"].paths
@@ -267,6 +272,28 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
         mine.target_name.values[mine.target.values[mine.target.values >= 0]], ["U1"]
     )
     write_ledger({}, tmp_path / "empty.nc", 77e9, {})
+
+
+@pytest.mark.sionna
+def test_points_of_paths_make_their_lengths():
+    """Transmitter, points, receiver: the legs' sum over the speed of light is the delay, to 1e-9 m.
+    Planted bug: points of one link under the rows of another."""
+    made = simulate.run(load(CANYON, frames=4), snapshots=1).dataset
+    names, spot = list(made.uav.values), made.uav_position.values
+    for k in range(0, made.sizes["path"], 37):
+        frame, observer = int(made.path_frame[k]), int(made.path_observer[k])
+        if made.path_bounces[k] == 0 and made.path_target[k] < 0:
+            continue  # a line of sight, or leakage, which has no length
+        ends = (
+            spot[frame, names.index(made[end].values[observer])]
+            for end in ("transmitter", "receiver")
+        )
+        points = made.path_points.values[k]
+        start, stop = ends
+        way = np.vstack([start, points[np.isfinite(points).all(axis=1)], stop])
+        length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+        assert abs(length - 299792458.0 * float(made.path_delay[k])) < 1e-9
+    assert (made.path_bounces.values > 0).sum() > 1000
 
 
 def test_commit_is_of_the_package_not_of_the_current_folder(tmp_path, monkeypatch):
