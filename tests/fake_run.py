@@ -179,7 +179,10 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     u_x=np.array([0.1]),
                     u_z=np.array([0.02]),
                     confirmed=np.array([True]),
-                    state=(np.concatenate([poses['U1'].position - own.position, [0.3, -0.7, 0.1]]) + 0.0213)[None],
+                    state=(
+                        np.concatenate([poses["U1"].position - own.position, [0.3, -0.7, 0.1]])
+                        + 0.0213
+                    )[None],
                     covariance=np.diag([0.09, 0.16, 0.25, 0.04, 0.01, 0.02])[None],
                     kind=np.array([1]),
                     target=np.array([2]),
