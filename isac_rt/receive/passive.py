@@ -13,6 +13,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.chain import Refiner, cfar_of, reader_of, refiner_of
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.fit import JointPath
+from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
@@ -88,6 +89,7 @@ class PassiveReceiver:
             known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
             found = self.detector.sense(clean_spectrum(cube, known), known)
             detections, reference = self._earliest(found, known)
+            detections, reference = self._alone(cube, known, detections, reference)
             return self._reception(cube, known, found, detections, reference, maps=maps)
         symbols = None
         if prediction is not None:
@@ -135,7 +137,25 @@ class PassiveReceiver:
         """What a frame shows once its symbols are taken out, with the reference put first."""
         spectra = clean_spectrum(cube, known)
         found = self.detector.sense(spectra, known)
-        return found, *self._at_prediction(spectra, known, found, prediction)
+        detections, reference = self._at_prediction(spectra, known, found, prediction)
+        return found, *self._alone(cube, known, detections, reference)
+
+    def _alone(
+        self, cube: IFCube, known: Known, detections: Detections, reference: Estimate | None
+    ) -> tuple[Detections, Estimate | None]:
+        """The reference told apart from another path in its cell, where one wave does not explain
+        it, and the other one among the detections."""
+        if reference is None or not self.settings.separate_reference:
+            return detections, reference
+        first = detections.select(detections.is_reference)
+        apart = None if first.starts[0] else separate(cube.samples, known, first)
+        if apart is None:
+            return detections, reference
+        both, power = apart
+        line = float(power[both.is_reference][0])
+        channels = reference.channels * np.sqrt(line / _power(reference))
+        kept = detections.select(_off(detections, both, known) & ~detections.is_reference)
+        return Detections.joined([both, kept]), replace(reference, channels=channels)
 
     def _earliest(self, found: Sensed, known: Known) -> tuple[Detections, Estimate | None]:
         """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the
@@ -171,10 +191,8 @@ class PassiveReceiver:
         on_grid = self.detector.estimator.on_grid
         reference = describe([estimate], np.array([snr]), known, on_grid=on_grid)
         d = found.detections
-        apart = np.abs(d.range - reference.range[0]) / w.range_cell(1) > 1
-        apart |= np.abs(d.velocity - reference.velocity[0]) / w.velocity_cell(1) > 1
         first = replace(reference, is_reference=np.ones(1, bool))
-        return Detections.joined([first, d.select(apart)]), estimate
+        return Detections.joined([first, d.select(_off(d, reference, known))]), estimate
 
     def _reception(
         self,
@@ -274,6 +292,14 @@ def _decoded(reception: Reception, symbols: Symbols) -> Reception:
         soft_bits=symbols.soft_bits,
         confidence_looks=symbols.looks,
     )
+
+
+def _off(detections: Detections, paths: Detections, known: Known) -> np.ndarray:
+    """(Q,) which detections are more than a cell of range or of velocity off all of some paths."""
+    w, d = known.waveform, detections
+    apart = np.abs(d.range[:, None] - paths.range) / w.range_cell(1) > 1
+    apart |= np.abs(d.velocity[:, None] - paths.velocity) / w.velocity_cell(1) > 1
+    return apart.all(axis=1)
 
 
 def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Reception:

@@ -41,6 +41,10 @@ class Receivers(Node):
     of the last frame without data, in which clutter counts too. `beams`: the antennas are added in
     phase towards the tracked paths, with a log-likelihood ratio for every bit; the most
     sensitive."""
+    separate_reference: bool = False
+    """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
+    reflection in the same cell, by direction, before it believes its range. Costs time only in
+    frames where one wave does not explain the cell."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""
@@ -185,6 +189,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "velocity_method": "auto",
         "refinement": "local",
         "symbol_decision": "powers",
+        "separate_reference": False,
         "clutter_filter": "none",
         "clutter_detector": "cfar",
         "false_alarm_rate": 1e-6,
@@ -206,6 +211,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "city": {
         "receivers": {
             **PLAIN["receivers"],
+            "symbol_decision": "beams",
+            "separate_reference": True,
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
         },

@@ -37,6 +37,11 @@ WEAKEST_DB = 25.0
 DIRECTIONS, DOPPLER_OFFSETS = 31, np.arange(-2.0, 2.01, 0.5)
 FARTHEST = np.array([1.5, 3.0])
 """Cells and bins that a path found beside another one may move away from it in the fit."""
+PROBED_CELLS = (-1.5, -0.75, 0.75, 1.5)
+"""Where a neighbour in the main lobe of Hann's window is sought besides, off the path in delay."""
+LINE_OF_SIGHT_DB = 10.0
+"""The earliest of the paths in a reference's cell that are no more than this below it is taken for
+the line of sight."""
 
 
 def refine_jointly(
@@ -66,6 +71,35 @@ def refine_jointly(
             break
         paths, parent = trial, [*parent, parent[beside]]
     return _merged(known, d, order, paths, parent)
+
+
+def separate(
+    samples: np.ndarray, known: Known, reference: Detections
+) -> tuple[Detections, np.ndarray] | None:
+    """A reference that shares its cell with another path told apart from it by direction, delay and
+    velocity.
+
+    Parameters
+    ----------
+    samples : (M, L_rx, P, N)
+    reference : one detection, whose estimate the other path may have pulled
+
+    Returns
+    -------
+    detections, power : of both paths, the earlier one of like power the reference, and their powers
+        per sample; None where no second path is found or the fit does not settle beside it
+    """
+    if not np.isfinite(reference.direction).all() or reference.range[0] <= 0:
+        return None
+    moments, start = Moments(samples, known), _path(known, reference, 0)
+    paths = fit(moments, [start])
+    found = _hidden(moments, paths, PROBED_CELLS) if _near(known, paths[0], start) else None
+    if found is None:
+        return None
+    trial = fit(moments, [*paths, found[1]], iterations=12)
+    if not _credible(known, trial, [*paths, paths[0]]):
+        return None
+    return _merged(known, reference, np.zeros(1, int), trial, [0, 0])
 
 
 def _path(known: Known, d: Detections, i: int) -> JointPath:
@@ -98,9 +132,11 @@ def _credible(known: Known, paths: list[JointPath], near: list[JointPath]) -> bo
     return power[-1] > beside * 10 ** (-WEAKEST_DB / 10) and power[-1] < beside * 10
 
 
-def _hidden(moments: Moments, paths: list[JointPath]) -> tuple[int, JointPath] | None:
+def _hidden(
+    moments: Moments, paths: list[JointPath], delays: tuple[float, ...] = ()
+) -> tuple[int, JointPath] | None:
     """The surest path that the residual of a fit holds about one of its paths, with that path's
-    number."""
+    number; sought at its delay and at so many cells off it."""
     known = moments.known
     limit = known.antennas.view_limit
     axis = np.linspace(-limit, limit, DIRECTIONS)
@@ -108,20 +144,29 @@ def _hidden(moments: Moments, paths: list[JointPath]) -> tuple[int, JointPath] |
     grid = grid[(grid**2).sum(axis=1) < 0.98]
     best: tuple[float, int, JointPath] | None = None
     sums = 1 if known.passes == 2 else known.antennas.num_tx
-    level = gammainccinv(sums, FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(paths)))
-    for k, (path, channels, counts, noise) in enumerate(
-        residual_channels(moments, paths, DOPPLER_OFFSETS)
-    ):
+    places = [*paths, *(_probe(known, p, cells) for p in paths for cells in delays)]
+    parents = [*range(len(paths)), *(k for k in range(len(paths)) for _ in delays)]
+    level = gammainccinv(sums, FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(places)))
+    around = residual_channels(moments, places, DOPPLER_OFFSETS)
+    for k, (path, channels, counts, noise) in zip(parents, around, strict=True):
         # (direction, offset), a sum of `sums` exponentials in noise
         power = _beams(known, path, channels, grid) / noise
         i, j = np.unravel_index(power.argmax(), power.shape)
         floor = (
-            10 ** (-WEAKEST_DB / 10) * float((np.abs(path.amplitude) ** 2 * counts).sum()) / noise
+            10 ** (-WEAKEST_DB / 10)
+            * float((np.abs(paths[k].amplitude) ** 2 * counts).sum())
+            / noise
         )
         if power[i, j] > max(level, floor) and (best is None or power[i, j] > best[0]):
             rate = path.delay_rate + DOPPLER_OFFSETS[j] * rate_bin(known.waveform)
             best = float(power[i, j]), k, replace(path, delay_rate=rate, direction=grid[i].copy())
     return None if best is None else best[1:]
+
+
+def _probe(known: Known, path: JointPath, cells: float) -> JointPath:
+    """A path without power beside another one: its residual is what the others leave there."""
+    delay = path.delay + cells * known.waveform.delay_step
+    return replace(path, delay=delay, amplitude=np.zeros_like(path.amplitude))
 
 
 def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -172,7 +217,8 @@ def _earlier_reference(
     line of sight."""
     out = np.zeros(reference.size, bool)
     for r in np.flatnonzero(reference)[:1]:
-        beside = old + np.flatnonzero((source[old:] == r) & (power[old:] > 0.1 * power[r]))
+        least = 10 ** (-LINE_OF_SIGHT_DB / 10) * power[r]
+        beside = old + np.flatnonzero((source[old:] == r) & (power[old:] > least))
         siblings = np.append(r, beside)
         out[siblings[np.argmin(ranges[siblings])]] = True
     return out
