@@ -438,9 +438,9 @@ def test_a_second_path_in_the_cell_no_longer_pulls_the_range():
 
 @pytest.mark.parametrize(("cells", "modulated"), [(0.6, False), (1.3, False), (1.3, True)])
 def test_a_reflection_beside_the_line_of_sight_no_longer_pulls_it(cells: float, modulated: bool):
-    """A reflection 0.3 dB weaker from a direction 0.4 away, as the ground makes: alone the reference
-    is tenths of a cell off, told apart within 5 deviations, with the reflection beside it. Planted
-    bug: probes at the path's own delay only (1.3 cells off nothing fits)."""
+    """A reflection 0.3 dB weaker from a direction 0.4 away, as the ground makes: as one wave the
+    reference is tenths of a cell off, told apart within 5 deviations, with the reflection beside
+    it. Planted bug: probes at the path's own delay only (1.3 cells off nothing fits)."""
     w, schedule, payload = frame(waveform=LONGER)
     cell, bin_ = w.range_cell(1), w.velocity_cell(1)
     ground = [LOS[0] + cells * cell, LOS[1] + 0.5 * bin_, 0.31, -0.62, 0.9, 0.97, -0.17, 0.02]
