@@ -12,14 +12,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from pydantic import TypeAdapter
+
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Propagation, Traced
-from isac_rt.propagation.pathset import PathSet
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.storage import BAD_DATA, Store
 from isac_rt.world.swarm import Pose
 
@@ -108,5 +111,32 @@ def _unpack(data: dict[str, Any]) -> tuple[Traced, Census]:
     out = {}
     for link in data["links"]:
         names = tuple(link.pop("target_names"))
-        out[Link(link["tx"], link["rx"])] = PathSet(**link, target_names=names)
-    return Traced(out, data["dropped"]), Census(**data["census"])
+        paths = PathSet(**link, target_names=names)
+        _check(paths)
+        out[paths.link] = paths
+    census = TypeAdapter(Census).validate_python(data["census"])
+    return Traced(out, TypeAdapter(int).validate_python(data["dropped"], strict=True)), census
+
+
+def _check(paths: PathSet) -> None:
+    """Refuse columns that do not fit each other.
+
+    Raises
+    ------
+    ValueError
+    """
+    count, depth = len(paths), paths.faces.shape[1]
+    wide = {"departure": (3,), "arrival": (3,), "points": (depth, 3), "faces": (depth,)}
+    whole = {"kind", "target", "bounces", "faces"}
+    for name, column in paths.arrays().items():
+        kind = "i" if name in whole else "c" if name == "gain" else "f"
+        if column.dtype.kind != kind or column.shape != (count, *wide.get(name, ())):
+            raise ValueError(f"{name}: {column.dtype}, {column.shape}")
+    if (
+        len(paths.arrays()) != len(fields(PathSet)) - len(("epoch", "tx", "rx", "target_names"))
+        or not all(isinstance(word, str) for word in (paths.tx, paths.rx, *paths.target_names))
+        or not isinstance(paths.epoch, float)
+        or not np.isin(paths.kind, [*PathKind]).all()
+        or not ((paths.target >= -1) & (paths.target < len(paths.target_names))).all()
+    ):
+        raise ValueError("no paths")

@@ -14,18 +14,34 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import xarray as xr
+from pydantic import BaseModel
 
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import to_yaml
-from isac_rt.storage import write_whole
+from isac_rt.storage import BAD_DATA, read_whole, write_whole
 
 FILE = "results.nc"
 
 
 class ResultsError(UserError):
     """Results cannot be read; the text says why and what to do."""
+
+
+class _Block(BaseModel):
+    """What is said of a terminal before anything else."""
+
+    hit_rate: float | None
+    ser_delay: float | None
+    ser_dpsk: float | None
+
+
+class _Summary(BaseModel):
+    frames: int
+    seed: int
+    terminals: dict[str, _Block]
 
 
 def write_dataset(dataset: xr.Dataset, file: Path) -> None:
@@ -39,6 +55,21 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
         if v.dtype.kind not in "OU" and v.ndim and v.size  # words cannot be filtered
     }
     write_whole(file, bytes(dataset.to_netcdf(engine="h5netcdf", encoding=encoding)))
+
+
+def read_dataset(file: Path) -> xr.Dataset:
+    """A NetCDF file that `write_dataset` wrote, in memory.
+
+    Raises
+    ------
+    OSError, MemoryError or one of `BAD_DATA`  If it is none, or bent.
+    """
+    if not file.is_file():
+        raise OSError(f"{file} is no file" if file.exists() else f"there is no {file}")
+    with h5py.File(file) as whole:
+        whole.attrs.get("_nc3_strict")  # where this fails, h5netcdf cannot close what it opened
+    with xr.open_dataset(file, engine="h5netcdf") as opened:
+        return opened.load()
 
 
 def write_figure(file: Path, figure: Any, **options: Any) -> None:
@@ -83,11 +114,12 @@ def open_results(folder: str | Path) -> Results:
 
     folder = Path(folder)
     try:
-        with xr.open_dataset(folder / FILE, engine="h5netcdf") as opened:
-            dataset = opened.load()
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as problem:
+        dataset = read_dataset(folder / FILE)
+        summary = json.loads(read_whole(folder / "summary.json"))
+        _Summary.model_validate(summary)
+    except (OSError, MemoryError, *BAD_DATA) as problem:
+        said = " ".join(str(problem).split())[:300]
         raise ResultsError(
-            f"cannot read results in {folder}: {problem}; give the folder that `isac-rt run` wrote"
+            f"cannot read results in {folder}: {said}; give the folder that `isac-rt run` wrote"
         ) from problem
     return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))

@@ -12,13 +12,13 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import xarray as xr
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from isac_rt.results.files import ResultsError, write_dataset
+from isac_rt.results.files import ResultsError, read_dataset, write_dataset
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import commit
 from isac_rt.scenario.file import plain_tree
@@ -39,10 +39,13 @@ MOST_BYTES = 64 * 1024**2
 """No outcome is larger: that of a point with ten links has some 30 kB."""
 
 
+Count = Annotated[int, Field(ge=0, lt=2**53)]
+
+
 class _Link(BaseModel):
     """What the dataset takes of a link's outcome, beside the numbers in it."""
 
-    counts: dict[str, tuple[int, int]] = {}
+    counts: dict[str, tuple[Count, Count]]
 
 
 class _Outcome(BaseModel):
@@ -52,7 +55,7 @@ class _Outcome(BaseModel):
     status: Literal["done", "failed"]
     error: str = ""
     links: dict[str, _Link] = {}
-    paths: dict[str, int] = {}
+    paths: dict[str, Count] = {}
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,8 @@ class Outcomes:
             claimed = outcome.pop("checksum")
             if _Outcome.model_validate(outcome).key != key or claimed != _checksum(key, outcome):
                 return None
+            for block in outcome.get("links", {}).values():
+                _ = [*flat_numbers(block)]  # all of them are numbers of float64
         except (OSError, *BAD_DATA):
             return None
         return outcome
@@ -302,11 +307,11 @@ def open_sweep(folder: Path | str) -> xr.Dataset:
     file = outcomes.folder / FILE
     if file.is_file():
         try:
-            with xr.open_dataset(file, engine="h5netcdf") as written:
-                if any(written.attrs.get(name) != value for name, value in _made_by().items()):
-                    return written.load()
-        except (OSError, *BAD_DATA) as problem:
+            written = read_dataset(file)
+        except (OSError, MemoryError, *BAD_DATA) as problem:
             raise ResultsError(f"{file} cannot be read ({problem}); delete it") from problem
+        if any(written.attrs.get(name) != value for name, value in _made_by().items()):
+            return written
     return assemble(outcomes.definition(), outcomes)
 
 

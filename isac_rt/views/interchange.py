@@ -7,15 +7,17 @@ SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interch
 from __future__ import annotations
 
 import datetime
+import hashlib
 import importlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from pydantic import TypeAdapter
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
@@ -23,15 +25,17 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
-from isac_rt.results.files import ResultsError, write_dataset
+from isac_rt.results.files import ResultsError, read_dataset, write_dataset
 from isac_rt.results.records import KINDS
-from isac_rt.storage import write_whole
+from isac_rt.storage import BAD_DATA, read_whole, write_whole
 
 if TYPE_CHECKING:
     import sionna.rt as rt
     from stonesoup.types.detection import Detection
 
 EXTRA = "pip install 'isac_rt[interchange]'"
+MOST_META_BYTES = 64 * 1024**2
+"""No description of a recording is larger."""
 _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
 
 
@@ -163,19 +167,54 @@ def load_cube(file: str | Path) -> IFCube:
     ResultsError  If the file is not one.
     """
     try:
-        with xr.open_dataset(file, engine="h5netcdf") as d:
-            samples = (d.samples_re.values + 1j * d.samples_im.values).astype(np.complex64)
-            waveform = Waveform(**json.loads(d.attrs["waveform"]))
-            return IFCube(
-                samples=samples,
-                waveform=waveform,
-                schedule=d.schedule.values,
-                start_time=float(d.attrs["start_time_s"]),
-            )
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as problem:
+        d = read_dataset(Path(file))
+        return _checked_cube(
+            d.samples_re.values + 1j * d.samples_im.values,
+            json.loads(d.attrs["waveform"]),
+            d.schedule.values,
+            d.attrs["start_time_s"],
+        )
+    except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(
-            f"cannot read an IF cube from {file}: {problem}; give a file that `save_cube` wrote"
+            f"cannot read an IF cube from {file}: {_short(problem)}; give a file that `save_cube` "
+            "wrote"
         ) from problem
+
+
+def _checked_cube(samples: np.ndarray, waveform: Any, schedule: np.ndarray, start: Any) -> IFCube:
+    """A cube whose parts fit each other.
+
+    Raises
+    ------
+    ValueError
+    """
+    if waveform.keys() != {field.name for field in fields(Waveform)}:
+        raise ValueError("its waveform has other keys")
+    w = TypeAdapter(Waveform).validate_python(waveform)
+    shape = (w.num_groups, *samples.shape[1:2], w.num_chirps, w.num_samples)
+    if samples.shape != shape or schedule.shape != (w.num_groups, w.num_chirps):
+        raise ValueError(f"samples {samples.shape} and schedule {schedule.shape} are not {shape}")
+    cube = IFCube(
+        samples=np.ascontiguousarray(samples, np.complex64),
+        waveform=w,
+        schedule=schedule,
+        start_time=float(start),
+    )
+    derived = (cube.start_time, w.slope, w.delay_step, w.frame_duration)
+    if (
+        not samples.size
+        or not np.isfinite([*derived, w.carrier_frequency, w.filter_transition]).all()
+        or min(derived[1:]) <= 0
+        or not np.isfinite(cube.samples).all()
+        or schedule.dtype.kind not in "iu"
+        or not ((schedule >= 0) & (schedule < w.num_tx)).all()
+    ):
+        raise ValueError("a sample, a time or a transmit antenna cannot be")
+    return cube
+
+
+def _short(problem: BaseException) -> str:
+    return " ".join(str(problem).split())[:300]
 
 
 def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[Path, Path]:
@@ -227,26 +266,28 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
 
 
 def read_sigmf(file: str | Path) -> IFCube:
-    """An IF cube from a recording that `write_sigmf` made; `file` without the suffix."""
+    """An IF cube from a recording that `write_sigmf` made; `file` without the suffix.
+
+    Raises
+    ------
+    ResultsError  If it is none, or its data are not those of its checksum.
+    """
     base = Path(file)
     try:
-        info = json.loads(base.with_name(base.name + ".sigmf-meta").read_text(encoding="utf-8"))[
-            "global"
-        ]
-        w, schedule = Waveform(**info["isac_rt:waveform"]), np.array(info["isac_rt:schedule"])
-        flat = np.fromfile(base.with_name(base.name + ".sigmf-data"), "<c8")
-        samples = flat.reshape(w.num_chirps, w.num_samples, len(schedule), -1).transpose(2, 3, 0, 1)
-    except (OSError, ValueError, KeyError, TypeError) as problem:
+        meta = read_whole(base.with_name(base.name + ".sigmf-meta"), MOST_META_BYTES)
+        data = read_whole(base.with_name(base.name + ".sigmf-data"))
+        info = json.loads(meta)["global"]
+        if hashlib.sha512(data).hexdigest() != info["core:sha512"]:
+            raise ValueError("the data are not those of its checksum")
+        w, schedule = info["isac_rt:waveform"], np.array(info["isac_rt:schedule"])
+        shape = (w["num_chirps"], w["num_samples"], len(schedule), -1)
+        samples = np.frombuffer(data, "<c8").reshape(shape).transpose(2, 3, 0, 1)
+        return _checked_cube(samples, w, schedule, info["isac_rt:start_time_s"])
+    except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(
-            f"cannot read an IF cube from {base}: {problem}; give a recording that `write_sigmf` "
-            "made"
+            f"cannot read an IF cube from {base}: {_short(problem)}; give a recording that "
+            "`write_sigmf` made"
         ) from problem
-    return IFCube(
-        samples=np.ascontiguousarray(samples),
-        waveform=w,
-        schedule=schedule,
-        start_time=info["isac_rt:start_time_s"],
-    )
 
 
 def from_sionna(

@@ -40,7 +40,7 @@ def cube() -> IFCube:
     return IFCube(
         samples=samples,
         waveform=W,
-        schedule=rng.permuted(np.arange(36).reshape(3, 12) % 4, axis=1),
+        schedule=rng.permuted(np.arange(36).reshape(3, 12) % 3, axis=1),
         start_time=0.7 / 3,
     )
 

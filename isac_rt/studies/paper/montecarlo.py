@@ -18,10 +18,11 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,7 +30,7 @@ from scipy import special, stats
 
 from isac_rt.randomness import generator
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.storage import load_data, program_fingerprint, save_data, versions
+from isac_rt.storage import BAD_DATA, load_data, program_fingerprint, save_data, versions
 from isac_rt.studies.paper.outcome import Progress
 
 Counts = Mapping[str, tuple[np.ndarray, int]]
@@ -232,6 +233,21 @@ def sample(
     }
 
 
+def _counts(frame: Mapping[str, Any], shape: tuple[int, ...]) -> Counts:
+    """The counts of one frame as they were kept.
+
+    Raises
+    ------
+    One of `BAD_DATA`  If they are none.
+    """
+    out = {}
+    for name, (events, total) in frame.items():
+        if events.shape != shape or not ((events >= 0) & (events <= total)).all() or total < 1:
+            raise ValueError(f"{name}: {events} of {total}")
+        out[name] = events, total
+    return out
+
+
 class _Store:
     """Counts of the frames of one curve on disk, if there is a folder for them."""
 
@@ -241,10 +257,9 @@ class _Store:
         self._file = None if folder is None else folder / f"{self._key}.frames"
         self._saved_at = time.monotonic()
         kept = None if self._file is None else load_data(self._file, self._key)
-        self._known: list[Counts] = [
-            {name: (events, total) for name, (events, total) in frame.items()}
-            for frame in kept or ()
-        ]
+        self._known: list[Counts] = []
+        with suppress(*BAD_DATA):  # sealed, but not by `save`
+            self._known = [_counts(frame, snr_db.shape) for frame in kept or ()]
 
     def known(self, number: int) -> Counts | None:
         return self._known[number] if number < len(self._known) else None
