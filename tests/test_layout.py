@@ -15,8 +15,8 @@ PACKAGE = Path(__file__).parent.parent / "isac_rt"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
-    "runtime randomness storage scenario kernels world frame propagation signal receive terminal "
-    "access results simulation sweep views studies cli"
+    "runtime randomness storage scenario kernels world frame hardware propagation signal receive "
+    "terminal access results simulation sweep views studies cli"
 ).split()
 GROUND = {"runtime", "randomness"}
 NEVER = {("receive", "signal"), ("receive", "propagation"), ("world", "frame")}

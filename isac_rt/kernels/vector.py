@@ -167,6 +167,17 @@ zip_high = _two(
 )
 
 
+@intrinsic
+def swap_pairs(typingctx, value):
+    """Lanes 1 0 3 2 ...: real and imaginary parts change places."""
+
+    def codegen(context, builder, signature, args):
+        nothing = ir.Constant(signature.return_type.form, ir.Undefined)
+        return builder.shuffle_vector(args[0], nothing, _mask(i ^ 1 for i in range(LANES)))
+
+    return value(value), codegen
+
+
 @overload(operator.add)
 def _plus(a, b):
     if isinstance(a, _Vector) and a == b:

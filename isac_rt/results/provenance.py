@@ -88,7 +88,14 @@ def path_content(tree: Mapping[str, Any], city: str) -> str:
     city : digest of the city's files
     """
     seen = {key: value for key, value in tree.items() if key not in UNSEEN_BY_PATHS}
+    seen["radio"] = _without_front_end(seen["radio"])
+    seen["swarm"] = {name: _without_front_end(uav) for name, uav in seen["swarm"].items()}
     return json.dumps([seen, city, program_fingerprint(), versions()], sort_keys=True)
+
+
+def _without_front_end(node: Mapping[str, Any]) -> dict[str, Any]:
+    """The hardware shows in the samples, not in the paths."""
+    return {key: value for key, value in node.items() if key != "front_end"}
 
 
 def run_content(scenario: Scenario, snapshots: int) -> str:

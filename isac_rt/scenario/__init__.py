@@ -8,6 +8,7 @@ from isac_rt.scenario.environment import (
     MaterialOverride,
     Propagation,
 )
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.scenario.swarm import Access, Rcs, RoleChange, Uav, Waypoint
@@ -19,6 +20,7 @@ __all__ = [
     "Array",
     "City",
     "Clutter",
+    "FrontEnd",
     "Leakage",
     "MaterialOverride",
     "Modulation",

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Decibels, Node, Positive, Problem
 
 
@@ -94,6 +95,9 @@ class Radio(Node):
     """Width of the IF filter's skirts on each side of its passband, which reaches from zero to the
     sampling rate [Hz]. Wider skirts let in more of the neighbouring resource blocks. The default is
     2 % of the default sampling rate; the paper names none."""
+    front_end: FrontEnd = FrontEnd()
+    """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. Ideal by
+    default."""
 
     def problems(self) -> Iterator[Problem]:
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
 MAX_SPEED_MPS = 1e4
@@ -83,6 +84,8 @@ class Uav(Node):
     resource_block: Annotated[int, Field(ge=0)] | None = None
     """First of the consecutive resource blocks, one per group, that an active UAV sends in, counted
     from 0. null, the default: the lowest blocks that the active UAVs before it leave free."""
+    front_end: FrontEnd | None = None
+    """This terminal's hardware in place of `radio.front_end`. null, the default: that of all."""
 
     @field_validator("boresight", mode="before")
     @classmethod
@@ -99,6 +102,8 @@ class Uav(Node):
     def applies(self, name: str) -> bool:
         if name == "resource_block":
             return self.role == "active"
+        if name == "front_end":
+            return self.role != "target"
         return name != "velocity_mps" or self.waypoints is None
 
     def problems(self) -> Iterator[Problem]:
@@ -108,6 +113,9 @@ class Uav(Node):
                 "role takes over its blocks); remove it"
             )
             yield Problem((("resource_block",), ("role",)), said)
+        if self.front_end is not None and self.role == "target":
+            said = "has no meaning for a target, which neither sends nor receives; remove it"
+            yield Problem((("front_end",), ("role",)), said)
         if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
             yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field, PrivateAttr, model_validator
 
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio, chirp_times, num_resource_blocks
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
@@ -147,6 +148,7 @@ class Scenario(Node):
         yield from self._role_problems()
         yield from self._block_problems()
         yield from self._model_problems()
+        yield from self._front_end_problems()
         yield from self._set_problems()
 
     def _timing_problems(self) -> Iterator[Problem]:
@@ -274,6 +276,23 @@ class Scenario(Node):
                     f"slot has {limit} (0 to {limit - 1}); "
                     "choose a lower block, fewer groups or fewer active UAVs",
                 )
+
+    def front_end_of(self, name: str) -> FrontEnd:
+        """The hardware of a terminal: its own, or that of all."""
+        return self.swarm[name].front_end or self.radio.front_end
+
+    def _front_end_problems(self) -> Iterator[Problem]:
+        real = [
+            name
+            for name, uav in self.swarm.items()
+            if uav.role != "target" and not self.front_end_of(name).ideal
+        ]
+        if real and self.receivers.active_input == "profiles":
+            said = (
+                f"profiles are made past the samples, in which the front end of {real[0]} shows; "
+                "take samples, or leave radio.front_end ideal"
+            )
+            yield Problem((("receivers", "active_input"), ("radio", "front_end")), said)
 
     def first_blocks(self) -> dict[str, int]:
         """First resource block of every UAV that is active at the start; a successor takes over its

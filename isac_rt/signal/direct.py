@@ -150,6 +150,15 @@ def _flush(out, to, num_samples, sums, fresh):
         store(sums, at + 16, zero)
 
 
+@jit(fast=True)
+def _turned(sums, turn):
+    """Multiply the sums of one chirp by as many complex factors, interleaved."""
+    for n in range(turn.shape[0] // 2):
+        at = 32 * (n // LANES) + n % LANES
+        re, im, c, s = sums[at], sums[at + 16], turn[2 * n], turn[2 * n + 1]
+        sums[at], sums[at + 16] = re * c - im * s, re * s + im * c
+
+
 class _Room(NamedTuple):
     """Memory of the kernel: sums of a chirp, phasors of 16 blocks and within one, and the places of
     the 16 within a block and of the 16 blocks' middles."""
@@ -161,7 +170,7 @@ class _Room(NamedTuple):
 
 
 @jit(fast=True)
-def _direct(out, shape, w, path, offset, t, fresh, room):
+def _direct(out, shape, w, path, offset, t, fresh, room, turn):
     """Add the listed (path, group offset) of the tones to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
     half = float(num_samples // 2)
@@ -206,6 +215,8 @@ def _direct(out, shape, w, path, offset, t, fresh, room):
                     )
                     phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], t.accel[k])
                     _tone(room, half, weight[i], phase, frequency, quadratic)
+                if turn.shape[0]:
+                    _turned(room.sums, turn[m * chirps + p])
                 _flush(
                     out,
                     2 * num_samples * ((m * num_rx + r) * chirps + p),
@@ -216,7 +227,12 @@ def _direct(out, shape, w, path, offset, t, fresh, room):
 
 
 def add_direct(
-    samples: np.ndarray, waveform: Waveform, tones: Tones, *, fresh: bool = False
+    samples: np.ndarray,
+    waveform: Waveform,
+    tones: Tones,
+    *,
+    fresh: bool = False,
+    turn: np.ndarray | None = None,
 ) -> None:
     """Add paths one by one, every element with its own delay (wideband, spherical).
 
@@ -228,6 +244,7 @@ def add_direct(
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
+    turn : (M, P, N) complex64 by which the paths' samples are multiplied; None: not
     """
     path, offset = sources(waveform, tones)
     if path.size == 0:
@@ -241,4 +258,7 @@ def add_direct(
     blocks = -(-samples.shape[3] // LANES)
     room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
     flat = samples.reshape(-1).view(np.float32)
-    _direct(flat, samples.shape, numbers(waveform), path, offset, tones, fresh, room)
+    rows = np.zeros((0, 0), np.float32)
+    if turn is not None:
+        rows = turn.reshape(-1, turn.shape[2]).view(np.float32)
+    _direct(flat, samples.shape, numbers(waveform), path, offset, tones, fresh, room, rows)

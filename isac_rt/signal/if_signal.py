@@ -87,7 +87,7 @@ def if_signal(
     >>> cube.samples.shape, int(np.abs(np.fft.fft(cube.samples[0, 0, 0])).argmax())
     ((1, 3, 6, 1024), 240)
     """
-    schedule, tones = _heard(waveform, links, receiver, reference)
+    schedule, tones = heard(waveform, links, receiver, reference)
     return IFCube(
         samples=method.samples(waveform, tones),
         waveform=waveform,
@@ -127,7 +127,7 @@ def range_profiles(
     -------
     RangeProfiles
     """
-    schedule, tones = _heard(waveform, links, receiver, reference)
+    schedule, tones = heard(waveform, links, receiver, reference)
     if setting is None:
         size = waveform.num_samples * tones.rx_delay.shape[1] * schedule.size
         seen = tones.power.max(initial=0.0) * GRIDDED_ERROR**2 * size
@@ -154,7 +154,7 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     return cube
 
 
-def _heard(
+def heard(
     waveform: Waveform, links: Links, receiver: ReceiveArray, reference: Reference
 ) -> tuple[Schedule, Tones]:
     """Schedule of the reference chirps, and what is heard in them."""

@@ -24,6 +24,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
+from isac_rt.hardware.front_end import Ends, FrontEnd, front_end_of
 from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_propagation
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.store import CachedPropagation, PathStore
@@ -37,6 +38,7 @@ from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
+from isac_rt.signal.received import received
 from isac_rt.simulation.coverage import Coverage, coverage
 from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
@@ -122,6 +124,10 @@ class Frame:
         link, s = Link(*link), self._setup
         arriving, noise = self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
+        ends = Ends(s.front_ends[link.rx], tuple(s.front_ends[t.name] for t, _ in arriving))
+        if not ends.ideal:
+            heard = self._listening(link)
+            return received(s.waveform, arriving, *heard, ends, method, noise)
         cube = if_signal(s.waveform, arriving, *self._listening(link), method)
         return add_noise(cube, noise.power, noise.seed_words)
 
@@ -198,6 +204,16 @@ class Setup:
     @property
     def schedule(self) -> Schedule:
         return self.timetable.schedule
+
+    @cached_property
+    def front_ends(self) -> dict[str, FrontEnd]:
+        """The hardware of every terminal."""
+        s = self.scenario
+        return {
+            name: front_end_of(s.front_end_of(name), self.waveform, s.seed, name)
+            for name, uav in s.swarm.items()
+            if uav.role != "target"
+        }
 
     @cached_property
     def walls(self) -> Walls:

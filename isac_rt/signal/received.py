@@ -1,0 +1,223 @@
+r"""IF samples behind real front ends: the ideal synthesis with what the hardware of both ends adds.
+
+Of a path with delay tau the oscillators add the phase
+
+.. math:: \phi_{rx}(t) - \phi_{tx}(t - \tau)
+
+at every sample. It is applied in three parts:
+
+- by sample to the whole cube, with the delay of the strongest path of the link, tau_0;
+- once a chirp to all others, by `BINS` of delay: the mean over the chirp of what their own delay
+  makes of it;
+- by sample to those paths alone whose noise within a chirp, P times its variance, would be more
+  than `SHARE` of the thermal noise; at most `MOST_ALONE`, the strongest.
+
+What is left out is a path's noise within a chirp beyond that of tau_0 (`isac_rt.hardware.oscillator
+.spread` is its variance), and the difference of the mean within a bin of delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
+from isac_rt.frame.waveform import Waveform
+from isac_rt.hardware.front_end import Ends
+from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
+from isac_rt.signal.chain import add_phases, finish, phasors
+from isac_rt.signal.direct import add_direct
+from isac_rt.signal.if_signal import heard
+from isac_rt.signal.methods import Method
+from isac_rt.signal.noise import WhiteNoise
+from isac_rt.signal.tones import Links, Tones
+
+BINS = 8
+"""Cells of delay of a link, each of which has one phase a chirp."""
+SHARE = 0.01
+"""Noise that an oscillator makes of a path within a chirp, over the thermal noise, from which on
+the path is made by itself."""
+MOST_ALONE = 16
+
+
+def received(
+    waveform: Waveform,
+    links: Links,
+    receiver: ReceiveArray,
+    reference: Reference,
+    ends: Ends,
+    method: Method,
+    noise: WhiteNoise,
+) -> IFCube:
+    """What a receiver with real hardware has of real transmitters in one frame, noise included.
+
+    Parameters
+    ----------
+    waveform, links, receiver, reference, method : as of `isac_rt.signal.if_signal.if_signal`
+    ends : the hardware, its senders in the order of the links
+    noise : at the receiver's input
+    """
+    schedule, tones = heard(waveform, links, receiver, reference)
+    delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
+    flicker = _Flicker.of(waveform, reference, ends, tones, delays)
+    factors = None
+    if flicker is None:
+        samples = method.samples(waveform, tones)
+    else:
+        alone = flicker.alone(noise.power)
+        rest = flicker.binned().select(np.setdiff1d(np.arange(tones.size), alone))
+        samples = method.samples(waveform, rest)
+        for k in alone:
+            add_direct(samples, waveform, tones.select(np.array([k])), turn=flicker.apart(int(k)))
+        factors = phasors(flicker.common())
+    finish(samples, factors, noise)
+    return IFCube(
+        samples=samples,
+        waveform=waveform,
+        schedule=schedule,
+        start_time=reference.start_time,
+    )
+
+
+@dataclass(frozen=True)
+class _Flicker:
+    """Phases of the oscillators in one frame of one receiver.
+
+    Attributes
+    ----------
+    waveform, tones : of the frame
+    begin : (M, P) time of the first sample of each chirp [s]
+    delays : (K,) of each path, without data and clocks [s]
+    mine : phase of the receiver's oscillator; None: ideal
+    theirs : of each link's transmitter
+    ends : whose oscillators they are
+    """
+
+    waveform: Waveform
+    tones: Tones
+    begin: np.ndarray
+    delays: np.ndarray
+    mine: Record | None
+    theirs: tuple[Record | None, ...]
+    ends: Ends
+
+    @classmethod
+    def of(
+        cls, w: Waveform, reference: Reference, ends: Ends, tones: Tones, delays: np.ndarray
+    ) -> _Flicker | None:
+        """None where all oscillators are ideal."""
+        mine, theirs = ends.receiver.oscillator, [one.oscillator for one in ends.senders]
+        if mine is None and not any(theirs):
+            return None
+        begin = reference.start_time + w.chirp_time + w.window_start
+        first = begin[0, 0] - delays.max(initial=0.0)
+        last = begin[-1, -1] + w.sampled_duration
+        made = {
+            one: one.record(first, last)
+            for one in dict.fromkeys([mine, *theirs])
+            if one is not None
+        }
+        records = tuple(None if one is None else made[one] for one in theirs)
+        own = None if mine is None else made[mine]
+        return cls(w, tones, begin, delays, own, records, ends)
+
+    @property
+    def main(self) -> float:
+        """Delay of the strongest path of the first link [s]."""
+        of_first = np.flatnonzero(self.tones.link == 0)
+        if not of_first.size:
+            return 0.0
+        return float(self.delays[of_first[np.argmax(self.tones.power[of_first])]])
+
+    def _cycles(self, parts: list[tuple[Record | None, float, float]]) -> np.ndarray:
+        """(M, P, N) sum of phases: records, delays [s], signs."""
+        out = np.zeros((self.begin.size, self.waveform.num_samples))
+        for record, delay, sign in parts:
+            if record is not None:
+                add_phases(out, record, self.begin.ravel() - delay, sign)
+        return out.reshape(*self.begin.shape, -1)
+
+    def common(self) -> np.ndarray:
+        """(M, P, N) phase of the strongest path [cycles]."""
+        theirs = self.theirs[0] if self.theirs else None
+        if theirs is not None and theirs is self.mine and self.main == 0:
+            return np.zeros((*self.begin.shape, self.waveform.num_samples))
+        return self._cycles([(self.mine, 0.0, 1.0), (theirs, self.main, -1.0)])
+
+    def apart(self, path: int) -> np.ndarray:
+        """(M, P, N) complex64, the phase of a path beside the common one, as a factor."""
+        theirs = self.theirs[self.tones.link[path]]
+        first = self.theirs[0]
+        parts = [(first, self.main, 1.0), (theirs, float(self.delays[path]), -1.0)]
+        return phasors(self._cycles(parts))
+
+    def binned(self) -> Tones:
+        """The tones with the mean phase of each chirp beside the common one in what is sent, each
+        cell of delay a link of its own."""
+        t, w = self.tones, self.waveform
+        duration = w.sampled_duration
+        send, link = np.repeat(t.send, BINS, axis=0), t.link * BINS
+        first = self.theirs[0] if self.theirs else None
+        means = {id(one): one.means(duration) for one in self.theirs if one is not None}
+        main = 0.0 if first is None else means[id(first)](self.begin - self.main)
+        for q, record in enumerate(self.theirs):
+            of_link = np.flatnonzero(t.link == q)
+            if not of_link.size:
+                continue
+            low, high = self.delays[of_link].min(), self.delays[of_link].max()
+            width = max((high - low) / BINS, 1e-15)
+            place = np.clip((self.delays[of_link] - low) // width, 0, BINS - 1).astype(np.int64)
+            link[of_link] += place
+            for b in np.unique(place):
+                middle = low + (b + 0.5) * width
+                own = 0.0 if record is None else means[id(record)](self.begin - middle)
+                send[q * BINS + b] *= np.exp(1j * (main - own))
+        return t._replace(
+            link=link,
+            send=send,
+            symbol_delay=np.repeat(t.symbol_delay, BINS, axis=0),
+            antenna=np.repeat(t.antenna, BINS, axis=0),
+        )
+
+    def alone(self, noise_power: float) -> np.ndarray:
+        """The paths that are made by themselves, strongest first."""
+        t, w = self.tones, self.waveform
+        first = self.ends.senders[0].oscillator if self.ends.senders else None
+        power = np.zeros(t.size)
+        for q, end in enumerate(self.ends.senders):
+            of_link = t.link == q
+            apart = np.abs(self.delays[of_link] - self.main)
+            if end.oscillator is first:
+                variance = within(first, w.sampled_duration, apart)
+            else:
+                two = [one for one in (first, end.oscillator) if one is not None]
+                never = np.full(apart.shape, np.inf)
+                parts = [within(one, w.sampled_duration, never) / 2 for one in two]
+                variance = np.sum(parts, axis=0)
+            power[of_link] = t.power[of_link] * variance
+        strongest = np.argsort(-power, kind="stable")[:MOST_ALONE]
+        return strongest[power[strongest] > SHARE * noise_power]
+
+
+def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) -> np.ndarray:
+    """Variance of the phase within a chirp for delays that differ by `apart` (K,) [rad^2]; spurs
+    count with their whole power."""
+    if oscillator is None:
+        return np.zeros(apart.shape)
+    grid, table = _within(oscillator.mask, duration, oscillator.rate)
+    far = np.isinf(apart)
+    out = np.interp(np.where(far, 0.0, apart), grid, table)
+    out[far] = spread(oscillator.mask, np.inf, duration, oscillator.rate)[1]
+    for offset, level in oscillator.spurs:
+        swing = np.where(far, 2.0, 4 * np.sin(np.pi * offset * np.where(far, 0.0, apart)) ** 2)
+        out += 2 * 10 ** (level / 10) * swing
+    return out
+
+
+@lru_cache(maxsize=16)
+def _within(mask: Mask | None, duration: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Delays [s] and the variances within a chirp at them."""
+    grid = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 60) / rate])
+    return grid, np.array([spread(mask, apart, duration, rate)[1] for apart in grid])

@@ -1,0 +1,59 @@
+"""What a scenario may say of hardware, and what it refuses."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.front_end import FrontEnd, Oscillator
+from isac_rt.scenario.tree import Scenario
+
+SWARM = {
+    "AT": {"role": "active", "position_m": [0, 0, 30], "boresight": [0, 1, 0]},
+    "PT": {"role": "passive", "position_m": [0, 30, 30], "boresight": [0, -1, 0]},
+}
+
+
+@pytest.mark.parametrize(
+    ("oscillator", "said"),
+    [
+        ({"mask_dbc_hz": [[1e4, -80], [1e5, -79]]}, "mask_dbc_hz.1: the mask rises"),
+        ({"mask_dbc_hz": [[1e5, -80], [1e5, -90]]}, "does not follow 100000 Hz"),
+        ({"mask_dbc_hz": [[1e5, -80]], "locked": False}, "needs two points or more"),
+        ({"mask_dbc_hz": [[1e5, float("nan")]]}, "finite number"),
+        ({"mask_dbc_hz": [[0.0, -80]]}, "greater than or equal to 0.001"),
+        ({"spurs_dbc": [[1e5, -3]]}, "no spur but a second carrier"),
+    ],
+)
+def test_masks_that_are_none_are_refused(oscillator, said):
+    """Planted bug: `after[1] < before[1]`."""
+    with pytest.raises(ValidationError, match=said):
+        Oscillator(**oscillator)
+
+
+def test_a_terminal_s_own_front_end_goes_before_that_of_all():
+    """Planted bug: `self.radio.front_end or ...`."""
+    noisy = {"oscillator": {"mask_dbc_hz": [[1e5, -80.0]]}}
+    swarm = SWARM | {"PT": SWARM["PT"] | {"front_end": {}}}
+    scenario = Scenario(swarm=swarm, radio={"front_end": noisy})
+    assert not scenario.front_end_of("AT").ideal
+    assert scenario.front_end_of("PT").ideal
+    assert FrontEnd().ideal
+
+
+def test_targets_and_profiles_have_no_front_end():
+    """Planted bug: `_front_end_problems` not called."""
+    with pytest.raises(ValidationError, match="no meaning for a target"):
+        Scenario(swarm=SWARM | {"U": {"role": "target", "position_m": [9, 9, 9], "front_end": {}}})
+    noisy = {"front_end": {"oscillator": {"mask_dbc_hz": [[1e5, -80.0]]}}}
+    with pytest.raises(ValidationError, match="profiles are made past the samples"):
+        Scenario(swarm=SWARM, radio=noisy, receivers={"active_input": "profiles"})
+
+
+def test_what_is_stated_is_written_and_read_again(tmp_path):
+    """Planted bug: a tuple of points written as one list."""
+    mask = {"oscillator": {"mask_dbc_hz": [[1e4, -80.0], [1e6, -100.5]], "locked": False}}
+    one = Scenario(swarm=SWARM, radio={"front_end": mask})
+    (tmp_path / "s.yaml").write_text(to_yaml(one))
+    assert load(tmp_path / "s.yaml").radio.front_end == one.radio.front_end
