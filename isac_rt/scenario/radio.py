@@ -96,8 +96,8 @@ class Radio(Node):
     sampling rate [Hz]. Wider skirts let in more of the neighbouring resource blocks. The default is
     2 % of the default sampling rate; the paper names none."""
     front_end: FrontEnd = FrontEnd()
-    """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. Ideal by
-    default."""
+    """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. By
+    default it is ideal."""
 
     def problems(self) -> Iterator[Problem]:
         if self.bandwidth_hz <= 2 * self.sampling_rate_hz:

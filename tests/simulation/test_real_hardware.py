@@ -21,14 +21,14 @@ def scenes():
 def test_oscillators_reach_data_and_samples(scenes):
     """-85 dBc/Hz at 1 MHz without a lock is a walk of 4 rad from chirp to chirp at a passive
     terminal, where no phase symbol survives (7 of 8 are wrong by chance); what the active terminal
-    hears of its own oscillator is no worse than before. Planted bugs: front ends by link in place of
-    by terminal; a frame's phase drawn from its number."""
-    ideal, noisy = (irt.prepare(scene).frame(4) for scene in scenes)
+    hears of its own oscillator is hardly worse. Planted bugs: front ends by link in place of by
+    terminal; a frame's phase drawn from its number."""
+    ideal, noisy = (irt.prepare(scene).frame(0) for scene in scenes)
     own, other = (f.samples(("AT", "AT")).samples for f in (ideal, noisy))
     assert 1e-4 < np.linalg.norm(other - own) / np.linalg.norm(own) < 0.2
     own, other = (f.samples(("AT", "PT1")).samples for f in (ideal, noisy))
     assert np.linalg.norm(other - own) > np.linalg.norm(own)
-    again = irt.prepare(scenes[1]).frame(4).samples(("AT", "PT1")).samples
+    again = irt.prepare(scenes[1]).frame(0).samples(("AT", "PT1")).samples
     assert np.array_equal(again, other)
 
 
