@@ -302,6 +302,10 @@ class Accuracy(Node):
     synthesis_error: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-4
     """Relative RMS error that fast synthesis of IF samples may have, for `budget` and `everything`;
     the cheapest method that keeps it is taken. The default is 80 dB below the signal."""
+    covered_error_db: Annotated[float, Field(ge=0, le=400)] | None = 20.0
+    """How far under the noise of a range-Doppler cell of all channels the error stays that
+    noise covers in the synthesis [dB], for `budget`: most scatterers of a `field` take half of
+    the time then, at a larger error than `synthesis_error`. null: none is covered."""
     cost_model: str | None = None
     """File of what the methods of synthesis cost on a machine, made by `isac-rt bench --fit` and
     relative to the scenario's folder, for `budget` and `everything`. It decides between methods

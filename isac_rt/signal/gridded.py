@@ -63,12 +63,16 @@ class Setting:
     wideband : delays of the receive elements applied to the whole chirp (to second order), not to
         its middle alone
     cubic : the third order in x too, of a wideband setting
+    faint : grid points per path that noise covers, to which the division by the kernel's response
+        is fitted then; these paths have delays of the elements to first order and their quadratic
+        phase at the middle alone. 0: no path is treated so
     """
 
     oversampling: float
     width: int
     wideband: bool
     cubic: bool = False
+    faint: int = 0
 
 
 DEFAULT = Setting(1.5, 6, True)
@@ -82,6 +86,8 @@ ACCURATE = Setting(1.5, 8, True, True)
 """Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square
 of the speed."""
 ACCURATE_ERROR = 5e-6
+COVERING = Setting(1.5, 12, True, faint=4)
+"""Error below `GRIDDED_ERROR`; of paths that noise covers below 2e-3 and 7e-5 v, v in m/s."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
 # several chirps
 _MANY = 4000
@@ -97,55 +103,87 @@ _MEAN_CUBE = 3 / 5  # and x^3 to 3/5 x
 _BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on the grid
 
 
+class Kernel(NamedTuple):
+    """What spreads tones on a grid and what divides its response out.
+
+    Attributes
+    ----------
+    grid : G, number of grid frequencies
+    polynomials : (4, degree + 1, width) float32, highest power first
+    faint : (4, degree + 1, faint width) float32, of paths that noise covers
+    deconvolution : (N,) float32, D at x = n - N//2
+    """
+
+    grid: int
+    polynomials: np.ndarray
+    faint: np.ndarray
+    deconvolution: np.ndarray
+
+
 @lru_cache(maxsize=16)
-def weights(
-    num_samples: int, oversampling: float, width: int
-) -> tuple[int, np.ndarray, np.ndarray]:
+def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -> Kernel:
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
 
     A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2,
     weights such that D(x) sum_j w_j exp(j 2 pi x (j - (WIDTH-1)/2 - r)/G) = 1, j x, x^2 - c, j (x^3
     - 3/5 x) for the four sets, x = -N/2 .. N/2 scaled to [-1, 1]. Least squares in turn for w and
-      for D, from a Kaiser-Bessel start; the weights are real by symmetry.
-
-    Returns
-    -------
-    grid : G, number of grid frequencies
-    polynomials : (4, degree + 1, WIDTH) float32, highest power first
-    deconvolution : (N,) float32, D at x = n - N//2
+    for D, from a Kaiser-Bessel start; the weights are real by symmetry. With `faint` D is that of
+    so many grid points, and what more of them leave is fitted to it.
     """
-    half, degree = num_samples // 2, width + _EXTRA
+    first = faint or width
     grid = scipy.fft.next_fast_len(
         max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True
     )
-    x = np.arange(-half, half + 1)
+    nodes, basis = _basis(num_samples, grid, first)
+    steps = np.arange(first) - (first - 1) / 2
+    beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * first
+    bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / first) ** 2, 0, None)))
+    for _ in range(12):
+        response = np.einsum("rxj,rj->rx", basis, bell)
+        deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
+        fits = _fits(num_samples, basis, deconvolution)
+        bell = fits[:, :, 0]
+    narrow = _polynomials(nodes, fits)
+    if faint:
+        nodes, basis = _basis(num_samples, grid, width)
+        wide = _polynomials(nodes, _fits(num_samples, basis, deconvolution))
+    else:
+        wide, narrow = narrow, np.zeros((4, 1, 0), np.float32)
+    return Kernel(grid, wide, narrow, deconvolution[:num_samples].astype(np.float32))
+
+
+def _basis(num_samples: int, grid: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places in a cell (R,) and the tones of the grid points about each, (R, N + 1, width)."""
+    half, degree = num_samples // 2, width + _EXTRA
     nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
     steps = np.arange(width) - (width - 1) / 2
-    basis = np.exp(
+    x = np.arange(-half, half + 1)
+    return nodes, np.exp(
         2j * np.pi / grid * x[None, :, None] * (steps[None, None, :] - nodes[:, None, None])
     )
-    scaled = x / half
-    skew = scaled**3 - _MEAN_CUBE * scaled
+
+
+def _fits(num_samples: int, basis: np.ndarray, deconvolution: np.ndarray) -> np.ndarray:
+    """(R, width, 4) weights of the four sets at each place."""
+    half = num_samples // 2
+    scaled = np.arange(-half, half + 1) / half
     goals = np.stack(
         [
             np.ones_like(scaled, complex),
             1j * scaled,
             scaled**2 - mean_square(num_samples) + 0j,
-            1j * skew,
+            1j * (scaled**3 - _MEAN_CUBE * scaled),
         ],
         axis=1,
     )
-    beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * width
-    bell = np.i0(beta * np.sqrt(np.clip(1 - ((steps - nodes[:, None]) * 2 / width) ** 2, 0, None)))
-    for _ in range(12):
-        response = np.einsum("rxj,rj->rx", basis, bell)
-        deconvolution = response.real.sum(0) / (np.abs(response) ** 2).sum(0)
-        fits = [_real_least_squares(deconvolution[:, None] * b, goals) for b in basis]
-        bell = np.array([f[:, 0] for f in fits])
-    polynomials = np.array(
-        [np.polyfit(nodes, np.array([f[:, which] for f in fits]), degree) for which in range(4)]
-    )
-    return grid, polynomials.astype(np.float32), deconvolution[:num_samples].astype(np.float32)
+    return np.array([_real_least_squares(deconvolution[:, None] * b, goals) for b in basis])
+
+
+def _polynomials(nodes: np.ndarray, fits: np.ndarray) -> np.ndarray:
+    """(4, degree + 1, width) float32."""
+    degree = nodes.size // 2
+    sets = [np.polyfit(nodes, fits[:, :, k], degree) for k in range(4)]
+    return np.array(sets).astype(np.float32)
 
 
 def mean_square(num_samples: int) -> float:
@@ -182,16 +220,18 @@ class _View(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path, the
-    orders of the wideband term, `weights`, the `plan` of the transform, and the chirps for which
-    the paths are read once."""
+    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path and
+    of one that noise covers, the orders of the wideband term, `weights`, the `plan` of the
+    transform, and the chirps for which the paths are read once."""
 
     half: float
     centre: float
     taps: tuple[int, ...]
+    few: tuple[int, ...]
     wideband: bool
     cubic: bool
     poly: np.ndarray
+    few_poly: np.ndarray
     deconvolution: np.ndarray
     radices: np.ndarray
     twiddles: np.ndarray
@@ -210,7 +250,8 @@ class _Blocks(NamedTuple):
         element
     factor : float32, of each block 16 real and 16 imaginary parts
     life : float64, of each block 16 begins and 16 ends
-    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
+    blocks : (B, 5) link, offset, number of paths, whether any of them is born or dies in the frame,
+        whether noise covers them
     bounds : (B, 2) least and greatest delay in the frame, without data
     """
 
@@ -329,6 +370,39 @@ def _spread(grid, base, places, scratch, count, taps, steer, k):
             store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
             at += ROW
         k += 32
+
+
+@jit(fast=True)
+def _weigh_faint(work, scratch, poly, taps):
+    """Weights of 1 and j x on the grid points of 16 paths that noise covers."""
+    r, width, degree = load(work, 0), len(taps), len(taps) + _EXTRA
+    set_size = (degree + 1) * width
+    for j in range(width):
+        v0, v1 = splat(poly[j]), splat(poly[set_size + j])
+        for d in range(1, degree + 1):
+            v0 = v0 * r + splat(poly[d * width + j])
+            v1 = v1 * r + splat(poly[set_size + d * width + j])
+        store(scratch, _STEP * j, v0)
+        store(scratch, _STEP * j + 16, v1)
+
+
+@jit(fast=True)
+def _spread_faint(grid, base, places, scratch, count, taps, steer, k, work):
+    """Add `count` of 16 paths that noise covers: strengths of 1 and j x, the element's own delay at
+    the middle of the chirp to first order."""
+    for i in range(count):
+        at = base + int(places[i]) * ROW
+        ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
+        c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
+        pr, pi = c * ar - s * ai, c * ai + s * ar
+        er, ei = pr + late * pi, pi - late * pr
+        br, bi = theta * er, theta * ei
+        for tap in range(len(taps)):
+            u, v = splat(scratch[i + _STEP * tap]), splat(scratch[i + _STEP * tap + 16])
+            store(grid, at, load(grid, at) + u * er + v * br)
+            store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi)
+            at += ROW
+        k += 48
 
 
 @jit(inline=True)
@@ -461,6 +535,7 @@ def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fre
     top, skirt, per_delay = w.rate / w.slope, w.transition / w.slope, w.slope * w.step
     cut = top + skirt
     stride, places = (size + _MARGIN) * ROW, np.zeros(32)
+    inner = (width - len(g.few)) // 2 * ROW
     for start in range(0, groups * num_chirps, g.together):
         count = min(g.together, groups * num_chirps - start)
         grid[:] = np.float32(0)
@@ -493,8 +568,12 @@ def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fre
                 if b.blocks[i, 3] or least < 0 or most > top:
                     _gate(work, b, i, w, time, delay)
                 last = _in_band(work, places, used, view.limit) if cells else used
-                _weigh(work, scratch, g.poly, g.taps, g.wideband, g.cubic)
                 to, k = c * stride, i * 16 * 48
+                if len(g.few) and b.blocks[i, 4]:
+                    _weigh_faint(work, scratch, g.few_poly, g.few)
+                    _spread_faint(grid, to + inner, places, scratch, last, g.few, steer, k, work)
+                    continue
+                _weigh(work, scratch, g.poly, g.taps, g.wideband, g.cubic)
                 if g.cubic:
                     _spread_cubic(grid, to, places, scratch, last, g.taps, steer, k, work, centre)
                 elif g.wideband:
@@ -553,16 +632,13 @@ def _steering(
     return out
 
 
-def _blocks(waveform: Waveform, t: Tones) -> _Blocks:
+def _blocks(waveform: Waveform, t: Tones, faint: np.ndarray) -> _Blocks:
     w = waveform
     path, offset = sources(w, t)
-    order = np.lexsort((t.delay[path], offset, t.link[path]))
+    order = np.lexsort((t.delay[path], faint[path], offset, t.link[path]))
     path, offset = path[order], offset[order]
-    segment = (
-        np.cumsum(np.r_[True, np.diff(t.link[path] * (2 * w.num_groups) + offset) != 0]) - 1
-        if path.size
-        else path
-    )
+    kind = (t.link[path] * (2 * w.num_groups) + offset) * 2 + faint[path]
+    segment = np.cumsum(np.r_[True, np.diff(kind) != 0]) - 1 if path.size else path
     _, starts, counts = np.unique(segment, return_index=True, return_counts=True)
     full = -(-counts // LANES)
     first = np.concatenate(
@@ -578,9 +654,8 @@ def _blocks(waveform: Waveform, t: Tones) -> _Blocks:
     motion = np.abs(t.rate[k]) * reach + np.abs(t.accel[k]) * reach**2 / 2
     bounds = np.stack([(delay - motion).min(axis=1), (delay + motion).max(axis=1)], axis=1)
     mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
-    blocks = np.stack(
-        [t.link[k[:, 0]], lag[:, 0], np.minimum(last - first + 1, LANES), mortal], axis=1
-    )
+    used = np.minimum(last - first + 1, LANES)
+    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], used, mortal, faint[k[:, 0]]], axis=1)
     factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
     return _Blocks(
         k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds
@@ -594,6 +669,7 @@ def add_gridded(
     setting: Setting = DEFAULT,
     *,
     fresh: bool = False,
+    faint: np.ndarray | None = None,
 ) -> None:
     """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and
     15 elements of the L).
@@ -606,11 +682,13 @@ def add_gridded(
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
+    faint : (K,) bool, paths that noise covers, of a setting that has a way for them
     """
     count = waveform.num_groups * waveform.num_chirps
     none, one = np.zeros(count), np.ones(count)
     views = _View(none, none, one, none, one, one.astype(complex))
-    heard = _synthesise(samples, samples.shape, waveform, tones, setting, fresh, no_band(), views)
+    job = _Job(waveform, tones, setting, faint)
+    heard = _synthesise(samples, samples.shape, job, fresh, no_band(), views)
     if fresh and not heard:
         samples[:] = 0
 
@@ -667,39 +745,51 @@ def range_cells(
         limit=limit * one,
         turn=np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0)),
     )
-    _synthesise(out, shape, w, tones, setting, True, band, views)
+    _synthesise(out, shape, _Job(w, tones, setting), True, band, views)
     return out
+
+
+class _Job(NamedTuple):
+    """What is synthesised and how; `faint` as of `add_gridded`."""
+
+    waveform: Waveform
+    tones: Tones
+    setting: Setting
+    faint: np.ndarray | None = None
 
 
 def _synthesise(
     out: np.ndarray,
     shape: tuple[int, ...],
-    w: Waveform,
-    t: Tones,
-    setting: Setting,
+    job: _Job,
     fresh: bool,
     band: Band,
     views: _View,
 ) -> bool:
     """Run the kernel over all elements; False, and nothing done, where no path can be heard and
     there is no band."""
-    b = _blocks(w, t)
+    w, t, setting, faint = job
+    if faint is None or not setting.faint:
+        faint = np.zeros(t.size, bool)
+    b = _blocks(w, t, faint)
     if b.path.size == 0 and band.turn.size == 0:
         return False
     num_samples = len(band.window) or w.num_samples
-    size, poly, deconvolution = weights(num_samples, setting.oversampling, setting.width)
+    kernel = weights(num_samples, setting.oversampling, setting.width, setting.faint)
     g = _Grid(
         float(w.num_samples // 2),
         mean_square(num_samples),
         (0,) * setting.width,
+        (0,) * setting.faint,
         setting.wideband,
         setting.wideband and setting.cubic,
-        poly.ravel(),
-        deconvolution,
-        *plan(size),
+        kernel.polynomials.ravel(),
+        kernel.faint.ravel(),
+        kernel.deconvolution,
+        *plan(kernel.grid),
         _TOGETHER if b.path.size > _MANY else 1,
     )
-    grids = aligned(g.together * (size + _MARGIN) * ROW)
+    grids = aligned(g.together * (kernel.grid + _MARGIN) * ROW)
     room = _Room(grids, aligned(80), aligned(_STEP * setting.width), aligned(512))
     flat = out.reshape(-1).view(np.float32)
     for first in range(0, shape[1], LANES):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.vector import cube_memory
+from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, read
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
@@ -64,19 +65,32 @@ class Direct:
 
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return _made(waveform, tones, DEFAULT, np.ones(tones.size, bool))
+        every = np.ones(tones.size, bool)
+        return _made(waveform, tones, Choice(DEFAULT, every, ~every))
 
 
 @dataclass(frozen=True)
 class Gridded:
-    """All paths through a grid of frequencies, for many: the error is that of the `setting`."""
+    """All paths through a grid of frequencies, for many: the error is that of the `setting`, of all
+    or of those that noise covers (`faint`)."""
 
     name: ClassVar[str] = "gridded"
     setting: Setting = DEFAULT
+    faint: bool = False
 
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return _made(waveform, tones, self.setting, np.zeros(tones.size, bool))
+        none, faint = np.zeros(tones.size, bool), np.full(tones.size, self.faint)
+        return _made(waveform, tones, Choice(self.setting, none, faint))
+
+
+class Choice(NamedTuple):
+    """Setting of the grid, and which paths (K,) go direct past it; which of the others noise
+    covers."""
+
+    setting: Setting
+    alone: np.ndarray
+    faint: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -85,15 +99,21 @@ class Auto:
 
     Direct go lines of sight (their joint curvature is not gridded); paths too fast for `max_error`;
     and of those whose error, integrated coherently over the cube, could exceed the noise of a cell
-    (power error^2 size > noise_power), the `max_direct` strongest.
+    (power error^2 size > noise_power), the `max_direct` strongest. Some settings have a faster way
+    with a larger error for paths that noise covers: all of a range-Doppler cell together keep it
+    under `covered` times the noise, integrated coherently over the cube. The error of a path lies
+    in its own cell and those beside it.
 
     Attributes
     ----------
     noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths go direct
-    max_error : relative RMS error of the samples, at least that of the direct method (1e-6)
+    max_error : relative RMS error of the samples, at least that of the direct method (1e-6); of
+        those of paths that noise does not cover
     max_direct : paths that go direct for their strength, at the most
     costs : what the methods cost; None: what ships with the program
     decide_for : number of paths whose cost decides, where the links hold some of them only
+    covered : error that noise covers, over the noise of a cell of all elements and chirps; 0: no
+        path is taken for covered
     """
 
     name: ClassVar[str] = "auto"
@@ -102,41 +122,54 @@ class Auto:
     max_direct: int = 16
     costs: CostModel | None = None
     decide_for: int | None = None
+    covered: float = 0.0
 
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        speed = tones.speed(waveform.frame_duration)
-        choice = self.choose(_shape(waveform, tones), tones.power, speed, tones.sight)
-        return _made(waveform, tones, *choice)
+        shape, speed = _shape(waveform, tones), tones.speed(waveform.frame_duration)
+        cell = resolution_cell(waveform, tones.delay, tones.rate) if self.covered else None
+        choice = self.choose(shape, tones.power, speed, tones.sight, cell)
+        return _made(waveform, tones, choice)
 
     def choose(
-        self, shape: tuple[int, ...], power: np.ndarray, speed: np.ndarray, sight: np.ndarray
-    ) -> tuple[Setting, np.ndarray]:
-        """Setting of the grid for a cube of this shape (M, L_rx, P, N), and which paths (K,) go
-        direct past it.
+        self,
+        shape: tuple[int, ...],
+        power: np.ndarray,
+        speed: np.ndarray,
+        sight: np.ndarray,
+        cell: np.ndarray | None = None,
+    ) -> Choice:
+        """How a cube of this shape (M, L_rx, P, N) is made.
 
         Parameters
         ----------
         power, speed, sight : (K,) of each path: received power [W], c ``|delay rate|`` / 2 [m/s],
             whether it is a line of sight
+        cell : (K,) int, range-Doppler cell in which it is seen; None: noise is taken to cover none
         """
         model = self.costs or read(SHIPPED)
         scale = 1.0 if self.decide_for is None else self.decide_for / max(power.size, 1)
-        best = (DEFAULT, np.ones(power.size, bool))
+        size, none = float(np.prod(shape)), np.zeros(power.size, bool)
+        best = Choice(DEFAULT, ~none, none)
         least = model.seconds(DIRECT, shape, scale * power.size)
         top = np.zeros(power.size, bool)
         top[np.argsort(-power, kind="stable")[: self.max_direct]] = True
         for candidate in CANDIDATES:
             error = candidate.error_at(speed)
-            strong = power * error**2 * float(np.prod(shape)) > self.noise_power
-            alone = (strong & top) | sight | (error > self.max_error)
+            strong = power * error**2 * size > self.noise_power
+            faint = none
+            if cell is not None:
+                limit = self.covered * self.noise_power / size
+                faint = ~sight & candidate.covered(power, speed, cell, limit)
+            alone = ~faint & ((strong & top) | sight | (error > self.max_error))
             if alone.all():
                 continue
-            cost = model.seconds(candidate.name, shape, scale * int((~alone).sum()))
+            several = scale * int((~alone & ~faint).sum()), scale * int(faint.sum())
+            cost = model.seconds(candidate.name, shape, *several)
             if alone.any():
                 cost += model.seconds(DIRECT, shape, scale * int(alone.sum()))
             if cost < least:
-                best, least = (candidate.setting, alone), cost
+                best, least = Choice(candidate.setting, alone, faint), cost
         return best
 
 
@@ -148,10 +181,12 @@ def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
     return w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples
 
 
-def _made(waveform: Waveform, tones: Tones, setting: Setting, alone: np.ndarray) -> np.ndarray:
-    """Samples with the paths of the mask `alone` made one by one, the others through a grid."""
+def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:
+    """Samples with some paths made one by one, the others through a grid."""
     samples = cube_memory(_shape(waveform, tones))
+    setting, alone, faint = choice
     if not alone.all():
-        add_gridded(samples, waveform, tones.select(~alone), setting, fresh=True)
+        rest = tones.select(~alone)
+        add_gridded(samples, waveform, rest, setting, fresh=True, faint=faint[~alone])
     add_direct(samples, waveform, tones.select(alone), fresh=bool(alone.all()))
     return samples

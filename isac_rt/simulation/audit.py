@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isac_rt.frame.cube import ReceiveArray, Reference
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.clutter.cells import Density, error_for
@@ -30,10 +30,14 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.store import CachedPropagation
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import power_map
+from isac_rt.receive.sense import window_gain
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.results.metrics import decibels
 from isac_rt.results.records import Use
 from isac_rt.signal.if_signal import if_signal
-from isac_rt.signal.methods import Direct
+from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.simulation.plan import (
     MATTERS_DB,
     decisions,
@@ -339,7 +343,7 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
 
 
 def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
-    powers = ("left_out", "left_out_bound", "missed_strongest")
+    powers = ("left_out", "left_out_bound", "missed_strongest", "covered", "covered_bound")
     return {
         (f"{key}_db" if key in powers else key): (decibels(value) if key in powers else value)
         for key, value in row.items()
@@ -373,6 +377,8 @@ def _errors(
         "turning_rad": _turning_error(setup, frame.number, kept),
         "turning_bound_rad": use.turning_error,
         "synthesis": _synthesis_error(setup, frame, link, level),
+        "covered": _covered_error(setup, frame, link, level),
+        "covered_bound": plan.covered,
     }
 
 
@@ -531,18 +537,43 @@ def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.nd
 
 
 def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
-    """Relative RMS error of the synthesis that the run uses, on some of a frame's paths."""
+    """Relative RMS error of the synthesis that the run uses, on some of a frame's paths, none of
+    them taken for covered by noise."""
     kept = frame.paths[link]
     if not len(kept):
         return 0.0
     rng = generator(setup.scenario.seed, "synthesis check", *link, frame.number)
     some = kept.select(np.sort(rng.choice(len(kept), min(len(kept), MOST_COMPARED), replace=False)))
-    links = [(frame.sent[link.tx], some)]
-    receiver = ReceiveArray(frame.poses[link.rx], setup.antennas)
-    reference = Reference(setup.timetable.start_time(frame.number, link.tx))
-    exact, fast = (
-        if_signal(setup.waveform, links, receiver, reference, method).samples
-        for method in (Direct(), setup.plan.synthesis(len(kept), level))
-    )
+    methods = Direct(), _uncovered(setup.plan.synthesis(len(kept), level))
+    exact, fast = (_made(setup, frame, link, some, method).samples for method in methods)
     scale = float(np.linalg.norm(exact))
     return float(np.linalg.norm(fast - exact)) / scale if scale else 0.0
+
+
+def _covered_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
+    """Most that the synthesis of paths that noise covers errs in a range-Doppler cell, over its
+    noise, if all channels' errors were in phase."""
+    kept = frame.paths[link]
+    if not len(kept) or not setup.plan.covered:
+        return 0.0
+    method = setup.plan.synthesis(len(kept), level)
+    cube = _made(setup, frame, link, kept, method)
+    cube.samples[:] -= _made(setup, frame, link, kept, _uncovered(method)).samples
+    passes = 2 if link.own else 1
+    known = Known.of(cube, frame.sent[link.tx].payload, setup.antennas, passes)
+    power = power_map(clean_spectrum(cube, known), known)
+    window = 3 / 8 * setup.waveform.window_length
+    return float(power.max()) * known.channels / (level * window * window_gain(known))
+
+
+def _uncovered(method: Method) -> Method:
+    """The same method with no path taken for covered by noise."""
+    return replace(method, covered=0.0) if isinstance(method, Auto) else method
+
+
+def _made(setup: Setup, frame: Frame, link: Link, paths: PathSet, method: Method) -> IFCube:
+    """Some of a link's paths as samples without noise."""
+    links = [(frame.sent[link.tx], paths)]
+    receiver = ReceiveArray(frame.poses[link.rx], setup.antennas)
+    reference = Reference(setup.timetable.start_time(frame.number, link.tx))
+    return if_signal(setup.waveform, links, receiver, reference, method)

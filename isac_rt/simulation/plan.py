@@ -130,7 +130,15 @@ class Plan:
             max_error=self.synthesis_error,
             costs=self.costs,
             decide_for=num_paths,
+            covered=self.covered,
         )
+
+    @property
+    def covered(self) -> float:
+        """Error of the synthesis that noise covers, over the noise of a cell of all channels; 0:
+        none."""
+        db = self.accuracy.covered_error_db
+        return 0.0 if db is None or self.preset != "budget" else float(10 ** (-db / 10))
 
     @property
     def synthesis_error(self) -> float:
@@ -386,6 +394,7 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0).name,
         "synthesis_error": plan.synthesis_error,
+        "covered_error_db": plan.accuracy.covered_error_db if plan.covered else None,
         "cost_model": plan.costs.record(),
     }
 

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 
 from isac_rt.cli.cli import main
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, hann
 from isac_rt.scenario.file import ScenarioError, load, to_yaml
 from isac_rt.signal.choice import (
     CANDIDATES,
     DIRECT,
+    FAINT,
     NAMES,
     SHIPPED,
     CostModel,
     read,
 )
-from isac_rt.signal.gridded import DEFAULT
+from isac_rt.signal.gridded import COVERING, DEFAULT
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
 from isac_rt.signal.tones import tones_of
 from isac_rt.simulation.plan import decisions
@@ -48,6 +49,11 @@ def test_what_is_predicted_twice_as_dear_is_dearer(size):
     links, shape = job.paths(size), (3, 15, 12, 1024)
     predicted = {name: model.seconds(name, shape, size) for name in NAMES}
     works = {c.name: (lambda c=c: job.samples(links, Gridded(c.setting))) for c in CANDIDATES}
+    works |= {
+        c.name + FAINT: (lambda c=c: job.samples(links, Gridded(c.setting, faint=True)))
+        for c in CANDIDATES
+        if c.faint
+    }
     works[DIRECT] = lambda: job.samples(links, Direct())
     measured = {name: cpu_seconds(work, 3) for name, work in works.items()}
     clear = [(a, b) for a, b in itertools.permutations(NAMES, 2) if predicted[a] > 2 * predicted[b]]
@@ -73,11 +79,11 @@ def test_the_choice_keeps_the_stated_error(speed):
 
 def test_few_paths_go_direct_and_many_are_gridded():
     """Planted bug: the costs of both compared the other way round."""
-    assert decide(3)[1].all()
-    setting, alone = decide(1000)
+    assert decide(3).alone.all()
+    setting, alone, _ = decide(1000)
     assert setting == DEFAULT
     assert not alone.any()
-    coarse, _ = decide(100_000, max_error=1e-3)
+    coarse = decide(100_000, max_error=1e-3).setting
     assert coarse == CANDIDATES[0].setting  # width 4 for very many
     assert (
         decide(300, max_error=1e-3)[0] == CANDIDATES[1].setting
@@ -88,8 +94,43 @@ def test_sights_fast_and_strong_paths_go_direct():
     """One of each among 500. Planted bug: `strong` and `sight` joined by `and`."""
     power, speed, sight = np.full(500, 1e-12), np.full(500, 3.0), np.zeros(500, bool)
     power[[7, 8, 9]], speed[20], sight[30] = (1.0, 2.0, 3.0), 300.0, True
-    _, alone = Auto(noise_power=1e-6, max_direct=2).choose(SHAPE, power, speed, sight)
+    _, alone, _ = Auto(noise_power=1e-6, max_direct=2).choose(SHAPE, power, speed, sight)
     assert np.flatnonzero(alone).tolist() == [8, 9, 20, 30]
+
+
+def test_noise_covers_what_a_cell_holds_together():
+    """Twelve hundred paths in cells of one, one cell of forty of the same power, one strong path
+    and a line of sight: what is covered is known cell by cell. Planted bug: the cell's sum taken
+    for the path's own."""
+    count, size = 1200, float(np.prod(SHAPE))
+    cell, power = np.arange(count), np.full(count, 1e-9)
+    cell[100:140], power[500], sight = 7, 1e-6, np.arange(count) == 600
+    speed = np.full(count, 3.0)
+    error = 2e-3 + 7e-5 * 3.0
+    noise = 20 * 1e-9 * error**2 * size / 0.01  # twenty of the paths keep 20 dB under it
+    choice = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cell)
+    expected = (cell != 7) & (power < 1e-7) & ~sight
+    assert choice.setting == COVERING
+    np.testing.assert_array_equal(choice.faint, expected)
+    assert np.flatnonzero(choice.alone).tolist() == [600]
+    none = Auto(noise).choose(SHAPE, power, speed, sight, cell)
+    assert not none.faint.any()
+
+
+def test_a_covered_cube_differs_by_less_than_its_noise():
+    """A hundred paths against the exact model, each cell of the error under the noise by 20
+    dB, all channels of a chirp in phase. Planted bug: the margin taken for an amplitude."""
+    job = Job(3)
+    links = job.paths(100)
+    w, shape = job.waveform, (3, 15, 3, 1024)
+    truth = job.samples(links, Exact())
+    noise = float(np.mean(np.abs(truth) ** 2)) / 100 * np.prod(shape) * 3e-3
+    auto = Auto(noise, covered=0.01, decide_for=20_000)
+    error = job.samples(links, auto) - truth
+    cells = np.abs(np.fft.fft(error * hann(np.arange(1024), 1024), axis=-1)) ** 2
+    gain = 3 / 8 * w.num_samples
+    assert relative(error + truth, truth) > 1e-3
+    assert (cells.mean(axis=(0, 1, 2)) * 3 * 15 * 3).max() < 0.01 * noise * gain
 
 
 def test_the_costs_decide():
@@ -97,8 +138,8 @@ def test_the_costs_decide():
     whatever is given."""
     shipped = read(SHIPPED)
     free = CostModel("made up", shipped.chirp_ns | {DIRECT: 0.1}, shipped.path_ns | {DIRECT: 1e-3})
-    assert decide(1000, costs=free)[1].all()
-    assert decide(1000, decide_for=3)[1].all()
+    assert decide(1000, costs=free).alone.all()
+    assert decide(1000, decide_for=3).alone.all()
     job = Job(3)
     links = job.paths(30)
     found = job.samples(links, Auto(noise_power=np.inf, costs=free))

@@ -23,7 +23,8 @@ def test_errors_of_the_synthesis_are_as_stated():
         *([] if nufft.missing() else [nufft.NAME]),
     }
     assert found["direct"] < 1e-6
-    assert max(found.values()) < 3e-4
+    covered = found.pop("gridded, 1.5 N, width 4, of what noise covers")
+    assert max(found.values()) < 3e-4 < covered < 3.05e-3
     assert found["gridded wideband, 1.5 N, width 6"] < GRIDDED_ERROR
     assert found["gridded narrowband, 1.5 N, width 8"] < 5e-6
     assert found["gridded wideband, cubic, 1.5 N, width 8"] < ACCURATE_ERROR

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.signal.choice import CANDIDATES, DIRECT, FORMAT
+from isac_rt.signal.choice import CANDIDATES, DIRECT, FAINT, FORMAT, NAMES
 from isac_rt.signal.methods import Direct, Gridded
 from isac_rt.studies.bench.measure import cpu_seconds
 from isac_rt.studies.bench.synthesis import Job
@@ -42,9 +42,11 @@ def fit(
     jobs: dict[tuple[str, int], Callable[[], object]] = {}
     for size in SIZES:
         links = job.paths(size)
-        jobs |= {
-            (c.name, size): partial(job.samples, links, Gridded(c.setting)) for c in CANDIDATES
-        }
+        for c in CANDIDATES:
+            jobs[c.name, size] = partial(job.samples, links, Gridded(c.setting))
+            if c.faint is not None:
+                covered = Gridded(c.setting, faint=True)
+                jobs[c.name + FAINT, size] = partial(job.samples, links, covered)
     jobs |= {
         (DIRECT, size): partial(job.samples, job.paths(size), Direct()) for size in DIRECT_SIZES
     }
@@ -55,7 +57,7 @@ def fit(
         if progress:
             progress(turn + 1, repeats)
     methods = {}
-    for name in (DIRECT, *(c.name for c in CANDIDATES)):
+    for name in NAMES:
         sizes = np.array([size for of, size in found if of == name], float)
         seconds = np.array([np.median(times) for (of, _), times in found.items() if of == name])
         methods[name] = _line(sizes, seconds / (chirps * (elements if name == DIRECT else 1)) * 1e9)

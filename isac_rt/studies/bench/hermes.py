@@ -22,7 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from isac_rt.signal.methods import Exact, Gridded
+from isac_rt.signal.methods import Exact
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
 from isac_rt.studies.bench.synthesis import GRIDS, Job, relative
 
@@ -85,8 +85,8 @@ def errors() -> dict[str, float]:
     links = job.paths(40)
     truth = {True: job.samples(links, Exact()), False: job.narrowband(links)}
     return {
-        name: relative(job.samples(links, Gridded(s)), truth[s.wideband])
-        for name, s in GRIDS
+        name: relative(job.samples(links, method), truth[method.setting.wideband])
+        for name, method in GRIDS
         if name in OURS
     }
 
@@ -140,14 +140,14 @@ def rows(quick: bool) -> list[dict[str, object]]:
         slow = theirs["seconds"][str(size)]
         add(name, size, slow, theirs["error"])
         links = ours.paths(size)
-        for method, setting in GRIDS:
-            if method in OURS:
-                fast = cpu_seconds(partial(ours.samples, links, Gridded(setting)))
+        for own, method in GRIDS:
+            if own in OURS:
+                fast = cpu_seconds(partial(ours.samples, links, method))
                 add(
-                    method,
+                    own,
                     size,
                     fast,
-                    error[method],
+                    error[own],
                     f"; {slow / fast:.0f} times less than HermesPy",
                 )
     return out

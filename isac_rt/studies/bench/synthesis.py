@@ -25,7 +25,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.signal.gridded import ACCURATE, DEFAULT, PROFILES, Setting
+from isac_rt.signal.gridded import ACCURATE, COVERING, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import if_signal, range_profiles
 from isac_rt.signal.methods import Direct, Exact, Gridded, Method
 from isac_rt.signal.noise import add_white_noise
@@ -42,14 +42,16 @@ BOTH = "samples (gridded wideband, 1.5 N, width 6), Hann window, transform, data
 JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
 ERROR_OF = "relative RMS against the exact model"
 GRIDS = (
-    ("gridded narrowband, 2.25 N, width 4", Setting(2.25, 4, False)),
-    ("gridded narrowband, 1.25 N, width 6", Setting(1.25, 6, False)),
-    ("gridded narrowband, 1.5 N, width 6", replace(DEFAULT, wideband=False)),
-    ("gridded narrowband, 1.5 N, width 8", replace(ACCURATE, wideband=False)),
-    ("gridded wideband, 2.25 N, width 4", Setting(2.25, 4, True)),
-    ("gridded wideband, 1.25 N, width 6", Setting(1.25, 6, True)),
-    ("gridded wideband, 1.5 N, width 6", DEFAULT),
-    ("gridded wideband, cubic, 1.5 N, width 8", ACCURATE),
+    ("gridded narrowband, 2.25 N, width 4", Gridded(Setting(2.25, 4, False))),
+    ("gridded narrowband, 1.25 N, width 6", Gridded(Setting(1.25, 6, False))),
+    ("gridded narrowband, 1.5 N, width 6", Gridded(replace(DEFAULT, wideband=False))),
+    ("gridded narrowband, 1.5 N, width 8", Gridded(replace(ACCURATE, wideband=False))),
+    ("gridded wideband, 2.25 N, width 4", Gridded(Setting(2.25, 4, True))),
+    ("gridded wideband, 1.25 N, width 6", Gridded(Setting(1.25, 6, True))),
+    ("gridded wideband, 1.5 N, width 6", Gridded(DEFAULT)),
+    ("gridded wideband, cubic, 1.5 N, width 8", Gridded(ACCURATE)),
+    ("gridded wideband, 1.5 N, width 12 over 4", Gridded(COVERING)),
+    ("gridded, 1.5 N, width 4, of what noise covers", Gridded(COVERING, faint=True)),
 )
 DIRECTLY = (
     ("profiles directly, 1.25 N, width 6", PROFILES),
@@ -164,10 +166,9 @@ def errors() -> dict[str, float]:
     links = job.paths(40)
     full, narrow = job.samples(links, Exact()), job.narrowband(links)
     found = {"direct": relative(job.samples(links, Direct()), full)}
-    for name, setting in GRIDS:
-        found[name] = relative(
-            job.samples(links, Gridded(setting)), full if setting.wideband else narrow
-        )
+    for name, method in GRIDS:
+        truth = full if method.setting.wideband else narrow
+        found[name] = relative(job.samples(links, method), truth)
     if nufft.missing() is None:
         found[nufft.NAME] = relative(job.by_finufft(links), narrow)
     whole = job.transformed(links, Exact())
@@ -238,8 +239,8 @@ def rows(quick: bool) -> list[dict[str, Any]]:
                 0.0,
                 oracle=True,
             )
-        for name, setting in GRIDS:
-            seconds = cpu_seconds(partial(job.samples, links, Gridded(setting)), times)
+        for name, method in GRIDS:
+            seconds = cpu_seconds(partial(job.samples, links, method), times)
             add(name, size, "paths", seconds, error[name])
         if size in PROFILE_SIZES and nufft.NAME in error:
             seconds = cpu_seconds(partial(job.by_finufft, links), times)
