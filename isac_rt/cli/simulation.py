@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isac_rt.cli.arguments import FrameNumber, InputProblem, Overrides, ScenarioFile, check_frame
+from isac_rt.cli.arguments import (
+    FrameNumber,
+    InputProblem,
+    Overrides,
+    ScenarioFile,
+    check_frame,
+    check_names,
+)
 from isac_rt.cli.console import err, out, say, say_table, with_progress, working
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
@@ -332,3 +339,62 @@ def animate(
     with ending_soon_after_interrupt(folder), working("drawing"):
         write_animation(results, target, number, city_of(results.scenario), rate)
     say(target)
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run` wrote.")],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--as",
+            metavar="FORMAT",
+            help="csv: tables; mat: for MATLAB; glb: city, flights, tracks and paths in 3-D; "
+            "stonesoup: detections; sigmf: IF samples of one frame.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the files go; default DIR/export.")
+    ] = None,
+    frame: FrameNumber = 0,
+    link: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose samples; default the first.")
+    ] = None,
+) -> None:
+    """Write a run for other programs; IF samples are made anew from the run's scenario."""
+    from isac_rt.results.files import open_results
+
+    results = open_results(folder)
+    target = out if out is not None else folder / "export"
+    with ending_soon_after_interrupt(target), working("exporting"):
+        from isac_rt.simulation.setup import city_of
+        from isac_rt.views import export as exports
+
+        check_names([form], [*exports.FORMATS, "sigmf"], "format")
+        if form == "sigmf":
+            files = _sigmf(results, frame, link, target)
+        else:
+            files = exports.write(results, form, target, lambda: city_of(results.scenario))
+    for file in files:
+        say(file)
+
+
+def _sigmf(results: Results, frame: int, observer: str | None, folder: Path) -> list[Path]:
+    """IF samples of an observer in one frame."""
+    from isac_rt.simulation.setup import prepare
+    from isac_rt.views.interchange import write_sigmf
+
+    d = results.dataset
+    names = [str(name) for name in d.observer.values]
+    observer = observer or names[0]
+    check_names([observer], names, "observer")
+    check_frame(results.scenario, frame)
+    here = {"frame": frame, "observer": names.index(observer)}
+    if d.fell_back[here]:
+        raise InputProblem(
+            f"--frame {frame}: its transmitter fell back to the conventional schedule, which only "
+            "the run itself knows; choose another frame"
+        )
+    ends = str(d.transmitter[here["observer"]].item()), str(d.receiver[here["observer"]].item())
+    cube = prepare(results.scenario).frame(frame).samples(ends)
+    name = observer.replace("->", "_to_")
+    return list(write_sigmf(cube, folder / f"{name}_{frame:04d}", results.scenario.name))
