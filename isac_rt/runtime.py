@@ -52,6 +52,10 @@ class UserError(Exception):
     line prints it alone and exits with 2."""
 
 
+class MissingPackage(UserError, ModuleNotFoundError):
+    """A package that only some of the program needs is not installed."""
+
+
 class MachineProblem(UserError):
     """The machine will not do as it is: its disk, its memory, a library. The same may succeed at
     another time or place."""

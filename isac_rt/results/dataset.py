@@ -473,7 +473,7 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
             meaning = f"position along the dimension {along}"
             put(f"{prefix}_{along}", [dim], where, DIMENSIONLESS, meaning)
         for name, column in columns.items():
-            parts = [np.asarray(row[name], column.dtype) for _, _, row in some]
+            parts: list[np.ndarray] = [np.asarray(r[name], column.dtype) for _, _, r in some]
             values = stacked(parts, column)
             put(f"{prefix}_{name}", [dim, *column.dims], values, column.units, column.meaning)
     _put_maps(put, [(i, j, row["maps"]) for i, j, row in present if "maps" in row], len(labels))

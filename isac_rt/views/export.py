@@ -6,6 +6,7 @@ from __future__ import annotations
 import datetime
 import io
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,6 +63,7 @@ def table(dataset: xr.Dataset, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
             flags = enumerate(v.attrs.get("flag_meanings", "").split())
             meaning = ", ".join([v.attrs["long_name"], *(f"{k}: {word}" for k, word in flags)])
             about.append((name, column, v.attrs["units"], meaning))
+    about = [row for row in about if not row[1].endswith(("_frame", "_observer"))]
     made = pd.DataFrame(columns)
     if len(rows) > 1:
         where = np.indices([dataset.sizes[dim] for dim in rows]).reshape(len(rows), -1)
@@ -75,9 +77,7 @@ def table(dataset: xr.Dataset, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def _columns(key: str, v: xr.DataArray, rows: int) -> Iterator[tuple[str, np.ndarray]]:
     """A variable's components as columns, named by their coordinates or numbers."""
-    labels = [
-        v[dim].values if dim in v.coords else range(v.sizes[dim]) for dim in v.dims[rows:]
-    ]
+    labels = [v[dim].values if dim in v.coords else range(v.sizes[dim]) for dim in v.dims[rows:]]
     values = v.values.reshape(-1, *v.shape[rows:])
     for place in np.ndindex(*v.shape[rows:]):
         ending = [str(along[i]) for along, i in zip(labels, place, strict=True)]
@@ -166,7 +166,7 @@ def scene(dataset: xr.Dataset, city: CityMesh) -> trimesh.Scene:
         path = trimesh.path.Path3D(
             [
                 trimesh.path.entities.Line(np.arange(low, high), color=np.multiply(255, colour))
-                for low, high in zip(ends, ends[1:], strict=False)
+                for low, high in pairwise(ends)
             ],
             _turned(np.vstack(lines)),
             process=False,
@@ -200,7 +200,9 @@ def _lines(dataset: xr.Dataset) -> dict[str, tuple[list[np.ndarray], Colour]]:
     return out
 
 
-def path_lines(dataset: xr.Dataset, rows: np.ndarray, most: int = MOST_PATHS) -> Iterator[np.ndarray]:
+def path_lines(
+    dataset: xr.Dataset, rows: np.ndarray, most: int = MOST_PATHS
+) -> Iterator[np.ndarray]:
     """(N, 3) transmitter, points and receiver [m] of the strongest paths among rows of the
     ledger; leakage has no line."""
     names = list(dataset.uav.values)
@@ -232,7 +234,7 @@ def write_stonesoup(dataset: xr.Dataset, folder: Path) -> list[Path]:
 
     Raises
     ------
-    ModuleNotFoundError  Without the package `stonesoup`.
+    isac_rt.runtime.MissingPackage  Without the package `stonesoup`.
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
     frames: Mapping[str, Any] = {
@@ -246,8 +248,6 @@ def write_stonesoup(dataset: xr.Dataset, folder: Path) -> list[Path]:
         files.append(folder / f"{name.replace('->', '_to_')}.yaml")
         write_whole(files[-1], YAML().dumps(detections))
     return files
-
-
 
 
 def write(results: Results, kind: str, folder: Path, city: Callable[[], CityMesh]) -> list[Path]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind, PathSet
+from isac_rt.runtime import MissingPackage
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.views.render import polyline
@@ -46,7 +47,7 @@ def scene_3d(
 
     Raises
     ------
-    ModuleNotFoundError  Without the package `plotly`.
+    isac_rt.runtime.MissingPackage  Without the package `plotly`.
 
     Examples
     --------
@@ -62,7 +63,7 @@ def scene_3d(
     try:
         import plotly.graph_objects as go
     except ModuleNotFoundError as problem:
-        raise ModuleNotFoundError(
+        raise MissingPackage(
             "interactive scenes need the package plotly: pip install 'isac_rt[notebooks]'"
         ) from problem
     figure = go.Figure()

@@ -27,6 +27,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
 from isac_rt.results.files import ResultsError, read_dataset, write_dataset
 from isac_rt.results.records import KINDS
+from isac_rt.runtime import MissingPackage
 from isac_rt.storage import BAD_DATA, read_whole, write_whole
 
 if TYPE_CHECKING:
@@ -227,7 +228,7 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
 
     Raises
     ------
-    ModuleNotFoundError  Without the package `sigmf`.
+    isac_rt.runtime.MissingPackage  Without the package `sigmf`.
     """
     sigmf = _imported("sigmf")
     w, base = cube.waveform, Path(file)
@@ -375,7 +376,7 @@ def stonesoup_detections(
 
     Raises
     ------
-    ModuleNotFoundError  Without the package `stonesoup`.
+    isac_rt.runtime.MissingPackage  Without the package `stonesoup`.
     KeyError  If there is no such observer.
     """
     _imported("stonesoup")
@@ -451,4 +452,4 @@ def _imported(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as problem:
-        raise ModuleNotFoundError(f"this needs the package {name}: {EXTRA}") from problem
+        raise MissingPackage(f"this needs the package {name}: {EXTRA}") from problem
