@@ -303,6 +303,8 @@ def test_gospa_is_of_confirmed_tracks_and_uavs_in_view():
     tracks = [(1, True, -1, "U1", 0.3), (2, True, -1, "PT1", 0.0), (3, False, -1, "U2", 0.0)]
     record = scored(scorer("AT"), DATA, rows, [], tracks)
     assert record.gospa[1:] == pytest.approx((0.09, 12.5, 12.5))
+    table = record.tracks  # of tracks that no detection has fed yet nothing is said
+    assert {*table.kind, *table.target, *table.uav} == {-1}
 
 
 def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():

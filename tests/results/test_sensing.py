@@ -96,6 +96,8 @@ def test_gospa_is_the_root_of_its_parts():
     parts = found["localisation_m"] ** 2 + 12.5 * (found["missed"] + found["false"])
     assert found["total_m"] ** 2 == pytest.approx(parts)
     assert found["empty_m"] == pytest.approx(np.sqrt((2 * 12.5 + 0) / 2))
+    five = Sensing.of([row(), row(seen=(1, 0)), row()], 2).block()["gospa"]
+    assert five["empty_m"] == pytest.approx(np.sqrt(5 * 12.5 / 3))
 
 
 def test_false_tracks_by_cause():

@@ -24,6 +24,7 @@ from isac_rt.results.files import open_results
 from isac_rt.results.provenance import run_content
 from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
+from isac_rt.simulation import resume as simulate_resume
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
@@ -381,6 +382,28 @@ def test_entries_are_some_time_apart(tmp_path):
     resume = Resume(tmp_path, "content", every=0.0)
     resume.append(1)
     assert resume.due()
+
+
+def test_what_could_not_be_kept_is_tried_again_after_twice_the_time(tmp_path, monkeypatch):
+    """Planted bug: four times."""
+    now = [100.0]
+    monkeypatch.setattr(simulate_resume.time, "monotonic", lambda: now[0])
+    resume = Resume(tmp_path, "content", every=7.0)
+    (tmp_path / FILE).mkdir()
+    for step, wait in enumerate((14.0, 28.0)):
+        with pytest.warns(ScenarioWarning, match="not kept"):
+            assert not resume.append(step)
+        now[0] += wait - 0.5
+        assert not resume.due()
+        now[0] += 0.5
+        assert resume.due()
+
+
+def test_a_schema_from_elsewhere_is_not_trusted(tmp_path):
+    """What a stranger's file has in its schema may not run functions. Planted bug: the pragma left
+    out."""
+    with kept(tmp_path, "one")._open("rw") as database:
+        assert database.execute("PRAGMA trusted_schema").fetchall() == [(0,)]
 
 
 def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsys):

@@ -298,6 +298,9 @@ def test_the_dataset_holds_each_points_summary(folder):
     low, high = binomial_interval(errors, total)
     here = d.sel(snr=-31, order=8, link="A->P1")
     assert total == 2 * 3 * 12
+    assert d.attrs["title"] == "isac_rt sweep: demo" and d.attrs["seed"] == 7
+    assert json.loads(d.attrs["base"]) == plain_tree(plan.base)
+    assert (d.attrs["axis_snr"], d.attrs["axis_order"]) == ("noise.snr_db", "modulation.dpsk_order")
     assert (
         float(here.ser_delay_pooled),
         float(here.ser_delay_low),

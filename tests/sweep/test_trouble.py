@@ -22,6 +22,7 @@ from isac_rt.cli.cli import main
 from isac_rt.results.files import ResultsError
 from isac_rt.scenario.document import ScenarioError
 from isac_rt.sweep import Outcomes, PointsLeft, execute, open_sweep, run_sweep, save_dataset, status
+from isac_rt.sweep.definition import Point
 from isac_rt.sweep.execute import ROOM, run_job
 from isac_rt.sweep.outcomes import _checksum
 
@@ -297,6 +298,63 @@ def test_points_that_the_machine_left_are_tried_again_and_then_left(folder, here
     monkeypatch.setattr(execute, "_simulate", simulate)
     run_sweep(plan, out)
     assert status(out).done == 12
+
+
+class Scheduler:
+    """A client that runs nothing: the keys of what it is given, in order."""
+
+    def __init__(self, threads):
+        self.given, self._threads = [], threads
+
+    def nthreads(self):
+        return self._threads
+
+    def submit(self, work, job, key, **rather):
+        self.given.append(job.key)
+        self.rather = rather
+        return SimpleNamespace(key=key)
+
+
+def ended(key, status="finished", word=None):
+    return SimpleNamespace(
+        key=f"point-{key}-0",
+        status=status,
+        cancelled=lambda: False,
+        release=lambda: None,
+        result=lambda: word or execute.Ended("done"),
+        exception=lambda: OSError("its disk"),
+    )
+
+
+def test_of_points_that_share_paths_one_goes_first(folder):
+    """Three of paths p, two of q, one of none: the followers of p wait until its first is back,
+    with whatever outcome; later points of p do not wait. The window holds four for each of two
+    threads at least, the same scenario is not given twice, a lost one is given again, and workers
+    in trouble are avoided. Planted bugs: the followers not held back, or never let go; every point
+    of traced paths held back."""
+    points = [
+        Point((i,), {}, {}, key, paths)
+        for i, (key, paths) in enumerate(
+            [("a", "p"), ("b", "p"), ("c", None), ("d", "q"), ("c", None), ("e", "p"), ("f", "q")]
+        )
+    ]
+    client = Scheduler({"one": 1, "two": 1})
+    queue = SimpleNamespace(add=lambda _: None)
+    runner = execute._Runner(plan_of(folder), Outcomes(folder / "o"), client, 0, False, None)
+    runner._fill(iter(points), queue)
+    assert client.given == ["a", "c", "d"]
+    left = execute.Ended("left", "no room", "one")
+    runner._finish(ended("a", word=left), queue)
+    assert client.given == ["a", "c", "d", "b", "e"]
+    assert client.rather["workers"] == ["two"] and client.rather["allow_other_workers"]
+    runner._fill(iter([Point((7,), {}, {}, "g", "p")]), queue)
+    runner._finish(ended("c", "lost"), queue)
+    assert client.given[5:] == ["g", "c"]
+    runner._finish(ended("d", "error"), queue)
+    assert client.given[7:] == ["f"]
+    runner._fill(iter([Point((i,), {}, {}, f"h{i}", None) for i in range(20)]), queue)
+    assert len(client.given) == 8 + 3  # b, e, g, c and f are at work: three more make eight
+    assert [why for _, why in runner._left.values()] == ["no room", "OSError: its disk"]
 
 
 def test_a_sweep_on_which_nothing_ends_stops_early(folder, here, monkeypatch):
