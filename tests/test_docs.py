@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from access.test_access_run import run as access_run
 from simulation.test_fall_back import scenario as dense
+from talking import scenario as talking
 
 from isac_rt.simulation import simulate
 
@@ -119,6 +120,7 @@ ELSEWHERE = {
     "missed_blocks",
     "false_blocks",
     "feedback",
+    "terminals",
 }
 """Keys whose own keys are names, or explained with another key."""
 AT_TIMES = {"checked", "by_set"}
@@ -137,9 +139,9 @@ def keys_of(tree: dict, at: str = ""):
 
 
 def test_every_key_of_a_summary_has_a_sentence():
-    """Two small runs, one with the stages before the data and feedback, one whose receivers judge
-    how sparse the scene is; no sentence is left without its key. Planted bugs: a key more in a
-    terminal's block; a sentence taken out."""
+    """Three small runs, one with the stages before the data and feedback, one whose receivers judge
+    how sparse the scene is, one whose terminals cooperate; no sentence is left without its key.
+    Planted bugs: a key more in a terminal's block; a sentence taken out."""
     access = {"establish": True, "synchronisation": "two_round", "feedback": True}
     with_access = access_run(frames=3, access=access).summary
     sparse = simulate.run(dense(frames=3), snapshots=0).summary
@@ -148,6 +150,9 @@ def test_every_key_of_a_summary_has_a_sentence():
     written["every terminal and link"] = {key for block in blocks for key in keys_of(block)}
     for part in ("timing_s", "fidelity", "access"):
         written[part] = set(keys_of(with_access[part]))
+    talked = simulate.run(talking(frames=3), snapshots=0).summary["swarm"]
+    assert talked["terminals"].keys() == {"AT", "PT"}
+    written["swarm"] = {key for of in (talked, talked["terminals"]["PT"]) for key in keys_of(of)}
     written["sparsity"] = {f"LINK.{key}" for row in sparse["sparsity"].values() for key in row}
     found = explained()
     assert written.keys() == found.keys()

@@ -17,7 +17,7 @@ import xarray as xr
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.results.losses import LOSSES
-from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord
+from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord
 
 Row = dict[str, Any]
 """A frame, or an observer in it, as numbers, arrays and further rows by name."""
@@ -284,6 +284,65 @@ TRACKS: dict[str, Column] = {
 }
 
 
+def _of_picture(name: str, column: int) -> Callable[[PictureRecord], np.ndarray]:
+    return lambda p: getattr(p, name)[:, column]
+
+
+PICTURES: dict[str, Column] = {
+    "gospa": Column(
+        float,
+        "m2",
+        "square of the GOSPA distance: localisation, missed, false",
+        "gospa",
+        ("part",),
+        np.nan,
+    ),
+    "seen": _number("target in view of a terminal", "seen", bool, dims=("uav",)),
+    "found": _number("target in view that the picture has", "found", bool, dims=("uav",)),
+    "error": _number(
+        "of targets found: position [m], velocity [m s-1], squared error of position in the "
+        "deviations stated over its axes",
+        "error",
+        float,
+        dims=("uav", "measure"),
+        missing=np.nan,
+    ),
+    "false": _number("bodies that stand for nobody", "false", np.int32),
+    "hidden": _number("bodies that stand for a target in nobody's view", "hidden", np.int32),
+    "unrecognised": _number(
+        "bodies that stand for a terminal without being recognised", "unrecognised", np.int32
+    ),
+    "reports": _number("tracks heard from others that count", "reports", np.int32),
+    "age": Column(float, "s", "mean age of the tracks heard from others", "age", missing=np.nan),
+    "messages": _number("messages that ended in the frame", "messages", np.int32),
+    "lost": _number("those of them that were lost", "lost", np.int32),
+}
+"""One value for each frame and picture."""
+FUSED: dict[str, Column] = {
+    "origin": _number("link whose track names the body, along observer", "origin", np.int16),
+    "number": _number("number of that track", "number", np.int32),
+    **{
+        f"{word}{axis}{suffix}": Column(
+            float,
+            units,
+            f"{meaning} {axis} of the {what}",
+            _of_picture(source, 3 * rate + i),
+        )
+        for source, suffix, meaning in (("mean", "", "world"), ("std", "_std", "deviation of"))
+        for rate, (word, units, what) in enumerate(
+            (("", "m", "position"), ("v", "m s-1", "velocity"))
+        )
+        for i, axis in enumerate("xyz")
+    },
+    "members": _number("tracks that are taken for the body", "members", np.int16),
+    "terminal": _number(
+        "index of the UAV of the swarm that it is recognised as, -1: none", "terminal", np.int16
+    ),
+    "uav": _number("index of the target that it is found as, -1: none", "uav", np.int16),
+}
+"""Bodies of the pictures."""
+
+
 def _power_db(p: PathSet) -> np.ndarray:
     with np.errstate(divide="ignore"):
         return 10 * np.log10(p.power)
@@ -388,6 +447,10 @@ def row_of(record: FrameRecord) -> Row:
         "observers": rows,
         "uses": {str(link): asdict(use) for link, use in record.uses.items()},
         "dropped": record.dropped,
+        "pictures": {
+            name: {**read(PICTURES, p), "fused": read(FUSED, p)}
+            for name, p in record.pictures.items()
+        },
     }
 
 
@@ -477,6 +540,7 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
             values = stacked(parts, column)
             put(f"{prefix}_{name}", [dim, *column.dims], values, column.units, column.meaning)
     _put_maps(put, [(i, j, row["maps"]) for i, j, row in present if "maps" in row], len(labels))
+    _put_pictures(put, rows, len(uavs))
     numbers = {
         "carrier_hz": w.carrier_frequency,
         "effective_carrier_hz": w.effective_carrier,
@@ -486,6 +550,42 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
         "velocity_cell_mps": w.velocity_cell(1),
     }
     return xr.Dataset(out, attrs=numbers)
+
+
+def _put_pictures(put: Callable[..., None], rows: Sequence[Row], num_uavs: int) -> None:
+    """The pictures of terminals that cooperate; nothing where none does."""
+    names = list(dict.fromkeys(name for row in rows for name in row["pictures"]))
+    if not names:
+        return
+    parts = ("localisation", "missed", "false")
+    measures = ("position", "velocity", "squared")
+    for name, words, meaning in (
+        ("picture", names, "terminal, or all of them together"),
+        ("part", parts, "part of the GOSPA distance"),
+        ("measure", measures, "measure of an error"),
+    ):
+        put(name, [name], np.array(list(words), object), DIMENSIONLESS, meaning)
+    sizes = {"uav": num_uavs, "part": len(parts), "measure": len(measures)}
+    for name, column in PICTURES.items():
+        shape = (len(rows), len(names), *(sizes[dim] for dim in column.dims))
+        values: np.ndarray = np.full(shape, column.missing, column.dtype)
+        for i, row in enumerate(rows):
+            for j, picture in enumerate(names):
+                values[i, j] = row["pictures"][picture][name]
+        dims = ["frame", "picture", *column.dims]
+        put(f"picture_{name}", dims, values, column.units, column.meaning)
+    tables = [
+        (i, j, row["pictures"][picture]["fused"])
+        for i, row in enumerate(rows)
+        for j, picture in enumerate(names)
+    ]
+    for k, along in enumerate(("frame", "picture")):
+        where = np.repeat([t[k] for t in tables], [len(t[2]["uav"]) for t in tables])
+        meaning = f"position along the dimension {along}"
+        put(f"fused_{along}", ["fused"], where.astype(np.int32), DIMENSIONLESS, meaning)
+    for name, column in FUSED.items():
+        every = np.concatenate([np.asarray(t[2][name], column.dtype) for t in tables])
+        put(f"fused_{name}", ["fused"], every, column.units, column.meaning)
 
 
 MAPS = (

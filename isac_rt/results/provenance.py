@@ -73,6 +73,7 @@ UNSEEN_BY_PATHS = (
     "receiver_preset",
     "receivers",
     "tracking",
+    "cooperation",
     "compare",
 )
 """Parts of a scenario on which its paths do not depend: runs that differ in nothing else share

@@ -16,6 +16,7 @@ from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord
 from isac_rt.results.sensing import Sensing, summary_block
+from isac_rt.results.swarm import summary_of
 from isac_rt.scenario.tree import Scenario
 
 STAGES = ("setup", "trace", "synthesis", "receive", "track")
@@ -144,7 +145,7 @@ class Recorder:
         }
 
     def blocks(self) -> dict[str, Any]:
-        """The keys `terminals` and `links` of the summary."""
+        """The keys `terminals`, `links` and `swarm` of the summary."""
         rows, timetable = self.rows, self.timetable
         duration = (
             (rows[-1]["frame"] - rows[0]["frame"]) * timetable.interval
@@ -176,7 +177,8 @@ class Recorder:
             str(link): block("active" if link.own else "passive", [link], counted)
             for link, counted in symbols.items()
         }
-        return {"terminals": terminals, "links": links}
+        swarm = summary_of(rows, list(timetable.first_roles))
+        return {"terminals": terminals, "links": links, "swarm": swarm}
 
     def _of(self, link: Link) -> list[Row]:
         """The rows of a link's receiver."""

@@ -122,6 +122,49 @@ class ObserverRecord:
     reference_snr: float = np.nan
 
 
+@dataclass(frozen=True, kw_only=True)
+class PictureRecord:
+    """One picture of a frame: of a terminal, or of all together. B bodies, U UAVs.
+
+    Attributes
+    ----------
+    gospa : (3,) localisation, missed, false [m^2], over targets in view of anyone and bodies that
+        are nobody's of the swarm
+    seen, found : (U,) bool; a target in view of a link's receiver when it last received; one that a
+        body stands for which the target's own echo feeds
+    error : (U, 3) of those found: position [m], velocity [m/s], squared error of position in the
+        deviations stated over its axes
+    false, hidden, unrecognised : bodies that stand for nobody, for a target in nobody's view, and
+        for a terminal that is not recognised
+    reports, age : what was heard from others and counts, and its mean age [s]
+    messages, lost : that reached the terminal in this frame, and those of them that were lost
+    origin, number : (B,) name: index of the link and number of its track
+    mean, std : (B, 6) position and velocity in world axes [m, m/s]
+    members : (B,) how many tracks are taken for it
+    terminal : (B,) index of the UAV of the swarm that it is recognised as, -1: none
+    uav : (B,) index of the target that it is found as, -1: none
+    """
+
+    gospa: np.ndarray
+    seen: np.ndarray
+    found: np.ndarray
+    error: np.ndarray
+    false: int
+    hidden: int
+    unrecognised: int
+    reports: int
+    age: float
+    messages: int
+    lost: int
+    origin: np.ndarray
+    number: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+    members: np.ndarray
+    terminal: np.ndarray
+    uav: np.ndarray
+
+
 @dataclass(frozen=True)
 class Use:
     """What was kept of the paths of one link in one frame, and the bounds of the rest.
@@ -164,6 +207,7 @@ class FrameRecord:
     snapshot : whether the whole path ledger and the maps are kept
     uses : what was kept of the paths of each link
     dropped : traced paths that the float64 geometry contradicted
+    pictures : of the terminals and of all together by name, where terminals cooperate
     """
 
     frame: int
@@ -174,3 +218,4 @@ class FrameRecord:
     snapshot: bool = False
     uses: Mapping[Link, Use] = field(default_factory=dict)
     dropped: int = 0
+    pictures: Mapping[str, PictureRecord] = field(default_factory=dict)

@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -76,6 +76,11 @@ class Scenario(Node):
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
     """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
+    cooperation: Literal["none", "tracks"] = "none"
+    """What terminals tell each other of what they see. `none`, the default: nothing. `tracks`:
+    their confirmed tracks and their own position, an active terminal with its data, a passive one
+    by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and hears.
+    What is sent does not depend on it."""
     compare: dict[Name, ReceiverSet] = Field({})
     """Further sets of receivers by name, which hear the same samples. By default none."""
 

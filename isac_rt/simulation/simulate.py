@@ -21,10 +21,12 @@ from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
-from isac_rt.results.records import FrameRecord, ObserverRecord
+from isac_rt.results.records import FrameRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
+from isac_rt.results.swarm import SwarmScorer
 from isac_rt.scenario.receivers import Receivers, ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
+from isac_rt.simulation.cooperation import Cooperation
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
@@ -137,12 +139,44 @@ class _Observer:
         return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
 
 
+class _Swarm:
+    """What the terminals of a set of receivers tell each other, with its score."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._swarm = setup.swarm
+        self._cooperation, self._scorer = Cooperation(setup), SwarmScorer(setup.timetable)
+
+    def step(
+        self,
+        frame: Frame,
+        heard: Mapping[Link, Heard],
+        records: Mapping[Link, ObserverRecord],
+    ) -> dict[str, PictureRecord]:
+        """The pictures after a frame, held against the truth."""
+        views = self._cooperation.step(
+            frame.number, heard, {link: o.symbols for link, o in records.items()}
+        )
+        poses = {name: self._swarm.poses(view.time) for name, view in views.items()}
+        return self._scorer.record(frame.number, views, records, poses)
+
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        return {"talk": self._cooperation.memory(), "scorer": self._scorer.memory()}
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self._cooperation.restore(memory["talk"])
+        self._scorer.restore(memory["scorer"])
+
+
 @dataclass
 class _Listeners:
-    """One set of receivers: every link's terminal with its score, and what is recorded of them."""
+    """One set of receivers: every link's terminal with its score, what they tell each other, and
+    what is recorded of them."""
 
     observers: dict[Link, _Observer]
     recorder: Recorder
+    swarm: _Swarm | None
 
     @classmethod
     def of(
@@ -153,29 +187,30 @@ class _Listeners:
         return cls(
             {link: _Observer(setup, link, terminal(link), receivers) for link in links},
             Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
+            None if setup.scenario.cooperation == "none" else _Swarm(setup),
         )
 
     def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
         """Hold a frame against the truth."""
         timetable = self.recorder.timetable
+        records = {link: self.observers[link].record(frame, h) for link, h in heard.items()}
+        pictures = self.swarm.step(frame, heard, records) if self.swarm else {}
         self.recorder.add(
             FrameRecord(
                 frame=frame.number,
                 time=timetable.epoch(frame.number),
                 modulated=timetable.modulated(frame.number),
                 poses=frame.poses,
-                observers={
-                    timetable.labels[link]: self.observers[link].record(frame, h)
-                    for link, h in heard.items()
-                },
+                observers={timetable.labels[link]: o for link, o in records.items()},
                 snapshot=snapshot,
                 uses=frame.uses,
                 dropped=frame.dropped,
+                pictures=pictures,
             )
         )
 
     def blocks(self) -> dict[str, Any]:
-        """`terminals` and `links` of the summary."""
+        """`terminals`, `links` and `swarm` of the summary."""
         return self.recorder.blocks()
 
     def costs(self) -> dict[str, float]:
@@ -185,12 +220,15 @@ class _Listeners:
     def memory(self, first: int) -> dict[str, Any]:
         """The rows from a frame on, and what every terminal carries over."""
         observers = {str(link): o.memory() for link, o in self.observers.items()}
-        return {"rows": self.recorder.rows[first:], "observers": observers}
+        swarm = None if self.swarm is None else self.swarm.memory()
+        return {"rows": self.recorder.rows[first:], "observers": observers, "swarm": swarm}
 
-    def restore(self, observers: Mapping[str, Any]) -> None:
+    def restore(self, memory: Mapping[str, Any]) -> None:
         """Take up what the terminals carried over."""
         for link, observer in self.observers.items():
-            observer.restore(observers[str(link)])
+            observer.restore(memory["observers"][str(link)])
+        if self.swarm is not None:
+            self.swarm.restore(memory["swarm"])
 
 
 def run(
@@ -420,9 +458,9 @@ class _Run:
                     last = entry
         if last is not None:
             with resume.reading():
-                self.own.restore(last["observers"])
+                self.own.restore(last)
                 for name, one in self.compared.items():
-                    one.restore(last["compared"][name]["observers"])
+                    one.restore(last["compared"][name])
                 self.schedules.restore(last["advice"])
                 self.stopwatch.restore(last["seconds"])
         self.kept = len(self.recorder.rows)

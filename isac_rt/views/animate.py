@@ -50,6 +50,20 @@ def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndar
     )
 
 
+def fused_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
+    """(B, 3) where the picture of an observer's terminal has bodies that are no terminals [m];
+    none where terminals do not cooperate."""
+    if "picture" not in dataset.variables:
+        return np.zeros((0, 3))
+    picture = list(dataset.picture.values).index(str(dataset.receiver.values[observer]))
+    mine = (
+        (dataset.fused_frame.values == frame)
+        & (dataset.fused_picture.values == picture)
+        & (dataset.fused_terminal.values < 0)
+    )
+    return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
+
+
 def animate(
     results: Results, observer: int = 0, city: CityMesh | None = None
 ) -> tuple[Figure, FuncAnimation]:
@@ -110,6 +124,11 @@ class _Moving:
             mew=1.6,
             label=f"tracks of {dataset.observer.values[observer]}",
         )
+        (self._fused,) = ax.plot(
+            [], [], "s", color="black", ms=10, mfc="none", label="its picture with what it hears"
+        )
+        if "picture" not in dataset.variables:
+            self._fused.set_label("_nothing is heard")
         ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
 
     def show(self, frame: int) -> None:
@@ -119,6 +138,8 @@ class _Moving:
             here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
         found = tracked_positions(self._d, frame, self._observer)
         self._tracks.set_data(found[:, 0], found[:, 1])
+        fused = fused_positions(self._d, frame, self._observer)
+        self._fused.set_data(fused[:, 0], fused[:, 1])
         self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
 
 

@@ -231,6 +231,41 @@ def gospa_table(summary: Mapping[str, Any]) -> Table:
     return Table(("Picture", *keys), rows)
 
 
+def swarm_table(summary: Mapping[str, Any]) -> Table:
+    """The pictures of terminals that cooperate, all of them together first; no rows where none
+    does."""
+    swarm = summary.get("swarm")
+    if swarm is None:
+        return Table((), ())
+    rows = [
+        (
+            name,
+            number(p["hit_rate"]),
+            *(number(p["gospa"][key]) for key in ("total_m", "empty_m", "missed", "false")),
+            *(number(p["rmse"][key]) for key in ("position_m", "velocity_mps")),
+            number(p["nees"]),
+            *(number(p[key]) for key in ("reports_per_frame", "age_s")),
+            f"{p['messages_lost']} of {p['messages']}" if name in swarm["terminals"] else DASH,
+        )
+        for name, p in {"All together": swarm, **swarm["terminals"]}.items()
+    ]
+    titles = (
+        "Picture",
+        "Hit rate",
+        "GOSPA [m]",
+        "Empty picture [m]",
+        "Missed",
+        "False",
+        "Position [m]",
+        "Velocity [m/s]",
+        "NEES",
+        "Heard",
+        "Age [s]",
+        "Lost messages",
+    )
+    return Table(titles, rows)
+
+
 def false_table(summary: Mapping[str, Any]) -> Table:
     """False tracks per frame of each link by what feeds them; causes that never were are left
     out."""
@@ -379,6 +414,7 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
         gospa=gospa_table(s),
         false_tracks=false_table(s),
+        swarm=swarm_table(s),
         targets=target_table(s),
         losses=loss_table(s),
         budget=row_table(

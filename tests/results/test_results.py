@@ -167,6 +167,7 @@ def test_summary_has_the_fixed_keys(run):
         "sparsity",
         "versions",
         "links",
+        "swarm",
     } == set(s)
     assert set(s["terminals"]) == {"AT", "PT1"} and set(s["links"]) == {"AT->AT", "AT->PT1"}
     for part in (*s["terminals"].values(), *s["links"].values()):

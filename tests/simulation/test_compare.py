@@ -46,7 +46,7 @@ def test_each_set_does_as_in_a_run_of_its_own(compared):
         own = {"receivers": one.receivers, "tracking": one.tracking, "compare": {}}
         alone = simulate.run(scenario.model_copy(update=own)).summary
         found = compared.summary["compared"][name]
-        assert found == {key: alone[key] for key in ("terminals", "links")}
+        assert found == {key: alone[key] for key in ("terminals", "links", "swarm")}
         assert found["links"] != compared.summary["links"]
 
 

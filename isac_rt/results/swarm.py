@@ -1,0 +1,247 @@
+"""Pictures of the swarm held against the truth: what terminals know together of who else flies.
+
+The swarm's own terminals are known by what they say of themselves and are not counted as found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from isac_rt.frame.link import Link
+from isac_rt.frame.timetable import Timetable
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.metrics import GOSPA_CUTOFF_M
+from isac_rt.results.records import ObserverRecord, PictureRecord
+from isac_rt.terminal.fusion import Fused, Key, Name
+from isac_rt.world.swarm import Pose
+
+SWARM = "swarm"
+"""The picture of all terminals together; a terminal of this name has none of its own."""
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Messages whose last frame a frame was: how many, and how many of them were lost."""
+
+    messages: int = 0
+    lost: int = 0
+
+    def __add__(self, other: Traffic) -> Traffic:
+        return Traffic(self.messages + other.messages, self.lost + other.lost)
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture after a frame.
+
+    Attributes
+    ----------
+    time : that it is of [s]
+    bodies : in it
+    ages : of the reports from others that it rests on [s]
+    traffic : messages to the terminal
+    """
+
+    time: float
+    bodies: tuple[Fused, ...]
+    ages: tuple[float, ...] = ()
+    traffic: Traffic = Traffic()
+
+
+class SwarmScorer:
+    """Holds pictures against the truth. It remembers which UAVs each link saw last, and what fed
+    each track last."""
+
+    def __init__(self, timetable: Timetable) -> None:
+        self._timetable = timetable
+        self._seen: dict[Link, np.ndarray] = {}
+        self._fed: dict[Key, int] = {}
+
+    def memory(self) -> dict[str, Any]:
+        """What is remembered as plain numbers and arrays, for `restore`."""
+        seen = [[*link, uavs] for link, uavs in self._seen.items()]
+        return {"seen": seen, "fed": [[*key, uav] for key, uav in self._fed.items()]}
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self._seen = {Link(tx, rx): uavs for tx, rx, uavs in memory["seen"]}
+        self._fed = {Key(origin, number): uav for origin, number, uav in memory["fed"]}
+
+    def record(
+        self,
+        frame: int,
+        views: Mapping[str, View],
+        observers: Mapping[Link, ObserverRecord],
+        poses: Mapping[str, Mapping[str, Pose]],
+    ) -> dict[str, PictureRecord]:
+        """Score a frame's pictures.
+
+        Parameters
+        ----------
+        views : by name
+        observers : the frame's records, by link
+        poses : of all UAVs at the time of each picture, by its name
+        """
+        timetable = self._timetable
+        for link, o in observers.items():
+            self._seen[link] = o.in_view & ~o.shadowed
+            origin, t = str(link), o.tracks
+            fed = np.where(t.kind == PathKind.TARGET, t.target, -1)
+            self._fed |= {Key(origin, int(k)): int(u) for k, u in zip(t.id, fed, strict=True)}
+        now = [uavs for link, uavs in self._seen.items() if timetable.holds(link, frame)]
+        roles = timetable.roles(frame)
+        target = np.array([role == "target" for role in roles.values()])
+        seen = np.any(now, axis=0) & target
+        return {name: self._score(view, seen, target, poses[name]) for name, view in views.items()}
+
+    def _score(
+        self, view: View, seen: np.ndarray, target: np.ndarray, poses: Mapping[str, Pose]
+    ) -> PictureRecord:
+        names, bodies = list(poses), view.bodies
+        truth = np.array([np.concatenate([p.position, p.velocity]) for p in poses.values()])
+        mean = np.array([b.state.mean for b in bodies]).reshape(-1, 6)
+        strange = np.array([b.terminal is None for b in bodies], bool)
+        nearest = np.linalg.norm(mean[:, None, :3] - truth[None, :, :3], axis=-1)
+        pairs = _paired(nearest[np.ix_(strange, seen)])
+        rows, columns = np.flatnonzero(strange), np.flatnonzero(seen)
+        stands = {int(columns[j]): int(rows[i]) for i, j in pairs}
+        left = np.setdiff1d(rows, list(stands.values()))
+        near = nearest[left] < GOSPA_CUTOFF_M
+        friend = (near & ~target).any(axis=1)
+        hidden = (near & target & ~seen).any(axis=1) & ~friend
+        each = GOSPA_CUTOFF_M**2 / 2
+        false = int((~friend & ~hidden).sum())
+        follows = np.full(len(bodies), -1)
+        error = np.full((len(names), 3), np.nan)
+        for u, k in stands.items():
+            if any(self._fed.get(key) == u for key in bodies[k].members):
+                follows[k] = u
+                error[u] = _errors(bodies[k], truth[u])
+        return PictureRecord(
+            gospa=np.array(
+                [
+                    sum(nearest[k, u] ** 2 for u, k in stands.items()),
+                    each * (int(seen.sum()) - len(stands)),
+                    each * false,
+                ]
+            ),
+            seen=seen,
+            found=np.isin(np.arange(len(names)), follows),
+            error=error,
+            false=false,
+            hidden=int(hidden.sum()),
+            unrecognised=int(friend.sum()),
+            reports=len(view.ages),
+            age=float(np.mean(view.ages)) if view.ages else np.nan,
+            messages=view.traffic.messages,
+            lost=view.traffic.lost,
+            origin=np.array([self._origin(b.name) for b in bodies], int),
+            number=np.array([b.name.number for b in bodies], int),
+            mean=mean,
+            std=np.array([np.sqrt(np.diag(b.state.covariance)) for b in bodies]).reshape(-1, 6),
+            members=np.array([len(b.members) for b in bodies], int),
+            terminal=np.array(
+                [-1 if b.terminal is None else names.index(b.terminal) for b in bodies], int
+            ),
+            uav=follows,
+        )
+
+    def _origin(self, name: Name) -> int:
+        return [str(link) for link in self._timetable.labels].index(name.origin)
+
+
+def _paired(distance: np.ndarray) -> list[tuple[int, int]]:
+    """GOSPA's pairs of (n, m) distances: of the least sum of squares, each under the cutoff."""
+    if not distance.size:
+        return []
+    d2 = np.minimum(distance, GOSPA_CUTOFF_M) ** 2
+    rows, columns = linear_sum_assignment(d2)
+    near = distance[rows, columns] < GOSPA_CUTOFF_M
+    return list(zip(rows[near].tolist(), columns[near].tolist(), strict=True))
+
+
+def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:
+    """Errors of position [m] and velocity [m/s], and the squared error of position in the
+    deviations stated, over its three axes."""
+    e = body.state.mean - truth
+    position = e[:3]
+    nees = float(position @ np.linalg.solve(body.state.covariance[:3, :3], position)) / 3
+    return float(np.linalg.norm(position)), float(np.linalg.norm(e[3:])), nees
+
+
+def summary_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any] | None:
+    """The key `swarm` of the summary: the picture of all terminals together, and under `terminals`
+    that of each (`docs/outputs.md` says what each figure means); None without pictures.
+
+    Parameters
+    ----------
+    rows : frames, of `isac_rt.results.dataset.row_of`
+    names : of the UAVs
+    """
+    frames = [row["pictures"] for row in rows if row.get("pictures")]
+    if not frames:
+        return None
+    of = {name: _block([f[name] for f in frames], names) for name in frames[0]}
+    together = of.pop(SWARM)
+    return {**together, "terminals": of}
+
+
+def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+    """The figures of one picture."""
+    seen, found = (np.array([row[key] for row in rows], bool) for key in ("seen", "found"))
+    localisation, missed, false = np.mean([row["gospa"] for row in rows], axis=0)
+    each = GOSPA_CUTOFF_M**2 / 2
+    error = np.array([row["error"] for row in rows], float)[found]
+    ages = np.array([row["age"] for row in rows], float)
+    reports = np.array([row["reports"] for row in rows])
+    heard = reports.sum()
+    position, velocity, nees = np.mean(error ** [2, 2, 1], axis=0) if len(error) else [None] * 3
+    in_view = int(seen.sum())
+    return {
+        "hit_rate": int(found.sum()) / in_view if in_view else None,
+        "gospa": {
+            "total_m": float(np.sqrt(localisation + missed + false)),
+            "missed": float(missed / each),
+            "false": float(false / each),
+            "localisation_m": float(np.sqrt(localisation)),
+            "empty_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
+        },
+        "false_tracks_per_frame": float(np.mean([row["false"] for row in rows])),
+        "hidden_per_frame": float(np.mean([row["hidden"] for row in rows])),
+        "unrecognised_per_frame": float(np.mean([row["unrecognised"] for row in rows])),
+        "rmse": {
+            "position_m": None if position is None else float(np.sqrt(position)),
+            "velocity_mps": None if velocity is None else float(np.sqrt(velocity)),
+        },
+        "nees": None if nees is None else float(nees),
+        "reports_per_frame": float(heard / len(rows)),
+        "age_s": float(np.nansum(ages * reports) / heard) if heard else None,
+        "messages": int(sum(row["messages"] for row in rows)),
+        "messages_lost": int(sum(row["lost"] for row in rows)),
+        "targets": {
+            name: {
+                "in_view": int(seen[:, u].sum()),
+                "found": int(found[:, u].sum()),
+                "switches": _switches(rows, u),
+            }
+            for u, name in enumerate(names)
+            if seen[:, u].any()
+        },
+    }
+
+
+def _switches(rows: Sequence[Mapping[str, Any]], u: int) -> int:
+    """Times that a UAV had another name than when it was found last."""
+    tables = [row["fused"] for row in rows]
+    names = [
+        (int(t["origin"][k]), int(t["number"][k]))
+        for t in tables
+        for k in np.flatnonzero(np.asarray(t["uav"]) == u)
+    ]
+    return sum(a != b for a, b in pairwise(names))

@@ -1,0 +1,114 @@
+"""Terminals that tell each other what they see, in whole runs in open space."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from talking import scenario
+from test_resume import Stopped, assert_equal_results, stopping_at
+
+from isac_rt.results.provenance import run_content
+from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
+from isac_rt.scenario.swarm import Access
+from isac_rt.simulation import simulate
+from isac_rt.simulation.resume import Resume
+from isac_rt.views.animate import fused_positions
+from isac_rt.views.report import swarm_table
+
+
+@pytest.fixture(scope="module")
+def talked():
+    return simulate.run(scenario(), snapshots=2)
+
+
+def test_nothing_else_of_a_run_depends_on_what_is_told(talked):
+    """The same bits. Planted bug: a picture's track that updates a terminal's tracker."""
+    alone = simulate.run(scenario(cooperation="none"), snapshots=2)
+    for name, variable in alone.dataset.variables.items():
+        kind = variable.dtype.kind == "f"
+        assert np.array_equal(talked.dataset[name].values, variable.values, equal_nan=kind), name
+    for key in ("terminals", "links", "paths"):
+        assert talked.summary[key] == alone.summary[key]
+    assert alone.summary["swarm"] is None
+
+
+def test_who_hears_what_and_when(talked):
+    """Three detections confirm a track, so frame 2 is the first after which there is something to
+    tell; it leaves with frame 3 and is in the other's picture from there on, a frame old. The AT
+    follows the PT and the target: 64 + 136 + 2 x 16 bits and 416 for each track. A frame holds
+    3 (60 x 7 + 57 x 3) = 1773 bits, half of them for messages: one track, so that the two take
+    turns, and their mean age is a frame and a half. The feedback has 1000 bits a frame and one
+    track to tell. Planted bugs: a message that arrives with the frame it is made after; a code
+    that costs nothing."""
+    d = talked.dataset
+    heard = {"AT": ([1] * 6, [0.02] * 6), "PT": ([1, 2, 2, 2, 2, 2], [0.02] + [0.03] * 5)}
+    for name, (count, age) in heard.items():
+        p = list(d.picture.values).index(name)
+        assert d.picture_reports.values[:, p].tolist() == [0] * 3 + count
+        assert np.allclose(d.picture_age.values[3:, p], age)
+
+
+def test_the_target_is_one_body_of_two_tracks_and_the_terminals_are_none(talked):
+    """In the last frame every picture has the target once, of both terminals' tracks, under one
+    name, and the PT's echo at the AT is recognised by what the PT says of itself."""
+    d = talked.dataset
+    last = d.fused_frame.values == 8
+    names = set()
+    for p in range(d.sizes["picture"]):
+        mine = last & (d.fused_picture.values == p)
+        (k,) = np.flatnonzero(mine & (d.fused_uav.values == 2))
+        assert d.fused_members.values[k] == 2
+        names.add((int(d.fused_origin.values[k]), int(d.fused_number.values[k])))
+        strange = mine & (d.fused_terminal.values < 0)
+        assert strange.sum() == 1
+    assert len(names) == 1
+    assert (d.fused_terminal.values[last] == 1).any()
+    swarm = talked.summary["swarm"]
+    assert swarm["targets"].keys() == {"U"}
+    assert swarm["targets"]["U"]["switches"] == 0
+    assert swarm["terminals"]["PT"]["messages_lost"] == 0
+
+
+def test_a_slow_feedback_makes_the_picture_old():
+    """1 kbit/s is 20 bits a frame: a message of a track and a terminal, 632 bits and more, takes
+    over 31 frames, so that the AT hears nothing in nine, while the PT hears as before."""
+    swarm = simulate.run(scenario(access=Access(feedback_rate_bps=1e3))).summary["swarm"]
+    assert swarm["terminals"]["AT"]["messages"] == 0
+    assert swarm["terminals"]["PT"]["messages"] > 3
+
+
+def test_a_terminal_that_does_not_decode_hears_nothing():
+    """The PT looks away: it acquires nobody. Its messages, and those to it, are lost."""
+    deaf = scenario().swarm["PT"].model_copy(update={"boresight": (0, 1, 0)})
+    swarm = {**scenario().swarm, "PT": deaf}
+    told = simulate.run(scenario(swarm=swarm, frames=6)).summary["swarm"]["terminals"]
+    for name in ("AT", "PT"):
+        assert told[name]["messages"] == told[name]["messages_lost"] > 0
+        assert told[name]["reports_per_frame"] == 0
+
+
+def test_a_stopped_run_goes_on_to_the_same_pictures(tmp_path):
+    """Also of a set that is compared. Planted bugs: the channels, the names or what fed the tracks
+    not taken up."""
+    other = {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking(confirm_hits=2))}
+    flight = scenario(frames=7, compare=other)
+    whole = simulate.run(flight, snapshots=2)
+    for stop in (3, 5, None):
+        resume = Resume(tmp_path, run_content(flight, 2), every=0.0)
+        try:
+            again = simulate.run(flight, snapshots=2, resume=resume, progress=stopping_at(stop))
+        except Stopped:
+            continue
+    assert_equal_results(again, whole)
+    assert whole.summary["compared"]["other"]["swarm"] != whole.summary["swarm"]
+
+
+def test_the_report_and_the_moving_picture_show_the_pictures(talked):
+    table = swarm_table(talked.summary)
+    assert [row[0] for row in table.rows] == ["All together", "AT", "PT"]
+    assert table.rows[2][-1].startswith("0 of ")
+    d = talked.dataset
+    (found,) = fused_positions(d, 8, 0)
+    assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
+    alone = d.drop_vars([name for name in d.variables if name == "picture"])
+    assert fused_positions(alone, 8, 0).shape == (0, 3)
