@@ -17,6 +17,15 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from isac_rt.capture.calibrate import Calibration as Calibration
+    from isac_rt.capture.calibrate import calibrate as calibrate
+    from isac_rt.capture.readers import import_file as import_file
+    from isac_rt.capture.readers import read_sigmf as read_sigmf
+    from isac_rt.capture.store import load_capture as load_capture
+    from isac_rt.capture.store import load_cube as load_cube
+    from isac_rt.capture.store import save_capture as save_capture
+    from isac_rt.capture.store import save_cube as save_cube
+    from isac_rt.capture.types import Capture as Capture
     from isac_rt.frame.cube import IFCube as IFCube
     from isac_rt.frame.cube import ReceiveArray as ReceiveArray
     from isac_rt.frame.cube import Reference as Reference
@@ -59,13 +68,14 @@ if TYPE_CHECKING:
     from isac_rt.views.animate import write_animation as write_animation
     from isac_rt.views.interactive import scene_3d as scene_3d
     from isac_rt.views.interchange import from_sionna as from_sionna
-    from isac_rt.views.interchange import load_cube as load_cube
-    from isac_rt.views.interchange import read_sigmf as read_sigmf
-    from isac_rt.views.interchange import save_cube as save_cube
     from isac_rt.views.interchange import stonesoup_detections as stonesoup_detections
     from isac_rt.views.interchange import write_sigmf as write_sigmf
 
 _NAMES = {
+    "capture.calibrate": "Calibration calibrate",
+    "capture.readers": "import_file read_sigmf",
+    "capture.store": "load_capture load_cube save_capture save_cube",
+    "capture.types": "Capture",
     "frame.cube": "IFCube ReceiveArray Reference Transmission",
     "frame.waveform": "Waveform",
     "propagation.pathset": "PathKind PathSet",
@@ -82,8 +92,7 @@ _NAMES = {
     "terminal.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",
     "views.interactive": "scene_3d",
-    "views.interchange": "from_sionna load_cube read_sigmf save_cube "
-    "stonesoup_detections write_sigmf",
+    "views.interchange": "from_sionna stonesoup_detections write_sigmf",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -16,7 +16,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
     "runtime randomness storage scenario kernels world frame hardware propagation signal receive "
-    "terminal access results simulation sweep views studies cli"
+    "terminal access results capture simulation sweep views studies cli"
 ).split()
 GROUND = {"runtime", "randomness"}
 NEVER = {("receive", "signal"), ("receive", "propagation"), ("world", "frame")}

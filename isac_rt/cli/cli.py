@@ -18,7 +18,7 @@ import typer
 from rich.text import Text
 
 import isac_rt
-from isac_rt.cli import setting_up, simulation, studies, sweeps
+from isac_rt.cli import captures, setting_up, simulation, studies, sweeps
 from isac_rt.cli.console import err
 from isac_rt.cli.interruption import Terminated, say_interrupted
 from isac_rt.runtime import UserError, of_machine
@@ -35,6 +35,8 @@ COMMANDS: dict[Callable[..., None], str] = {
     studies.reproduce: "reproduce table1 fig8 --quick",
     studies.validate: "validate --quick --only geometry",
     studies.bench: "bench synthesis --quick",
+    captures.import_: "import adc_data.bin --description board.yaml --out cube.nc",
+    captures.calibrate: "calibrate cube.nc --out board.cal --json",
     setting_up.doctor: "doctor",
     setting_up.new: "new mine.yaml --footprints buildings.geojson",
     setting_up.schema: "schema > scenario.schema.json",
@@ -44,7 +46,9 @@ COMMANDS: dict[Callable[..., None], str] = {
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 for _command, _example in COMMANDS.items():
     app.command(
-        help=" ".join(str(_command.__doc__).split()), epilog=f"Example: isac-rt {_example}"
+        _command.__name__.rstrip("_"),
+        help=" ".join(str(_command.__doc__).split()),
+        epilog=f"Example: isac-rt {_example}",
     )(_command)
 
 
@@ -79,9 +83,10 @@ def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> No
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = app(
-            args=None if arguments is None else list(arguments),
+            args=captures.with_standard_output(given),
             prog_name="isac-rt",
             standalone_mode=False,
         )

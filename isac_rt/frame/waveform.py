@@ -35,6 +35,8 @@ class Waveform:
     filter_transition : width of the skirts of the IF filter [Hz], which passes [0, f_s]
     blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A
         receiver that reads some of the groups only sees a waveform of these (`of_groups`)
+    slot_period : from one chirp of a group to its next [s], where a board keeps its own time; None:
+        as the guard interval asks for
 
     Examples
     --------
@@ -52,6 +54,7 @@ class Waveform:
     num_tx: int = 3
     filter_transition: float = 0.4e6
     blocks: tuple[int, ...] | None = None
+    slot_period: float | None = None
 
     def __post_init__(self) -> None:
         if self.bandwidth <= 2 * self.sampling_rate:
@@ -97,7 +100,7 @@ class Waveform:
     @property
     def slot_duration(self) -> float:
         """T- [s], from one chirp of a group to its next."""
-        return self._times.slot
+        return self._times.slot if self.slot_period is None else self.slot_period
 
     @property
     def frame_duration(self) -> float:

@@ -1,5 +1,5 @@
-"""Files and objects that others read: path ledgers and IF cubes as NetCDF, cubes as SigMF, Sionna's
-path sets, detections for Stone Soup.
+"""Files and objects that others read: path ledgers as NetCDF, IF cubes as SigMF, Sionna's path
+sets, detections for Stone Soup.
 
 SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interchange]`).
 """
@@ -7,37 +7,30 @@ SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interch
 from __future__ import annotations
 
 import datetime
-import hashlib
 import importlib
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from pydantic import TypeAdapter
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
-from isac_rt.results.files import ResultsError, read_dataset, write_dataset
+from isac_rt.results.files import write_dataset
 from isac_rt.results.records import KINDS
 from isac_rt.runtime import MissingPackage
-from isac_rt.storage import BAD_DATA, read_whole, write_whole
+from isac_rt.storage import write_whole
 
 if TYPE_CHECKING:
     import sionna.rt as rt
     from stonesoup.types.detection import Detection
 
 EXTRA = "pip install 'isac_rt[interchange]'"
-MOST_META_BYTES = 64 * 1024**2
-"""No description of a recording is larger."""
-_SAMPLE_AXES = ("group", "rx", "chirp", "sample")
 
 
 def write_ledger(
@@ -97,127 +90,6 @@ def _names(meaning: str, end: str) -> Column:
     )
 
 
-def cube_dataset(cube: IFCube) -> xr.Dataset:
-    """An IF cube as labelled arrays; NetCDF knows no complex numbers, so real and imaginary parts
-    stand apart.
-
-    Returns
-    -------
-    Dataset with `samples_re`, `samples_im` (group, rx, chirp, sample) float32 [sqrt(W)], `schedule`
-    (group, chirp), the start of each slot `slot_time` (chirp,) and fast time `time` (sample,) [s];
-    the waveform is the JSON attribute `waveform`
-    """
-    w = cube.waveform
-    values = {
-        "samples_re": (
-            _SAMPLE_AXES,
-            cube.samples.real,
-            {"units": "W0.5", "long_name": "in-phase part of the IF samples"},
-        ),
-        "samples_im": (
-            _SAMPLE_AXES,
-            cube.samples.imag,
-            {"units": "W0.5", "long_name": "quadrature part of the IF samples"},
-        ),
-        "schedule": (
-            ("group", "chirp"),
-            np.asarray(cube.schedule),
-            {"units": "1", "long_name": "transmit antenna of each chirp"},
-        ),
-    }
-    slots = cube.start_time + np.arange(w.num_chirps) * w.slot_duration
-    coordinates = {
-        "slot_time": ("chirp", slots, {"units": "s", "long_name": "start of the reference chirp"}),
-        "time": (
-            "sample",
-            np.arange(w.num_samples) / w.sampling_rate,
-            {"units": "s", "long_name": "time since that"},
-        ),
-    }
-    attributes = {
-        "waveform": json.dumps(asdict(w)),
-        "start_time_s": cube.start_time,
-        "Conventions": "CF-1.11",
-    }
-    return xr.Dataset(values, coordinates, attributes)
-
-
-def save_cube(cube: IFCube, file: str | Path) -> None:
-    """Write an IF cube as NetCDF (see `cube_dataset`); the file appears whole or not at all.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import isac_rt as irt
-    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
-    >>> cube = setup.frame(0).samples(("AT", "PT1"))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     irt.save_cube(cube, f"{folder}/cube.nc")
-    ...     again = irt.load_cube(f"{folder}/cube.nc")
-    >>> bool((again.samples == cube.samples).all())
-    True
-    """
-    write_dataset(cube_dataset(cube), Path(file))
-
-
-def load_cube(file: str | Path) -> IFCube:
-    """An IF cube that `save_cube` wrote.
-
-    Raises
-    ------
-    ResultsError  If the file is not one.
-    """
-    try:
-        d = read_dataset(Path(file))
-        return _checked_cube(
-            d.samples_re.values + 1j * d.samples_im.values,
-            json.loads(d.attrs["waveform"]),
-            d.schedule.values,
-            d.attrs["start_time_s"],
-        )
-    except (OSError, MemoryError, *BAD_DATA) as problem:
-        raise ResultsError(
-            f"cannot read an IF cube from {file}: {_short(problem)}; give a file that `save_cube` "
-            "wrote"
-        ) from problem
-
-
-def _checked_cube(samples: np.ndarray, waveform: Any, schedule: np.ndarray, start: Any) -> IFCube:
-    """A cube whose parts fit each other.
-
-    Raises
-    ------
-    ValueError
-    """
-    if waveform.keys() != {field.name for field in fields(Waveform)}:
-        raise ValueError("its waveform has other keys")
-    w = TypeAdapter(Waveform).validate_python(waveform)
-    shape = (w.num_groups, *samples.shape[1:2], w.num_chirps, w.num_samples)
-    if samples.shape != shape or schedule.shape != (w.num_groups, w.num_chirps):
-        raise ValueError(f"samples {samples.shape} and schedule {schedule.shape} are not {shape}")
-    cube = IFCube(
-        samples=np.ascontiguousarray(samples, np.complex64),
-        waveform=w,
-        schedule=schedule,
-        start_time=float(start),
-    )
-    derived = (cube.start_time, w.slope, w.delay_step, w.frame_duration)
-    if (
-        not samples.size
-        or not np.isfinite([*derived, w.carrier_frequency, w.filter_transition]).all()
-        or min(derived[1:]) <= 0
-        or not np.isfinite(cube.samples).all()
-        or schedule.dtype.kind not in "iu"
-        or not ((schedule >= 0) & (schedule < w.num_tx)).all()
-    ):
-        raise ValueError("a sample, a time or a transmit antenna cannot be")
-    return cube
-
-
-def _short(problem: BaseException) -> str:
-    return " ".join(str(problem).split())[:300]
-
-
 def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[Path, Path]:
     """Write IF samples as a SigMF recording: ``FILE.sigmf-data`` and ``FILE.sigmf-meta``.
 
@@ -264,31 +136,6 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
     made.validate()
     write_whole(meta, made.dumps())
     return data, meta
-
-
-def read_sigmf(file: str | Path) -> IFCube:
-    """An IF cube from a recording that `write_sigmf` made; `file` without the suffix.
-
-    Raises
-    ------
-    ResultsError  If it is none, or its data are not those of its checksum.
-    """
-    base = Path(file)
-    try:
-        meta = read_whole(base.with_name(base.name + ".sigmf-meta"), MOST_META_BYTES)
-        data = read_whole(base.with_name(base.name + ".sigmf-data"))
-        info = json.loads(meta)["global"]
-        if hashlib.sha512(data).hexdigest() != info["core:sha512"]:
-            raise ValueError("the data are not those of its checksum")
-        w, schedule = info["isac_rt:waveform"], np.array(info["isac_rt:schedule"])
-        shape = (w["num_chirps"], w["num_samples"], len(schedule), -1)
-        samples = np.frombuffer(data, "<c8").reshape(shape).transpose(2, 3, 0, 1)
-        return _checked_cube(samples, w, schedule, info["isac_rt:start_time_s"])
-    except (OSError, MemoryError, *BAD_DATA) as problem:
-        raise ResultsError(
-            f"cannot read an IF cube from {base}: {_short(problem)}; give a recording that "
-            "`write_sigmf` made"
-        ) from problem
 
 
 def from_sionna(

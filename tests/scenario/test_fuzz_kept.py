@@ -23,6 +23,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_fuzz import JUNK, PROFILE, broken, one_message
 
+from isac_rt.capture.readers import read_sigmf
+from isac_rt.capture.store import load_cube, save_cube
 from isac_rt.frame.cube import IFCube
 from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError, open_results, save, write_dataset
@@ -36,7 +38,7 @@ from isac_rt.studies.paper import montecarlo
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, save_dataset, status
 from isac_rt.sweep.execute import Job, run_job
 from isac_rt.sweep.outcomes import _checksum, assemble
-from isac_rt.views.interchange import load_cube, read_sigmf, save_cube, write_sigmf
+from isac_rt.views.interchange import write_sigmf
 
 SCENE = """
 name: small

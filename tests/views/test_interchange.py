@@ -9,6 +9,8 @@ import json
 import numpy as np
 import pytest
 
+from isac_rt.capture.readers import read_sigmf
+from isac_rt.capture.store import cube_dataset, load_cube, save_cube
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind
@@ -19,11 +21,7 @@ from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.views.interchange import (
-    cube_dataset,
     from_sionna,
-    load_cube,
-    read_sigmf,
-    save_cube,
     stonesoup_detections,
     write_sigmf,
 )

@@ -1,0 +1,389 @@
+"""Files of radar boards to cubes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isac_rt.capture.description import Description
+from isac_rt.capture.matfile import read_mat
+from isac_rt.capture.store import checked_cube, short
+from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.frame.antennas import Antennas, ti_cascade
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import Waveform
+from isac_rt.results.files import ResultsError
+from isac_rt.storage import BAD_DATA, read_whole
+
+TI_SAMPLING_RATE = 8e6
+"""Of TI's calibration captures [Hz], where their file does not state it."""
+MOST_BYTES = 2 * 1024**3
+MOST_META_BYTES = 64 * 1024**2
+"""No description of a recording is larger."""
+SUFFIXES = {
+    ".mat": "ti_calibration",
+    ".bin": "dca1000",
+    ".npy": "numpy",
+    ".sigmf-meta": "sigmf",
+    ".sigmf-data": "sigmf",
+}
+_SIGMF_TYPES = {"cf32_le": "<c8", "cf64_le": "<c16", "rf32_le": "<f4", "rf64_le": "<f8"}
+_SIGMF_TYPES |= {"ri16_le": "<i2", "ru16_le": "<u2", "ci16_le": "<i2", "cu16_le": "<u2"}
+
+
+def import_file(
+    file: str | Path, description: Description | None = None, format: str | None = None
+) -> Capture:
+    """One measured frame from a file of a radar board.
+
+    Parameters
+    ----------
+    file : TI's calibration (.mat), a DCA1000's raw samples (.bin), NumPy (.npy) or SigMF
+    description : what the file does not say of itself; a TI calibration needs none
+    format : kind of file; None: as the description or the file's name says
+
+    Raises
+    ------
+    CaptureError  If the file cannot be read, does not fit the description, or holds what is no
+        number.
+    """
+    file, said = Path(file), description or Description()
+    kind = format or said.format or SUFFIXES.get(file.suffix)
+    if kind not in _READERS:
+        raise CaptureError(
+            f"{file}: a name that ends in {file.suffix or 'nothing'} does not tell the format; "
+            f"state one of {', '.join(_READERS)}"
+        )
+    found = _READERS[kind](file, said)
+    bad = int((~np.isfinite(found.cube.samples)).sum())
+    if bad:
+        raise CaptureError(
+            f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such chirps "
+            "out"
+        )
+    return found
+
+
+# ---- TI's calibration
+
+
+def _ti_calibration(file: Path, d: Description) -> Capture:
+    """The mean chirp of every channel, as TI's calibration keeps it: its zero-padded FFT under the
+    window sin^2(pi (n+1)/(N+1))."""
+    tree = read_mat(file)
+    result, params = tree.get("calibResult"), tree.get("params")
+    spectra = result.get("Rx_fft") if isinstance(result, dict) else None
+    if not isinstance(spectra, np.ndarray) or spectra.ndim != 3 or min(spectra.shape) < 1:
+        seen = "no array" if not isinstance(spectra, np.ndarray) else f"an array of {spectra.shape}"
+        raise CaptureError(
+            f"{file}: calibResult.Rx_fft is {seen}, a calibration has (cells, receivers, "
+            "transmitters); give a file that TI's cascade calibration wrote"
+        )
+    params = params if isinstance(params, dict) else {}
+    slope = _stated(file, params.get("Slope_MHzperus"), d.slope_mhz_per_us, "slope", "MHz/us")
+    rate = _stated(
+        file, params.get("Sampling_Rate_sps"), d.sampling_rate_hz, "sampling rate", "samples/s"
+    )
+    if slope is None:
+        raise CaptureError(f"{file}: no slope is stated; give slope_mhz_per_us in a description")
+    samples = _without_window(file, spectra, d.samples_per_chirp)
+    size, num_rx, num_tx = samples.shape
+    said = Description.model_validate(
+        d.model_dump()
+        | {
+            "slope_mhz_per_us": slope,
+            "sampling_rate_hz": rate or TI_SAMPLING_RATE,
+            "samples_per_chirp": size,
+            "chirps": tuple(range(num_tx)),
+            "loops": 1,
+        }
+    )
+    _same(file, "receivers", num_rx, d.receivers)
+    antennas = d.antennas()
+    if antennas is None and (num_tx, num_rx) == (12, 16):
+        antennas = Antennas.placed(*ti_cascade())
+    chirps = samples.transpose(1, 2, 0)[None]  # (group, rx, chirp, sample)
+    return _capture(file, said, chirps, antennas, "ti_calibration")
+
+
+def _stated(file: Path, found: Any, described: float | None, what: str, unit: str) -> float | None:
+    """A number that the file states or the description; refused where they differ."""
+    if not isinstance(found, np.ndarray) or found.size == 0:
+        return described
+    value = float(np.ravel(found)[0].real)
+    if found.size != 1 or not (math.isfinite(value) and value > 0):
+        raise CaptureError(f"{file}: the {what} is {value:g} {unit}, it must be above 0")
+    if described is not None and abs(described / value - 1) > 1e-6:
+        raise CaptureError(
+            f"{file}: the file states a {what} of {value:g} {unit}, the description {described:g}; "
+            "leave the latter out or correct it"
+        )
+    return value
+
+
+def _without_window(file: Path, spectra: np.ndarray, stated: int | None) -> np.ndarray:
+    """IF samples (N, L_rx, L_tx) of zero-padded spectra under TI's window."""
+    if not np.isfinite(spectra).all():
+        bad = int((~np.isfinite(spectra)).sum())
+        raise CaptureError(
+            f"{file}: {bad} of {spectra.size} numbers of Rx_fft are not finite; capture again"
+        )
+    padded = np.fft.ifft(spectra.astype(np.complex128), axis=0)
+    level = np.abs(padded).max(axis=(1, 2))
+    least = level.max() * 1e-6  # single precision leaves some 1e-7 behind the chirp's end
+    if not least > 0:
+        raise CaptureError(f"{file}: Rx_fft is zero everywhere; capture again")
+    size = int(np.flatnonzero(level > least)[-1]) + 1
+    if stated is not None and size > stated:
+        raise CaptureError(
+            f"{file}: the chirps have {size} samples, the description states {stated}; correct "
+            "samples_per_chirp"
+        )
+    size = stated or size
+    if not 16 <= size <= 65536:
+        raise CaptureError(f"{file}: the chirps have {size} samples, 16 to 65536 can be read")
+    window = np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2
+    return np.asarray(padded[:size] / window[:, None, None])
+
+
+# ---- DCA1000
+
+
+def _dca1000(file: Path, d: Description) -> Capture:
+    """Raw samples of 16 bits as TI's capture card streams them."""
+    said = _complete(file, d)
+    rows, num_rx, size = said.frames * said.loops * len(said.chirps), said.receivers, said.size
+    parts = 1 if d.sampling == "real" else 2
+    content = _read(file)
+    _fits(file, said, len(content), 2 * parts * rows * num_rx * size)
+    words = np.frombuffer(content, "<i2").astype(np.float32)
+    shape = (rows, size, num_rx) if d.interleaved else (rows, num_rx, size)
+    if parts == 1:
+        flat = words.reshape(shape).astype(np.complex64)
+    elif d.interleaved:
+        pairs = words.reshape(rows, size, 2, num_rx)
+        flat = _joined(pairs[:, :, 0], pairs[:, :, 1], d)
+    else:
+        if size % 2:
+            raise CaptureError(
+                f"{file}: {size} samples per chirp; two lanes deliver an even number of them"
+            )
+        pairs = words.reshape(rows, num_rx, size // 2, 2, 2)
+        flat = _joined(pairs[:, :, :, 0], pairs[:, :, :, 1], d).reshape(shape)
+    by_rx = flat.transpose(0, 2, 1) if d.interleaved else flat
+    return _framed(file, said, by_rx.reshape(said.frames, -1, num_rx, size), "dca1000")
+
+
+def _joined(first: np.ndarray, second: np.ndarray, d: Description) -> np.ndarray:
+    i, q = (second, first) if d.q_first else (first, second)
+    return (i + 1j * q).astype(np.complex64)
+
+
+# ---- NumPy and SigMF
+
+
+def _numpy(file: Path, d: Description) -> Capture:
+    try:
+        array = np.load(io.BytesIO(_read(file)), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as problem:
+        raise CaptureError(
+            f"{file}: is no NumPy file of numbers ({problem}); save an array with numpy.save"
+        ) from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufc":
+        raise CaptureError(f"{file}: holds no array of numbers; save one with numpy.save")
+    return _ordered(file, array, d, "numpy")
+
+
+def _sigmf(file: Path, d: Description) -> Capture:
+    base = file.with_suffix("") if file.suffix in (".sigmf-meta", ".sigmf-data") else file
+    meta, data = (base.with_name(base.name + end) for end in (".sigmf-meta", ".sigmf-data"))
+    try:
+        info = json.loads(_read(meta))["global"]
+        kind = str(info["core:datatype"])
+    except (ValueError, KeyError, TypeError) as problem:
+        raise CaptureError(f"{meta}: is no SigMF description ({problem})") from None
+    if "isac_rt:waveform" in info:
+        return Capture(cube=read_sigmf(base), source={"file": file.name, "format": "sigmf"})
+    if kind not in _SIGMF_TYPES:
+        raise CaptureError(
+            f"{meta}: samples of type {kind} are not read; {', '.join(_SIGMF_TYPES)} are"
+        )
+    content, dtype = _read(data), np.dtype(_SIGMF_TYPES[kind])
+    if len(content) % dtype.itemsize:
+        raise CaptureError(
+            f"{data}: {len(content)} bytes are no whole number of samples of {dtype.itemsize} bytes"
+        )
+    flat = np.frombuffer(content, dtype)
+    if kind.startswith("c") and dtype.kind != "c":
+        if flat.size % 2:
+            raise CaptureError(f"{data}: {flat.size} numbers are no pairs of I and Q")
+        pairs = _unwrapped(flat, d).astype(np.float32).reshape(-1, 2)
+        return _ordered(data, pairs[:, 0] + 1j * pairs[:, 1], d, "sigmf")
+    return _ordered(data, flat, d, "sigmf")
+
+
+def read_sigmf(file: str | Path) -> IFCube:
+    """An IF cube from a recording that `write_sigmf` made; `file` without the suffix.
+
+    Raises
+    ------
+    ResultsError  If it is none, or its data are not those of its checksum.
+    """
+    base = Path(file)
+    try:
+        meta = read_whole(base.with_name(base.name + ".sigmf-meta"), MOST_META_BYTES)
+        data = read_whole(base.with_name(base.name + ".sigmf-data"))
+        info = json.loads(meta)["global"]
+        if hashlib.sha512(data).hexdigest() != info["core:sha512"]:
+            raise ValueError("the data are not those of its checksum")
+        w, schedule = info["isac_rt:waveform"], np.array(info["isac_rt:schedule"])
+        shape = (w["num_chirps"], w["num_samples"], len(schedule), -1)
+        samples = np.frombuffer(data, "<c8").reshape(shape).transpose(2, 3, 0, 1)
+        return checked_cube(samples, w, schedule, info["isac_rt:start_time_s"])
+    except (OSError, MemoryError, *BAD_DATA) as problem:
+        raise ResultsError(
+            f"cannot read an IF cube from {base}: {short(problem)}; give a recording that "
+            "`write_sigmf` made"
+        ) from problem
+
+
+def _unwrapped(values: np.ndarray, d: Description) -> np.ndarray:
+    return np.where(values >= 32768, values - 65536.0, values) if d.wrapped else values
+
+
+def _ordered(file: Path, array: np.ndarray, d: Description, kind: str) -> Capture:
+    """The frame of an array whose axes the description names."""
+    said = _complete(file, d)
+    sizes = {
+        "frame": said.frames,
+        "loop": said.loops,
+        "chirp": len(said.chirps),
+        "receiver": said.receivers,
+        "sample": said.size,
+    }
+    shape = tuple(sizes[name] for name in d.axes)
+    if array.size != math.prod(shape):
+        raise CaptureError(
+            f"{file}: an array of {' x '.join(map(str, array.shape))} has {array.size} numbers, "
+            f"{' x '.join(f'{n} {name}s' for name, n in zip(d.axes, shape, strict=True))} make "
+            f"{math.prod(shape)}; correct the description"
+        )
+    if np.iscomplexobj(array):
+        array = _unwrapped(array.real, d) + 1j * _unwrapped(array.imag, d)
+    else:
+        array = _unwrapped(array, d)
+    wanted = [d.axes.index(name) for name in ("frame", "loop", "chirp", "receiver", "sample")]
+    frames = array.reshape(shape).transpose(wanted)
+    return _framed(file, said, frames.reshape(said.frames, -1, said.receivers, said.size), kind)
+
+
+# ---- what all have in common
+
+
+class _Complete(Description):
+    """A description with every number that a cube needs."""
+
+    slope_mhz_per_us: float
+    sampling_rate_hz: float
+    samples_per_chirp: int
+    receivers: int
+
+    @property
+    def size(self) -> int:
+        return self.samples_per_chirp
+
+
+def _complete(file: Path, d: Description) -> _Complete:
+    needed = ("slope_mhz_per_us", "sampling_rate_hz", "samples_per_chirp", "receivers")
+    missing = [name for name in needed if getattr(d, name) is None]
+    if missing:
+        raise CaptureError(
+            f"{file}: does not say its {', '.join(missing)}; state them in a description"
+        )
+    return _Complete.model_validate(d.model_dump())
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return read_whole(file, MOST_BYTES)
+    except OSError as problem:
+        raise CaptureError(f"{file}: cannot be read: {problem.strerror}; check the path") from None
+
+
+def _fits(file: Path, d: _Complete, found: int, wanted: int) -> None:
+    if found != wanted:
+        raise CaptureError(
+            f"{file}: has {found} bytes, the description asks for {wanted}: {d.frames} frames x "
+            f"{d.loops} loops x {len(d.chirps)} chirps x {d.receivers} receivers x {d.size} "
+            f"samples of {2 if d.sampling == 'real' else 4} bytes; correct the description"
+        )
+
+
+def _same(file: Path, what: str, found: int, stated: int | None) -> None:
+    if stated is not None and found != stated:
+        raise CaptureError(
+            f"{file}: has {found} {what}, the description states {stated}; correct it"
+        )
+
+
+def _framed(file: Path, d: _Complete, frames: np.ndarray, kind: str) -> Capture:
+    """The chosen frame of (frames, chirps, L_rx, N)."""
+    chirps = frames[d.frame].transpose(1, 0, 2)[None]
+    return _capture(file, d, chirps, d.antennas(), kind)
+
+
+def waveform_described(d: Description) -> Waveform:
+    """The sampled part of a board's chirp as a `Waveform`.
+
+    A `Waveform` starts to sample 2 f_s / alpha after the start of its chirp. Its carrier is the
+    frequency so long before the board's first sample: f_0 + alpha t_ADC - 2 f_s.
+    """
+    assert d.slope_mhz_per_us and d.sampling_rate_hz and d.samples_per_chirp
+    slope, rate, size = d.slope_mhz_per_us * 1e12, d.sampling_rate_hz, d.samples_per_chirp
+    chirps = d.loops * len(d.chirps)
+    return Waveform(
+        carrier_frequency=d.carrier_hz + slope * d.adc_start_us * 1e-6 - 2 * rate,
+        bandwidth=slope * size / rate + 2 * rate,
+        sampling_rate=rate,
+        num_samples=size,
+        num_chirps=chirps,
+        num_groups=1,
+        num_tx=d.num_tx,
+        slot_period=None if d.chirp_interval_us is None else d.chirp_interval_us * 1e-6,
+    )
+
+
+def _capture(
+    file: Path, d: Description, chirps: np.ndarray, antennas: Antennas | None, kind: str
+) -> Capture:
+    """A capture of (1, L_rx, chirps, N) samples."""
+    if antennas is not None:
+        _same(file, "receivers", chirps.shape[1], antennas.num_rx)
+        _same(file, "transmitters", d.num_tx, antennas.num_tx)
+    cube = IFCube(
+        samples=np.ascontiguousarray(chirps, np.complex64),
+        waveform=waveform_described(d),
+        schedule=np.tile(np.array(d.chirps, np.int64), d.loops)[None],
+        start_time=0.0,
+    )
+    return Capture(
+        cube=cube,
+        antennas=antennas,
+        source={"file": file.name, "format": kind, "sampling": d.sampling},
+    )
+
+
+_READERS: dict[str, Callable[[Path, Description], Capture]] = {
+    "ti_calibration": _ti_calibration,
+    "dca1000": _dca1000,
+    "numpy": _numpy,
+    "sigmf": _sigmf,
+}
+FORMATS = tuple(_READERS)

@@ -1,0 +1,176 @@
+"""Commands on measured samples: `import` and `calibrate`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from isac_rt.cli.arguments import InputProblem
+from isac_rt.cli.console import say, say_table, working
+
+if TYPE_CHECKING:
+    from isac_rt.capture.types import Capture
+
+DescriptionFile = Annotated[
+    Path | None,
+    typer.Option("--description", metavar="YAML", help="What the file does not say of itself."),
+]
+Format = Annotated[
+    str | None,
+    typer.Option(
+        "--format",
+        metavar="NAME",
+        help="ti_calibration, dca1000, numpy or sigmf; by default as the file's name ends.",
+    ),
+]
+CalibrationFile = Annotated[
+    Path | None,
+    typer.Option("--calibration", metavar="CAL", help="Of the board: what to take out."),
+]
+KEYS = (
+    "range_m range_scatter_mm rank_one_share left_db left_deg gain_spread_rx_db gain_spread_tx_db "
+    "unexplained_db unexplained_response_db range_bound_mm snr_db"
+).split()
+STDOUT = "-"
+
+
+def with_standard_output(arguments: list[str]) -> list[str]:
+    """`calibrate --json` without a file means standard output."""
+    if arguments[:1] != ["calibrate"]:
+        return arguments
+    out: list[str] = []
+    for word, after in zip(arguments, [*arguments[1:], "--"], strict=True):
+        out.append(word)
+        if word == "--json" and after.startswith("--"):
+            out.append(STDOUT)
+    return out
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Samples of a radar board.")],
+    out: Annotated[Path, typer.Option(metavar="CUBE.nc", help="Where the cube goes.")],
+    description: DescriptionFile = None,
+    format: Format = None,
+    calibration: CalibrationFile = None,
+) -> None:
+    """Make a cube of IF samples of a radar board's file: TI's calibration (.mat), a DCA1000's
+    (.bin), NumPy (.npy) or SigMF."""
+    from isac_rt.capture.store import load_capture, save_capture
+    from isac_rt.results.files import check_folder
+
+    check_folder(out.parent)
+    with working("reading the samples"):
+        found = _calibrated(_imported(file, description, format), calibration)
+        save_capture(found, out)
+        again = load_capture(out)
+    if (again.cube.samples != found.cube.samples).any():
+        raise InputProblem(f"{out}: does not read back as it was written; is the disk sound?")
+    say(f"{out}: {found.cube!r}")
+
+
+def calibrate(
+    cube: Annotated[
+        Path | None,
+        typer.Argument(metavar="CUBE", help="A cube, or a file that `import` reads by itself."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="CAL", help="Where the calibration goes.")
+    ] = None,
+    json_file: Annotated[
+        str | None,
+        typer.Option("--json", metavar="[FILE]", help="Figures as JSON; no file: printed."),
+    ] = None,
+    description: DescriptionFile = None,
+    azimuth_deg: Annotated[
+        float, typer.Option(min=-89, max=89, help="Of the reflector from the boresight.")
+    ] = 0.0,
+    elevation_deg: Annotated[
+        float, typer.Option(min=-89, max=89, help="Of the reflector from the horizontal.")
+    ] = 0.0,
+) -> None:
+    """Find a board's gains, phases, delays and response over the sweep from one strong
+    reflector."""
+    from isac_rt.capture.calibrate import calibrate as fit
+    from isac_rt.capture.calibrate import save_calibration
+    from isac_rt.results.files import check_folder
+    from isac_rt.storage import write_whole
+
+    if cube is None and json_file not in (None, STDOUT):  # `--json CUBE`
+        cube, json_file = Path(str(json_file)), STDOUT
+    if cube is None:
+        raise InputProblem("calibrate: which CUBE? name the file")
+    for target in (out, json_file):
+        if target not in (None, STDOUT):
+            check_folder(Path(str(target)).parent)
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    with working("fitting"):
+        found = fit(
+            _opened(cube, description),
+            (math.cos(elevation) * math.sin(azimuth), math.sin(elevation)),
+        )
+    figures = {name: getattr(found, name) for name in KEYS} | _per_channel(found)
+    text = json.dumps(figures, indent=1, allow_nan=False) + "\n"
+    if out is not None:
+        save_calibration(found, out)
+    if json_file == STDOUT:
+        typer.echo(text, nl=False)
+        return
+    if json_file is not None:
+        write_whole(Path(json_file), text)
+    say_table(("", cube.name), [(name, f"{figures[name]:.4f}") for name in KEYS])
+    say(*([f"{out}: name it with --calibration"] if out is not None else []))
+
+
+def _per_channel(found: Any) -> dict[str, Any]:
+    """Gains, phases, delays and the sweep as lists, with their standard deviations."""
+    import numpy as np
+
+    out: dict[str, Any] = {}
+    for end in ("rx", "tx"):
+        gain, spread = getattr(found, f"{end}_gain"), getattr(found, f"{end}_gain_std")
+        delay, late = getattr(found, f"{end}_delay"), getattr(found, f"{end}_delay_std")
+        out[end] = {
+            "gain_db": (20 * np.log10(np.abs(gain))).tolist(),
+            "gain_std_db": (20 / math.log(10) / math.sqrt(2) * spread).tolist(),
+            "phase_deg": np.rad2deg(np.angle(gain)).tolist(),
+            "phase_std_deg": np.rad2deg(spread / math.sqrt(2)).tolist(),
+            "delay_ps": (delay * 1e12).tolist(),
+            "delay_std_ps": (late * 1e12).tolist(),
+        }
+    frequency, response, spread = found.sweep
+    out["sweep"] = {
+        "frequency_hz": frequency.real.tolist(),
+        "gain_db": (20 * np.log10(np.abs(response))).tolist(),
+        "phase_deg": np.rad2deg(np.angle(response)).tolist(),
+        "relative_std": spread.real.tolist(),
+    }
+    return out
+
+
+def _imported(file: Path, description: Path | None, format: str | None) -> Capture:
+    from isac_rt.capture.description import load_description
+    from isac_rt.capture.readers import FORMATS, import_file
+
+    if format is not None and format not in FORMATS:
+        raise InputProblem(f"--format {format}: choose from {', '.join(FORMATS)}")
+    return import_file(file, None if description is None else load_description(description), format)
+
+
+def _opened(file: Path, description: Path | None) -> Capture:
+    """A cube that `import` wrote, or what `import` would make of a board's file."""
+    from isac_rt.capture.readers import SUFFIXES
+    from isac_rt.capture.store import load_capture
+
+    if file.suffix in SUFFIXES or description is not None:
+        return _imported(file, description, None)
+    return load_capture(file)
+
+
+def _calibrated(capture: Capture, calibration: Path | None) -> Capture:
+    from isac_rt.capture.calibrate import apply, load_calibration
+
+    return capture if calibration is None else apply(load_calibration(calibration), capture)
