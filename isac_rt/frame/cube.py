@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ class Transmission:
         to every delay
     active : (M, P) bool, False where nothing is sent (on-off keying)
     first_block : resource block of its group 0; block b starts 2 b T_d into every slot
+    codes : (L_tx, P) by which each antenna multiplies its chirps where all send at once; None: one
+        sends in each group and slot, by `schedule`
     """
 
     name: str
@@ -42,6 +44,26 @@ class Transmission:
     clock_drift: float = 0.0
     active: np.ndarray | None = None
     first_block: int = 0
+    codes: np.ndarray | None = None
+
+    @property
+    def num_streams(self) -> int:
+        """Antennas that send at once."""
+        return 1 if self.codes is None else len(self.codes)
+
+    def streams(self) -> list[Transmission]:
+        """The same as transmissions in which one antenna sends at a time."""
+        if self.codes is None:
+            return [self]
+        return [
+            replace(
+                self,
+                codes=None,
+                schedule=np.full_like(self.schedule, a),
+                payload=replace(self.payload, phases=self.payload.phases * code),
+            )
+            for a, code in enumerate(self.codes)
+        ]
 
 
 @dataclass(frozen=True)

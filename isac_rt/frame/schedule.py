@@ -1,8 +1,11 @@
-"""Antenna schedules of TDM-MIMO: which antenna sends in each group and slot."""
+"""Which antenna sends when: schedules of TDM-MIMO, and the codes of antennas that send at once."""
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from scipy.linalg import hadamard
 
 from isac_rt.frame.waveform import Waveform
 
@@ -38,11 +41,80 @@ def is_latin(schedule: Schedule, num_tx: int) -> bool:
 
 
 def schedule_of(kind: str, waveform: Waveform, rng: np.random.Generator) -> Schedule:
-    """The antenna schedule of a kind (``array.schedule``)."""
+    """The antenna schedule of a kind (``array.schedule``); zeros where all send at once."""
     w = waveform
+    if w.scheme != "tdm":
+        return _frozen(np.zeros((1, w.num_chirps), np.int64))
     if kind == "conventional":
         return conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
     return pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng)
+
+
+@lru_cache(maxsize=16)
+def codes_of(waveform: Waveform) -> np.ndarray | None:
+    r"""(L_tx, P) complex128: what each antenna multiplies its chirps by where all send at once;
+    None where they take turns.
+
+    With B bands antenna a sends :math:`e^{j 2\pi a p / B}` ("ddm": its echoes lie a/B of the span
+    of velocities higher) or a row of a Hadamard matrix of size B, over and over ("bpm"). Two codes
+    are orthogonal over every B chirps.
+    """
+    w = waveform
+    if w.scheme == "tdm":
+        return None
+    antenna, chirp = np.arange(w.num_tx)[:, None], np.arange(w.num_chirps)[None, :]
+    if w.scheme == "ddm":
+        return _frozen(np.exp(2j * np.pi * (antenna * chirp % w.bands) / w.bands))
+    rows = np.array(_hadamard_rows(w.num_tx, w.bands))[:, None]
+    return _frozen(hadamard(w.bands)[rows, chirp % w.bands].astype(complex))
+
+
+@lru_cache(maxsize=16)
+def _hadamard_rows(num_tx: int, size: int) -> tuple[int, ...]:
+    """Rows of Sylvester's matrix, one after the other so that the strongest image stays weakest.
+
+    The product of rows i and j is row i ^ j, and an antenna's echoes appear in another's channel by
+    the lines of that row.
+    """
+    lines = np.abs(np.fft.fft(hadamard(size), axis=1) / size) ** 2
+    rows, image = [0], np.zeros(size)
+    left = list(range(1, size))
+    for _ in range(num_tx - 1):
+        added = [image + 2 * lines[[r ^ s for s in rows]].sum(axis=0) for r in left]
+        best = int(np.argmin([one.max().round(9) for one in added]))
+        rows.append(left.pop(best))
+        image = added[best]
+    return tuple(rows)
+
+
+def images(waveform: Waveform) -> np.ndarray:
+    """(B,) power of a path on the map that is added over all channels, in each of the B bands, over
+    that of one channel in the right one: L_tx in band 0, and less in the others unless velocities
+    are ambiguous; of antennas that take turns all are there, or 1 where B is 1."""
+    codes = codes_of(waveform)
+    if codes is None:
+        return np.array([float(waveform.num_tx)])
+    period = codes[:, : waveform.bands]
+    lines = np.fft.fft(period[:, None] * period.conj(), axis=-1) / waveform.bands
+    return np.asarray((np.abs(lines) ** 2).sum(axis=(0, 1)))
+
+
+def unambiguous_share(waveform: Waveform) -> float:
+    """Share of the velocities of one chirp in each slot that a plain radar tells apart: all, or one
+    band where another is as strong; 1 / L_tx where antennas take turns; 1 where there are data."""
+    w = waveform
+    if w.carries_data:
+        return 1.0
+    if w.scheme == "tdm":
+        return 1.0 / w.num_tx
+    alike = np.flatnonzero(images(w) > w.num_tx - 1e-6)[1:]
+    return float(alike[0]) / w.bands if alike.size else 1.0
+
+
+def decoded_schedule(waveform: Waveform) -> Schedule:
+    """The schedule of `Waveform.decoded`: group m holds the chirps of antenna m."""
+    shape = waveform.num_tx, waveform.num_chirps
+    return _frozen(np.broadcast_to(np.arange(waveform.num_tx)[:, None], shape).copy())
 
 
 def _frozen(a: np.ndarray) -> np.ndarray:

@@ -61,9 +61,11 @@ class Timetable:
 
     def modulated(self, frame: int) -> bool:
         """Whether a frame carries data: all but the periodic pilots and the acquisition frames at
-        the start and after a change of roles."""
+        the start and after a change of roles, and none of a plain radar."""
         every = self.modulation.pilot_every_frames
         pilot = every is not None and frame % every == 0
+        if not self.waveform.carries_data:
+            return False
         since = frame - max((c.frame for c in self.role_changes if c.frame <= frame), default=0)
         return since >= self.modulation.acquisition_frames and not pilot
 
@@ -159,7 +161,7 @@ class Timetable:
         heard = [
             f
             for f in range(0, self.frames, self.active_every)
-            if f >= self.modulation.acquisition_frames
+            if f >= self.modulation.acquisition_frames or not self.waveform.carries_data
         ] or [0]
         places = np.linspace(0, len(heard) - 1, min(count, len(heard)))
         return {heard[i] for i in places.round().astype(int)}

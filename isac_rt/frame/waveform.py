@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,25 @@ from isac_rt.scenario.radio import Array, ChirpTimes, Radio, chirp_times, num_re
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
+
+
+Scheme = Literal["tdm", "ddm", "bpm"]
+
+
+class Sweep(NamedTuple):
+    """Timing of a plain FMCW chirp, counted from the start of its ramp.
+
+    Attributes
+    ----------
+    slope : alpha [Hz/s]
+    ramp_end, adc_start : end of the ramp and first sample [s]
+    repetition : start of the next ramp [s]
+    """
+
+    slope: float
+    ramp_end: float
+    adc_start: float
+    repetition: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +57,11 @@ class Waveform:
         receiver that reads some of the groups only sees a waveform of these (`of_groups`)
     slot_period : from one chirp of a group to its next [s], where a board keeps its own time; None:
         as the guard interval asks for
+    sweep : timing of a plain FMCW chirp; None: that of the paper, in which `bandwidth` sets it
+    carries_data : whether half of the range cells are kept free for delay symbols
+    scheme : how antennas share the chirps: "tdm", one in each group and slot; "ddm" and "bpm", all
+        at once, by codes (`isac_rt.frame.schedule.codes_of`)
+    bands : Doppler bands, or length of the codes, of antennas that send at once; 1: they do not
 
     Examples
     --------
@@ -55,17 +80,22 @@ class Waveform:
     filter_transition: float = 0.4e6
     blocks: tuple[int, ...] | None = None
     slot_period: float | None = None
+    sweep: Sweep | None = None
+    carries_data: bool = True
+    scheme: Scheme = "tdm"
+    bands: int = 1
 
     def __post_init__(self) -> None:
-        if self.bandwidth <= 2 * self.sampling_rate:
+        if self.sweep is None and self.bandwidth <= 2 * self.sampling_rate:
             raise ValueError(
                 f"bandwidth {self.bandwidth:g} Hz must exceed twice the sampling rate "
                 f"{self.sampling_rate:g} Hz; raise the bandwidth or lower the sampling rate"
             )
-        if self.num_chirps % self.num_tx:
+        if self.num_chirps % (self.bands if self.bands > 1 else self.num_tx):
             raise ValueError(
                 f"{self.num_chirps} chirps per frame are not a multiple of the {self.num_tx} "
-                "transmit antennas; every antenna needs the same number of slots"
+                f"transmit antennas or {self.bands} bands; every antenna needs the same number of "
+                "slots"
             )
         if not 1 <= self.num_groups <= self.num_tx:
             raise ValueError(
@@ -75,6 +105,12 @@ class Waveform:
 
     @cached_property
     def _times(self) -> ChirpTimes:
+        if self.sweep is not None:
+            sampled, longest = (
+                self.num_samples / self.sampling_rate,
+                self.sampling_rate / self.sweep.slope,
+            )
+            return ChirpTimes(sampled, longest, self.sweep.ramp_end, self.sweep.repetition)
         return chirp_times(self.bandwidth, self.sampling_rate, self.num_samples, self.num_tx)
 
     @property
@@ -110,7 +146,7 @@ class Waveform:
     @property
     def slope(self) -> float:
         """alpha = B / T~ [Hz/s]."""
-        return self.bandwidth / self.chirp_duration
+        return self.sweep.slope if self.sweep is not None else self.bandwidth / self.chirp_duration
 
     @property
     def sample_interval(self) -> float:
@@ -120,6 +156,8 @@ class Waveform:
     @property
     def window_start(self) -> float:
         """T~ - T [s], where sampling starts after the start of the reference chirp."""
+        if self.sweep is not None:
+            return self.sweep.adc_start
         return self.chirp_duration - self.sampled_duration
 
     @property
@@ -130,6 +168,8 @@ class Waveform:
     @property
     def num_resource_blocks(self) -> int:
         """Resource blocks in a slot: as many chirps, 2 T_d apart, start in it."""
+        if self.sweep is not None:
+            return max(int(self.slot_duration / self.group_spacing), 1)
         return num_resource_blocks(self.bandwidth, self.sampling_rate, self.num_tx)
 
     @property
@@ -154,11 +194,26 @@ class Waveform:
         return self.num_samples // 2
 
     @property
+    def num_range_cells(self) -> int:
+        """Range cells that a receiver looks at: those that every chirp shows whatever its data
+        symbol, or all N of a plain radar."""
+        return self.num_delay_symbols if self.carries_data else self.num_samples
+
+    @property
+    def decoded(self) -> Waveform:
+        """The frame of antennas that send at once after their codes are taken out: a group of
+        chirps for each antenna, all of them at the same times."""
+        blocks = (0,) * self.num_tx
+        return replace(self, num_groups=self.num_tx, blocks=blocks, scheme="tdm")
+
+    @property
     def bits_per_delay_symbol(self) -> int:
         return self.num_delay_symbols.bit_length() - 1
 
     def bits_per_frame(self, dpsk_order: int) -> int:
-        """N_bit = M P floor(log2(N/2)) + M (P - L_tx) log2(D)."""
+        """N_bit = M P floor(log2(N/2)) + M (P - L_tx) log2(D); none of a plain radar."""
+        if not self.carries_data:
+            return 0
         return self.num_groups * (
             self.num_chirps * self.bits_per_delay_symbol
             + (self.num_chirps - self.num_tx) * (dpsk_order.bit_length() - 1)
@@ -174,7 +229,7 @@ class Waveform:
         return SPEED_OF_LIGHT / (passes * self.frame_duration * self.effective_carrier)
 
     def max_velocity(self, passes: int) -> float:
-        """Largest unambiguous radial speed [m/s] of a full (Latin) slow-time sampling."""
+        """Largest unambiguous radial speed [m/s] of a slow-time sampling in every slot."""
         return SPEED_OF_LIGHT / (2 * passes * self.slot_duration * self.effective_carrier)
 
     @cached_property
@@ -209,6 +264,8 @@ class Waveform:
     @cached_property
     def window_length(self) -> float:
         """Samples that the range window may cover, whatever the data: N less the largest s_D."""
+        if not self.carries_data:
+            return float(self.num_samples)
         return self.num_samples - float(self.data_shift(self.num_delay_symbols))
 
     @cached_property
@@ -263,6 +320,10 @@ class Waveform:
 
 def waveform_of(r: Radio, a: Array) -> Waveform:
     """The waveform that a scenario's radio and array state."""
+    num_tx, sweep, scheme = a.num_tx, None, r.scheme
+    if r.chirp is not None:
+        slope, start = r.chirp.slope_mhz_per_us * 1e12, r.chirp.adc_start_us * 1e-6
+        sweep = Sweep(slope, r.ramp_end_s, start, r.repetition_s)
     return Waveform(
         carrier_frequency=r.carrier_hz,
         bandwidth=r.bandwidth_hz,
@@ -270,8 +331,12 @@ def waveform_of(r: Radio, a: Array) -> Waveform:
         num_samples=r.samples_per_chirp,
         num_chirps=r.chirps_per_frame,
         num_groups=r.groups,
-        num_tx=a.tx_x + a.tx_z - 1,
+        num_tx=num_tx,
         filter_transition=r.filter_transition_hz,
+        sweep=sweep,
+        carries_data=r.mode == "isac",
+        scheme=scheme if r.bands(num_tx) > 1 and scheme != "simo" else "tdm",
+        bands=r.bands(num_tx),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
+from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.known import Known
@@ -47,7 +48,8 @@ class ActiveReceiver:
         else:
             spectra = cube.spectra if self.clutter_filter is None else cube.spectra.copy()
         if self.clutter_filter is not None:
-            self.clutter_filter.clean(spectra, cube.schedule)
+            self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
+        spectra, known = known.decoded(spectra)
         found = self.detector.sense(spectra, known, clutter)
         detections = found.detections
         if self.refiner is not None and isinstance(cube, IFCube):

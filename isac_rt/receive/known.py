@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,13 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload, unmodulated
-from isac_rt.frame.schedule import Schedule, is_latin
+from isac_rt.frame.schedule import (
+    Schedule,
+    codes_of,
+    decoded_schedule,
+    is_latin,
+    unambiguous_share,
+)
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 
 
@@ -26,6 +32,8 @@ class Known:
     phases : (M, P) complex, beta of the DPSK
     antennas : of both ends
     passes : 2 for echoes at the active terminal, 1 at a passive one (`Link.passes`)
+    unambiguous_share : of the velocities of a chirp in every slot, that the codes of antennas that
+        send at once leave unambiguous
     """
 
     waveform: Waveform
@@ -34,6 +42,7 @@ class Known:
     phases: np.ndarray
     antennas: Antennas
     passes: int
+    unambiguous_share: float = 1.0
 
     @classmethod
     def of(
@@ -50,6 +59,16 @@ class Known:
         """What is known of a frame without data."""
         pilot = unmodulated(waveform)
         return cls(waveform, schedule, pilot.delay_symbols, pilot.phases, antennas, passes)
+
+    def decoded(self, spectra: np.ndarray) -> tuple[np.ndarray, Known]:
+        """Spectra (1, L_rx, rows, P) of antennas that send at once, one group for each antenna's
+        code, and what is known of them; as they are where antennas take turns."""
+        codes, w = codes_of(self.waveform), self.waveform
+        if codes is None:
+            return spectra, self
+        known = Known.unmodulated(w.decoded, decoded_schedule(w), self.antennas, self.passes)
+        known = replace(known, unambiguous_share=unambiguous_share(w))
+        return spectra * codes.conj().astype(np.complex64)[:, None, None], known
 
     @cached_property
     def channels(self) -> int:

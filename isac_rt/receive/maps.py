@@ -10,8 +10,10 @@ the output is -P/2. Receding is positive.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform, hann
 from isac_rt.kernels.jit import jit
@@ -95,6 +97,13 @@ def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * num_rx)
 
 
+class Levels(NamedTuple):
+    """A map and its background (rows, P)."""
+
+    power: np.ndarray
+    background: np.ndarray
+
+
 class LatinUnion:
     """All groups as one uniform sampling of slow time; the map of a receiver by this way.
 
@@ -113,7 +122,7 @@ class LatinUnion:
         return power_map(spectra, known)
 
     def keep(
-        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
     ) -> np.ndarray:
         """Which of the cells `above` the threshold may be peaks."""
         return above
@@ -132,9 +141,33 @@ class Conventional(LatinUnion):
         return conventional_power(spectra, known)
 
     def keep(
-        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
     ) -> np.ndarray:
         return above & own_bins(known.waveform)
+
+
+class Banded(LatinUnion):
+    """Antennas that send at once, each decoded from all chirps.
+
+    In an antenna's channel the echoes of the others lie whole Doppler bands away. A path shows in
+    all channels in its own band and in fewer of them in the others, so that the strongest band
+    counts, by the power of a cell and its neighbours, and no skirt of the others does. Where codes
+    leave two bands alike the lowest velocities do.
+    """
+
+    def keep(
+        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
+    ) -> np.ndarray:
+        w = known.waveform
+        share = known.unambiguous_share
+        if share == 1:
+            about = ndimage.uniform_filter(levels.power, 3, mode=("nearest", "wrap"))
+            around = ndimage.maximum_filter(about, 3, mode=("nearest", "wrap"))
+            step = w.num_chirps // w.bands
+            for k in range(1, w.bands):
+                above = above & (about >= np.roll(around, k * step, axis=1))
+            return above
+        return above & (np.abs(doppler_bins(w) + 0.25) < share * w.num_chirps / 2)
 
 
 @jit

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import LatinUnion
+from isac_rt.receive.maps import LatinUnion, Levels
 
 SPARSITY = 4
 """Atoms per range row."""
@@ -152,7 +152,7 @@ class Omp(LatinUnion):
     advises = True
 
     def keep(
-        self, above: np.ndarray, level: np.ndarray, spectra: np.ndarray, known: Known
+        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
     ) -> np.ndarray:
         rows, out = np.flatnonzero(above.any(axis=1)), np.zeros_like(above)
         if rows.size:
@@ -160,5 +160,5 @@ class Omp(LatinUnion):
             # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2,
             # OMP one group's
             gain = (len(known.schedule) / 2) ** 2
-            out[rows] = found * gain > level[rows]
+            out[rows] = found * gain > levels.background[rows]
         return above & out

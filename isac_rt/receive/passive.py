@@ -95,7 +95,7 @@ class PassiveReceiver:
         if prediction is not None:
             symbols = self.reader.read(cube, prediction, self.antennas, profile)
         if prediction is None or symbols is None or not self._believed(symbols, w):
-            power = np.zeros((w.num_delay_symbols, w.num_chirps))
+            power = np.zeros((w.num_range_cells, w.num_chirps))
             picture = make_maps(power, cube, self.settings, 1) if maps else None
             return Reception.undecoded(w, no_detections(), picture)
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)

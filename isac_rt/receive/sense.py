@@ -20,7 +20,15 @@ from isac_rt.receive.estimate import (
     standard_deviations,
 )
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR, Conventional, LatinUnion, doppler_bins, slow_window
+from isac_rt.receive.maps import (
+    UNION_FLOOR,
+    Banded,
+    Conventional,
+    LatinUnion,
+    Levels,
+    doppler_bins,
+    slow_window,
+)
 from isac_rt.receive.omp import Omp, sparse_enough
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Maps
 from isac_rt.scenario.receivers import Receivers
@@ -97,7 +105,7 @@ class Cfar:
             added = len(known.schedule) if way.separate else 1
             noise = float(np.median(power)) * added / window_gain(known)
             sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, known)
-        above = way.keep(above, level, spectra, known)
+        above = way.keep(above, Levels(power, level), spectra, known)
         rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
         estimates = [
             self.estimate(spectra, known, power, row, column)
@@ -109,10 +117,11 @@ class Cfar:
 
 
 def doppler_of(known: Known) -> LatinUnion:
-    """The union where it samples every antenna in every slot; else each antenna's own DFT where its
-    chirps are equally spaced, as in a conventional schedule; OMP elsewhere."""
+    """The union where it samples every antenna in every slot, by bands where all send at once; else
+    each antenna's own DFT where its chirps are equally spaced, as in a conventional schedule; OMP
+    elsewhere."""
     if known.full:
-        return LatinUnion()
+        return Banded() if known.waveform.bands > 1 else LatinUnion()
     schedule, num_tx = known.schedule, known.waveform.num_tx
     equally = (schedule[:, num_tx:] == schedule[:, :-num_tx]).all()
     return Conventional() if equally else Omp()

@@ -91,7 +91,7 @@ def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> n
     """
     w, samples, symbols = known.waveform, cube.samples, known.delay_symbols
     num_groups, num_rx, num_chirps, num_samples = samples.shape
-    num_rows = w.num_delay_symbols if num_rows is None else num_rows
+    num_rows = w.num_range_cells if num_rows is None else num_rows
     shift = w.data_shift(symbols)
     out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
     for m in range(num_groups):

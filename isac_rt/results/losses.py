@@ -77,9 +77,12 @@ class Sensitivity:
         groups: int,
     ) -> Sensitivity:
         """What the link budget says of a frame of which the receiver reads so many groups."""
+        groups = groups * sent.num_streams
         w, chirps = waveform, groups * waveform.num_chirps
         sample = sent.amplitude**2 / noise_power
-        united = groups == w.num_tx and is_latin(sent.schedule, w.num_tx)
+        united = sent.codes is not None or (
+            groups == w.num_tx and is_latin(sent.schedule, w.num_tx)
+        )
         united = united and settings.velocity_method != "conventional"
         looks = antennas.num_tx * antennas.num_rx * (1 if united else groups)
         per_look = chirps * antennas.num_rx / looks

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from fractions import Fraction as Rational
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Decibels, Node, Positive, Problem
@@ -43,6 +43,11 @@ def num_resource_blocks(bandwidth: float, sampling_rate: float, num_tx: int) -> 
     return int((ratio - 2) / 2 + 1 + num_tx)
 
 
+def hadamard_size(num_tx: int) -> int:
+    """Least power of two that holds a code for each transmit antenna."""
+    return 1 << (num_tx - 1).bit_length()
+
+
 GAIN_ROUNDING_DB = 0.01
 """A gain stated to two digits may stand this far above the largest that is possible."""
 
@@ -63,6 +68,40 @@ def beam_solid_angle(half_view: float) -> float:
         return 2 * math.pi - 4 * math.pi * (1 - s)
     slope = s / math.sqrt(1 - s * s)
     return 2 * math.pi - 4 * math.acos(-slope * slope) + 8 * s * math.asin(slope)
+
+
+STATED_SHARE = 1e-2
+"""A bandwidth or a duration that is stated twice may differ by this share."""
+
+
+class Chirp(Node):
+    """Timing of a plain FMCW chirp as a data sheet states it."""
+
+    slope_mhz_per_us: Positive
+    """Slope of the ramp [MHz/us]."""
+    ramp_end_us: Positive | None = None
+    """End of the ramp after its start [us]. null, the default: when the last sample is taken."""
+    adc_start_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """First sample after the start of the ramp [us]; not before the echo of the longest range has
+    come back."""
+    samples: Annotated[int, Field(ge=16, le=65536)] | None = None
+    """Samples taken of each chirp. null, the default: `radio.samples_per_chirp`."""
+    sampling_msps: Positive | None = None
+    """Rate of complex samples [Msps]; of a sensor that samples real values half of its rate. null,
+    the default: `radio.sampling_rate_hz`."""
+    idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    """Pause between a ramp's end and the next one's start [us]. null, the default: what
+    `repetition_us` leaves."""
+    repetition_us: Positive | None = None
+    """Time from the start of a ramp to the start of the next [us]. null, the default: `idle_us` and
+    `ramp_end_us` together."""
+
+    def problems(self) -> Iterator[Problem]:
+        if self.idle_us is None and self.repetition_us is None:
+            yield Problem(
+                (("idle_us",), ("repetition_us",)),
+                "missing: a chirp needs idle_us or repetition_us; add one of them",
+            )
 
 
 class Radio(Node):
@@ -98,9 +137,104 @@ class Radio(Node):
     front_end: FrontEnd = FrontEnd()
     """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. By
     default it is ideal."""
+    mode: Literal["isac", "fmcw"] = "isac"
+    """What the chirps are for. `isac`, the default and the paper's, carries data to passive
+    terminals; `fmcw` is a plain radar without data, which sees all range cells."""
+    scheme: Literal["simo", "tdm", "ddm", "bpm"] = "tdm"
+    """How the transmit antennas share the chirps, for `mode: fmcw`. `simo`: there is one antenna.
+    `tdm`, the default: one after the other. `ddm`: all at once, each in a Doppler band of its own
+    by a phase that advances from chirp to chirp. `bpm`: all at once, told apart by a Hadamard code
+    over the chirps."""
+    sub_bands: Annotated[int, Field(ge=2, le=256)] | None = None
+    """Doppler bands that `scheme: ddm` divides the velocities into, or length of the codes of
+    `bpm`, a power of two; it divides `chirps_per_frame`. With more bands than transmit antennas the
+    full velocity stays unambiguous. null, the default: the least such number for `ddm`, the least
+    power of two that holds the antennas for `bpm`."""
+    chirp: Chirp | None = None
+    """Timing of the chirp as a data sheet states it, for `mode: fmcw`, in place of `bandwidth_hz`,
+    which follows. null, the default: `bandwidth_hz`, `sampling_rate_hz` and `samples_per_chirp` set
+    the timing as in the paper."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_stated(cls, data: Any) -> Any:
+        """One group in a plain radar, and the numbers that follow from a data sheet's timing where
+        they are not stated. What is malformed stays as it is, for whoever checks it."""
+        if not isinstance(data, dict) or data.get("mode") != "fmcw":
+            return data
+        out = {"groups": 1, **data}
+        chirp = data.get("chirp")
+        chirp = chirp.model_dump() if isinstance(chirp, Chirp) else chirp
+        if not isinstance(chirp, dict):
+            return out
+        numbers = {k: v for k, v in chirp.items() if type(v) in (int, float) and 0 <= v < 1e9}
+        if "samples" in numbers:
+            out.setdefault("samples_per_chirp", numbers["samples"])
+        if numbers.get("sampling_msps"):
+            out.setdefault("sampling_rate_hz", numbers["sampling_msps"] * 1e6)
+        default = cls.model_fields
+        size = out.get("samples_per_chirp", default["samples_per_chirp"].default)
+        rate = out.get("sampling_rate_hz", default["sampling_rate_hz"].default)
+        if type(size) is int and type(rate) in (int, float) and rate > 0:
+            last = numbers.get("adc_start_us", 0.0) + size / rate * 1e6
+            ramp = numbers.get("ramp_end_us", last)
+            if sweep := numbers.get("slope_mhz_per_us", 0.0) * ramp:
+                out.setdefault("bandwidth_hz", sweep * 1e6)
+        return out
+
+    def applies(self, name: str) -> bool:
+        if name in ("scheme", "sub_bands", "chirp"):
+            return self.mode == "fmcw"
+        return name != "mode" or self.mode != "isac"
+
+    @property
+    def ramp_end_s(self) -> float:
+        """End of the data sheet's ramp after its start."""
+        assert self.chirp is not None
+        if self.chirp.ramp_end_us is not None:
+            return self.chirp.ramp_end_us * 1e-6
+        return self.chirp.adc_start_us * 1e-6 + self.samples_per_chirp / self.sampling_rate_hz
+
+    @property
+    def repetition_s(self) -> float:
+        """From the start of a data sheet's ramp to the start of the next."""
+        assert self.chirp is not None
+        if self.chirp.repetition_us is not None:
+            return self.chirp.repetition_us * 1e-6
+        assert self.chirp.idle_us is not None
+        return self.chirp.idle_us * 1e-6 + self.ramp_end_s
+
+    def times(self, num_tx: int) -> ChirpTimes:
+        """Durations of a chirp that `num_tx` antennas share."""
+        rate, size = self.sampling_rate_hz, self.samples_per_chirp
+        if self.chirp is None:
+            return chirp_times(self.bandwidth_hz, rate, size, num_tx)
+        longest = rate / (self.chirp.slope_mhz_per_us * 1e12)
+        return ChirpTimes(size / rate, longest, self.ramp_end_s, self.repetition_s)
+
+    def num_blocks(self, num_tx: int) -> int:
+        """Resource blocks in a slot."""
+        if self.chirp is None:
+            return num_resource_blocks(self.bandwidth_hz, self.sampling_rate_hz, num_tx)
+        times = self.times(num_tx)
+        return max(int(times.slot / (2 * times.max_delay)), 1)
+
+    def bands(self, num_tx: int) -> int:
+        """Doppler bands or length of the codes by which antennas that send at once are told apart;
+        1 where they take turns."""
+        if self.mode == "isac" or self.scheme in ("simo", "tdm"):
+            return 1
+        if self.sub_bands is not None:
+            return self.sub_bands
+        if self.scheme == "bpm":
+            return hadamard_size(num_tx)
+        able = (n for n in range(num_tx + 1, 257) if self.chirps_per_frame % n == 0)
+        return next(able, num_tx + 1)
 
     def problems(self) -> Iterator[Problem]:
-        if self.bandwidth_hz <= 2 * self.sampling_rate_hz:
+        yield from self._fmcw_problems()
+        yield from self._chirp_problems()
+        if self.chirp is None and self.bandwidth_hz <= 2 * self.sampling_rate_hz:
             yield Problem(
                 (("bandwidth_hz",), ("sampling_rate_hz",)),
                 f"{self.bandwidth_hz:g} Hz must exceed twice the sampling rate of "
@@ -120,6 +254,66 @@ class Radio(Node):
                 "must be even: half of the range cells carry the data symbols",
             )
 
+    def _fmcw_problems(self) -> Iterator[Problem]:
+        if self.mode == "isac":
+            for key in ("chirp", "sub_bands"):
+                if getattr(self, key) is not None:
+                    said = "has no meaning with mode isac; set radio.mode: fmcw, or leave it out"
+                    yield Problem(((key,), ("mode",)), said)
+            return
+        if self.groups != 1:
+            said = f"{self.groups} groups carry data, which mode fmcw has none of; leave it out"
+            yield Problem((("groups",), ("mode",)), said)
+        if self.sub_bands is None:
+            return
+        if self.scheme in ("simo", "tdm"):
+            said = f"has no meaning with scheme {self.scheme}, only with ddm or bpm; leave it out"
+            yield Problem((("sub_bands",), ("scheme",)), said)
+        elif self.scheme == "bpm" and self.sub_bands & (self.sub_bands - 1):
+            said = "must be a power of two with scheme bpm, the length of a Hadamard code"
+            yield Problem((("sub_bands",), ("scheme",)), said)
+
+    def _chirp_problems(self) -> Iterator[Problem]:
+        if self.chirp is None or self.mode == "isac":
+            return
+        c, sampled = self.chirp, self.samples_per_chirp / self.sampling_rate_hz
+        twice: tuple[tuple[str, float | None, float], ...] = (
+            ("samples_per_chirp", c.samples, self.samples_per_chirp),
+            ("sampling_rate_hz", c.sampling_msps and c.sampling_msps * 1e6, self.sampling_rate_hz),
+            ("bandwidth_hz", c.slope_mhz_per_us * 1e12 * self.ramp_end_s, self.bandwidth_hz),
+        )
+        for key, follows, stated in twice:
+            if follows is not None and abs(stated - follows) > STATED_SHARE * follows:
+                said = f"but {follows:g} follows from radio.chirp; leave one of the two out"
+                yield Problem(((key,), ("chirp",)), said)
+        last = c.adc_start_us * 1e-6 + sampled
+        if last > self.ramp_end_s * (1 + 1e-9):
+            yield Problem(
+                (("chirp", "ramp_end_us"), ("chirp", "adc_start_us"), ("samples_per_chirp",)),
+                f"the last sample is taken {last * 1e6:g} us after the start of the ramp, which "
+                "has ended by then; lengthen the ramp, or take fewer samples, earlier or faster",
+            )
+        if (slot := self.repetition_s) < self.ramp_end_s * (1 - 1e-9):
+            yield Problem(
+                (("chirp", "repetition_us"), ("chirp", "ramp_end_us")),
+                f"{slot * 1e6:g} us are shorter than the ramp of {self.ramp_end_s * 1e6:g} us",
+            )
+        if c.idle_us is not None and c.repetition_us is not None:
+            whole = c.idle_us + self.ramp_end_s * 1e6
+            if abs(whole - c.repetition_us) > STATED_SHARE * c.repetition_us:
+                yield Problem(
+                    (("chirp", "repetition_us"), ("chirp", "idle_us"), ("chirp", "ramp_end_us")),
+                    f"but idle time and ramp last {whole:g} us together; leave one of them out",
+                )
+        longest = self.sampling_rate_hz / (c.slope_mhz_per_us * 1e12)
+        if c.adc_start_us * 1e-6 < longest * (1 - 1e-9):
+            yield Problem(
+                (("chirp", "adc_start_us"), ("chirp", "slope_mhz_per_us")),
+                f"the echo whose beat is the sampling rate comes back {longest * 1e6:.4g} us after "
+                "the ramp's start, after the first sample; sample later or slower, or take a "
+                "steeper ramp",
+            )
+
 
 class Array(Node):
     """The antenna arrays of every terminal: an L of elements along X and Z for sending and one for
@@ -131,12 +325,13 @@ class Array(Node):
     tx_z: Annotated[int, Field(ge=1, le=16)] = 2
     """Transmit elements along Z (upwards), the corner of the L included. The default gives three
     transmit antennas with `tx_x`, as in the paper."""
-    rx_x: Annotated[int, Field(ge=2, le=64)] = 8
+    rx_x: Annotated[int, Field(ge=1, le=64)] = 8
     """Receive elements along X (to the right of the boresight), the corner of the L included. More
     elements resolve azimuth more finely. The default is the paper's."""
-    rx_z: Annotated[int, Field(ge=2, le=64)] = 8
+    rx_z: Annotated[int, Field(ge=1, le=64)] = 8
     """Receive elements along Z (upwards), the corner of the L included. More elements resolve
-    elevation more finely. The default is the paper's."""
+    elevation more finely; with 1, and `tx_z` 1, elevation is not observed. The default is the
+    paper's."""
     spacing_wavelengths: Positive = 0.5774
     """Distance between neighbouring receive elements, in wavelengths at `radio.carrier_hz`;
     transmit elements stand one receive arm apart. The default makes directions unambiguous within
@@ -160,6 +355,11 @@ class Array(Node):
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0
     """Full angle that the arrays look at, in azimuth as in elevation [degrees]. Targets outside
     count as out of view. The default is what the default spacing tells without ambiguity."""
+
+    @property
+    def num_tx(self) -> int:
+        """L_tx, transmit elements."""
+        return self.tx_x + self.tx_z - 1
 
     @property
     def largest_gain_dbi(self) -> float:

@@ -18,7 +18,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
 from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio, chirp_times, num_resource_blocks
+from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
 from isac_rt.scenario.swarm import Access, RoleChange, Uav
 
@@ -132,15 +132,19 @@ class Scenario(Node):
 
     @property
     def num_tx(self) -> int:
-        """L_tx, elements of the transmitting L."""
-        return self.array.tx_x + self.array.tx_z - 1
+        """L_tx, transmit elements."""
+        return self.array.num_tx
+
+    @property
+    def schedule(self) -> str:
+        """Order in which transmit antennas take the slots: `array.schedule`; in a plain radar one
+        after the other."""
+        return self.array.schedule if self.radio.mode == "isac" else "conventional"
 
     @property
     def frame_duration_s(self) -> float:
         """P T-, the frame without the pause that `frame_interval_s` may leave after it."""
-        r = self.radio
-        times = chirp_times(r.bandwidth_hz, r.sampling_rate_hz, r.samples_per_chirp, self.num_tx)
-        return r.chirps_per_frame * times.slot
+        return self.radio.chirps_per_frame * self.radio.times(self.num_tx).slot
 
     @property
     def flight_duration_s(self) -> float:
@@ -149,6 +153,7 @@ class Scenario(Node):
 
     def problems(self) -> Iterator[Problem]:
         yield from self._timing_problems()
+        yield from self._fmcw_problems()
         yield from self._swarm_problems()
         yield from self._role_problems()
         yield from self._block_problems()
@@ -159,7 +164,9 @@ class Scenario(Node):
     def _timing_problems(self) -> Iterator[Problem]:
         sizes = (("array", "tx_x"), ("array", "tx_z"))
         antennas = f"the {self.num_tx} transmit antennas (array.tx_x + array.tx_z - 1)"
-        if self.radio.chirps_per_frame % self.num_tx:
+        if self.radio.bands(self.num_tx) > 1:
+            yield from self._code_problems()
+        elif self.radio.chirps_per_frame % self.num_tx:
             yield Problem(
                 (("radio", "chirps_per_frame"), *sizes),
                 f"{self.radio.chirps_per_frame} chirps are not a multiple of {antennas}; every "
@@ -183,13 +190,78 @@ class Scenario(Node):
                 f"is shorter than a frame, which lasts {self.frame_duration_s:.7g} s; lengthen it, "
                 "or leave it out for contiguous frames",
             )
-        if self.modulation.acquisition_frames >= self.frames:
+        carries = self.radio.mode == "isac"
+        if carries and self.modulation.acquisition_frames >= self.frames:
             yield Problem(
                 (("modulation", "acquisition_frames"), ("frames",)),
                 f"{self.modulation.acquisition_frames} acquisition frames leave none of the "
                 f"{self.frames} frames for data; "
                 "run more frames or set modulation.acquisition_frames lower",
             )
+
+    def _code_problems(self) -> Iterator[Problem]:
+        """What antennas that send at once need."""
+        r, sizes = self.radio, (("array", "tx_x"), ("array", "tx_z"))
+        bands = r.bands(self.num_tx)
+        if bands < self.num_tx:
+            yield Problem(
+                (("radio", "sub_bands"), *sizes),
+                f"{bands} do not hold the {self.num_tx} transmit antennas; take as many at least",
+            )
+        if r.chirps_per_frame % bands:
+            yield Problem(
+                (("radio", "chirps_per_frame"), ("radio", "sub_bands"), *sizes),
+                f"{r.chirps_per_frame} chirps are not a multiple of the {bands} sub_bands of "
+                f"scheme {r.scheme}; change one of them",
+            )
+
+    def _fmcw_problems(self) -> Iterator[Problem]:
+        """What a plain radar does not have, and what its receivers cannot do."""
+        r = self.radio
+        if r.mode == "isac":
+            return
+        for name, uav in self.swarm.items():
+            if uav.role == "passive":
+                said = "mode fmcw has no passive terminals; make it a target, or active"
+                yield Problem((("swarm", name, "role"), ("radio", "mode")), said)
+        for key, off in (("establish", False), ("feedback", False)):
+            if getattr(self.access, key) != off:
+                said = "mode fmcw has no links between terminals; leave it out"
+                yield Problem((("access", key), ("radio", "mode")), said)
+        if self.array.fall_back:
+            said = "mode fmcw has its own order of antennas (radio.scheme); leave it out"
+            yield Problem((("array", "fall_back"), ("radio", "mode")), said)
+        if r.scheme == "simo" and self.num_tx != 1:
+            yield Problem(
+                (("radio", "scheme"), ("array", "tx_x"), ("array", "tx_z")),
+                f"simo sends from one antenna, and there are {self.num_tx}; set array.tx_x and "
+                "array.tx_z to 1, or take another scheme",
+            )
+        if self.receivers.active_input == "profiles":
+            said = "profiles hold at most 3/4 of the range cells, mode fmcw shows all; use samples"
+            yield Problem((("receivers", "active_input"), ("radio", "mode")), said)
+        usual: dict[str, tuple[str, ...]] = {
+            "velocity_method": ("auto", "latin_union", "conventional")
+        }
+        if r.bands(self.num_tx) > 1:
+            usual = {
+                "velocity_method": ("auto",),
+                "refinement": ("local", "grid"),
+                "clutter_detector": ("cfar",),
+                "clutter_filter": ("none", "zero_doppler"),
+            }
+        elif r.scheme == "tdm":
+            usual = {"velocity_method": ("auto", "conventional")}
+        sets: dict[Key, Receivers] = {("receivers",): self.receivers}
+        sets |= {("compare", n, "receivers"): one.receivers for n, one in self.compare.items()}
+        for at, receivers in sets.items():
+            for key, values in usual.items():
+                if (value := getattr(receivers, key)) not in values:
+                    yield Problem(
+                        ((*at, key), ("radio", "scheme")),
+                        f"{value} is not made for mode fmcw with scheme {r.scheme}; use "
+                        f"{' or '.join(values)}, or another scheme",
+                    )
 
     def _swarm_problems(self) -> Iterator[Problem]:
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
@@ -268,7 +340,7 @@ class Scenario(Node):
 
     def _block_problems(self) -> Iterator[Problem]:
         r = self.radio
-        limit = num_resource_blocks(r.bandwidth_hz, r.sampling_rate_hz, self.num_tx)
+        limit = r.num_blocks(self.num_tx)
         for name, first in self.first_blocks().items():
             if first + r.groups > limit:
                 yield Problem(

@@ -132,7 +132,7 @@ def range_profiles(
         size = waveform.num_samples * tones.rx_delay.shape[1] * schedule.size
         seen = tones.power.max(initial=0.0) * GRIDDED_ERROR**2 * size
         setting = ACCURATE if seen > (0.0 if noise is None else noise.power) else PROFILES
-    cells = waveform.num_delay_symbols if num_cells is None else num_cells
+    cells = waveform.num_range_cells if num_cells is None else num_cells
     return RangeProfiles(
         spectra=range_cells(waveform, tones, payload, cells, setting, noise),
         waveform=waveform,

@@ -76,6 +76,7 @@ def tones_of(
     """All links' paths at a receiver whose frame has its middle at `middle` [s] and whose reference
     chirps begin in block `first_block`."""
     w = waveform
+    links = [(stream, paths) for sent, paths in links for stream in sent.streams()]
     rx = receiver.pose.to_world(receiver.antennas.rx_positions)
     num_tx = max((t.antennas.num_tx for t, _ in links), default=1)
     none, grid = np.zeros(0), (w.num_groups, w.num_chirps)

@@ -1,11 +1,11 @@
 """What a radar can see: ranges, velocities and angles link by link, and what of the swarm
 lies outside them in how many frames.
 
-A receiver's maps hold N/2 range cells. What lies within them arrives in every chirp, whatever its
-data symbol; half a cell farther a passive terminal finds no line of sight and loses every symbol.
-From there to N cells the IF filter lets pass the chirps whose symbol is small enough, and beyond N
-cells (the delay T_d) none. Shadows of the city are not counted here: they are known when its paths
-are traced. Clocks are taken to agree.
+A receiver's maps hold N/2 range cells, or all N of a plain radar. What lies within them arrives in
+every chirp, whatever its data symbol; half a cell farther a passive terminal finds no line of sight
+and loses every symbol. From there to N cells the IF filter lets pass the chirps whose symbol is
+small enough, and beyond N cells (the delay T_d) none. Shadows of the city are not counted here:
+they are known when its paths are traced. Clocks are taken to agree.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.link import Link
+from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.cfar import first_row
@@ -143,6 +144,8 @@ def unambiguous_velocity(
     """Largest radial speed that a link reports as it is [m/s]: that of a chirp in every slot, and
     divided by the transmit antennas where each is looked at alone and sends at equal distances."""
     w = timetable.waveform
+    if not w.carries_data:
+        return w.max_velocity(link.passes) * unambiguous_share(w)
     groups = len(timetable.groups(link) or range(w.num_groups))
     whole = schedule == "pseudo_random" or (
         groups == w.num_tx and velocity_method != "conventional"
@@ -158,7 +161,7 @@ def _link_coverage(
     apart = SPEED_OF_LIGHT / (float(w.carrier()) * antennas.spacing)
     return LinkCoverage(
         link=str(link),
-        max_range_m=w.num_delay_symbols * cell,
+        max_range_m=w.num_range_cells * cell,
         filtered_range_m=w.num_samples * cell,
         min_range_m=first_row(receivers, cell) * cell,
         range_resolution_m=cell,

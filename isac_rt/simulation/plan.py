@@ -374,7 +374,7 @@ def next_slot_delay(waveform: Waveform, blocks: Iterable[int]) -> float:
     """
     w, first = waveform, list(blocks)
     apart = max(first) + w.num_groups - 1 - min(first)
-    data = w.num_delay_symbols * w.delay_step
+    data = w.num_delay_symbols * w.delay_step if w.carries_data else 0.0
     return w.slot_duration - apart * w.group_spacing - data - w.filter_transition / w.slope
 
 

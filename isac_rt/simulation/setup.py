@@ -21,7 +21,7 @@ from isac_rt.frame.level import (
     transmit_amplitude,
 )
 from isac_rt.frame.link import Link
-from isac_rt.frame.schedule import Schedule, schedule_of
+from isac_rt.frame.schedule import Schedule, codes_of, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.hardware.front_end import Ends, FrontEnd, front_end_of
@@ -146,7 +146,8 @@ class Frame:
         )
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
-        """What reaches a link's receiver, its own transmitter's first."""
+        """What reaches a link's receiver, its own transmitter's first; antennas that send at once one
+        by one."""
         if link not in self.paths:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
@@ -155,7 +156,7 @@ class Frame:
         for name in dict.fromkeys([link.tx, *self.sent]):
             clock = s.connections.apart(name, link, when)
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
-            out.append((sent, self.paths[Link(name, link.rx)]))
+            out += [(one, self.paths[Link(name, link.rx)]) for one in sent.streams()]
         return out
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
@@ -224,7 +225,7 @@ class Setup:
     def coverage(self) -> Coverage:
         """What the links can see, and what of the swarm they cannot."""
         s = self.scenario
-        return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.array.schedule)
+        return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.schedule)
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
@@ -282,6 +283,7 @@ class Setup:
             payload=self.timetable.payload(active, frame, schedule),
             amplitude=self.plan.amplitude,
             first_block=self.timetable.first_block(active, frame),
+            codes=codes_of(self.waveform),
         )
 
     def _expected_clutter(self, frame: int, active: list[str]) -> dict[str, ExpectedClutter]:
@@ -344,7 +346,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     waveform = waveform_of(scenario.radio, scenario.array)
     antennas = antennas_of(scenario.array, waveform)
     swarm = swarm_of(scenario)
-    schedule = schedule_of(scenario.array.schedule, waveform, generator(scenario.seed, "schedule"))
+    schedule = schedule_of(scenario.schedule, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
     check_memory(antennas, timetable)
     check_flights(swarm, timetable)
@@ -358,7 +360,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     city = city_about(*about, radius, digest)
     check_passage(swarm, timetable, city_about(*about, digest=digest))
     warn_of_aliases(
-        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.array.schedule
+        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.schedule
     )
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     floor = noise_floor(scenario, plan, free)

@@ -18,6 +18,7 @@ from scipy.special import gammainccinv
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
+from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
@@ -107,7 +108,8 @@ class ActiveTerminal:
         walls: Walls | None = None,
     ) -> None:
         self._receiver = ActiveReceiver.of(antennas, receivers)
-        self.tracker = Tracker(tracking, 2 * waveform.max_velocity(2))
+        period = 2 * waveform.max_velocity(2) * unambiguous_share(waveform)
+        self.tracker = Tracker(tracking, period)
         self._doubts = None
         if tracking.births == "unexplained":
             if walls is None:

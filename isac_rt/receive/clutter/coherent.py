@@ -384,7 +384,7 @@ class Bucketed:
         beat, doppler = cells_of(clutter, w)
         tables = _tables(w, taper)
         strongest = tables[0].max() * tables[1].max()
-        rows = w.num_delay_symbols + 2 * REACH
+        rows = w.num_range_cells + 2 * REACH
         row = np.round(beat).astype(np.int64) + REACH
         heard = (row >= 0) & (row < rows) & (clutter.power * strongest > LEAST_WEIGHT * noise)
         clutter, beat, doppler, row = clutter.select(heard), beat[heard], doppler[heard], row[heard]

@@ -47,7 +47,7 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
     noise : mean noise power of a cell
     """
     w = known.waveform
-    rows = min(power.shape[0], w.num_delay_symbols)
+    rows = min(power.shape[0], w.num_range_cells)
     response = Response(w, rows, UNTAPERED)
     towards = clutter.departure + clutter.arrival
     per_velocity = -w.carrier() * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s

@@ -38,8 +38,16 @@ class ClutterFilter:
 
     least: int | None
 
-    def clean(self, spectra: np.ndarray, schedule: Schedule) -> None:
-        """Take what stands still out of the AT's spectra, in place."""
+    def clean(
+        self, spectra: np.ndarray, schedule: Schedule, codes: np.ndarray | None = None
+    ) -> None:
+        """Take what stands still out of the AT's spectra, in place; `codes` (L_tx, P) are those of
+        antennas that send at once, None where they take turns."""
+        if codes is not None:
+            spectra -= (spectra @ codes.conj().T.astype(np.complex64)) @ (
+                codes / codes.shape[1]
+            ).astype(np.complex64)
+            return
         remove_standing(spectra, schedule, self.least)
 
 

@@ -1,0 +1,111 @@
+"""The plain radar's chain from samples made by formula: peak, velocity and direction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import unmodulated
+from isac_rt.frame.schedule import codes_of, conventional_schedule, schedule_of
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Sweep, Waveform
+from isac_rt.receive import receive_active
+from isac_rt.scenario.receivers import Receivers
+
+RANGE, VELOCITY, U = 21.37, -7.3, (0.21, -0.13)
+
+
+def waveform(scheme: str, bands: int, num_tx: int = 3) -> Waveform:
+    return Waveform(
+        carrier_frequency=76.2e9,
+        sampling_rate=8e6,
+        num_samples=128,
+        num_chirps=96,
+        num_groups=1,
+        num_tx=num_tx,
+        sweep=Sweep(30e12, 26e-6, 4e-6, 31e-6),
+        carries_data=False,
+        scheme=scheme,
+        bands=bands,
+    )
+
+
+def by_formula(w: Waveform, a: Antennas) -> IFCube:
+    """Sum over transmit antennas of code times exp(j 2 pi (f t + S t (u - t/2))), each element's
+    delay in t, sample by sample."""
+    schedule = schedule_of("conventional", w, np.random.default_rng(1))
+    codes = codes_of(w)
+    if codes is None:
+        codes = (schedule[0] == np.arange(w.num_tx)[:, None]).astype(complex)
+    u = np.array([U[0], np.sqrt(1 - U[0] ** 2 - U[1] ** 2), U[1]])
+    fast = 4e-6 + np.arange(128) / 8e6
+    t = np.arange(96)[:, None] * 31e-6 + fast - 96 * 31e-6 / 2
+    samples = np.zeros((1, a.num_rx, 96, 128), complex)
+    for tx, code in zip(a.tx_positions, codes, strict=True):
+        for r, rx in enumerate(a.rx_positions):
+            tau = (2 * (RANGE + VELOCITY * t) - (tx + rx) @ u) / SPEED_OF_LIGHT
+            cycles = 76.2e9 * tau + 30e12 * tau * (fast - tau / 2)
+            samples[0, r] += code[:, None] * np.exp(2j * np.pi * cycles)
+    return IFCube(
+        samples=samples.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("scheme", "bands"), [("tdm", 1), ("ddm", 4), ("ddm", 6), ("bpm", 4), ("bpm", 8)]
+)
+def test_one_target_by_formula(scheme, bands):
+    """One detection where it is: the images of the other antennas are none. Bounds: a hundredth of
+    a cell, and of a beam. Bugs: codes not conjugated; bands told apart by the weakest."""
+    w = waveform(scheme, bands)
+    a = Antennas(tx_x=2, tx_z=2, rx_x=4, rx_z=4, spacing=0.5 * w.wavelength)
+    cube = by_formula(w, a)
+    found = receive_active(cube, unmodulated(w), a, Receivers(), maps=True)
+    d = found.detections
+    assert len(d) == 1
+    assert d.range[0] == pytest.approx(RANGE, abs=0.01 * w.range_cell(2))
+    assert d.velocity[0] == pytest.approx(VELOCITY, abs=0.01 * w.velocity_cell(2))
+    # the estimator takes a spherical wave's curvature out, which this plane wave has not
+    assert d.direction[0] == pytest.approx(U, abs=2e-3)
+    assert found.maps is not None and found.maps.range_doppler.shape == (128, 96)
+    row, column = np.unravel_index(found.maps.range_doppler.argmax(), (128, 96))
+    beat = (
+        30e12 * 2 * RANGE / SPEED_OF_LIGHT + 2 * VELOCITY * w.carrier() / SPEED_OF_LIGHT
+    ) * 16e-6
+    assert row == round(float(beat))
+    period = 2 * w.max_velocity(2) * (1 / 3 if scheme == "tdm" else 1)  # the map shows it again
+    off = (found.maps.velocity_axis[column] - VELOCITY + period / 2) % period - period / 2
+    assert abs(off) < 0.51 * w.velocity_cell(2)
+
+
+def test_simo_is_one_antenna():
+    """A single transmit antenna samples every slot; bug: N/2 range cells seen."""
+    w = waveform("tdm", 1, num_tx=1)
+    a = Antennas(tx_x=1, tx_z=1, rx_x=4, rx_z=4, spacing=0.5 * w.wavelength)
+    cube = by_formula(w, a)
+    assert (cube.schedule == conventional_schedule(1, 96, 1)).all()
+    found = receive_active(cube, unmodulated(w), a, Receivers()).detections
+    assert len(found) == 1 and found.range[0] > 64 * w.range_cell(2) / 2
+    assert found.velocity[0] == pytest.approx(VELOCITY, abs=0.01 * w.velocity_cell(2))
+
+
+def test_what_stands_still_goes_with_all_codes():
+    """The notch takes a resting echo out of all bands, not of one; bug: codes left out of it."""
+    w = waveform("ddm", 4)
+    a = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5 * w.wavelength)
+    still = codes_of(w).sum(axis=0)[None, None, :, None] * np.exp(0.4j * np.arange(128))
+    moving = by_formula(w, a)
+    noise = np.random.default_rng(3).normal(size=(2, *moving.samples.shape)) * 0.05
+    cube = IFCube(
+        samples=(moving.samples + 30 * still + noise[0] + 1j * noise[1]).astype(np.complex64),
+        waveform=w,
+        schedule=moving.schedule,
+        start_time=0.0,
+    )
+    plain = receive_active(cube, unmodulated(w), a, Receivers())
+    notched = receive_active(cube, unmodulated(w), a, Receivers(clutter_filter="zero_doppler"))
+    assert abs(plain.detections.velocity[0]) < w.velocity_cell(2)
+    # the mean over the chirps takes a little of the moving echo too: 39 dB less of it at rest
+    assert (notched.detections.snr[1:] < 1e-3 * notched.detections.snr[0]).all()
+    assert notched.detections.velocity[0] == pytest.approx(VELOCITY, abs=0.05)
