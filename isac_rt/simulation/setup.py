@@ -146,8 +146,8 @@ class Frame:
         )
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
-        """What reaches a link's receiver, its own transmitter's first; antennas that send at once one
-        by one."""
+        """What reaches a link's receiver, its own transmitter's first; antennas that send at once
+        one by one."""
         if link not in self.paths:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
