@@ -115,13 +115,11 @@ OF_CASES = {
         "velocity = self._spline(inside, 1)",
         "velocity = self._spline(inside, 1) * 1.001",
     ),
-    "longitude and latitude to metres": Bug(
-        "world/city/footprints.py", 'ellps="WGS84"', 'ellps="sphere"'
-    ),
+    "longitude and latitude to metres": Bug("world/city/place.py", "+ellps=WGS84", "+ellps=sphere"),
     "buildings are closed and face outward": Bug(
         "world/city/extrude.py",
-        "Surface(vertices, cap[:, ::-1], floor)",
-        "Surface(vertices, cap, floor)",
+        "Surface(vertices, cap[:, ::-1], finish.floor)",
+        "Surface(vertices, cap, finish.floor)",
     ),
     "friis": Bug(
         "propagation/free_space.py",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from isac_rt.scenario.node import Decibels, Fraction, Loss, Node, Positive, Problem
+from isac_rt.scenario.node import Decibels, Fraction, Loss, Node, Positive, Problem, Vector
 
 
 class MaterialOverride(Node):
@@ -47,7 +47,14 @@ class City(Node):
     """Name of a scene of Sionna RT, such as munich, for `builtin`."""
     file: str | None = None
     """Path of the city's file, relative to the scenario's folder, for `mitsuba` (XML), `mesh` (PLY,
-    OBJ, STL, GLB) and `footprints` (GeoJSON, CityJSON)."""
+    OBJ, STL, GLB) and `footprints` (GeoJSON, CityJSON, CityJSONSeq; with the extra `cities` also
+    GeoPackage, Shapefile, FlatGeobuf, GeoParquet, and OpenStreetMap's .osm and .osm.pbf)."""
+    layer: str | None = None
+    """Layer of a `footprints` file that holds the buildings, where it has several. By default the
+    one with building in its name."""
+    lod: Annotated[float, Field(ge=0, le=4)] | None = None
+    """Highest level of detail that is taken of CityJSON, such as 1.2, without unit; a lower level
+    has fewer faces. By default the highest that there is."""
     up_axis: Literal["y", "z"] = "z"
     """Axis of a `mesh` file that points up. The default is z; glTF has y by its standard."""
     scale: Positive = 1.0
@@ -56,14 +63,32 @@ class City(Node):
     """Material of the pieces of a `mesh` that neither `material_map` nor their names tell. The
     default, concrete, is the most common."""
     material_map: dict[str, str] = Field({})
-    """Material by the name of a node, geometry or material of a `mesh` file. By default these names
-    are looked up in the table of materials as they are."""
+    """Material by the name of a node, geometry or material of a `mesh` file; by the type of an
+    object or surface of CityJSON, such as SolitaryVegetationObject. By default these names are
+    looked up in the table of materials as they are, and a CityJSON type has the material that `new`
+    prints."""
     coordinates: Literal["auto", "metres", "lonlat"] = "auto"
     """Coordinates of `footprints`: `metres`, `lonlat` for longitude and latitude in degrees, or
     `auto`, the default: told by their size."""
+    crs: str | None = None
+    """Coordinate reference system of a `footprints` file, such as EPSG:2056, which goes before what
+    the file says. Grids in true metres are kept, all others projected about the origin. By default
+    what the file says, else told by the size of its numbers."""
+    origin: Vector | None = None
+    """Point of a `footprints` file [x, y, z] that becomes the world's origin, in the coordinates of
+    the file (metres, or longitude and latitude in degrees) and with a height in metres. By default
+    that of the file where it is in metres, else the middle of the buildings at height 0."""
+    terrain: str | None = None
+    """Path of a GeoTIFF with heights of the ground [m], relative to the scenario's folder, for
+    `footprints`; needs the extra `cities`. By default the relief of CityJSON, else a ground that is
+    made through the feet of the buildings."""
     height_property: str = "height"
-    """Property that holds a building's height [m] in a `footprints` file. The default is what most
+    """Property that holds a building's height [m] in a `footprints` file; text such as 12,5 or
+    40 ft is understood. Where it is missing, `building:levels` counts. The default is what most
     exports of OpenStreetMap call it."""
+    level_height_m: Positive = 3.0
+    """Height of a storey [m], where a `footprints` file tells storeys. The default is that of
+    OpenStreetMap's Simple 3D Buildings."""
     default_height_m: Positive = 10.0
     """Height of a building whose footprint has none [m]. The default is three storeys."""
     wall_material: str = "concrete"
@@ -113,6 +138,11 @@ class City(Node):
                     f"has no meaning with city.source {self.source}, only with {sources}; remove "
                     "the key or change the source",
                 )
+        if self.crs is not None and self.coordinates != "auto":
+            yield Problem(
+                (("crs",), ("coordinates",)),
+                f"says more than city.coordinates {self.coordinates}; remove one of them",
+            )
         if self.source == "builtin" and not self.name:
             yield Problem(
                 (("name",), ("source",)),
@@ -135,7 +165,21 @@ CITY_KEYS: dict[str, frozenset[str]] = {
     "builtin": frozenset({"name"}),
     "mitsuba": frozenset({"file"}),
     "mesh": frozenset({"file", "up_axis", "scale", "material", "material_map"}),
-    "footprints": frozenset({"file", "coordinates", "height_property", "default_height_m"})
+    "footprints": frozenset(
+        {
+            "file",
+            "layer",
+            "lod",
+            "coordinates",
+            "crs",
+            "origin",
+            "terrain",
+            "height_property",
+            "level_height_m",
+            "default_height_m",
+            "material_map",
+        }
+    )
     | _SURFACES,
     "canyon": _BUILT | _SURFACES | {"street_length_m"},
     "blocks": _BUILT | _SURFACES | {"blocks_x", "blocks_y"},

@@ -14,8 +14,7 @@ import trimesh
 
 from isac_rt import scenario
 from isac_rt.world.city import CityError, CityMesh, load_city
-from isac_rt.world.city.extrude import building
-from isac_rt.world.city.footprints import is_lonlat
+from isac_rt.world.city.extrude import Finish, building
 from isac_rt.world.city.materials import (
     KNOWN_MATERIALS,
     MaterialUse,
@@ -23,6 +22,7 @@ from isac_rt.world.city.materials import (
     water_permittivity,
 )
 from isac_rt.world.city.mesh import Surface, clean, distance_to_triangles
+from isac_rt.world.city.place import is_lonlat
 
 F_C = 77e9
 ORIGIN = (0.0, 0.0, 0.0)
@@ -129,7 +129,7 @@ def test_corners_on_straight_walls_leave_no_gap():
     ]
     court = [(8, 3), (8, 5), (7, 5), (7, 3)]
     parts = building(
-        shapely.Polygon(ring, [court]), -1.5, 8.25, *[MaterialUse("concrete")] * 3, "house"
+        shapely.Polygon(ring, [court]), -1.5, 8.25, Finish(*[MaterialUse("concrete")] * 3), "house"
     )
     mesh = trimesh.Trimesh(
         parts[0].vertices, np.concatenate([p.faces for p in parts]), process=True

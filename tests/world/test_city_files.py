@@ -455,6 +455,10 @@ def test_boundaries_with_odd_indices(index, tmp_path):
     document = cityjson()
     document["CityObjects"]["a"]["geometry"][0]["boundaries"][0][1][0][2] = index
     (tmp_path / "f.json").write_text(json.dumps(document))
+    notes = city(tmp_path, "footprints", "f.json").notes
+    assert any("1 of 2 objects left out" in note for note in notes)
+    del document["CityObjects"]["b"]
+    (tmp_path / "f.json").write_text(json.dumps(document))
     assert complaint(tmp_path, "footprints", "f.json")
 
 

@@ -17,10 +17,10 @@ from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.studies.validation.truths import chain_length, derivatives, flown, wide
 from isac_rt.world.city import load_city
-from isac_rt.world.city.extrude import building
-from isac_rt.world.city.footprints import projection
+from isac_rt.world.city.extrude import Finish, building
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import clean
+from isac_rt.world.city.place import LONLAT, Place, plane_about
 from isac_rt.world.swarm import Pose, Trajectory
 
 C = 299_792_458.0
@@ -404,7 +404,8 @@ def longitude_and_latitude_to_metres() -> float:
     lat, away = 48.137, np.array([-0.0143, 0.0027, 0.0269])
     a, f = 6378137.0, 1 / 298.257223563
     e2 = f * (2 - f)
-    found = projection(11.575, lat)(np.column_stack([np.full(3, 11.575), lat + away]))[:, 1]
+    place = Place(LONLAT, (11.575, lat, 0.0), plane_about(11.575, lat))
+    found = place.to_world(np.column_stack([np.full(3, 11.575), lat + away]))[:, 1]
     arcs = [
         quad(
             lambda x: a * (1 - e2) / (1 - e2 * np.sin(x) ** 2) ** 1.5,
@@ -436,7 +437,7 @@ def buildings_are_closed_and_face_outward() -> float:
 
     use = MaterialUse("concrete")
     vertices, faces, *_ = clean(
-        building(shapely.Polygon(outer, [yard]), 1.3, 18.9, use, use, use, "house"),
+        building(shapely.Polygon(outer, [yard]), 1.3, 18.9, Finish(use, use, use), "house"),
         "house",
         np.array([4.0, 5.0, 6.0]),
         None,

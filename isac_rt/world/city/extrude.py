@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mapbox_earcut
 import numpy as np
@@ -16,6 +17,15 @@ MAX_CORNERS = 10_000
 """Of one polygon: triangulation takes a time that grows with their square, 1 s here."""
 MAX_CROSSINGS = 100
 """Of one polygon with itself; GEOS repairs some 2000 in a second."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """What a building is made of."""
+
+    wall: MaterialUse
+    roof: MaterialUse
+    floor: MaterialUse
 
 
 def check_corners(count: int, what: str) -> None:
@@ -124,9 +134,7 @@ def building(
     polygon: shapely.Polygon,
     base: float,
     top: float,
-    wall: MaterialUse,
-    roof: MaterialUse,
-    floor: MaterialUse,
+    finish: Finish,
     what: str,
 ) -> list[Surface]:
     """A closed prism over a polygon: walls, roof and floor, normals outward.
@@ -137,7 +145,7 @@ def building(
         Valid; holes become courtyards. [m]
     base, top : float
         Heights of floor and roof. [m]
-    wall, roof, floor : MaterialUse
+    finish : Finish
     what : str
         For messages.
     """
@@ -164,9 +172,112 @@ def building(
         [np.column_stack([here, nxt, nxt + num]), np.column_stack([here, nxt + num, here + num])]
     )
     return [
-        Surface(vertices, walls, wall),
-        Surface(vertices, cap + num, roof),
-        Surface(vertices, cap[:, ::-1], floor),
+        Surface(vertices, walls, finish.wall),
+        Surface(vertices, cap + num, finish.roof),
+        Surface(vertices, cap[:, ::-1], finish.floor),
+    ]
+
+
+SQUARE_SHARE = 0.85
+"""Of its smallest rectangle a plan with four corners fills at least this to carry a ridge."""
+STRAIGHT_M = 0.2
+"""Corners that stand out of a straight wall by less than this do not count."""
+USUAL_PITCH = 2 / 3
+"""Height of a roof over half of its span, where nobody says: 34 degrees."""
+MOST_OF_HEIGHT = 0.6
+"""A roof of unknown height takes no more of a building's."""
+
+
+def quadrangle(polygon: shapely.Polygon) -> NDArray[np.float64] | None:
+    """The four corners (4, 2) of a plan that is nearly a rectangle, counter-clockwise, a longer
+    side first; None of any other."""
+    plain = shapely.simplify(shapely.geometry.polygon.orient(polygon), STRAIGHT_M)
+    corners = shapely.get_coordinates(plain.exterior)[:-1]
+    if len(plain.interiors) or len(corners) != 4:
+        return None
+    if plain.area < SQUARE_SHARE * shapely.minimum_rotated_rectangle(plain).area:
+        return None
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    return corners if sides[0] + sides[2] >= sides[1] + sides[3] else np.roll(corners, -1, axis=0)
+
+
+def _crown(
+    polygon: shapely.Polygon, shape: str, across: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+    """Corners (N, 2), ridge (1 or 2, 2) and half of the span [m] of a roof; None if the plan is not
+    simple enough for it."""
+    if shape == "pyramidal":
+        convex = shapely.convex_hull(polygon).area <= polygon.area * (1 + 1e-3)
+        if len(polygon.interiors) or not convex:
+            return None
+        corners = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon).exterior)[:-1]
+        middle = shapely.get_coordinates(polygon.centroid)
+        return corners, middle, float(np.linalg.norm(corners - middle, axis=1).min())
+    corners_or_none = quadrangle(polygon)
+    if corners_or_none is None:
+        return None
+    corners = np.roll(corners_or_none, -1, axis=0) if across else corners_or_none
+    ends = np.stack([corners[[3, 0]].mean(axis=0), corners[[1, 2]].mean(axis=0)])
+    half = float(np.linalg.norm(corners[[0, 1]] - corners[[3, 2]], axis=1).mean()) / 2
+    if shape == "hipped":
+        along = ends[1] - ends[0]
+        length = float(np.linalg.norm(along))
+        if length <= 2.2 * half:  # nothing of the ridge is left
+            return corners, ends.mean(axis=0, keepdims=True), half
+        ends = ends + np.array([[1.0], [-1.0]]) * along * half / length
+    return corners, ends, half
+
+
+def roofed(
+    polygon: shapely.Polygon,
+    heights: tuple[float, float],
+    roof: tuple[str, float | None, bool],
+    finish: Finish,
+) -> list[Surface] | None:
+    """A closed building with a gabled, hipped or pyramidal roof; None if its plan is not simple
+    enough for one.
+
+    Parameters
+    ----------
+    polygon : shapely.Polygon
+    heights : (floor, ridge) [m]
+    roof : (shape, height [m] or None, whether the ridge runs across the longer side)
+    finish : Finish
+    """
+    shape, own, across = roof
+    found = _crown(polygon, shape, across)
+    base, top = heights
+    if found is None:
+        return None
+    plan, ridge, half = found
+    if own is None:
+        own = min(half * USUAL_PITCH, MOST_OF_HEIGHT * (top - base))
+    eaves = top - min(own, top - base)
+    n = len(plan)
+    layers = [np.column_stack([p, np.full(len(p), z)]) for p, z in ((plan, base), (plan, eaves))]
+    vertices = np.concatenate([*layers, np.column_stack([ridge, np.full(len(ridge), top)])])
+    here, after = np.arange(n), np.roll(np.arange(n), -1)
+    walls = [
+        np.column_stack([here, after, after + n]),
+        np.column_stack([here, after + n, here + n]),
+    ]
+    first, last = 2 * n, 2 * n + len(ridge) - 1
+    if len(ridge) == 1:
+        slopes, ends = np.column_stack([here + n, after + n, np.full(n, first)]), None
+    else:
+        slopes = np.array(
+            [(n, n + 1, last), (n, last, first), (n + 2, n + 3, first), (n + 2, first, last)]
+        )
+        ends = np.array([(n + 1, n + 2, last), (n + 3, n, first)])
+    if ends is not None and shape == "gabled":
+        walls.append(ends)
+    elif ends is not None:
+        slopes = np.concatenate([slopes, ends])
+    floor = _cap(shapely.Polygon(plan), plan)
+    return [
+        Surface(vertices, np.concatenate(walls), finish.wall),
+        Surface(vertices, slopes, finish.roof),
+        Surface(vertices, floor[:, ::-1], finish.floor),
     ]
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import os
 import stat
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 from urllib.parse import unquote
 
 from pydantic import BaseModel, ConfigDict, FailFast, ValidationError
@@ -32,6 +33,21 @@ class Part(BaseModel):
     that are not looked at."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+
+
+def needs_extra(module: str, name: str, kind: str) -> Any:
+    """A module of the extra `cities`.
+
+    Raises
+    ------
+    CityError  If it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise CityError(
+            f"{name}: to read {kind}, install its readers: pip install 'isac_rt[cities]'"
+        ) from None
 
 
 Document = TypeVar("Document", bound=BaseModel)
@@ -97,6 +113,11 @@ def parsed(data: bytes, model: type[Document], name: str, remedy: str) -> Docume
     try:
         return model.model_validate_json(data.removeprefix(_BYTE_ORDER_MARK))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        place = " ".join(str(part) for part in first["loc"])
-        raise CityError(f"{name}: {place}: {first['msg']}; {remedy}") from None
+        raise CityError(f"{name}: {first_error(error)}; {remedy}") from None
+
+
+def first_error(error: ValidationError) -> str:
+    """The first place that is not as it should be, and why."""
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    place = " ".join(str(part) for part in first["loc"])
+    return f"{place}: {first['msg']}"

@@ -1,191 +1,209 @@
-"""Building footprints with heights: GeoJSON and CityJSON, in metres or in longitude and
-latitude."""
+"""Cities from maps: footprints with heights, and buildings with surfaces of their own, in metres or
+in any other coordinates, on their ground."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import Field, RootModel
 
 from isac_rt import scenario
-from isac_rt.world.city.cityjson import CityJson, CityModel, parse_height, read_cityjson
-from isac_rt.world.city.extrude import building, ground, polygons_of
-from isac_rt.world.city.files import JSON_FACTOR, Items, Part, parsed, read_bytes
+from isac_rt.world.city.buildings import Outline, buildings, moved
+from isac_rt.world.city.cityjson import CityModel, is_sequence, read_cityjson
+from isac_rt.world.city.extrude import Finish, building, polygons_of, roofed
+from isac_rt.world.city.files import JSON_FACTOR, read_bytes
+from isac_rt.world.city.geojson import by_lines, read_geojson, tell_bad
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, check_coordinates
+from isac_rt.world.city.place import Place, crs_name, place_of
+from isac_rt.world.city.tables import TABLES, read_table
+from isac_rt.world.city.terrain import Ground, Plan, feet_of, flat, lowered, of_raster, of_relief
+from isac_rt.world.city.terrain import through_feet as ground_through
 
-LONLAT_FOOTPRINT = 0.05
-"""No building is this many degrees across (5 km), and hardly any is this few metres."""
-
-
-def is_lonlat(boxes: NDArray[np.float64]) -> bool:
-    """Whether footprints look like degrees.
-
-    Parameters
-    ----------
-    boxes : (B, 4) float64
-        West, south, east, north of each footprint, in the file's unit.
-    """
-    west, south, east, north = boxes.T
-    in_range = west.min() >= -180 and east.max() <= 180 and south.min() >= -90 and north.max() <= 90
-    return bool(in_range and np.median(np.maximum(east - west, north - south)) < LONLAT_FOOTPRINT)
+STRAY = 20.0
+"""Farther from the middle than so many times nine of ten, and `STRAY_M`, is a stray footprint."""
+STRAY_M = 30e3
+_ALONG_M = 20.0
+"""Along walls the ground is looked at so often."""
+SEEN_LOWERED_M = 0.5
+"""Buildings that go down to the ground by more are counted."""
 
 
-def projection(lon: float, lat: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Longitude and latitude (N, 2) [degrees] to metres east and north of a point: azimuthal
-    equidistant, WGS 84.
-
-    Distances from the centre are exact; elsewhere they are off by about (r / 6400 km)^2 / 6: 1e-8
-    at 2 km.
-    """
-    import pyproj
-
-    plane = pyproj.Proj(proj="aeqd", lon_0=lon, lat_0=lat, ellps="WGS84")
-
-    def to_metres(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.column_stack(plane(points[:, 0], points[:, 1]))
-
-    return to_metres
+def _model(city: scenario.City, path: Path, notes: list[str]) -> CityModel:
+    """What a file holds, in its own coordinates."""
+    if path.suffix.lower() in TABLES:
+        features, crs = read_table(path, city.layer, notes)
+        return CityModel(crs, buildings(features, city, path.name, notes))
+    data = read_bytes(path, JSON_FACTOR).removeprefix(b"\xef\xbb\xbf")
+    if data.lstrip()[:1] == b"<":
+        raise CityError(_REMEDY_XML.format(path.name))
+    if is_sequence(data) or b'"CityJSON"' in data:
+        return read_cityjson(data, city, path.name, notes)
+    lines = path.suffix.lower() in (".geojsonl", ".geojsons", ".ndjson", ".jsonl")
+    features, crs = read_geojson(by_lines(data) if lines else data, path.name, notes)
+    return CityModel(crs, buildings(features, city, path.name, notes))
 
 
-def _placed(
-    boxes: NDArray[np.float64], coordinates: str, name: str, notes: list[str]
-) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """The projection that a file needs; None if it is in metres already."""
-    if coordinates == "metres" or (coordinates == "auto" and not is_lonlat(boxes)):
-        return None
-    if boxes[:, [1, 3]].min() < -90 or boxes[:, [1, 3]].max() > 90:
-        worst = float(boxes[:, [1, 3]].flat[np.argmax(np.abs(boxes[:, [1, 3]]))])
-        raise CityError(
-            f"{name}: latitude {worst:g} is beyond 90 degrees; longitude and latitude are swapped "
-            "(GeoJSON has longitude first), or the file is in metres: city.coordinates: metres"
-        )
-    if boxes[:, [0, 2]].min() < -180 or boxes[:, [0, 2]].max() > 180:
-        raise CityError(
-            f"{name}: a longitude is beyond 180 degrees; if the file is in metres, set "
-            "city.coordinates: metres"
-        )
-    lon, lat = (boxes[:, [0, 1]].min(axis=0) + boxes[:, [2, 3]].max(axis=0)) / 2
-    notes.append(
-        f"world origin at longitude {lon:.7f}, latitude {lat:.7f} degrees (azimuthal equidistant, "
-        "WGS 84)"
-    )
-    return projection(float(lon), float(lat))
+_REMEDY_XML = (
+    "{0}: is XML; CityGML becomes CityJSON by: citygml-tools to-cityjson {0} (OpenStreetMap's XML "
+    "is read where its name ends in .osm)"
+)
 
 
-_Position = Annotated[Items[float], Field(min_length=2)]
-_Rings = Items[Annotated[Items[_Position], Field(min_length=3)]]
+def _boxes(model: CityModel) -> NDArray[np.float64]:
+    """West, south, east, north of all that a file holds."""
+    boxes = [shapely.bounds(outline.shape) for outline in model.outlines]
+    for body in model.bodies:
+        plan = body.vertices[:, :2]
+        boxes.append(np.concatenate([plan.min(axis=0), plan.max(axis=0)]))
+    return np.array(boxes).reshape(-1, 4)
 
 
-def _polygon(rings: _Rings) -> shapely.Polygon:
-    plan = [[position[:2] for position in ring] for ring in rings]
-    return shapely.Polygon(plan[0], plan[1:]) if plan else shapely.Polygon()
-
-
-class _Polygon(Part):
-    type: Literal["Polygon"]
-    coordinates: _Rings
-
-    def shape(self) -> shapely.Geometry:
-        return _polygon(self.coordinates)
-
-
-class _MultiPolygon(Part):
-    type: Literal["MultiPolygon"]
-    coordinates: Items[_Rings]
-
-    def shape(self) -> shapely.Geometry:
-        return shapely.MultiPolygon([_polygon(rings) for rings in self.coordinates])
-
-
-class _Other(Part):
-    type: Literal["Point", "MultiPoint", "LineString", "MultiLineString"]
-
-    def shape(self) -> shapely.Geometry:
-        return shapely.Polygon()
-
-
-class _Collection(Part):
-    type: Literal["GeometryCollection"]
-    geometries: Items[_Geometry]
-
-    def shape(self) -> shapely.Geometry:
-        return shapely.GeometryCollection([part.shape() for part in self.geometries])
-
-
-_Geometry = Annotated[_Polygon | _MultiPolygon | _Other | _Collection, Field(discriminator="type")]
-
-
-class _Feature(Part):
-    type: Literal["Feature"]
-    geometry: _Geometry | None = None
-    properties: dict[str, Any] | None = None
-
-    def shape(self) -> shapely.Geometry:
-        return shapely.Polygon() if self.geometry is None else self.geometry.shape()
-
-
-_Item = Annotated[
-    _Feature | _Polygon | _MultiPolygon | _Other | _Collection, Field(discriminator="type")
-]
-
-
-class _FeatureCollection(Part):
-    type: Literal["FeatureCollection"]
-    features: Items[_Item]
-
-
-class _Map(RootModel):
-    """GeoJSON or CityJSON."""
-
-    root: Annotated[
-        _FeatureCollection | _Feature | _Polygon | _MultiPolygon | _Collection | CityJson,
-        Field(discriminator="type"),
-    ]
-
-
-def _geojson(
-    features: Sequence[_Item], key: str, name: str, notes: list[str]
-) -> list[tuple[shapely.Geometry, float | None, str]]:
-    """Geometry, height and label of each polygonal feature."""
-    found: list[tuple[shapely.Geometry, float | None, str]] = []
-    for i, feature in enumerate(features):
-        what = f"{name}: feature {i}"
+def _without_strays(model: CityModel, bad: list[str]) -> CityModel:
+    """The model without outlines that lie where no place is, or far from all others."""
+    if not model.outlines:
+        return model
+    boxes = np.array([shapely.bounds(outline.shape) for outline in model.outlines])
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    away = np.abs(middle - np.median(middle, axis=0)).max(axis=1)
+    usual = float(np.quantile(away, 0.9))
+    degrees = np.abs(boxes).max(axis=1).mean() <= 360
+    stray = away > max(STRAY * usual, STRAY_M / 1e5 if degrees else STRAY_M)
+    kept = []
+    for outline, far in zip(model.outlines, stray.tolist(), strict=True):
         try:
-            shape = feature.shape()
-        except (ValueError, shapely.errors.ShapelyError) as error:
+            check_coordinates(shapely.get_coordinates(outline.shape), outline.what)
+        except CityError as problem:
+            bad.append(str(problem))
+            continue
+        if far:
+            bad.append(f"{outline.what}: lies far from all others; correct or remove it")
+        else:
+            kept.append(outline)
+    return CityModel(model.crs, kept, model.bodies)
+
+
+def _place(city: scenario.City, model: CityModel, name: str, notes: list[str]) -> Place:
+    """Where a city lies, by the scenario, the file, or the size of its numbers."""
+    crs = ""
+    if city.crs is not None:
+        crs = crs_name(city.crs) or ""
+        if not crs:
             raise CityError(
-                f"{what}: its coordinates cannot be read ({error}); rings are lists of [x, y]"
-            ) from None
-        if not shape.is_empty:
-            properties = feature.properties if isinstance(feature, _Feature) else None
-            found.append((shape, parse_height((properties or {}).get(key), what), what))
-    if len(found) < len(features):
-        notes.append(f"{len(features) - len(found)} features without a polygon left out")
-    return found
+                f"city.crs {city.crs!r} is no coordinate reference system; write EPSG:2056, or "
+                "what it is"
+            )
+    elif model.crs:
+        crs = crs_name(model.crs) or ""
+        if not crs:
+            notes.append(f"coordinate reference system {model.crs[:80]!r} of the file is unknown")
+    return place_of(_boxes(model), crs, city.coordinates, city.origin, name)
+
+
+def _moved(model: CityModel, place: Place) -> CityModel:
+    """The same in world coordinates."""
+    z = place.origin[2]
+    outlines = [
+        replace(
+            moved(outline, shapely.transform(outline.shape, place.to_world)),
+            foot=None if outline.foot is None else outline.foot - z,
+        )
+        for outline in model.outlines
+    ]
+    if not model.bodies:
+        return CityModel(model.crs, outlines)
+    vertices = place.to_world(np.concatenate([body.vertices for body in model.bodies]))
+    ends = np.cumsum([len(body.vertices) for body in model.bodies])[:-1]
+    bodies = [
+        replace(body, vertices=own)
+        for body, own in zip(model.bodies, np.split(vertices, ends), strict=True)
+    ]
+    return CityModel(model.crs, outlines, bodies)
+
+
+def _ground(
+    city: scenario.City, model: CityModel, terrain: Path | None, place: Place, notes: list[str]
+) -> Ground:
+    """What the city stands on."""
+    boxes = _boxes(model)
+    plan = Plan(
+        boxes[:, :2].min(axis=0),
+        boxes[:, 2:].max(axis=0),
+        city.ground_margin_m,
+        MaterialUse(city.ground_material),
+    )
+    relief = [body for body in model.bodies if body.kind == "TINRelief"]
+    if terrain is not None:
+        return of_raster(plan, terrain, place, notes)
+    if relief:
+        return of_relief(relief)
+    _, feet = feet_of(model.bodies)
+    stand = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in _standing(model)]
+    feet = np.concatenate([feet, np.array(stand, dtype=np.float64).reshape(-1, 3)])
+    if len(feet):
+        return ground_through(plan, feet, notes)
+    lowest = min((float(body.vertices[:, 2].min()) for body in model.bodies), default=0.0)
+    return flat(plan, lowest if model.bodies else -place.origin[2])
+
+
+def _standing(model: CityModel) -> list[Outline]:
+    return [outline for outline in model.outlines if outline.foot is not None]
 
 
 def _extruded(
-    city: scenario.City,
-    outlines: Sequence[tuple[shapely.Geometry, float | None, str]],
-    base: float,
-    bases: Sequence[float],
-    notes: list[str],
+    outline: Outline, base: Ground, default: float, finish: Finish, plain: Counter[str]
 ) -> list[Surface]:
-    wall, roof, floor = (
-        MaterialUse(m) for m in (city.wall_material, city.roof_material, city.ground_material)
-    )
+    """A building over a footprint."""
+    polygons = polygons_of(outline.shape, outline.what)
+    step = max(_ALONG_M, sum(p.length for p in polygons) / 100)
+    floor = base.under(shapely.get_coordinates(shapely.segmentize(polygons, step)))
+    foot = floor if outline.foot is None else outline.foot
+    height = default if outline.height is None else outline.height
+    low = floor if not outline.above else foot + outline.above
+    top = foot + height
+    if not top > low:
+        raise CityError(
+            f"{outline.what}: its lowest point is {outline.above:g} m high and its top {height:g} m"
+        )
     surfaces: list[Surface] = []
-    for (shape, height, what), foot in zip(outlines, bases, strict=True):
-        top = foot + (city.default_height_m if height is None else height)
-        for polygon in polygons_of(shape, what):
-            surfaces += building(polygon, base, top, wall, roof, floor, what)
-    missing = sum(height is None for _, height, _ in outlines)
+    for polygon in polygons:
+        made, roof = None, outline.roof
+        if roof.shape in ("gabled", "hipped", "pyramidal"):
+            made = roofed(polygon, (low, top), (roof.shape, roof.height, roof.across), finish)
+        if made is None and roof.shape != "flat":
+            plain[roof.shape] += 1
+        surfaces += made or building(polygon, low, top, finish, outline.what)
+    return surfaces
+
+
+def _raised(
+    city: scenario.City, outlines: Sequence[Outline], base: Ground, bad: list[str], notes: list[str]
+) -> list[Surface]:
+    """Buildings over all footprints; bad ones are left out."""
+    finish = Finish(
+        MaterialUse(city.wall_material),
+        MaterialUse(city.roof_material),
+        MaterialUse(city.ground_material),
+    )
+    surfaces, good, plain = list[Surface](), 0, Counter[str]()
+    for outline in outlines:
+        try:
+            surfaces += _extruded(outline, base, city.default_height_m, finish, plain)
+            good += 1
+        except CityError as problem:
+            bad.append(str(problem))
+        if len(bad) > 100 + good:
+            break
+    tell_bad(bad, good, notes)
+    if plain:
+        said = ", ".join(f"{count} {shape[:30]}" for shape, count in plain.most_common(8))
+        notes.append(f"roofs drawn flat, at their full height: {said}")
+    missing = sum(outline.height is None for outline in outlines)
     if missing:
         notes.append(
             f"{missing} of {len(outlines)} footprints without {city.height_property!r}: "
@@ -194,61 +212,55 @@ def _extruded(
     return surfaces
 
 
-def footprints(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
-    """Closed buildings and a ground from a GeoJSON or CityJSON file.
+def footprints(
+    city: scenario.City, path: Path, terrain: Path | None = None
+) -> tuple[list[Surface], list[str], Place]:
+    """Closed buildings and a ground from a map.
 
-    GeoJSON stands on z = 0. CityJSON keeps its heights; its ground plane lies at its lowest point,
-    and what is extruded reaches down to it. Longitude and latitude are projected about the middle
-    of the data, which becomes the world's origin; metres stay as they are.
+    GeoJSON and tables stand on z = 0, or on the terrain. CityJSON keeps its heights, and what
+    stands on the ground reaches down to it.
 
     Returns
     -------
     surfaces : list of Surface
         World coordinates.
     notes : list of str
+    place : Place
 
     Raises
     ------
     CityError
     """
-    data, notes = read_bytes(path, JSON_FACTOR), list[str]()
-    document = parsed(data, _Map, path.name, "give GeoJSON with polygons, or CityJSON").root
-    model = CityModel()
-    if isinstance(document, CityJson):
-        model = read_cityjson(document, city, path.name, notes)
-    else:
-        features = document.features if isinstance(document, _FeatureCollection) else [document]
-        model.outlines = _geojson(features, city.height_property, path.name, notes)
-        model.bases = [0.0] * len(model.outlines)
-    outlines, bases, solids = model.outlines, model.bases, model.surfaces
-    if not outlines and not solids:
-        raise CityError(f"{path.name}: there is no polygon in it; give building footprints")
-    points = [shapely.bounds(shape) for shape, _, _ in outlines]
-    points += [
-        np.concatenate([s.vertices[:, :2].min(axis=0), s.vertices[:, :2].max(axis=0)])
-        for s in solids
-    ]
-    to_metres = _placed(np.array(points), city.coordinates, path.name, notes)
-    if to_metres is not None:
-        outlines = [
-            (shapely.transform(shape, to_metres), height, what) for shape, height, what in outlines
-        ]
-        solids = [
-            Surface(
-                np.column_stack([to_metres(s.vertices[:, :2]), s.vertices[:, 2]]),
-                s.faces,
-                s.material,
-            )
-            for s in solids
-        ]
-    for shape, _, what in outlines:
-        check_coordinates(shapely.get_coordinates(shape), what)
-    lowest = min([*bases, *(float(s.vertices[:, 2].min()) for s in solids)])
-    surfaces = solids + _extruded(city, outlines, lowest, bases, notes)
-    plan = np.concatenate([s.vertices[:, :2] for s in surfaces])
-    if not model.terrain:
-        floor = MaterialUse(city.ground_material)
-        surfaces.append(
-            ground(plan.min(axis=0), plan.max(axis=0), city.ground_margin_m, lowest, floor)
+    notes, bad = list[str](), list[str]()
+    model = _without_strays(_model(city, path, notes), bad)
+    if not model.outlines and not model.bodies:
+        raise CityError(
+            bad[0] if bad else f"{path.name}: there is no polygon in it; give building footprints"
         )
-    return surfaces, notes
+    place = _place(city, model, path.name, notes)
+    model = _moved(model, place)
+    base = _ground(city, model, terrain, place, notes)
+    if place.crs or any(place.origin):
+        notes.append(place.words())
+    surfaces = _raised(city, model.outlines, base, bad, notes)
+    if base.surface is not None:
+        surfaces.append(base.surface)
+    return [*_bodies(model, base, terrain is not None, notes), *surfaces], notes, place
+
+
+def _bodies(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
+    """What has surfaces of its own, down to the ground."""
+    standing = {id(body) for body in feet_of(model.bodies)[0]}
+    surfaces, deep = list[Surface](), list[float]()
+    for body in model.bodies:
+        if replaced and body.kind == "TINRelief":
+            continue
+        grounded, by = lowered(body, base) if id(body) in standing else (body, 0.0)
+        surfaces += grounded.surfaces()
+        deep += [by] if by > SEEN_LOWERED_M else []
+    if deep:
+        notes.append(
+            f"{len(deep)} buildings reach down to the ground, by {np.median(deep):.1f} m in the "
+            f"median and up to {max(deep):.1f} m"
+        )
+    return surfaces

@@ -166,6 +166,7 @@ _SCATTERING = {
     "medium_dry_ground": 0.4,
     "wet_ground": 0.4,
     "vegetation": 0.9,
+    "water": 0.1,
 }
 _THICKNESS = {
     "glass": 0.012,
@@ -284,6 +285,9 @@ def itu_constants(name: str, frequency: float) -> tuple[float, float, str]:
             sigma,
             f"Mätzler 1994 leaf model, dry matter {LEAF_DRY_MATTER:g}, salt neglected",
         )
+    if name == "water":
+        eps, sigma = _constants(water_permittivity(frequency), frequency)
+        return eps, sigma, "Liebe 1991 model of fresh water, 20 degrees Celsius"
     fits = ITU_FITS[name]
     for fit in fits:
         if fit.low <= f <= fit.high:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from isac_rt.kernels.jit import jit
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
+from isac_rt.world.city.place import Place
 
 _LOG = logging.getLogger(__name__)
 PLANE_TOLERANCE = 1e-6
@@ -66,6 +67,8 @@ class CityMesh:
         Coplanar within this. [m]
     num_beyond : int
         Faces that `within` cut away.
+    place : Place or None
+        Where it lies on Earth, of cities from maps.
     """
 
     name: str
@@ -77,6 +80,7 @@ class CityMesh:
     notes: tuple[str, ...] = ()
     plane_tolerance: float = PLANE_TOLERANCE
     num_beyond: int = 0
+    place: Place | None = None
 
     def __post_init__(self) -> None:
         for array in (self.vertices, self.faces, self.face_material, self.origin):
@@ -172,13 +176,18 @@ class CityMesh:
     def plain(self) -> dict[str, Any]:
         """All of it as plain data and arrays, for `of_plain`."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}
-        return own | {"materials": [asdict(material) for material in self.materials]}
+        place = None if self.place is None else asdict(self.place)
+        return own | {
+            "materials": [asdict(material) for material in self.materials],
+            "place": place,
+        }
 
     @classmethod
     def of_plain(cls, own: dict[str, Any]) -> CityMesh:
         """The city that `plain` took apart."""
         materials = tuple(Material(**material) for material in own["materials"])
-        return cls(**own | {"materials": materials, "notes": tuple(own["notes"])})
+        place = own["place"] and Place(**own["place"] | {"origin": tuple(own["place"]["origin"])})
+        return cls(**own | {"materials": materials, "notes": tuple(own["notes"]), "place": place})
 
     def bounds(self) -> NDArray[np.float64]:
         """(2, 3) lowest and highest local coordinates; zeros for an empty city. [m]"""

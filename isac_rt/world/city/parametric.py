@@ -7,7 +7,7 @@ import shapely
 
 from isac_rt import scenario
 from isac_rt.randomness import splitmix64
-from isac_rt.world.city.extrude import building, ground
+from isac_rt.world.city.extrude import Finish, building, ground
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 
@@ -33,17 +33,15 @@ def _check(city: scenario.City) -> None:
 def _blocks(
     city: scenario.City, boxes: list[tuple[float, float, float, float, float]]
 ) -> list[Surface]:
-    wall, roof, floor = (
-        MaterialUse(m) for m in (city.wall_material, city.roof_material, city.ground_material)
+    finish = Finish(
+        *(MaterialUse(m) for m in (city.wall_material, city.roof_material, city.ground_material))
     )
     surfaces: list[Surface] = []
     for x_0, y_0, x_1, y_1, height in boxes:
-        surfaces += building(
-            shapely.box(x_0, y_0, x_1, y_1), 0.0, height, wall, roof, floor, "block"
-        )
+        surfaces += building(shapely.box(x_0, y_0, x_1, y_1), 0.0, height, finish, "block")
     edges = np.array(boxes)
     low, high = edges[:, :2].min(axis=0), edges[:, 2:4].max(axis=0)
-    return [*surfaces, ground(low, high, city.ground_margin_m, 0.0, floor)]
+    return [*surfaces, ground(low, high, city.ground_margin_m, 0.0, finish.floor)]
 
 
 def canyon(city: scenario.City) -> list[Surface]:

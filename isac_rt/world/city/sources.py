@@ -16,6 +16,8 @@ from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
 from isac_rt.world.city.parametric import blocks, canyon
+from isac_rt.world.city.place import Place
+from isac_rt.world.city.tables import table_files
 
 
 def _path(city: scenario.City, folder: Path) -> Path:
@@ -38,6 +40,18 @@ def _path(city: scenario.City, folder: Path) -> Path:
     return path
 
 
+def _terrain(city: scenario.City, folder: Path) -> Path | None:
+    if city.terrain is None:
+        return None
+    path = folder / city.terrain
+    if not os.path.isfile(path):
+        raise CityError(
+            f"city.terrain {city.terrain!r} does not exist in {folder}, or is no file; paths are "
+            "relative to the scenario's folder"
+        )
+    return path
+
+
 def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
     """Every file that a city is read from, in an order of their own.
 
@@ -49,18 +63,23 @@ def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
         return []
     path = _path(city, folder)
     if city.source == "footprints":
-        return [path]
+        terrain = _terrain(city, folder)
+        return [*table_files(path), *([] if terrain is None else [terrain])]
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
 
 
-def _surfaces(city: scenario.City, folder: Path) -> tuple[str, list[Surface], list[str]]:
+def _surfaces(
+    city: scenario.City, folder: Path
+) -> tuple[str, list[Surface], list[str], Place | None]:
     if city.source == "canyon":
-        return city.name or "canyon", canyon(city), []
+        return city.name or "canyon", canyon(city), [], None
     if city.source == "blocks":
-        return city.name or "blocks", blocks(city), []
+        return city.name or "blocks", blocks(city), [], None
     path = _path(city, folder)
-    read = {"mesh": mesh_file, "footprints": footprints}.get(city.source, mitsuba_file)
-    return city.name or path.name, *read(city, path)
+    name = city.name or path.name
+    if city.source == "footprints":
+        return name, *footprints(city, path, _terrain(city, folder))
+    return name, *(mesh_file if city.source == "mesh" else mitsuba_file)(city, path), None
 
 
 def load_city(
@@ -95,7 +114,7 @@ def load_city(
     if city is None:
         return empty_city("free space", origin)
     with np.errstate(all="ignore"):  # what overflows is refused by `clean`
-        name, surfaces, notes = _surfaces(city, Path(folder))
+        name, surfaces, notes, place = _surfaces(city, Path(folder))
     uses, materials = resolve_materials(
         [s.material for s in surfaces], carrier_frequency, city.materials
     )
@@ -113,4 +132,5 @@ def load_city(
         origin,
         tuple(counted),
         tolerance,
+        place=place,
     )
