@@ -75,7 +75,7 @@ def said(city: CityMesh, *words: str) -> bool:
     ],
 )
 def test_heights_as_people_write_them(text, metres):
-    """Seen failing: "12,5" and "40'" ended the whole file. Planted bug: inches as tenths of feet."""
+    """Seen failing: "12,5" ended the whole file. Planted bug: inches as tenths of feet."""
     assert parse_length(text) == (metres if metres is None else pytest.approx(metres, rel=1e-12))
 
 
