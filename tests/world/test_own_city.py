@@ -247,7 +247,7 @@ def test_a_feature_in_each_line(tmp_path):
 
 def degrees(x: float, y: float, crs: str) -> list[float]:
     turned = pyproj.Transformer.from_crs("OGC:CRS84", crs, always_xy=True)
-    return [list(turned.transform(*p)) for p in square(x, y, 2e-3, 1e-3)]  # type: ignore[return-value]
+    return [list(turned.transform(*p)) for p in square(x, y, 2e-3, 1e-3)]
 
 
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:2056", "EPSG:2263", "EPSG:32632"])
@@ -408,9 +408,10 @@ def test_triangles_stay_as_they_are_and_concave_walls_are_whole(tmp_path):
     vertices = [[x, y, z] for z in (0, 5) for x, y in plan]
     shell = [
         [[0, 3, 2, 1]],
-        [[4, 5, 7]], [[5, 6, 7]],
+        [[4, 5, 7]],
+        [[5, 6, 7]],
         *[[[i, (i + 1) % 4, (i + 1) % 4 + 4, i + 4]] for i in range(4)],
-    ]  # fmt: skip
+    ]
     objects = {"a": {"type": "Building", "geometry": [solid(0, "2", shell, semantics=False)]}}
     (tmp_path / "c.json").write_text(json.dumps(cityjson(vertices, objects)))
     made = body(read(tmp_path, "c.json", **LOCAL))

@@ -280,9 +280,10 @@ def _faces(
     rings: dict[str, _Rings] = {}
     foot, highest = set[int](), -1
     for boundary, value in _flat(geometry.boundaries, semantics.values, geometry.depth):
-        named = value is not None and 0 <= value < len(kinds)
-        group = rings.setdefault(materials[value] if named else plain, _Rings([], [], []))  # type: ignore[index]  # not None
-        if named and kinds[value] == "GroundSurface":  # type: ignore[index]  # not None
+        index = None if value is None or not 0 <= value < len(kinds) else value
+        material = plain if index is None else materials[index]
+        group = rings.setdefault(material, _Rings([], [], []))
+        if index is not None and kinds[index] == "GroundSurface":
             foot.update(*boundary)
         highest = max([highest, *(max(ring, default=-1) for ring in boundary)])
         if len(boundary) == 1 and len(boundary[0]) in (3, 4):

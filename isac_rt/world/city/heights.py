@@ -20,10 +20,12 @@ _SEVERAL = re.compile(r"[;|]|(?<=[\d'\"m])\s*[-–]\s*(?=\d)")
 
 def _number(text: str) -> float:
     """``12.5``, ``12,5`` and ``1,234.5``: of two kinds of mark the last is the decimal's."""
-    whole, mark, rest = re.fullmatch(r"([\d.,]*?)(?:([.,])(\d*))?", text.rstrip(".,")).groups()  # type: ignore[union-attr]  # any text matches
+    text = text.rstrip(".,")
+    at = max(text.rfind("."), text.rfind(","))
+    whole, mark, rest = (text, "", "0") if at < 0 else (text[:at], text[at], text[at + 1 :])
     if mark and mark in whole:
         return math.nan
-    return float(f"{re.sub('[.,]', '', whole)}.{rest or 0}")
+    return float(f"{re.sub('[.,]', '', whole)}.{rest}")
 
 
 def _length(text: str) -> float:
