@@ -98,7 +98,8 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         from isac_rt.views.figures import make_figures
         from isac_rt.views.report import write_report
 
-        write_report(results, folder, make_figures(results, folder, setup.city))
+        pictures = make_figures(results, folder, setup.city)
+        write_report(results, folder, pictures, setup.city)
     resume.remove()
     _say_summary(results)
 

@@ -45,6 +45,15 @@ def errors_of(values: xr.Dataset | Row, group: str, name: str) -> np.ndarray:
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 
 
+def tracked_states(dataset: xr.Dataset) -> np.ndarray:
+    """(K, 6) state of every track in world axes [m, m/s]: what its observer tracked, added to where
+    the observer is."""
+    own = [list(dataset.uav.values).index(name) for name in dataset.receiver.values]
+    frame, uav = dataset.track_frame.values, np.array(own)[dataset.track_observer.values]
+    of = [dataset[f"uav_{name}"].values[frame, uav] for name in ("position", "velocity")]
+    return np.asarray(dataset.track_state.values + np.concatenate(of, axis=1))
+
+
 class Column(NamedTuple):
     """How an array of the dataset is made: from which attribute (or by which function) of an
     `ObserverRecord` or a `PathSet`, over which dimensions beside frame and observer (or beside a

@@ -15,6 +15,7 @@ import pandas as pd
 import xarray as xr
 from matplotlib.colors import to_rgba
 
+from isac_rt.results.dataset import tracked_states
 from isac_rt.results.recorder import Results
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of
@@ -136,15 +137,6 @@ def write_mat(dataset: xr.Dataset, file: Path) -> None:
     drawn = io.BytesIO()
     savemat(drawn, out, long_field_names=True, do_compression=True, oned_as="column")
     write_whole(file, drawn.getvalue())
-
-
-def tracked_states(dataset: xr.Dataset) -> np.ndarray:
-    """(K, 6) state of every track in world axes [m, m/s]: what its observer tracked, added to where
-    the observer is."""
-    own = [list(dataset.uav.values).index(name) for name in dataset.receiver.values]
-    frame, uav = dataset.track_frame.values, np.array(own)[dataset.track_observer.values]
-    of = [dataset[f"uav_{name}"].values[frame, uav] for name in ("position", "velocity")]
-    return np.asarray(dataset.track_state.values + np.concatenate(of, axis=1))
 
 
 def scene(dataset: xr.Dataset, city: CityMesh) -> trimesh.Scene:

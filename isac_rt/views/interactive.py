@@ -1,8 +1,5 @@
 """The city, the swarm and the paths of a frame as a scene to turn about: in a notebook, or as a
-page that needs no network.
-
-Plotly is in the extra ``notebooks`` (`pip install isac_rt[notebooks]`).
-"""
+page that needs no network."""
 
 from __future__ import annotations
 
@@ -14,9 +11,9 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind, PathSet
-from isac_rt.runtime import MissingPackage
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
+from isac_rt.views.moving_scene import city_traces, layout
 from isac_rt.views.render import polyline
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
@@ -45,10 +42,6 @@ def scene_3d(
     time : of the swarm and the paths [s]
     reach : how far beyond the swarm the city is drawn [m]
 
-    Raises
-    ------
-    isac_rt.runtime.MissingPackage  Without the package `plotly`.
-
     Examples
     --------
     >>> import isac_rt as irt
@@ -60,16 +53,12 @@ def scene_3d(
     >>> len(figure.data) > len(setup.swarm.uavs)
     True
     """
-    try:
-        import plotly.graph_objects as go
-    except ModuleNotFoundError as problem:
-        raise MissingPackage(
-            "interactive scenes need the package plotly: pip install 'isac_rt[notebooks]'"
-        ) from problem
+    import plotly.graph_objects as go  # takes long to load
+
     figure = go.Figure()
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
-    if city.num_faces:
-        figure.add_trace(go.Mesh3d(**_mesh(city, tracks, reach), name="city", showlegend=True))
+    flat = tracks[..., :2]
+    figure.add_traces(city_traces(city, flat.min((0, 1)) - reach, flat.max((0, 1)) + reach))
     poses = swarm.poses(time)
     for kind in PathKind:
         lines, count = _lines(paths, kind, swarm, time)
@@ -117,47 +106,8 @@ def scene_3d(
                 name=f"{name}, {uav.role}",
             )
         )
-    figure.update_layout(
-        scene={
-            "aspectmode": "data",
-            "xaxis_title": "east [m]",
-            "yaxis_title": "north [m]",
-            "zaxis_title": "up [m]",
-            "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}},
-        },
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"x": 0.01, "y": 0.99},
-        template="plotly_white",
-    )
+    figure.update_layout(layout(), template="plotly_white")
     return figure
-
-
-def _mesh(city: CityMesh, tracks: np.ndarray, reach: float) -> dict[str, object]:
-    """The faces near the swarm, lighter the higher."""
-    corners = city.corners + city.origin
-    low, high = tracks[..., :2].min((0, 1)) - reach, tracks[..., :2].max((0, 1)) + reach
-    near = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(
-        axis=1
-    )
-    if not near.any():
-        near[:] = True
-    points, index = np.unique(corners[near].reshape(-1, 3), axis=0, return_inverse=True)
-    i, j, k = index.reshape(-1, 3).T
-    return {
-        "x": points[:, 0],
-        "y": points[:, 1],
-        "z": points[:, 2],
-        "i": i,
-        "j": j,
-        "k": k,
-        "intensity": points[:, 2],
-        "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
-        "showscale": False,
-        "flatshading": True,
-        "hoverinfo": "skip",
-        "opacity": 0.75,
-        "lighting": {"ambient": 0.65, "diffuse": 0.6, "specular": 0.05},
-    }
 
 
 def _lines(

@@ -17,6 +17,8 @@ from isac_rt.results.recorder import TIMINGS, Results
 from isac_rt.results.sensing import FALSE_CAUSES
 from isac_rt.scenario.tree import OWN
 from isac_rt.storage import write_whole
+from isac_rt.views.moving_scene import MOST_LINES, moving_scene, page_part
+from isac_rt.world.city.mesh import CityMesh
 
 DASH = "\u2013"
 _CAPTIONS = {
@@ -384,9 +386,11 @@ def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
     return out
 
 
-def write_report(results: Results, folder: str | Path, pictures: Sequence[Path]) -> Path:
-    """Write ``report.html`` into `folder` with the figures `pictures` embedded; nothing in it is
-    fetched from elsewhere.
+def write_report(
+    results: Results, folder: str | Path, pictures: Sequence[Path], city: CityMesh | None = None
+) -> Path:
+    """Write ``report.html`` into `folder` with the figures `pictures` embedded, and with the scene
+    to turn about in the `city` if it is given; nothing in it is fetched from elsewhere.
 
     Raises
     ------
@@ -423,6 +427,8 @@ def write_report(results: Results, folder: str | Path, pictures: Sequence[Path])
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]
         ),
+        scene=page_part(moving_scene(d, city), "scene") if city and "track_state" in d else None,
+        lines=MOST_LINES,
         figures=_embedded(pictures),
         access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),
         sparsity=row_table(

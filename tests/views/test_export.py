@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from fake_run import fake_run
 from isac_rt.cli.cli import main
 from isac_rt.results.files import save
 from isac_rt.views import export
+from isac_rt.views.moving_scene import moving_scene, page_part
 from isac_rt.world.city.mesh import CityMesh
 
 
@@ -80,6 +82,35 @@ def test_a_scene_stands_upright(run, tmp_path):
     drawn = found.geometry["flight of U1"].vertices
     assert np.abs(drawn - flight[:, [0, 2, 1]] * [1, 1, -1]).max() < 1e-5  # float32 of the format
     assert found.geometry["city"].bounds.tolist() == [[0, 0, -5], [8, 3, 0]]
+
+
+def test_a_moving_scene_is_where_the_run_was(run):
+    """Read off the figure that the page holds: UAVs, tracks and paths of a frame against the run,
+    to the centimetre that it keeps; of a flat roof the outline is drawn and not its diagonal.
+    Planted bug: tracks of all frames at once."""
+    corners = np.array([[0.0, -9, 3], [8, -9, 3], [8, 2, 3], [0, 2, 3]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    city = CityMesh("roof", corners, faces, np.zeros(2, np.int16), (), np.zeros(3))
+    figure = json.loads(json.dumps(moving_scene(run.dataset, city)))
+    d, frame = run.dataset, figure["frames"][4]
+    assert [f["name"] for f in figure["frames"]] == [str(k) for k in range(7)]
+    data = {trace["name"]: trace for trace in frame["data"]}
+
+    def points(trace):
+        found = np.array([trace[a] for a in "xyz"], float).T
+        return found[np.isfinite(found).all(axis=1)]
+
+    assert np.abs(points(data["UAVs"]) - d.uav_position.values[4]).max() <= 0.005 + 1e-9
+    mine = (d.track_frame.values == 4) & (d.track_observer.values == 1)
+    expected = d.uav_position.values[4, 1] + d.track_state.values[mine, :3]
+    assert np.abs(points(data["tracks of PT1"]) - expected).max() <= 0.005 + 1e-9
+    line = data["line of sight paths"]  # made up: it has points between its ends
+    sight = np.array([[line[a][k] for a in "xyz"] for k in (0, line["x"].index(None) - 1)])
+    assert np.abs(sight - d.uav_position.sel(uav=["AT", "PT1"]).values[2]).max() <= 0.005 + 1e-9
+    edges = points(next(t for t in figure["data"] if t["name"] == "edges")).reshape(-1, 2, 3)
+    lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
+    assert sorted(lengths.tolist()) == [8, 8, 11, 11]  # of a rectangle, without its diagonal
+    assert "</script><script" not in page_part(figure, "scene")[-2000:]
 
 
 def test_stonesoup_loads_its_own(run, tmp_path):

@@ -113,7 +113,7 @@ def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
 
         pictures = make_figures(results, folder, setup.city)
         parts.mark("figures")
-        write_report(results, folder, pictures)
+        write_report(results, folder, pictures, setup.city)
     parts.mark("report")
     stages = ("trace", "synthesis", "receive", "track", "other")
     return {

@@ -1,0 +1,245 @@
+"""The scene of a finished run to turn about, with a slider through its frames: where the UAVs were,
+where the terminals' tracks stood, and the strongest paths of the frame whose ledger is nearest.
+
+It is made as plain mappings, for plotly's own objects take longer to build than the page.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from isac_rt.results.dataset import tracked_states
+from isac_rt.views.export import path_lines
+from isac_rt.views.figures import KIND_COLOURS, colour_of, words
+from isac_rt.world.city.mesh import CityMesh
+
+Trace = dict[str, Any]
+MOST_STEPS = 120
+"""Positions of the slider; of longer runs frames are left out evenly."""
+MOST_LINES = 15
+"""Paths of a kind that are drawn at a time, the strongest."""
+CREASE = np.deg2rad(20.0)
+"""Faces that meet at more than this have an edge drawn between them [rad]."""
+_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
+_AXES = "xyz"
+
+
+def layout() -> dict[str, Any]:
+    """How a scene is laid out: metres alike on all axes, seen from the south-east."""
+    axes = zip(_AXES, ("east [m]", "north [m]", "up [m]"), strict=True)
+    return {
+        "scene": {
+            "aspectmode": "data",
+            "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}},
+            **{f"{a}axis": {"title": {"text": title}} for a, title in axes},
+        },
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"x": 0.01, "y": 0.99},
+    }
+
+
+def lines_of(parts: Sequence[np.ndarray]) -> dict[str, list[float | None]]:
+    """Polylines (N, 3) as one broken line, in centimetres' precision."""
+    gap = np.full((1, 3), np.nan)
+    every = np.vstack([a for part in parts for a in (part, gap)] or [np.zeros((0, 3))])
+    return points_of(every)
+
+
+def points_of(points: np.ndarray) -> dict[str, list[float | None]]:
+    """Points (N, 3) by axis, in centimetres' precision; None where there is none."""
+    rounded = np.round(points, 2)
+    return {
+        a: [None if v != v else v for v in column.tolist()]
+        for a, column in zip(_AXES, rounded.T, strict=True)
+    }
+
+
+def city_traces(city: CityMesh, low: np.ndarray, high: np.ndarray) -> list[Trace]:
+    """The faces that reach into a rectangle from `low` to `high` (2,) [m], lighter the higher, and
+    the edges at which they meet."""
+    import trimesh
+
+    if not city.num_faces:
+        return []
+    corners = city.corners + city.origin
+    flat = corners[..., :2]
+    near = ((flat.max(axis=1) > low) & (flat.min(axis=1) < high)).all(axis=1)
+    near = near if near.any() else np.ones_like(near)
+    mesh = trimesh.Trimesh(corners[near].reshape(-1, 3), np.arange(3 * near.sum()).reshape(-1, 3))
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    creases = mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE]
+    open_edges = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    edges = mesh.vertices[np.vstack([creases, open_edges])]
+    corner = dict(zip("ijk", mesh.faces.T.tolist(), strict=True))
+    points = points_of(mesh.vertices)
+    shading = {
+        "intensity": points["z"],
+        "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
+        "showscale": False,
+        "flatshading": True,
+        "opacity": 0.85,
+        "lighting": {"ambient": 0.6, "diffuse": 0.7, "specular": 0.05},
+    }
+    return [
+        {"type": "mesh3d", "name": "city", "showlegend": True, "hoverinfo": "skip"}
+        | points
+        | corner
+        | shading,
+        _line(lines_of(list(edges)), "#5F666D", 1.5, "edges"),
+    ]
+
+
+def _line(where: Mapping[str, Any], colour: str, width: float, name: str, **more: Any) -> Trace:
+    line = {"color": colour, "width": width}
+    kind = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "name": name}
+    return {**kind, "line": line, **where, **more}
+
+
+def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> dict[str, Any]:
+    """The scene as plotly's figure: data, layout and a frame for each position of the slider.
+
+    Parameters
+    ----------
+    reach : how far beyond the swarm the city is drawn [m]
+    """
+    position = dataset.uav_position.values
+    fixed = city_traces(
+        city, position[..., :2].min((0, 1)) - reach, position[..., :2].max((0, 1)) + reach
+    )
+    fixed += [
+        _line(points_of(position[:, u]), colour_of(u), 4, f"{name}, flight", showlegend=False)
+        for u, name in enumerate(dataset.uav.values)
+    ]
+    count = dataset.sizes["frame"]
+    steps = np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_STEPS)).round().astype(int))
+    moving = _Moving(dataset)
+    frames = [moving.at(int(f)) for f in steps]
+    places = list(range(len(fixed), len(fixed) + len(moving.names)))
+    names = [str(int(dataset.frame.values[f])) for f in steps]
+    start = frames[0] if frames else []
+    return {
+        "data": fixed + start,
+        "layout": layout() | (_controls(dataset, steps, names) if len(steps) > 1 else {}),
+        "frames": [
+            {"name": name, "data": data, "traces": places}
+            for name, data in zip(names, frames, strict=True)
+        ],
+    }
+
+
+class _Moving:
+    """The traces that change from frame to frame: UAVs, tracks of each observer, paths by kind."""
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self._d, self._states = dataset, tracked_states(dataset)[:, :3]
+        shown = np.unique(dataset.path_kind.values)
+        kinds = dataset.kind.values
+        self._kinds = [int(k) for k in shown if kinds[k] not in ("diffuse", "leakage")]
+        self._kept = np.unique(dataset.path_frame.values)
+        self.names = [
+            "UAVs",
+            *(f"tracks of {observer}" for observer in dataset.observer.values),
+            *(f"{words(kinds[k])} paths" for k in self._kinds),
+        ]
+
+    def at(self, frame: int) -> list[Trace]:
+        """The traces in a frame."""
+        d = self._d
+        mark = {"type": "scatter3d", "mode": "markers"}
+        uavs = {
+            "type": "scatter3d",
+            "mode": "markers+text",
+            "text": d.uav.values.tolist(),
+            "marker": {
+                "size": 6,
+                "color": [colour_of(u) for u in range(d.sizes["uav"])],
+                "symbol": [_SYMBOLS[role] for role in d.role.values],
+            },
+            **points_of(d.uav_position.values[frame]),
+        }
+        tracks = [
+            {
+                **mark,
+                "marker": {"size": 4, "symbol": "x", "color": colour_of(o)},
+                **points_of(self._states[self._of("track", frame, o) & d.track_confirmed.values]),
+            }
+            for o in range(d.sizes["observer"])
+        ]
+        traces = [uavs, *tracks, *self._paths(frame)]
+        return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
+
+    def _of(self, rows: str, frame: int, observer: int) -> np.ndarray:
+        mine = self._d[f"{rows}_observer"].values == observer
+        return np.asarray(mine & (self._d[f"{rows}_frame"].values == frame))
+
+    def _paths(self, frame: int) -> list[Trace]:
+        """Paths of the nearest frame that has any."""
+        if not self._kept.size:
+            return []
+        nearest = self._kept[np.argmin(np.abs(self._kept - frame))]
+        kind, here = self._d.path_kind.values, self._d.path_frame.values == nearest
+        return [
+            _line(
+                lines_of(list(path_lines(self._d, np.flatnonzero(here & (kind == k)), MOST_LINES))),
+                KIND_COLOURS[self._d.kind.values[k]],
+                2,
+                "",
+            )
+            for k in self._kinds
+        ]
+
+
+def _controls(dataset: xr.Dataset, steps: np.ndarray, names: list[str]) -> dict[str, Any]:
+    """A slider of time and a button that plays."""
+    now = {"mode": "immediate", "transition": {"duration": 0}}
+    still = now | {"frame": {"duration": 0, "redraw": True}}
+    play = now | {"frame": {"duration": 150, "redraw": True}, "fromcurrent": True}
+    times = [f"{dataset.time.values[f]:.2f}" for f in steps]
+    return {
+        "sliders": [
+            {
+                "steps": [
+                    {"method": "animate", "label": time, "args": [[name], still]}
+                    for time, name in zip(times, names, strict=True)
+                ],
+                "currentvalue": {"prefix": "time [s]: "},
+                "x": 0.12,
+                "len": 0.86,
+                "pad": {"t": 0, "b": 10},
+            }
+        ],
+        "updatemenus": [
+            {
+                "type": "buttons",
+                "direction": "left",
+                "x": 0.1,
+                "xanchor": "right",
+                "y": 0,
+                "yanchor": "top",
+                "pad": {"t": 20},
+                "buttons": [
+                    {"method": "animate", "label": "play", "args": [None, play]},
+                    {"method": "animate", "label": "stop", "args": [[None], still]},
+                ],
+            }
+        ],
+    }
+
+
+def page_part(figure: Mapping[str, Any], name: str) -> str:
+    """HTML that shows a figure and fetches nothing: plotly's own script, then the figure."""
+    script = files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
+    drawn = json.dumps(figure, separators=(",", ":")).replace("</", "<\\/")
+    return (
+        f"<script>{script}</script>\n"
+        f'<div id="{name}" style="height: 620px; background: #fff"></div>\n'
+        f"<script>const {name} = {drawn};\n"
+        f'Plotly.newPlot("{name}", {name}.data, {name}.layout, {{responsive: true}})'
+        f'.then(() => Plotly.addFrames("{name}", {name}.frames));</script>'
+    )
