@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
+from isac_rt.hardware.channels import Elements, elements_of
 from isac_rt.hardware.oscillator import Oscillator, oscillator_of
 from isac_rt.scenario import front_end as scenario
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """What a terminal's hardware does to what it sends and receives.
+    """What a terminal's hardware does to what it sends and receives; None: a part that is ideal.
 
     Attributes
     ----------
-    oscillator : None where it is ideal
+    oscillator : its phase noise
+    transmit, receive : errors of the elements
     """
 
     oscillator: Oscillator | None = None
+    transmit: Elements | None = None
+    receive: Elements | None = None
+
+    @property
+    def ideal(self) -> bool:
+        """Whether all parts are."""
+        return all(getattr(self, part.name) is None for part in fields(self))
 
 
 IDEAL = FrontEnd()
@@ -40,9 +50,16 @@ class Ends:
     @property
     def ideal(self) -> bool:
         """Whether the samples are those of `isac_rt.signal.if_signal.if_signal`."""
-        return self.receiver == IDEAL and all(one == IDEAL for one in self.senders)
+        return self.receiver.ideal and all(one.ideal for one in self.senders)
 
 
-def front_end_of(node: scenario.FrontEnd, waveform: Waveform, seed: int, name: str) -> FrontEnd:
+def front_end_of(
+    node: scenario.FrontEnd, waveform: Waveform, antennas: Antennas, seed: int, name: str
+) -> FrontEnd:
     """The front end of a terminal that a scenario states."""
-    return FrontEnd(oscillator_of(node.oscillator, waveform.sampling_rate, seed, name))
+    wave = waveform.wavelength
+    return FrontEnd(
+        oscillator_of(node.oscillator, waveform.sampling_rate, seed, name),
+        elements_of(node.transmit, antennas.tx_positions, wave, seed, name, "tx"),
+        elements_of(node.receive, antennas.rx_positions, wave, seed, name, "rx"),
+    )

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from isac_rt.scenario.node import Decibels, Node, Problem
+from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
 Offset = Annotated[float, Field(ge=1e-3, le=1e12, allow_inf_nan=False)]
 
@@ -56,6 +56,72 @@ class Oscillator(Node):
                 yield Problem((("spurs_dbc", i),), said)
 
 
+Degrees = Annotated[float, Field(ge=-3600, le=3600, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
+Picoseconds = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+"""A delay of 100 ns is 15 m of cable; more is no error of an antenna."""
+Part = tuple[Finite, Finite]
+
+
+class Elements(Node):
+    """Errors of the elements of one array: what is stated of each, and what is drawn for each."""
+
+    gain_db: tuple[Decibels, ...] = ()
+    """Gain of each element over what it should be [dB], in the order of the elements. Empty, the
+    default: 0."""
+    phase_deg: tuple[Degrees, ...] = ()
+    """Phase that each element adds to its IF samples [degrees]. Empty, the default: 0."""
+    delay_ps: tuple[Picoseconds, ...] = ()
+    """Delay of each element's line [ps]: it shifts the range of what the element hears or sends.
+    Empty, the default: 0."""
+    position_mm: tuple[Vector, ...] = ()
+    """How far each element is from where it should be, in body axes [mm]. Empty, the default:
+    nowhere."""
+    tilt_deg: tuple[Part, ...] = ()
+    """Turn of each element's pattern [degrees], to the right and upwards. Empty, the default: all
+    look ahead."""
+    gain_std_db: Spread = 0.0
+    """Standard deviation of gains that are drawn for each element once a run [dB]; they add to
+    those stated. By default none."""
+    phase_std_deg: Spread = 0.0
+    """The same for phases [degrees]. By default none."""
+    delay_std_ps: Spread = 0.0
+    """The same for delays [ps]. By default none."""
+    position_std_mm: Spread = 0.0
+    """The same for places, along each axis [mm]. By default none."""
+    tilt_std_deg: Spread = 0.0
+    """The same for the turns of patterns, to both sides [degrees]. By default none."""
+    gain_drift_std_db_per_s: Spread = 0.0
+    """Standard deviation of the rates at which gains change from the start of the run on [dB/s],
+    one rate for each element. By default they stay."""
+    phase_drift_std_deg_per_s: Spread = 0.0
+    """The same for phases [degrees/s]. By default they stay."""
+    coupling_db: Annotated[float, Field(ge=-400, le=-3, allow_inf_nan=False)] | None = None
+    """Level at which the two nearest elements couple [dB]; between others it falls with the square
+    of the distance, and its phase is that of the way. null, the default: no coupling."""
+    coupling: tuple[tuple[Part, ...], ...] = ()
+    """Coupling matrix in place of that: row by row, of each entry [real, imaginary], of waves at
+    the carrier, ones on the diagonal included. Empty, the default: as `coupling_db` says."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether all elements are as they should be."""
+        return self == Elements()
+
+    def problems(self) -> Iterator[Problem]:
+        if self.coupling and self.coupling_db is not None:
+            said = "the matrix says how elements couple; remove coupling_db or the matrix"
+            yield Problem((("coupling",), ("coupling_db",)), said)
+
+    def counts(self) -> Iterator[tuple[str, int]]:
+        """Keys that state something of each element, and of how many."""
+        for name in ("gain_db", "phase_deg", "delay_ps", "position_mm", "tilt_deg", "coupling"):
+            if stated := getattr(self, name):
+                yield name, len(stated)
+        for row in self.coupling:
+            yield "coupling", len(row)
+
+
 class FrontEnd(Node):
     """How far a terminal's hardware is from ideal. Each part is off by default and acts by
     itself."""
@@ -64,7 +130,12 @@ class FrontEnd(Node):
     """Phase noise and spurs. At an active terminal one oscillator serves both ways, so that near
     echoes hardly show its noise; at a passive one its own and the transmitter's add up."""
 
+    transmit: Elements = Elements()
+    """Errors of the transmit elements. None by default."""
+    receive: Elements = Elements()
+    """Errors of the receive elements. None by default."""
+
     @property
     def ideal(self) -> bool:
         """Whether nothing departs from the ideal."""
-        return self.oscillator.ideal
+        return self.oscillator.ideal and self.transmit.ideal and self.receive.ideal

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
-from isac_rt.scenario.front_end import FrontEnd
+from isac_rt.scenario.front_end import Elements, FrontEnd
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
@@ -140,6 +140,11 @@ class Scenario(Node):
         """Order in which transmit antennas take the slots: `array.schedule`; in a plain radar one
         after the other."""
         return self.array.schedule if self.radio.mode == "isac" else "conventional"
+
+    @property
+    def num_rx(self) -> int:
+        """L_rx, elements of the receiving L."""
+        return self.array.rx_x + self.array.rx_z - 1
 
     @property
     def frame_duration_s(self) -> float:
@@ -370,6 +375,23 @@ class Scenario(Node):
                 "take samples, or leave radio.front_end ideal"
             )
             yield Problem((("receivers", "active_input"), ("radio", "front_end")), said)
+        stated: dict[Key, FrontEnd] = {("radio", "front_end"): self.radio.front_end}
+        stated |= {
+            ("swarm", name, "front_end"): uav.front_end
+            for name, uav in self.swarm.items()
+            if uav.front_end is not None
+        }
+        for key, one in stated.items():
+            yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
+            yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
+
+    @staticmethod
+    def _element_problems(key: Key, elements: Elements, size: int) -> Iterator[Problem]:
+        for name, count in elements.counts():
+            if count != size:
+                said = f"{count} values for {size} {key[-1]} elements; state one of each element"
+                yield Problem(((*key, name), ("array",)), said)
+                return
 
     def first_blocks(self) -> dict[str, int]:
         """First resource block of every UAV that is active at the start; a successor takes over its

@@ -195,6 +195,8 @@ def _direct(out, shape, w, path, offset, t, fresh, room, turn):
                 amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
                 if amplitude == 0:
                     continue
+                if t.tx_gain.shape[0]:
+                    amplitude *= t.tx_gain[k, t.antenna[q, source, p]]
                 chosen[count], weight[count] = i, amplitude
                 terms[count, 0], terms[count, 1], terms[count, 2] = (
                     tau,
@@ -214,7 +216,8 @@ def _direct(out, shape, w, path, offset, t, fresh, room, turn):
                         + t.cross[t.cross_row[k], a, r]
                     )
                     phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], t.accel[k])
-                    _tone(room, half, weight[i], phase, frequency, quadratic)
+                    own = weight[i] * t.rx_gain[k, r] if t.rx_gain.shape[0] else weight[i]
+                    _tone(room, half, own, phase, frequency, quadratic)
                 if turn.shape[0]:
                     _turned(room.sums, turn[m * chirps + p])
                 _flush(

@@ -54,6 +54,8 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
                 if not weight.any():
                     continue
                 antenna = t.antenna[q, source]
+                if t.tx_gain.size:
+                    weight = weight * t.tx_gain[k, antenna][:, None]
                 for rx in range(out.shape[1]):
                     element = (
                         t.tx_delay[k, antenna]
@@ -61,5 +63,6 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
                         + t.cross[t.cross_row[k], antenna, rx]
                     )
                     tau = base + element[:, None]
-                    out[m, rx] += weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
+                    own = t.rx_gain[k, rx] if t.rx_gain.size else 1.0
+                    out[m, rx] += own * weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
     return out

@@ -248,7 +248,8 @@ class _Blocks(NamedTuple):
     path : (16 B,) index into the tones, the last repeated where a block is not full
     table : float64, of each block 16 delays, rates, accelerations and delays of each transmit
         element
-    factor : float32, of each block 16 real and 16 imaginary parts
+    factor : float32, of each block 16 real and 16 imaginary parts; where elements differ, of each
+        transmit element one after the other
     life : float64, of each block 16 begins and 16 ends
     blocks : (B, 5) link, offset, number of paths, whether any of them is born or dies in the frame,
         whether noise covers them
@@ -278,7 +279,9 @@ def _prepare(work, places, b, block, w, g, view, time, symbol, send, antenna):
     middle of the cell, complex factor (less the filter's gain), quadratic term [rad] and lambda, 16
     floats of each, to `work`."""
     f_c, slope, ts, u = w.carrier, w.slope, w.step, w.middle + view.origin * w.step
-    half, size, f = g.half, g.rows.shape[0], 32 * block
+    half, size = g.half, g.rows.shape[0]
+    variants = b.factor.shape[0] // (32 * b.blocks.shape[0])  # by transmit element, or one
+    f = 32 * (block * variants + (antenna if variants > 1 else 0))
     table, at = b.table, block * (b.table.shape[0] // b.blocks.shape[0])
     delay, rate, accel, extra = (
         load(table, at),
@@ -602,9 +605,10 @@ def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fre
 
 
 @jit(fast=True)
-def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
+def _steer(out, planes, path, rx, first, frequency, slope, turn, delay):
     """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from
     the last element on."""
+    rx_delay, gain = rx
     count = min(LANES, rx_delay.shape[1] - first)
     for i in range(path.shape[0]):
         for r in range(count):
@@ -614,12 +618,19 @@ def _steer(out, planes, path, rx_delay, first, frequency, slope, turn, delay):
         c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
         store(out, at, c)
         store(out, at + LANES, s)
+        for r in range(count if gain.shape[0] else 0):
+            own = gain[path[i], first + r] * complex(out[at + r], out[at + LANES + r])
+            out[at + r], out[at + LANES + r] = own.real, own.imag
         if planes == 3:
             store(out, at + 2 * LANES, narrow(late * splat(turn)))
 
 
 def _steering(
-    waveform: Waveform, rx_delay: np.ndarray, path: np.ndarray, first: int, wideband: bool
+    waveform: Waveform,
+    rx: tuple[np.ndarray, np.ndarray],
+    path: np.ndarray,
+    first: int,
+    wideband: bool,
 ) -> np.ndarray:
     """Of each listed path the phasors of the up to 16 receive elements from `first` on at
     mid-window (real, imaginary) and, `wideband`, their turn over half a chirp [rad]: (32 or 48 n,)
@@ -628,7 +639,7 @@ def _steering(
     out = aligned(len(path) * planes * LANES)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
     turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
-    _steer(out, planes, path, rx_delay, first, middle, w.slope, turn, np.zeros(LANES))
+    _steer(out, planes, path, rx, first, middle, w.slope, turn, np.zeros(LANES))
     return out
 
 
@@ -656,7 +667,11 @@ def _blocks(waveform: Waveform, t: Tones, faint: np.ndarray) -> _Blocks:
     mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
     used = np.minimum(last - first + 1, LANES)
     blocks = np.stack([t.link[k[:, 0]], lag[:, 0], used, mortal, faint[k[:, 0]]], axis=1)
-    factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
+    if t.tx_gain.size:
+        by_antenna = t.factor[k][:, None] * np.moveaxis(t.tx_gain[k], 2, 1)
+        factor = np.stack([by_antenna.real, by_antenna.imag], axis=2).astype(np.float32)
+    else:
+        factor = np.stack([t.factor[k].real, t.factor[k].imag], axis=1).astype(np.float32)
     return _Blocks(
         k.ravel(), table.ravel(), factor.ravel(), life.ravel(), blocks.astype(np.int64), bounds
     )
@@ -793,6 +808,6 @@ def _synthesise(
     room = _Room(grids, aligned(80), aligned(_STEP * setting.width), aligned(512))
     flat = out.reshape(-1).view(np.float32)
     for first in range(0, shape[1], LANES):
-        steer = _steering(w, t.rx_delay, b.path, first, setting.wideband)
+        steer = _steering(w, (t.rx_delay, t.rx_gain), b.path, first, setting.wideband)
         _chirps(flat, shape, first, numbers(w), views, g, b, steer, t, band, room, fresh)
     return True

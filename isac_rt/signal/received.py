@@ -60,6 +60,8 @@ def received(
     noise : at the receiver's input
     """
     schedule, tones = heard(waveform, links, receiver, reference)
+    middle = reference.start_time + waveform.frame_duration / 2
+    tones = _with_elements(tones, waveform, links, receiver, ends, middle)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
     flicker = _Flicker.of(waveform, reference, ends, tones, delays)
     factors = None
@@ -79,6 +81,33 @@ def received(
         schedule=schedule,
         start_time=reference.start_time,
     )
+
+
+def _with_elements(
+    tones: Tones, w: Waveform, links: Links, receiver: ReceiveArray, ends: Ends, middle: float
+) -> Tones:
+    """The tones with what the elements of both ends add to delays and amplitudes; `middle` of the
+    frame [s]."""
+    frequency = float(w.carrier(time=w.fast_time[w.num_samples // 2]))
+    own = ends.receiver.receive
+    if own is not None and tones.size:
+        arrival = receiver.pose.to_body(np.concatenate([s.arrival for _, s in links]))
+        at = receiver.antennas
+        tones = tones._replace(
+            rx_delay=tones.rx_delay + own.delays(arrival),
+            rx_gain=own.factors(arrival, at.rx_positions, at, frequency, middle),
+        )
+    if all(one.transmit is None for one in ends.senders) or not tones.size:
+        return tones
+    delay, gain = tones.tx_delay.copy(), np.ones(tones.tx_delay.shape, complex)
+    for q, ((sent, paths), one) in enumerate(zip(links, ends.senders, strict=True)):
+        if one.transmit is None:
+            continue
+        departure, at = sent.pose.to_body(paths.departure), sent.antennas
+        here = np.ix_(tones.link == q, np.arange(at.num_tx))
+        delay[here] += one.transmit.delays(departure)
+        gain[here] = one.transmit.factors(departure, at.tx_positions, at, frequency, middle)
+    return tones._replace(tx_delay=delay, tx_gain=gain)
 
 
 @dataclass(frozen=True)

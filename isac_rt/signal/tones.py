@@ -13,6 +13,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 
 Links = Sequence[tuple[Transmission, PathSet]]
 """Transmissions, each with the paths from it to the receiver."""
+NO_GAIN = np.zeros((0, 0), complex)
 _CHUNK = 1024  # paths whose element delays stay in the second-level cache
 
 
@@ -34,6 +35,8 @@ class Tones(NamedTuple):
     symbol_delay : (Q, M, P) delay of the data [s]
     send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
     antenna : (Q, M, P) int64 transmit element
+    tx_gain, rx_gain : (K, L_tx), (K, L_rx) complex128, factor of each path at an element, or
+        `NO_GAIN` where all are 1
     """
 
     link: np.ndarray
@@ -52,6 +55,8 @@ class Tones(NamedTuple):
     symbol_delay: np.ndarray
     send: np.ndarray
     antenna: np.ndarray
+    tx_gain: np.ndarray = NO_GAIN
+    rx_gain: np.ndarray = NO_GAIN
 
     @property
     def size(self) -> int:
@@ -62,7 +67,11 @@ class Tones(NamedTuple):
         """The paths that a mask or an index array chooses."""
         shared = ("cross", "symbol_delay", "send", "antenna")
         return self._replace(
-            **{name: v[which] for name, v in self._asdict().items() if name not in shared}
+            **{
+                name: v[which]
+                for name, v in self._asdict().items()
+                if name not in shared and v is not NO_GAIN
+            }
         )
 
     def speed(self, duration: float) -> np.ndarray:
@@ -81,7 +90,7 @@ def tones_of(
     num_tx = max((t.antennas.num_tx for t, _ in links), default=1)
     none, grid = np.zeros(0), (w.num_groups, w.num_chirps)
     parts = [
-        dict.fromkeys(Tones._fields, none)
+        dict.fromkeys(set(Tones._fields) - {"tx_gain", "rx_gain"}, none)
         | {"link": none.astype(np.int64), "cross_row": none.astype(np.int64)}
         | {"sight": none.astype(bool), "factor": none.astype(complex)}
         | {"tx_delay": np.zeros((0, num_tx)), "rx_delay": np.zeros((0, len(rx)))}

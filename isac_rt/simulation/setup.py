@@ -211,7 +211,7 @@ class Setup:
         """The hardware of every terminal."""
         s = self.scenario
         return {
-            name: front_end_of(s.front_end_of(name), self.waveform, s.seed, name)
+            name: front_end_of(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
             for name, uav in s.swarm.items()
             if uav.role != "target"
         }

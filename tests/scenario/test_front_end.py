@@ -51,6 +51,27 @@ def test_targets_and_profiles_have_no_front_end():
         Scenario(swarm=SWARM, radio=noisy, receivers={"active_input": "profiles"})
 
 
+@pytest.mark.parametrize(
+    ("elements", "said"),
+    [
+        ({"transmit": {"gain_db": [1, 2]}}, "gain_db: 2 values for 3 transmit elements"),
+        ({"receive": {"position_mm": [[0, 0, 0]]}}, "1 values for 15 receive elements"),
+        ({"transmit": {"coupling": [[[1, 0]] * 3] * 2}}, "2 values for 3 transmit elements"),
+        ({"transmit": {"coupling": [[[1, 0]] * 2] * 3}}, "2 values for 3 transmit elements"),
+        ({"transmit": {"coupling": [[[1, 0]]], "coupling_db": -20}}, "remove coupling_db or"),
+        ({"receive": {"gain_std_db": -1}}, "greater than or equal to 0"),
+        ({"receive": {"delay_ps": [float("inf")]}}, "finite number"),
+    ],
+)
+def test_elements_that_do_not_match_the_array_are_refused(elements, said):
+    """At all terminals and at one. Planted bugs: rows of a matrix not counted; transmit held
+    against the receive elements."""
+    with pytest.raises(ValidationError, match=said):
+        Scenario(swarm=SWARM, radio={"front_end": elements})
+    with pytest.raises(ValidationError, match=said):
+        Scenario(swarm=SWARM | {"PT": SWARM["PT"] | {"front_end": elements}})
+
+
 def test_what_is_stated_is_written_and_read_again(tmp_path):
     """Planted bug: a tuple of points written as one list."""
     mask = {"oscillator": {"mask_dbc_hz": [[1e4, -80.0], [1e6, -100.5]], "locked": False}}

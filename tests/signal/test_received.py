@@ -9,11 +9,14 @@ import pytest
 from test_ifsignal import SMALL, START, antennas, paths, pose, sender
 
 from isac_rt.frame.cube import ReceiveArray, Reference
+from isac_rt.hardware.channels import elements_of
 from isac_rt.hardware.front_end import IDEAL, Ends, FrontEnd
 from isac_rt.hardware.oscillator import Mask, Oscillator, spread
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.scenario import front_end as scenario
+from isac_rt.signal.gridded import ACCURATE
 from isac_rt.signal.if_signal import if_signal
-from isac_rt.signal.methods import Direct, Exact
+from isac_rt.signal.methods import Direct, Exact, Gridded
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.received import received
 
@@ -120,3 +123,60 @@ def test_ideal_ends_change_no_bit():
     assert ends.ideal
     found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
     assert np.array_equal(found, if_signal(W, links, ear, Reference(START), Direct()).samples)
+
+
+def test_elements_reach_every_method():
+    """Gains, phases, lines, places, coupling and tilted patterns at both ends, in all methods: each
+    against the exact one, which is against two of them by hand. Planted bugs: the factor of antenna
+    0 for all in the gridded kernel; receive gains applied twice in the direct one."""
+    links, ear = scene(30, seed=6)
+    stated = scenario.Elements(
+        gain_std_db=2.0,
+        phase_std_deg=40.0,
+        delay_std_ps=50.0,
+        position_std_mm=0.2,
+        tilt_std_deg=3.0,
+        coupling_db=-15.0,
+    )
+    wave, at = W.wavelength, antennas(W)
+    end = FrontEnd(
+        transmit=elements_of(stated, at.tx_positions, wave, 3, "A", "tx"),
+        receive=elements_of(stated, at.rx_positions, wave, 3, "A", "rx"),
+    )
+    ends = Ends(end, (end,))
+    truth, *fast = (
+        received(W, links, ear, Reference(START), ends, method, SILENT).samples
+        for method in (Exact(), Direct(), Gridded(ACCURATE))
+    )
+    assert error(fast[0], truth) < 1e-6
+    assert error(fast[1], truth) < 1e-4  # 60 m/s of delay rate in a short chirp, as in `Gridded`
+    assert error(if_signal(W, links, ear, Reference(START), Direct()).samples, truth) > 0.3
+
+
+def test_one_path_by_hand():
+    """One path, unmodulated antennas: the samples of element r and chirps of antenna a are those of
+    the ideal array with the stated factors, whose line of 80 ps is a phase of 77 GHz and a shift
+    of the beat. Planted bug: the delay of the receiver taken for the transmitter's."""
+    links, ear = scene(1, seed=8)
+    at = antennas(W)
+    tx = scenario.Elements(gain_db=(3, 0, -3, 1, 0), phase_deg=(0, 30, 60, 90, -45))
+    rx = scenario.Elements(delay_ps=(80, 0, 0, 0))
+    end = FrontEnd(
+        transmit=elements_of(tx, at.tx_positions, W.wavelength, 3, "A", "tx"),
+        receive=elements_of(rx, at.rx_positions, W.wavelength, 3, "A", "rx"),
+    )
+    found = received(W, links, ear, Reference(START), Ends(end, (end,)), Exact(), SILENT).samples
+    ideal = if_signal(W, links, ear, Reference(START), Exact()).samples
+    factor = 10 ** (np.array(tx.gain_db) / 20) * np.exp(1j * np.radians(tx.phase_deg))
+    schedule = links[0][0].schedule
+    for m, p in np.ndindex(schedule.shape):
+        strong = np.abs(ideal[m, 1, p]) > 0.5 * np.abs(ideal).max()
+        ratio = found[m, 1:, p][:, strong] / ideal[m, 1:, p][:, strong]
+        if strong.any():
+            # groups hear their neighbours through the filter's skirts
+            np.testing.assert_allclose(ratio, factor[schedule[m, p]], rtol=1e-4)
+    line = found[:, 0] / ideal[:, 0] / (found[:, 1] / ideal[:, 1])
+    frequency = W.carrier(time=W.fast_time) - W.slope * links[0][1].delay
+    strong = np.abs(ideal[:, 0]) > 0.5 * np.abs(ideal).max()
+    truth = np.broadcast_to(np.exp(2j * np.pi * 80e-12 * frequency), line.shape)
+    assert np.abs(line - truth)[strong].max() < 0.02
