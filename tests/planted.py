@@ -442,6 +442,29 @@ OF_CASES = {
         "betaincinv(successes, trials - successes + 1, tail)",
         "betaincinv(successes + 1, trials - successes + 1, tail)",
     ),
+    "boards before a corner reflector": Bug(
+        "capture/calibrate.py",
+        "return np.asarray(np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2)",
+        "return np.ones(size)",
+    ),
+    "measured echo explained by the simulated": Bug(
+        "capture/calibrate.py",
+        "delay = delay + one.rx_delay[:, None] + one.tx_delay",
+        "delay = delay - one.rx_delay[:, None] + one.tx_delay",
+    ),
+    "each part of a board counts": Bug(
+        "capture/calibrate.py",
+        "out = out * (1 + one.response_slope * off / one.half_sweep_hz)",
+        "out = out * (1 + 0 * one.response_slope * off / one.half_sweep_hz)",
+    ),
+    "people in a measured frame": Bug(
+        "capture/readers.py",
+        "np.where(values >= 32768, values - 65536.0, values)",
+        "np.where(values >= 65536, values - 65536.0, values)",
+    ),
+    "small uav as published": Bug(
+        "propagation/rcs.py", '{"small": 3.74, "large": 2.50}', '{"small": 3.47, "large": 2.50}'
+    ),
     "paths of a canyon against sionna": Bug(
         "propagation/legs/reflection.py",
         "return (field * vertical(legs.arrival)).sum(1)",

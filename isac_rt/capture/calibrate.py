@@ -7,13 +7,15 @@ is of rank one is the board's and the reflector's, what is not is neither.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.storage import load_data, save_data
 
@@ -58,6 +60,8 @@ class Calibration:
     rx_gain_std, tx_gain_std : relative standard deviations of these
     rx_delay, tx_delay : [s], of mean 0
     rx_delay_std, tx_delay_std : [s]
+    pair_gain, pair_delay : (L_rx, L_tx) what the best fit with the response has besides these in
+        every pair of antennas; of the scene as well as of the board, so `apply` leaves it
     response_slope : complex, over half of the sampled sweep
     sweep : (3, `SWEEP_POINTS`) frequency [Hz], mean complex response of all channels, and its
         standard deviation; 1 at the middle
@@ -83,6 +87,8 @@ class Calibration:
     tx_delay: np.ndarray
     rx_delay_std: np.ndarray
     tx_delay_std: np.ndarray
+    pair_gain: np.ndarray
+    pair_delay: np.ndarray
     response_slope: complex
     sweep: np.ndarray
     carrier_hz: float
@@ -119,8 +125,9 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     rx, tx, _ = _rank_one(_amplitudes(y, cells - delay / w.delay_step))
     spread = np.abs(left - 1) * np.sqrt(left.size / free)
     levels, metres = _decibels(amplitude), w.range_cell(2)
-    unexplained, _ = _unexplained(y, cells, respond=False)
-    with_response, slope = _unexplained(y, cells, respond=True)
+    plain, fit = (_unexplained(y, cells, respond=respond) for respond in (False, True))
+    pair = fit.amplitude / (rx[:, None] * tx)
+    pair_late = (fit.beat - cells + delay / w.delay_step) * w.delay_step
     rx_late, tx_late = _late(capture, cells.mean() * metres, cosines)
     return Calibration(
         range_m=float(cells.mean() * metres),
@@ -131,8 +138,8 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
         left_deg=float(np.rad2deg(np.angle(left).std())),
         gain_spread_rx_db=float(levels.mean(axis=1).std(ddof=1)),
         gain_spread_tx_db=float(levels.mean(axis=0).std(ddof=1)),
-        unexplained_db=unexplained,
-        unexplained_response_db=with_response,
+        unexplained_db=plain.left_db,
+        unexplained_response_db=fit.left_db,
         snr_db=snr_db,
         rx_gain=_levelled(rx * np.exp(-2j * np.pi * w.effective_carrier * rx_late)),
         tx_gain=_levelled(tx * np.exp(-2j * np.pi * w.effective_carrier * tx_late)),
@@ -142,7 +149,9 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
         tx_delay=_centred(tx_delay - tx_late),
         rx_delay_std=np.full(rx.size, scatter / np.sqrt(tx.size)),
         tx_delay_std=np.full(tx.size, scatter / np.sqrt(rx.size)),
-        response_slope=slope,
+        pair_gain=pair,
+        pair_delay=pair_late,
+        response_slope=fit.slope,
         sweep=_sweep(y, cells, w),
         carrier_hz=float(w.effective_carrier),
         half_sweep_hz=w.slope * w.sampled_duration / 2,
@@ -267,9 +276,18 @@ def _bound(y: np.ndarray, amplitude: np.ndarray) -> float:
     return float(np.sqrt((1 / (information * np.abs(amplitude) ** 2)).mean()))
 
 
-def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> tuple[float, complex]:
-    """Power that the best tones leave within `REACH` cells, over the power there [dB], and the
-    slope of the response that all share (0 unless they `respond`).
+class _Fit(NamedTuple):
+    """Beats [cells] and amplitudes (L_rx, L_tx) of tones, the slope of the response, and the power
+    that they leave over the power [dB]."""
+
+    beat: np.ndarray
+    amplitude: np.ndarray
+    slope: complex
+    left_db: float
+
+
+def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> _Fit:
+    """The best tones within `REACH` cells, with one response for all if they `respond`.
 
     Each tone's amplitude and beat are fitted to the windowed spectrum there, by Levenberg and
     Marquardt: to first order an imaginary slope is a common shift of the beats.
@@ -282,7 +300,7 @@ def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> tuple[float
     beat = cells.ravel()
     begin = np.round(beat * PADDING) / PADDING
     seen = (y.reshape(-1, size) * window * np.exp(-np.multiply.outer(begin, turn))) @ atoms
-    best, least, damping = (beat, 0j), np.inf, 1e-3
+    best, least, damping = (beat, 0j, seen[:, :1]), np.inf, 1e-3
     slope = 0j
     for _ in range(ROUNDS):
         tones = window * np.exp(np.multiply.outer(beat - begin, turn))
@@ -292,14 +310,16 @@ def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> tuple[float
         rest = seen - amplitude * model
         left = float((np.abs(rest) ** 2).sum())
         if left < least:
-            best, least, damping = (beat, slope), left, damping / 4
+            best, least, damping = (beat, slope, amplitude), left, damping / 4
             moved, bent = (amplitude * (d - _projection(model, d) * model) for d in (moved, bent))
             equations = _Equations.of(moved, bent, rest)
         else:
             damping *= 8
         step, change = equations.solved(damping, respond)
         beat, slope = best[0] + np.clip(step, -0.3, 0.3), best[1] + change
-    return 10 * float(np.log10(least / (np.abs(seen) ** 2).sum())), best[1]
+    beat, slope, amplitude = best
+    left_db = 10 * float(np.log10(least / (np.abs(seen) ** 2).sum()))
+    return _Fit(beat.reshape(cells.shape), amplitude.reshape(cells.shape), slope, left_db)
 
 
 @dataclass(frozen=True)
@@ -335,6 +355,15 @@ class _Equations:
         return (self.own_right - change @ self.mixed) / own, complex(*change)
 
 
+def near_spectra(capture: Capture, cell: float) -> np.ndarray:
+    """Windowed five-fold spectra (L_rx, L_tx, points) of every channel within `REACH` cells."""
+    y = capture.channels()
+    size = y.shape[-1]
+    offset = np.round(cell * PADDING) + np.arange(-REACH * PADDING, REACH * PADDING + 1)
+    turns = np.multiply.outer(_places(size), offset / PADDING / size)
+    return np.asarray((y * _window(size)) @ np.exp(-2j * np.pi * turns))
+
+
 def _projection(on: np.ndarray, of: np.ndarray) -> np.ndarray:
     """Coefficient (rows, 1) of each row's projection on another."""
     return np.asarray((on.conj() * of).sum(axis=1) / (np.abs(on) ** 2).sum(axis=1))[:, None]
@@ -364,6 +393,10 @@ def _sweep(y: np.ndarray, cells: np.ndarray, w: Waveform) -> np.ndarray:
 # ---- used on other samples
 
 
+PARTS = ("gains", "delays", "response", "pairs")
+"""What a board does, by name."""
+
+
 def apply(calibration: Calibration, capture: Capture) -> Capture:
     """The frame as an ideal board would have delivered it: every channel's gain, phase and delay
     and the response over the sweep are taken out.
@@ -372,26 +405,46 @@ def apply(calibration: Calibration, capture: Capture) -> Capture:
     ------
     CaptureError  If the board has other antennas.
     """
-    cube, w = capture.cube, capture.cube.waveform
+    cube = capture.cube
+    ideal = cube.samples / board(calibration, cube, PARTS[:3])
+    return replace(
+        capture,
+        cube=replace(cube, samples=ideal.astype(np.complex64)),
+        source={**capture.source, "calibrated": "yes"},
+    )
+
+
+def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.ndarray:
+    """Factor on every sample (M, L_rx, P, N) that the `parts` of a board make.
+
+    Raises
+    ------
+    CaptureError  If the board has other antennas.
+    """
+    w, senders, one = cube.waveform, cube.schedule, calibration
     seen = cube.samples.shape[1], w.num_tx
-    known = calibration.rx_gain.size, calibration.tx_gain.size
+    known = one.rx_gain.size, one.tx_gain.size
     if seen != known:
         raise CaptureError(
             f"the calibration is of {known[0]} receivers and {known[1]} transmitters, the samples "
             f"of {seen[0]} and {seen[1]}; calibrate this board"
         )
     sweep = _places(w.num_samples) * w.slope / w.sampling_rate
-    off = w.effective_carrier - calibration.carrier_hz + sweep
-    senders = cube.schedule  # (M, P)
-    gain = calibration.rx_gain[:, None] * calibration.tx_gain[senders][:, None]  # (M, L_rx, P)
-    delay = calibration.rx_delay[:, None] + calibration.tx_delay[senders][:, None]
-    response = 1 + calibration.response_slope * off / calibration.half_sweep_hz
-    ideal = np.exp(-2j * np.pi * delay[..., None] * off) / response / gain[..., None]
-    return replace(
-        capture,
-        cube=replace(cube, samples=(cube.samples * ideal).astype(np.complex64)),
-        source={**capture.source, "calibrated": "yes"},
-    )
+    off = w.effective_carrier - one.carrier_hz + sweep
+    gain = np.ones(known, complex)
+    delay = np.zeros(known)
+    if "gains" in parts:
+        gain = gain * one.rx_gain[:, None] * one.tx_gain
+    if "delays" in parts:
+        delay = delay + one.rx_delay[:, None] + one.tx_delay
+    if "pairs" in parts:
+        gain, delay = gain * one.pair_gain, delay + one.pair_delay
+    by_chirp = (value[:, senders].transpose(1, 0, 2)[..., None] for value in (gain, delay))
+    level, late = by_chirp  # (M, L_rx, P, 1)
+    out = level * np.exp(2j * np.pi * late * off)
+    if "response" in parts:
+        out = out * (1 + one.response_slope * off / one.half_sweep_hz)
+    return np.asarray(out)
 
 
 def save_calibration(calibration: Calibration, file: str | Path) -> None:

@@ -96,6 +96,7 @@ def calibrate(
     reflector."""
     from isac_rt.capture.calibrate import calibrate as fit
     from isac_rt.capture.calibrate import save_calibration
+    from isac_rt.capture.explain import STEPS, unexplained_by
     from isac_rt.results.files import check_folder
     from isac_rt.storage import write_whole
 
@@ -107,12 +108,17 @@ def calibrate(
         if target not in (None, STDOUT):
             check_folder(Path(str(target)).parent)
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    cosines = math.cos(elevation) * math.sin(azimuth), math.sin(elevation)
     with working("fitting"):
-        found = fit(
-            _opened(cube, description),
-            (math.cos(elevation) * math.sin(azimuth), math.sin(elevation)),
-        )
-    figures = {name: getattr(found, name) for name in KEYS} | _per_channel(found)
+        capture = _opened(cube, description)
+        found = fit(capture, cosines)
+        left = {}
+        if capture.antennas is not None and cosines == (0, 0):
+            left = dict(
+                zip(STEPS, unexplained_by(capture, found, list(STEPS.values())), strict=True)
+            )
+    figures: dict[str, Any] = {name: getattr(found, name) for name in KEYS}
+    figures |= {"unexplained_by_db": left} | _per_channel(found)
     text = json.dumps(figures, indent=1, allow_nan=False) + "\n"
     if out is not None:
         save_calibration(found, out)
@@ -122,6 +128,9 @@ def calibrate(
     if json_file is not None:
         write_whole(Path(json_file), text)
     say_table(("", cube.name), [(name, f"{figures[name]:.4f}") for name in KEYS])
+    if left:
+        rows = [(name, f"{level:.2f}") for name, level in left.items()]
+        say_table(("simulated with the board's", "unexplained [dB]"), rows)
     say(*([f"{out}: name it with --calibration"] if out is not None else []))
 
 

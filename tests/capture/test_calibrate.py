@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from synthetic import C, channels, write_ti
 
-from isac_rt.capture.calibrate import apply, calibrate, load_calibration, save_calibration
+from isac_rt.capture.calibrate import PARTS, apply, calibrate, load_calibration, save_calibration
 from isac_rt.capture.description import Description
+from isac_rt.capture.explain import unexplained_by
 from isac_rt.capture.readers import import_file, waveform_described
 from isac_rt.capture.types import Capture, CaptureError, measured_folder
 from isac_rt.cli.cli import main
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
 
 TABLE = {
@@ -230,3 +231,32 @@ def test_the_reflectors_place_is_no_error_of_the_board():
     assert np.abs(np.rad2deg(np.angle(found.rx_gain))).max() < 0.5
     assert np.abs(np.rad2deg(np.angle(found.tx_gain))).max() < 0.5
     assert np.abs(found.rx_delay).max() < 0.05e-12
+
+
+def test_the_simulated_board_explains_the_measured(tmp_path):
+    """A made-up board of TI's size in front of a point: the program's own cube with all parts is
+    the same to what noise and the definition of gains at a common range leave, and each part that
+    is left out costs. Without places of elements there is no scene.
+
+    Planted bug: the response's sign in `board`; spherical waves left out of `simulated`."""
+    antennas = Antennas.placed(*ti_cascade())
+    slope, rate, distance, size = 60e12, 8e6, 4.4, 128
+    samples, _ = channels(
+        num_rx=16, num_tx=12, slope=slope, rate=rate, distance=distance, size=size, bend=-0.3
+    )
+    target = np.array([0, distance, 0])
+    middle = 77e9 + slope * (6e-6 + (size - 1) / 2 / rate)
+    t = (np.arange(size) - (size - 1) / 2) / rate
+    for end, at in ((1, antennas.rx_positions), (2, antennas.tx_positions)):
+        late = (np.linalg.norm(target - at, axis=1) - distance) / C
+        wave = np.exp(2j * np.pi * (middle * late + slope * np.multiply.outer(t, late)))
+        samples = samples * (wave[:, :, None] if end == 1 else wave[:, None, :])
+    write_ti(tmp_path / "b.mat", samples, slope / 1e12, rate)
+    capture = import_file(tmp_path / "b.mat")
+    found = calibrate(capture)
+    sets = [PARTS, PARTS[:3], *([p for p in PARTS[:3] if p != part] for part in PARTS[:3]), ()]
+    whole, three, *without, ideal = unexplained_by(capture, found, sets)
+    assert whole < -60 and three < -40 and ideal > -1
+    assert min(without) > three + 10
+    with pytest.raises(CaptureError, match="places of the elements are unknown"):
+        unexplained_by(replace(capture, antennas=None), found, sets)

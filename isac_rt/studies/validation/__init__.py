@@ -13,6 +13,7 @@ def all_cases(quick: bool = False) -> list[Case]:
         clutter,
         crosschecks,
         geometry,
+        measured,
         noise,
         receivers,
         signal,
@@ -20,6 +21,16 @@ def all_cases(quick: bool = False) -> list[Case]:
     )
     from isac_rt.studies.validation.case import cases_of
 
-    modules = (geometry, amplitude, clutter, signal, noise, receivers, tracking, crosschecks)
+    modules = (
+        geometry,
+        amplitude,
+        clutter,
+        signal,
+        noise,
+        receivers,
+        tracking,
+        measured,
+        crosschecks,
+    )
     cases = [case for module in modules for case in cases_of(module)]
     return [case for case in cases if case.quick or not quick]
