@@ -193,9 +193,13 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 loss=np.where(see, Loss.INACCURATE if f == 5 else Loss.FOUND, -1),
                 target_snr=np.where(see, 317.0, np.nan),
                 target_clutter=np.where(see, 0.37, np.nan),
+                cooperative=np.array([True, True, False]),
+                genie=np.where(see, 0.97, np.nan),
+                clutter_free=np.where(see, 0.83, np.nan),
                 gospa=Gospa(
                     np.sqrt(0.09 + 12.5), 0.09, 12.5 * (see.sum() - 1), 12.5 * (not see[2])
                 ),
+                gospa_targets=Gospa(0.3, 0.09, 0.0, 12.5 * (not see[2])),
                 detection_kind=np.array([1, 3, -1, 4][:detections])
                 if detections
                 else np.zeros(0, int),

@@ -109,6 +109,9 @@ NAMES = {"targets": "UAV", "links": "LINK"}
 ELSEWHERE = {
     "rmse_tracked",
     "counts",
+    "apart.targets.bounds",
+    "apart.targets.gospa",
+    "apart.terminals.bounds",
     "targets.UAV.median",
     "targets.UAV.p90",
     "targets.UAV.losses",

@@ -130,14 +130,30 @@ OBSERVERS: dict[str, Column] = {
         dims=("uav",),
         missing=np.nan,
     ),
+    "cooperative": _number("UAV that is a terminal", "cooperative", bool, dims=("uav",)),
+    "genie": _number(
+        "probability that a matched filter at the true parameters finds the UAV's own path",
+        "genie",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    "clutter_free": _number(
+        "probability that the receiver's detector would find the UAV in noise alone",
+        "clutter_free",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
     **{
-        f"gospa_{part}": Column(
+        f"{of}_{part}": Column(
             float,
             "m2",
-            f"{words} in the square of the GOSPA distance of the confirmed tracks",
-            f"gospa.{part}",
+            f"{words} in the square of the GOSPA distance of the confirmed tracks{but}",
+            f"{of}.{part}",
             missing=np.nan,
         )
+        for of, but in (("gospa", ""), ("gospa_targets", ", terminals left out"))
         for part, words in (
             ("localisation", "errors of position"),
             ("missed", "UAVs without a track"),

@@ -60,11 +60,14 @@ class Sensitivity:
     matched : SNR of a matched filter that is coherent over all samples, chirps and antennas
     cell : SNR in the cell of one channel of a Hann-windowed range-Doppler map
     rule : by which a cell of that map stands out of those around it
+    beam_rate : false alarms in a cell of a detector that adds the channels in phase, None: this one
+        adds their powers
     """
 
     matched: float
     cell: float
     rule: CfarRule
+    beam_rate: float | None = None
 
     @classmethod
     def of(
@@ -75,8 +78,10 @@ class Sensitivity:
         sent: Transmission,
         noise_power: float,
         groups: int,
+        own: bool = False,
     ) -> Sensitivity:
-        """What the link budget says of a frame of which the receiver reads so many groups."""
+        """What the link budget says of a frame of which the receiver reads so many groups; `own`:
+        it hears its own chirps."""
         groups = groups * sent.num_streams
         w, chirps = waveform, groups * waveform.num_chirps
         sample = sent.amplitude**2 / noise_power
@@ -90,6 +95,7 @@ class Sensitivity:
             sample * w.num_samples * chirps * antennas.num_rx,
             sample * w.window_length * per_look / HANN_LOSS**2,
             CfarRule.of(settings, looks),
+            settings.false_alarm_rates[0] if settings.looks_by_beam(own) else None,
         )
 
     def detection_probability(self, snr: float, background: float = 0.0) -> float:
@@ -97,6 +103,24 @@ class Sensitivity:
         its power in the cells around."""
         degrees, threshold = 2 * self.rule.looks, self.rule.threshold * (1 + background)
         return float(ncx2.sf(degrees * threshold, degrees, degrees * snr))
+
+    def clutter_free(self, snr: float) -> float:
+        """Probability that this detector would find a steady path with this SNR in a channel's cell
+        if there were noise alone."""
+        if self.beam_rate is None:
+            return self.detection_probability(snr)
+        return single_look(snr * self.rule.looks, self.beam_rate)
+
+    def genie(self, snr: float) -> float:
+        """Probability that a matched filter at a path's true delay, Doppler and direction finds it,
+        from its coherent SNR; its false alarms are those of a cell."""
+        return single_look(snr, self.rule.rate)
+
+
+def single_look(snr: float, rate: float) -> float:
+    """Probability of detection of a steady path by one coherent test with a rate of false
+    alarms."""
+    return float(ncx2.sf(-2 * np.log(rate), 2, 2 * snr))
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,13 @@ class ObserverRecord:
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
         frame (linear), NaN where it is not in view or shadowed
     target_clutter : (U,) power of the clutter in its cell over the noise (linear), likewise
+    cooperative : (U,) bool; whether a UAV is a terminal in this frame, which says where it is
+    genie : (U,) probability that a matched filter at the true parameters finds its own path, NaN
+        where it is not in view or shadowed
+    clutter_free : (U,) probability that the receiver's detector would find it in noise alone,
+        likewise
     gospa : of the confirmed tracks against the UAVs in view and unshadowed
+    gospa_targets : the same without terminals and the tracks that their own paths feed
     detection_kind, detection_target, detection_order, detection_face, detection_skirt : (Q,) what
         explains each detection, as `isac_rt.results.labels.Explanation` says, targets as indices
         of UAVs
@@ -108,7 +114,11 @@ class ObserverRecord:
     loss: np.ndarray
     target_snr: np.ndarray
     target_clutter: np.ndarray
+    cooperative: np.ndarray
+    genie: np.ndarray
+    clutter_free: np.ndarray
     gospa: Gospa
+    gospa_targets: Gospa
     detection_kind: np.ndarray
     detection_target: np.ndarray
     detection_order: np.ndarray

@@ -112,6 +112,7 @@ class Scorer:
             own = bool((labels.uav == i).any())
             loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
         raw = reception.raw_delay_symbols
+        friends = np.array([role != "target" for role in timetable.roles(frame).values()])
         return ObserverRecord(
             transmitter=self.link.tx,
             reception=reception,
@@ -127,7 +128,17 @@ class Scorer:
             loss=loss,
             target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
             target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, len(hit)),
+            cooperative=friends,
+            genie=_by_uav({i: sees.genie(c.matched) for i, c in chances.items()}, len(hit)),
+            clutter_free=_by_uav(
+                {i: sees.clutter_free(c.cell) for i, c in chances.items()}, len(hit)
+            ),
             gospa=gospa(view.places, tracks.mean[tracks.confirmed, :3], GOSPA_CUTOFF_M),
+            gospa_targets=gospa(
+                view.places[~friends[list(view.seen)]],
+                tracks.mean[tracks.confirmed & ~self._of_friends(tracks, friends), :3],
+                GOSPA_CUTOFF_M,
+            ),
             **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
             symbols=symbols,
             fell_back=sent.schedule is not timetable.schedule,
@@ -160,7 +171,13 @@ class Scorer:
         mine = timetable.groups(self.link) if timetable.modulated(frame) else None
         groups = timetable.waveform.num_groups if mine is None else len(mine)
         return Sensitivity.of(
-            timetable.waveform, self._antennas, self._receivers, sent, noise_power, groups
+            timetable.waveform,
+            self._antennas,
+            self._receivers,
+            sent,
+            noise_power,
+            groups,
+            self.link.own,
         )
 
     def _labels_of(self, d: Detections, paths: PathSet, sees: Sensitivity) -> _Labels:
@@ -224,6 +241,11 @@ class Scorer:
             target=target,
             uav=follows,
         )
+
+    def _of_friends(self, tracks: TrackSet, friends: np.ndarray) -> np.ndarray:
+        """(K,) which tracks a terminal's own path fed last; the reference is one."""
+        uav = np.array([self._labels[track][-1] for track in tracks.ids.tolist()], int)
+        return tracks.is_reference | (np.append(friends, False)[uav])
 
     def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:
         """What the strongest straight path of each UAV seen amounts to."""

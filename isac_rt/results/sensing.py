@@ -17,6 +17,7 @@ from isac_rt.results.records import KINDS
 RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
 """Shares of a summary that have a numerator and a denominator."""
 ERROR_KEYS = tuple(key for _, key in MEASURES.values())
+GOSPA_PARTS = ("localisation", "missed", "false")
 FALSE_CAUSES = (*KINDS, "noise")
 """What a false track is fed by; the last stands for -1."""
 
@@ -34,7 +35,10 @@ class Sensing:
     loss : (F, U) `Loss`, -1 where it is not seen
     switched : (F, U) bool, another track follows it than the last that did
     resumed : (F, U) bool, followed again after frames in view in which no track did
-    gospa : (F, 3) localisation, missed, false [m^2]
+    cooperative : (F, U) bool, terminals
+    genie, clutter_free : (F, U) probabilities of detection by a matched filter at the true
+        parameters, and by the receiver's detector in noise alone
+    gospa, gospa_targets : (F, 3) localisation, missed, false [m^2]; of all, and without terminals
     num_false, num_clutter : (F,) detections
     false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`
     ghosts : (F, U) those of them that ghosts of each UAV feed
@@ -48,7 +52,11 @@ class Sensing:
     loss: np.ndarray
     switched: np.ndarray
     resumed: np.ndarray
+    cooperative: np.ndarray
+    genie: np.ndarray
+    clutter_free: np.ndarray
     gospa: np.ndarray
+    gospa_targets: np.ndarray
     num_false: np.ndarray
     num_clutter: np.ndarray
     false_tracks: np.ndarray
@@ -70,8 +78,10 @@ class Sensing:
                     out[f, :, k] = np.rad2deg(e) if unit == "rad" else e
             return out
 
+        def parts(of: str) -> np.ndarray:
+            return np.stack([column(f"{of}_{part}", float, ()) for part in GOSPA_PARTS], axis=-1)
+
         in_view, shadowed = column("in_view", bool), column("shadowed", bool)
-        parts = ("gospa_localisation", "gospa_missed", "gospa_false")
         false = [_false_tracks(row["track"], num_uavs) for row in rows]
         return cls(
             in_view & ~shadowed,
@@ -81,7 +91,11 @@ class Sensing:
             errors("tracked"),
             column("loss", int),
             *_breaks(rows, in_view & ~shadowed),
-            np.stack([column(name, float, ()) for name in parts], axis=-1),
+            column("cooperative", bool),
+            column("genie", float),
+            column("clutter_free", float),
+            parts("gospa"),
+            parts("gospa_targets"),
             column("num_false", int, ()),
             column("num_clutter", int, ()),
             np.array([f for f, _ in false], int).reshape(count, len(FALSE_CAUSES)),
@@ -102,13 +116,21 @@ class Sensing:
         false = self.false_tracks.sum(axis=0)
         return {
             "hit_rate": share(int(self.hit.sum()), in_view),
+            "bounds": self._bounds(self.seen),
             "matched": share(int(found.sum()), in_view),
             "matched_tracked": share(int(followed.sum()), in_view),
             "false_per_frame": share(int(self.num_false.sum()), frames),
             "clutter_per_frame": share(int(self.num_clutter.sum()), frames),
             "rmse": _by_axis(self.detected[found], rms),
             "rmse_tracked": _by_axis(self.tracked[followed], rms),
-            "gospa": self._gospa(),
+            "gospa": gospa_block(self.gospa, self.seen),
+            "apart": {
+                "targets": {
+                    **self._found(~self.cooperative),
+                    "gospa": gospa_block(self.gospa_targets, self.seen & ~self.cooperative),
+                },
+                "terminals": self._found(self.cooperative),
+            },
             "false_tracks_per_frame": share(int(false.sum()), frames),
             "false_tracks": {
                 name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
@@ -136,18 +158,43 @@ class Sensing:
             "losses": _counts(self.loss[:, i]),
         }
 
-    def _gospa(self) -> dict[str, float | None]:
-        if not len(self.gospa):
-            return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "empty_m"))
-        localisation, missed, false = self.gospa.mean(axis=0)
-        each = GOSPA_CUTOFF_M**2 / 2
+    def _found(self, of: np.ndarray) -> dict[str, Any]:
+        """Target-frames in view of some of the UAVs (F, U), and the share of them that was
+        found."""
+        seen = self.seen & of
         return {
-            "total_m": float(np.sqrt(localisation + missed + false)),
-            "missed": float(missed / each),
-            "false": float(false / each),
-            "localisation_m": float(np.sqrt(localisation)),
-            "empty_m": float(np.sqrt(each * self.seen.sum(axis=1).mean())),
+            "in_view": int(seen.sum()),
+            "hit_rate": share(int((self.hit & seen).sum()), int(seen.sum())),
+            "bounds": self._bounds(seen),
         }
+
+    def _bounds(self, seen: np.ndarray) -> dict[str, float | None]:
+        """Mean probabilities of detection over target-frames (F, U)."""
+        of = {"genie": self.genie, "clutter_free": self.clutter_free}
+        return {
+            name: float(values[seen].mean()) if seen.any() else None for name, values in of.items()
+        }
+
+
+def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
+    """GOSPA over frames under the keys of the summary; null without frames.
+
+    Parameters
+    ----------
+    parts : (F, 3) localisation, missed, false [m^2]
+    seen : (F, U) bool, what ought to be in the picture
+    """
+    if not len(parts):
+        return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "empty_m"))
+    localisation, missed, false = np.mean(parts, axis=0)
+    each = GOSPA_CUTOFF_M**2 / 2
+    return {
+        "total_m": float(np.sqrt(localisation + missed + false)),
+        "missed": float(missed / each),
+        "false": float(false / each),
+        "localisation_m": float(np.sqrt(localisation)),
+        "empty_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
+    }
 
 
 def _false_tracks(track: Row, num_uavs: int) -> tuple[np.ndarray, np.ndarray]:

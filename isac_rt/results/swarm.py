@@ -18,6 +18,7 @@ from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
 from isac_rt.results.records import ObserverRecord, PictureRecord
+from isac_rt.results.sensing import gospa_block
 from isac_rt.terminal.fusion import Fused, Key, Name
 from isac_rt.world.swarm import Pose
 
@@ -195,8 +196,6 @@ def summary_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[
 def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any]:
     """The figures of one picture."""
     seen, found = (np.array([row[key] for row in rows], bool) for key in ("seen", "found"))
-    localisation, missed, false = np.mean([row["gospa"] for row in rows], axis=0)
-    each = GOSPA_CUTOFF_M**2 / 2
     error = np.array([row["error"] for row in rows], float)[found]
     ages = np.array([row["age"] for row in rows], float)
     reports = np.array([row["reports"] for row in rows])
@@ -205,13 +204,7 @@ def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str,
     in_view = int(seen.sum())
     return {
         "hit_rate": int(found.sum()) / in_view if in_view else None,
-        "gospa": {
-            "total_m": float(np.sqrt(localisation + missed + false)),
-            "missed": float(missed / each),
-            "false": float(false / each),
-            "localisation_m": float(np.sqrt(localisation)),
-            "empty_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
-        },
+        "gospa": gospa_block(np.array([row["gospa"] for row in rows]), seen),
         "false_tracks_per_frame": float(np.mean([row["false"] for row in rows])),
         "hidden_per_frame": float(np.mean([row["hidden"] for row in rows])),
         "unrecognised_per_frame": float(np.mean([row["unrecognised"] for row in rows])),

@@ -233,6 +233,35 @@ def gospa_table(summary: Mapping[str, Any]) -> Table:
     return Table(("Picture", *keys), rows)
 
 
+def apart_table(summary: Mapping[str, Any]) -> Table:
+    """Targets and terminals apart, with what could be found of them at most."""
+    rows = [
+        (
+            f"{_link(name)}, {who}",
+            number(part["in_view"]),
+            number(part["hit_rate"]),
+            *(number(part["bounds"][key]) for key in ("clutter_free", "genie")),
+            *(
+                number(part["gospa"][key]) if "gospa" in part else DASH
+                for key in ("total_m", "empty_m")
+            ),
+        )
+        for name, s in summary["links"].items()
+        for who, part in s.get("apart", {}).items()
+        if part["in_view"]
+    ]
+    titles = (
+        "Apart",
+        "In view",
+        "Hit rate",
+        "Without clutter",
+        "Matched filter",
+        "GOSPA [m]",
+        "Empty picture [m]",
+    )
+    return Table(titles, rows)
+
+
 def swarm_table(summary: Mapping[str, Any]) -> Table:
     """The pictures of terminals that cooperate, all of them together first; no rows where none
     does."""
@@ -418,6 +447,7 @@ def write_report(
         sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
         gospa=gospa_table(s),
         false_tracks=false_table(s),
+        apart=apart_table(s),
         swarm=swarm_table(s),
         targets=target_table(s),
         losses=loss_table(s),

@@ -43,6 +43,8 @@ TERMINAL_KEYS = {
     "false_per_frame",
     "clutter_per_frame",
     "gospa",
+    "apart",
+    "bounds",
     "false_tracks_per_frame",
     "false_tracks",
     "losses",

@@ -307,6 +307,26 @@ def test_gospa_is_of_confirmed_tracks_and_uavs_in_view():
     assert {*table.kind, *table.target, *table.uav} == {-1}
 
 
+def test_targets_are_scored_without_the_terminals():
+    """U1 with a track 0.3 m off, PT1 with one of its own path 2 m off that coasts in the next
+    frame, and a wall's track at U2, who is not in view: of all there is one false track, of targets
+    alone likewise, and PT1's is neither found nor false. The bounds are those of 20 dB and more.
+    Planted bugs: the terminal's track counts as false; its label forgotten as it coasts."""
+    judge = scorer("AT")
+    for frame, fed in ((DATA, (0, 1, 2)), (DATA + 1, (-1, -1, -1))):
+        rows = [path_of("AT", "U1", frame, 3.0), path_of("AT", "PT1", frame, 3.0)]
+        rows += [path_of("AT", "U2", frame, 3.0, PathKind.DIFFUSE)]
+        points = [point("AT", name, frame) for name in ("U1", "PT1", "U2")] if fed[0] == 0 else []
+        names = zip((4, 5, 6), fed, ("U1", "PT1", "U2"), (0.3, 2.0, 0.0), strict=True)
+        tracks = [(number, True, row, name, east) for number, row, name, east in names]
+        record = scored(judge, frame, rows, points, tracks)
+        assert record.cooperative.tolist() == [False, True, True, False]
+        assert record.gospa[1:] == pytest.approx((4.09, 0.0, 12.5))
+        assert record.gospa_targets[1:] == pytest.approx((0.09, 0.0, 12.5))
+        assert (record.genie[[0, 2]] > 0.99).all() and np.isnan(record.genie[[1, 3]]).all()
+        assert (record.clutter_free[[0, 2]] > 0.99).all()
+
+
 def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     """The own path explains them, more than three resolutions off: a velocity a period off, and a
     track that went astray. Planted bug: no gate."""

@@ -10,7 +10,11 @@ from isac_rt.results.dataset import MEASURES
 from isac_rt.results.losses import LOSSES, Loss
 from isac_rt.results.sensing import FALSE_CAUSES, Sensing, summary_block
 
-GOSPA = {"gospa_localisation": 0.0, "gospa_missed": 0.0, "gospa_false": 0.0}
+GOSPA = {
+    f"{of}_{part}": 0.0
+    for of in ("gospa", "gospa_targets")
+    for part in ("localisation", "missed", "false")
+}
 
 
 def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
@@ -19,6 +23,11 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     seen = np.array(seen, bool)
     out = {"in_view": seen, "shadowed": np.zeros(2, bool), "hit": np.zeros(2, bool)}
     out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
+    out |= {"cooperative": np.array([False, True])}
+    out |= {
+        "genie": np.where(seen, [0.9, 0.4], np.nan),
+        "clutter_free": np.where(seen, 0.7, np.nan),
+    }
     table = np.array(tracks, int).reshape(-1, 5)
     out["track"] = dict(zip(("id", "confirmed", "kind", "target", "uav"), table.T, strict=True))
     for k, name in enumerate(MEASURES):
@@ -152,3 +161,29 @@ def test_nothing_is_null():
         assert block[key] is None
     assert block["gospa"] == dict.fromkeys(block["gospa"])
     assert block["losses"] == dict.fromkeys(LOSSES, 0)
+
+
+def test_terminals_and_targets_apart():
+    """Of three frames UAV 0, a target, is in view in two and found in one, UAV 1, a terminal, in
+    view in three and found in all; GOSPA without the terminal has parts of its own. Planted bugs:
+    all UAVs in either part; the GOSPA of all; the empty picture of all."""
+    hits = [(True, True), (False, True), (False, True)]
+    rows = [
+        row(
+            seen=(k > 0, 1),
+            hit=np.array(hit) & (k > 0, True),
+            gospa_targets_missed=12.5 * (k == 1),
+            gospa_missed=1000.0,
+        )
+        for k, hit in zip((1, 2, 0), hits, strict=True)
+    ]
+    apart = Sensing.of(rows, 2).block()["apart"]
+    targets, terminals = apart["targets"], apart["terminals"]
+    assert (targets["in_view"], targets["hit_rate"]) == (2, 0.5)
+    assert (terminals["in_view"], terminals["hit_rate"]) == (3, 1.0)
+    assert targets["bounds"] == pytest.approx({"genie": 0.9, "clutter_free": 0.7})
+    assert terminals["bounds"] == pytest.approx({"genie": 0.4, "clutter_free": 0.7})
+    assert targets["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
+    assert targets["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
+    bounds = Sensing.of(rows, 2).block()["bounds"]
+    assert bounds["genie"] == pytest.approx((2 * 0.9 + 3 * 0.4) / 5)
