@@ -47,6 +47,11 @@ _NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
 """What libraries say that raise no MemoryError."""
 
 
+def shortly(problem: BaseException) -> str:
+    """What a library says of a bad file, in one line of at most 300 characters."""
+    return " ".join(str(problem).split())[:300]
+
+
 class UserError(Exception):
     """What the user can mend: the text says what, where, the limit and the remedy. The command
     line prints it alone and exits with 2."""

@@ -661,5 +661,67 @@ OF_TESTS = (
         "test_access_stages::test_the_timetable_on_paper",
         Bug("access/protocol.py", "0.0 if data else n.hold", "n.hold"),
     ),
+    (
+        "test_keys::test_stored_paths_hold_the_instant_the_links_and_every_pose",
+        Bug(
+            "propagation/store.py",
+            "json.dumps([self._content, epoch, links, where])",
+            "json.dumps([self._content, epoch, where])",
+        ),
+    ),
+    (
+        "test_keys::test_keys_hold_every_value_of_a_scenario",
+        Bug("results/provenance.py", '    "compare",\n)', '    "compare",\n    "swarm",\n)'),
+    ),
+    (
+        "test_keys::test_keys_hold_every_value_of_a_scenario",
+        Bug(
+            "results/provenance.py",
+            "if key not in UNSEEN_BY_PATHS}",
+            'if key not in UNSEEN_BY_PATHS}; seen["swarm"] = {uav: {k: v for k, v in one.items() if k != "rcs"} for uav, one in tree["swarm"].items()}',
+        ),
+    ),
+    (
+        "test_keys::test_keys_hold_the_version_of_every_package",
+        Bug("sweep/definition.py", '"versions": json.dumps(versions()),', '"versions": "",'),
+    ),
+    (
+        "test_resume::test_everything_that_is_carried_over_is_taken_up",
+        Bug(
+            "terminal/terminal.py",
+            '"slips_repaired": self.slips_repaired,',
+            '"slips_repaired": 0,',
+        ),
+    ),
+    (
+        "test_resume::test_everything_that_is_carried_over_is_taken_up",
+        Bug(
+            "simulation/simulate.py",
+            """            "feedback": self.feedback,
+            "seconds\"""",
+            """            "feedback": {"answers": 0, "corrections": 0},
+            "seconds\"""",
+        ),
+    ),
+    (
+        "test_trouble::test_of_points_that_share_paths_one_goes_first",
+        Bug(
+            "sweep/execute.py",
+            "and point.paths_key not in self._traced",
+            "and point.paths_key in self._traced",
+        ),
+    ),
+    (
+        "test_trouble::test_a_scheduler_that_is_killed_is_one_message",
+        Bug(
+            "sweep/execute.py",
+            "logger.setLevel(logging.CRITICAL)",
+            "logger.setLevel(logging.ERROR)",
+        ),
+    ),
+    (
+        "test_scoring::test_gospa_is_of_confirmed_tracks_and_uavs_in_view",
+        Bug("results/scoring.py", "get(track, [-1, -1, -1])", "get(track, [0, 0, 0])"),
+    ),
 )
 """(file::name of a test of a hard case, a bug with which it fails) (``--hard``)."""

@@ -19,7 +19,7 @@ import xarray as xr
 from pydantic import BaseModel
 
 from isac_rt.results.recorder import Results
-from isac_rt.runtime import UserError
+from isac_rt.runtime import UserError, shortly
 from isac_rt.scenario.file import to_yaml
 from isac_rt.storage import BAD_DATA, read_whole, write_whole
 
@@ -118,8 +118,8 @@ def open_results(folder: str | Path) -> Results:
         summary = json.loads(read_whole(folder / "summary.json"))
         _Summary.model_validate(summary)
     except (OSError, MemoryError, *BAD_DATA) as problem:
-        said = " ".join(str(problem).split())[:300]
         raise ResultsError(
-            f"cannot read results in {folder}: {said}; give the folder that `isac-rt run` wrote"
+            f"cannot read results in {folder}: {shortly(problem)}; give the folder that "
+            "`isac-rt run` wrote"
         ) from problem
     return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))

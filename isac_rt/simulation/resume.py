@@ -18,7 +18,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from isac_rt.runtime import UserError
+from isac_rt.runtime import UserError, shortly
 from isac_rt.scenario.file import ScenarioWarning
 from isac_rt.storage import BAD_DATA, checksum, pack, unpack
 
@@ -97,7 +97,7 @@ class Resume:
         except (sqlite3.Error, *BAD_DATA) as problem:
             raise ResumeError(
                 f"{self.file} is damaged or was not written by isac-rt "
-                f"({type(problem).__name__}: {problem}); --restart lets go of it"
+                f"({type(problem).__name__}: {shortly(problem)}); --restart lets go of it"
             ) from problem
 
     def due(self) -> bool:

@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field
 from isac_rt.results.files import ResultsError, read_dataset, write_dataset
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import commit
+from isac_rt.runtime import shortly
 from isac_rt.scenario.file import plain_tree
 from isac_rt.scenario.tree import Scenario
 from isac_rt.storage import (
@@ -129,8 +130,8 @@ class Outcomes:
             )
         except (OSError, *BAD_DATA) as problem:
             raise ResultsError(
-                f"{self.folder} holds no sweep ({problem}); give the folder that `isac-rt sweep` "
-                "wrote"
+                f"{self.folder} holds no sweep ({shortly(problem)}); give the folder that "
+                "`isac-rt sweep` wrote"
             ) from problem
 
 
@@ -309,7 +310,9 @@ def open_sweep(folder: Path | str) -> xr.Dataset:
         try:
             written = read_dataset(file)
         except (OSError, MemoryError, *BAD_DATA) as problem:
-            raise ResultsError(f"{file} cannot be read ({problem}); delete it") from problem
+            raise ResultsError(
+                f"{file} cannot be read ({shortly(problem)}); delete it"
+            ) from problem
         if any(written.attrs.get(name) != value for name, value in _made_by().items()):
             return written
     return assemble(outcomes.definition(), outcomes)
