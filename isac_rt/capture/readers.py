@@ -14,12 +14,13 @@ import numpy as np
 
 from isac_rt.capture.description import Description
 from isac_rt.capture.matfile import read_mat
-from isac_rt.capture.store import checked_cube, short
+from isac_rt.capture.store import checked_cube
 from isac_rt.capture.types import Capture, CaptureError
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.results.files import ResultsError
+from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA, read_whole
 
 TI_SAMPLING_RATE = 8e6
@@ -249,7 +250,7 @@ def read_sigmf(file: str | Path) -> IFCube:
         return checked_cube(samples, w, schedule, info["isac_rt:start_time_s"])
     except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(
-            f"cannot read an IF cube from {base}: {short(problem)}; give a recording that "
+            f"cannot read an IF cube from {base}: {shortly(problem)}; give a recording that "
             "`write_sigmf` made"
         ) from problem
 

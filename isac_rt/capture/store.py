@@ -16,6 +16,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.results.files import ResultsError, read_dataset, write_dataset
+from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA
 
 _SAMPLE_AXES = ("group", "rx", "chirp", "sample")
@@ -132,7 +133,7 @@ def load_capture(file: str | Path) -> Capture:
         return Capture(cube=cube, antennas=antennas, source=source)
     except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(
-            f"cannot read an IF cube from {file}: {short(problem)}; give a file that `save_cube` "
+            f"cannot read an IF cube from {file}: {shortly(problem)}; give a file that `save_cube` "
             "wrote"
         ) from problem
 
@@ -167,8 +168,3 @@ def checked_cube(samples: np.ndarray, waveform: Any, schedule: np.ndarray, start
     ):
         raise ValueError("a sample, a time or a transmit antenna cannot be")
     return cube
-
-
-def short(problem: BaseException) -> str:
-    """What an exception says, in one line of at most 300 characters."""
-    return " ".join(str(problem).split())[:300]
