@@ -18,7 +18,7 @@ from isac_rt.capture.store import checked_cube
 from isac_rt.capture.types import Capture, CaptureError
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import Sweep, Waveform
 from isac_rt.results.files import ResultsError
 from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA, read_whole
@@ -341,23 +341,26 @@ def _framed(file: Path, d: _Complete, frames: np.ndarray, kind: str) -> Capture:
 
 
 def waveform_described(d: Description) -> Waveform:
-    """The sampled part of a board's chirp as a `Waveform`.
-
-    A `Waveform` starts to sample 2 f_s / alpha after the start of its chirp. Its carrier is the
-    frequency so long before the board's first sample: f_0 + alpha t_ADC - 2 f_s.
-    """
+    """A board's chirp as a `Waveform` without data."""
     assert d.slope_mhz_per_us and d.sampling_rate_hz and d.samples_per_chirp
-    slope, rate, size = d.slope_mhz_per_us * 1e12, d.sampling_rate_hz, d.samples_per_chirp
-    chirps = d.loops * len(d.chirps)
+    slope, start = d.slope_mhz_per_us * 1e12, d.adc_start_us * 1e-6
+    end = start + d.samples_per_chirp / d.sampling_rate_hz
+    again = end if d.chirp_interval_us is None else d.chirp_interval_us * 1e-6
+    if again < end - start:
+        raise CaptureError(
+            f"chirp_interval_us: {again * 1e6:g} us from chirp to chirp, but the samples of one "
+            f"take {(end - start) * 1e6:g} us; correct the description"
+        )
     return Waveform(
-        carrier_frequency=d.carrier_hz + slope * d.adc_start_us * 1e-6 - 2 * rate,
-        bandwidth=slope * size / rate + 2 * rate,
-        sampling_rate=rate,
-        num_samples=size,
-        num_chirps=chirps,
+        carrier_frequency=d.carrier_hz,
+        bandwidth=slope * end,
+        sampling_rate=d.sampling_rate_hz,
+        num_samples=d.samples_per_chirp,
+        num_chirps=d.loops * len(d.chirps),
         num_groups=1,
         num_tx=d.num_tx,
-        slot_period=None if d.chirp_interval_us is None else d.chirp_interval_us * 1e-6,
+        sweep=Sweep(slope, end, start, again),
+        carries_data=False,
     )
 
 

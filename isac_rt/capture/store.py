@@ -145,7 +145,7 @@ def checked_cube(samples: np.ndarray, waveform: Any, schedule: np.ndarray, start
     ------
     ValueError
     """
-    if {*waveform, "slot_period"} != {field.name for field in fields(Waveform)}:
+    if waveform.keys() != {field.name for field in fields(Waveform)}:
         raise ValueError("its waveform has other keys")
     w = TypeAdapter(Waveform).validate_python(waveform)
     shape = (w.num_groups, *samples.shape[1:2], w.num_chirps, w.num_samples)

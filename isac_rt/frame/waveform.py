@@ -55,8 +55,6 @@ class Waveform:
     filter_transition : width of the skirts of the IF filter [Hz], which passes [0, f_s]
     blocks : resource block of each group, counted from the transmitter's first; None: 0 .. M-1. A
         receiver that reads some of the groups only sees a waveform of these (`of_groups`)
-    slot_period : from one chirp of a group to its next [s], where a board keeps its own time; None:
-        as the guard interval asks for
     sweep : timing of a plain FMCW chirp; None: that of the paper, in which `bandwidth` sets it
     carries_data : whether half of the range cells are kept free for delay symbols
     scheme : how antennas share the chirps: "tdm", one in each group and slot; "ddm" and "bpm", all
@@ -79,7 +77,6 @@ class Waveform:
     num_tx: int = 3
     filter_transition: float = 0.4e6
     blocks: tuple[int, ...] | None = None
-    slot_period: float | None = None
     sweep: Sweep | None = None
     carries_data: bool = True
     scheme: Scheme = "tdm"
@@ -136,7 +133,7 @@ class Waveform:
     @property
     def slot_duration(self) -> float:
         """T- [s], from one chirp of a group to its next."""
-        return self._times.slot if self.slot_period is None else self.slot_period
+        return self._times.slot
 
     @property
     def frame_duration(self) -> float:
