@@ -30,6 +30,7 @@ COMMANDS: dict[Callable[..., None], str] = {
     simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",
     simulation.view: "view scenes/street_canyon.yaml --out scene.html",
     simulation.animate: "animate runs/munich --out runs/munich/run.mp4",
+    simulation.figures: "figures runs/munich --as svg --style column",
     simulation.export: "export runs/munich --as csv --out tables",
     sweeps.sweep: "sweep scenes/sweeps/canyon_power.yaml --workers 2",
     studies.reproduce: "reproduce table1 fig8 --quick",

@@ -342,6 +342,34 @@ def animate(
     say(target)
 
 
+def figures(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run` wrote.")],
+    form: Annotated[str, typer.Option("--as", metavar="FORM", help="png, svg or pdf.")] = "pdf",
+    style: Annotated[
+        str,
+        typer.Option(help="screen; page: both columns of a journal's page; column: one of them."),
+    ] = "page",
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where they go; default DIR/figures_STYLE."),
+    ] = None,
+) -> None:
+    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style."""
+    from isac_rt.results.files import open_results
+
+    results = open_results(folder)
+    target = out if out is not None else folder / f"figures_{style}"
+    with ending_soon_after_interrupt(target), working("drawing"):
+        from isac_rt.simulation.setup import city_of
+        from isac_rt.views.figures import FORMS, STYLES, redraw
+
+        check_names([form], FORMS, "form")
+        check_names([style], list(STYLES), "style")
+        files = redraw(results, target, city_of(results.scenario), form, style)
+    for file in files:
+        say(file)
+
+
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run` wrote.")],
     form: Annotated[

@@ -72,11 +72,19 @@ def read_dataset(file: Path) -> xr.Dataset:
         return opened.load()
 
 
+NO_DATES: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+"""What keeps the clock and the library out of a figure of each form."""
+
+
 def write_figure(file: Path, figure: Any, **options: Any) -> None:
-    """A matplotlib figure as a PNG file that appears whole or not at all; options as for its
-    `savefig`."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", metadata={"Software": None}, **options)
+    """A matplotlib figure as a file of the form that its suffix names, PNG, SVG or PDF; it appears
+    whole or not at all. Options as for its `savefig`."""
+    form, drawn = file.suffix[1:], io.BytesIO()
+    figure.savefig(drawn, format=form, metadata=NO_DATES[form], **options)
     write_whole(file, drawn.getvalue())
 
 

@@ -4,10 +4,11 @@ all."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -67,13 +68,17 @@ STYLE: dict[Any, Any] = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.4,
 }
-_MARGINS = (0.75, 0.15, 0.5, 0.35, 0.75, 0.8)
+_MARGINS = (0.75, 0.15, 0.5, 0.55, 0.75, 1.0)
 """Left, right, bottom, top, between columns and between rows of a figure [inch]."""
 _LEGEND_ROW = 0.17
 """Height of a row of a legend [inch]."""
+_LEGEND_COLUMN = 1.6
+"""Width of a column of a legend [inch]."""
 _SHOWN_DB = 60.0
-_TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 """Depth of a map's colour scale [dB]."""
+_LEAKAGE_CELLS = 3.0
+"""Range cells in which an active terminal's own leakage decides how bright a map is."""
+_TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 _UNITS = {
     "range": (1.0, "m"),
     "velocity": (1.0, "m/s"),
@@ -199,15 +204,16 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
     rows, columns = np.isfinite(r), np.isfinite(v)
     level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], _TINY))
-    level = level - np.median(
-        level
-    )  # most cells hold noise alone; the peak may be the transmitter's own leakage
+    level = level - np.median(level)  # most cells hold noise alone
+    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
+    far = r[rows] > _LEAKAGE_CELLS * dataset.attrs["range_cell_m"] * own
+    brightest = level[far].max() if far.any() else level.max()
     _map(
         ax,
         v[columns],
         r[rows],
         level,
-        (-5.0, np.clip(level.max(), 5.0, _SHOWN_DB)),
+        (-5.0, np.clip(brightest, 5.0, _SHOWN_DB)),
         "power above the median cell [dB]",
     )
     if not power.any():
@@ -242,21 +248,28 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     )
     far = np.concatenate([dataset.det_range.values[mine], y[np.isfinite(y)], [20.0]])
     ax.set(xlim=(v[columns].min(), v[columns].max()), ylim=(0, min(1.4 * far.max(), r[rows].max())))
-    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
     ax.set(
         xlabel="radial velocity [m/s] (receding is positive)",
         ylabel="range [m]" if own else "path length [m]",
     )
-    ax.set_title(f"{dataset.observer.values[observer]}, frame {number}")
-    legend = ax.legend(
-        loc="upper right",
+    figure = ax.get_figure(root=True)
+    columns = max(1, int((figure.get_figwidth() if figure else 8.0) / _LEGEND_COLUMN))
+    rows_above = math.ceil(len(ax.get_legend_handles_labels()[0]) / columns)
+    ax.set_title(
+        f"{dataset.observer.values[observer]}, frame {number}",
+        pad=6 + 72 * _LEGEND_ROW * rows_above,
+    )
+    ax.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=columns,
+        borderaxespad=0.2,
+        columnspacing=1.0,
         frameon=True,
         facecolor="#303030",
         edgecolor="none",
         labelcolor="white",
-        fontsize=7,
     )
-    legend.set_zorder(9)
     return ax
 
 
@@ -342,6 +355,10 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         )
         ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
+    if name == "range":
+        ax.set_title(
+            f"{dataset.observer.values[observer]}: truth (line), detections (dots), tracks (broad)"
+        )
     return _labelled(ax, "time [s]", f"{name} [{unit}]", columns=8)
 
 
@@ -448,7 +465,7 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     _shade(ax, t, d.shadowed.values[:, sender], "#303030")
     ax.set_ylim(-0.04, 1.14)
     ax.set_title(f"{d.observer.values} (shaded: the city hides {d.transmitter.values})")
-    return _labelled(ax, "time [s]", "symbol error rate", loc="center right")
+    return _labelled(ax, "time [s]", "symbol error rate", columns=3)
 
 
 def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
@@ -490,17 +507,62 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     return _labelled(ax, "time [s]", "path gain of the kind [dB]", columns=6)
 
 
-def _figure(
-    draw: Sequence[Callable[[Axes], Any]], height: float, columns: int = 1, width: float = 8.4
-) -> Figure:
-    """A figure of one axis for each of `draw`, row by row.
+@dataclass(frozen=True)
+class Style:
+    """How figures are drawn for a place.
+
+    Attributes
+    ----------
+    width : of a figure [inch]
+    columns : axes beside each other, at most
+    height : of a row over that on a screen
+    settings : of matplotlib, over `STYLE`
+    """
+
+    width: float
+    columns: int
+    height: float
+    settings: Mapping[str, Any]
+
+
+_PRINT = {
+    "font.family": "serif",
+    "axes.titlesize": 8,
+    "lines.linewidth": 1.0,
+    "pdf.fonttype": 42,
+    "savefig.dpi": 300,
+}
+STYLES = {
+    "screen": Style(8.4, 2, 1.0, {}),
+    "page": Style(7.16, 2, 0.8, _PRINT | {"font.size": 8, "legend.fontsize": 7}),
+    "column": Style(3.5, 1, 0.7, _PRINT | {"font.size": 7, "legend.fontsize": 5.5}),
+}
+"""For a screen, for both columns of a page of a journal, and for one."""
+FORMS = ("png", "svg", "pdf")
+
+
+class Drawing(NamedTuple):
+    """A figure to be: its name, what draws each axis, the height of a row [inch], and how many
+    axes stand beside each other."""
+
+    name: str
+    axes: Sequence[Callable[[Axes], Any]]
+    height: float
+    columns: int = 1
+
+
+def _figure(drawing: Drawing, style: Style) -> Figure:
+    """The figure, row by row.
 
     It is outside pyplot, so that none stays open. Margins are fixed in inches: a layout solver
     would draw everything twice.
     """
-    figure, rows = Figure(figsize=(width, height)), len(draw) // columns
+    columns = min(drawing.columns, style.columns)
+    rows = len(drawing.axes) // columns
+    width, height = style.width, drawing.height * style.height * rows
+    figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, columns, squeeze=False)
-    left, right, bottom, top, across, down = _MARGINS
+    left, right, bottom, top, across, down = np.multiply(_MARGINS, style.height**0.5)
     figure.subplots_adjust(
         left=left / width,
         right=1 - right / width,
@@ -509,63 +571,61 @@ def _figure(
         wspace=across / ((width - left - right - (columns - 1) * across) / columns),
         hspace=down / ((height - bottom - top - (rows - 1) * down) / rows),
     )
-    for ax, drawn in zip(axes.flat, draw, strict=True):
+    for ax, drawn in zip(axes.flat, drawing.axes, strict=True):
         drawn(ax)
     return figure
 
 
 def _maps(
     d: xr.Dataset, snapshot: int, name: str, function: Callable, height: float
-) -> Iterator[tuple[str, Figure]]:
+) -> Iterator[Drawing]:
     """Maps of the terminals that have one; where profiles were made directly the data were never
     in."""
     values = d["map_power" if function is range_doppler else "map_equivalent_range"][snapshot]
     shown = np.flatnonzero(np.isfinite(values.values).any(axis=(1, 2)))
     draw = [partial(function, dataset=d, snapshot=snapshot, observer=o) for o in shown]
     if draw:
-        yield f"{name}_{_moment(d, snapshot)[1]:04d}", _figure(draw, height * len(draw))
+        yield Drawing(f"{name}_{_moment(d, snapshot)[1]:04d}", draw, height)
 
 
-def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[tuple[str, Figure]]:
-    """Names and figures of a run, one after the other."""
+def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[Drawing]:
+    """The figures of a run."""
     observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
-    yield "scene", _figure([partial(scene_map, dataset=d, city=city)], 6.4)
+    yield Drawing("scene", [partial(scene_map, dataset=d, city=city)], 6.4)
     for s in sorted({0, kept // 2, kept - 1}) if kept else ():
         yield from _maps(d, s, "range_doppler", range_doppler, 4.1)
     if kept:  # every frame shows the same
         yield from _maps(d, kept // 2, "equivalent_range", equivalent_range, 3.2)
     for o in observers:
         of = ("range", "velocity", "azimuth")
-        figure = _figure([partial(over_time, dataset=d, observer=o, name=m) for m in of], 7.6)
-        label = str(d.observer.values[o])
-        figure.axes[0].set_title(
-            f"{label}: truth (line), detections (dots), tracks (broad); shaded where hidden"
+        label = str(d.observer.values[o]).replace("->", "_to_")
+        yield Drawing(
+            f"tracks_{label}", [partial(over_time, dataset=d, observer=o, name=m) for m in of], 2.53
         )
-        yield f"tracks_{label.replace('->', '_to_')}", figure
-    yield "errors", _figure([partial(error_cdf, dataset=d, name=m) for m in MEASURES], 7.0, 2)
+    yield Drawing("errors", [partial(error_cdf, dataset=d, name=m) for m in MEASURES], 3.5, 2)
     if d.sizes["path"]:
         draw = [
             partial(path_power, dataset=d, observer=o, against=against)
             for o in observers
             for against in ("delay", "doppler")
         ]
-        yield "paths", _figure(draw, 3.3 * len(observers), 2, 10.0)
+        yield Drawing("paths", draw, 3.3, 2)
     decoders = [o for o in observers if (d.symbol_total.values[:, o] > 0).any()]
     if decoders:
-        draw = [partial(decoding, dataset=d, observer=o) for o in decoders]
-        yield "decoding", _figure(draw, 2.8 * len(decoders))
+        yield Drawing("decoding", [partial(decoding, dataset=d, observer=o) for o in decoders], 2.8)
     counts = [partial(path_counts, dataset=d, observer=o) for o in observers]
-    draw = [partial(reference_snr, dataset=d), *counts]
-    yield "link", _figure(draw, 2.7 * len(draw))
+    yield Drawing("link", [partial(reference_snr, dataset=d), *counts], 2.7)
 
 
-def _written(figures: Iterable[tuple[str, Figure]], folder: str | Path) -> list[Path]:
-    """The figures as ``figures/*.png``; each is made when the one before is written."""
+def _written(
+    drawings: Iterable[Drawing], folder: Path, form: str = "png", style: str = "screen"
+) -> list[Path]:
+    """The figures as files; each is made when the one before is written."""
     written = []
-    with matplotlib.rc_context(STYLE):
-        for name, figure in figures:
-            file = Path(folder) / "figures" / f"{name}.png"
-            write_figure(file, figure)
+    with matplotlib.rc_context(STYLE | {**STYLES[style].settings, "svg.hashsalt": "isac_rt"}):
+        for drawing in drawings:
+            file = folder / f"{drawing.name}.{form}"
+            write_figure(file, _figure(drawing, STYLES[style]))
             written.append(file)
     return written
 
@@ -578,7 +638,17 @@ def make_figures(results: Results, folder: str | Path, city: CityMesh | None = N
     ------
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
-    return _written(_all(results.dataset, city), folder)
+    return _written(_all(results.dataset, city), Path(folder) / "figures")
+
+
+def redraw(results: Results, folder: Path, city: CityMesh, form: str, style: str) -> list[Path]:
+    """Write all figures of a run into a folder in one of `FORMS` and one of `STYLES`.
+
+    Raises
+    ------
+    isac_rt.storage.StorageError  If the folder cannot be written.
+    """
+    return _written(_all(results.dataset, city), folder, form, style)
 
 
 def sweep_curves(
@@ -634,10 +704,12 @@ def make_sweep_figures(
     dataset: xr.Dataset, figures: Iterable[tuple[str, str, str | None]], folder: str | Path
 ) -> list[Path]:
     """Write (quantity, against, by) figures of a sweep as ``figures/*.png`` under `folder`."""
-
-    def made() -> Iterator[tuple[str, Figure]]:
-        for quantity, against, by in figures:
-            draw = partial(sweep_curves, dataset=dataset, quantity=quantity, against=against, by=by)
-            yield "_".join(filter(None, (quantity, against, by))), _figure([draw], 4.4)
-
-    return _written(made(), folder)
+    drawings = (
+        Drawing(
+            "_".join(filter(None, (quantity, against, by))),
+            [partial(sweep_curves, dataset=dataset, quantity=quantity, against=against, by=by)],
+            4.4,
+        )
+        for quantity, against, by in figures
+    )
+    return _written(drawings, Path(folder) / "figures")

@@ -43,7 +43,8 @@ _CAPTIONS = {
     "tracks": (
         "Tracks against truth",
         "Seen from one terminal. Estimates are drawn at the UAV they were associated with after "
-        "the fact, by the path that caused them; the receiver does not know it.",
+        "the fact, by the path that caused them; the receiver does not know it. Shaded: hidden by "
+        "the city.",
     ),
     "errors": (
         "Errors",

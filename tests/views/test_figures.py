@@ -11,6 +11,8 @@ from fake_run import fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from isac_rt.cli.cli import main
+from isac_rt.results.files import save
 from isac_rt.results.records import KINDS
 from isac_rt.views.figures import (
     KIND_COLOURS,
@@ -160,3 +162,34 @@ def test_report_is_one_self_contained_page(run, written):
         assert text in page
     text = re.sub(r"base64,[^\"]+", "", page)
     assert not re.search(r"\b(nan|None|inf)\b", re.sub(r"(?s)<pre>.*</pre>", "", text))
+
+
+@pytest.mark.parametrize("form", ["svg", "pdf"])
+def test_figures_for_a_paper(run, tmp_path, form, capsys):
+    """Both columns or one, fonts of print, the same bytes twice: nothing of the clock is in them.
+    Planted bug: a PDF's date left in."""
+    save(run, tmp_path)
+    made = []
+    for where in ("a", "b"):
+        command = ["figures", str(tmp_path), "--as", form, "--style", "column"]
+        assert main([*command, "--out", str(tmp_path / where)]) == 0
+        made.append({file.name: file.read_bytes() for file in (tmp_path / where).iterdir()})
+    assert made[0] == made[1] and {f"errors.{form}", f"scene.{form}"} <= set(made[0])
+    if form == "svg":
+        assert b'width="252pt"' in made[0]["errors.svg"]  # 3.5 inches
+    assert main(["figures", str(tmp_path), "--style", "poster"]) == 2
+    assert "choose from screen, page, column" in capsys.readouterr().err
+
+
+def test_leakage_does_not_set_the_scale_of_a_map(run):
+    """An active terminal's leakage, 50 dB over everything else in its first cells, leaves the scale
+    as it was; a target as strong farther out does not. Planted bug: the peak of the whole map."""
+    d = run.dataset.copy(deep=True)
+    at = list(d.observer.values).index("AT")
+    before = range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()
+    power = d.map_power.values[0, at]
+    power[0, 0] = 1e5 * np.nanmax(power)
+    after = range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()
+    assert after == pytest.approx(before, abs=0.1)  # the median of the cells moves by one
+    power[np.isfinite(d.map_range.values[at]).sum() - 1, 0] = power[0, 0]
+    assert range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()[1] > before[1] + 10
