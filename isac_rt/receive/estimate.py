@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, cos_sin_double, floor, load, splat, store
 from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -32,6 +34,9 @@ STENCILS = 0.2, 0.08, 0.03
 """Half widths of the stencils on which a peak of the likelihood is fitted [cells, bins]."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
+TIE = 1e-9
+"""Share by which a direction must be stronger: both ends of the axis may be the same one."""
+T = TypeVar("T", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -76,112 +81,181 @@ class LocalSpectra:
         aliases only."""
         w, low = known.waveform, max(row - HALF_WIDTH, 0)
         self._sets = w.num_groups if separate else 1
-        self.waveform, self._first = w, low
+        self.waveform = w
         rows = spectra[:, :, low : row + HALF_WIDTH + 1]
         # the window begins at sample 0 and its transform is real about its middle: the turn from
         # row to row is taken out here
         turn = np.exp(
             2j * np.pi * (low + np.arange(rows.shape[2])) * (w.window_length / 2 / w.num_samples)
         )
-        self._data = np.ascontiguousarray(rows.transpose(0, 3, 2, 1) * turn[:, None]).reshape(
-            known.schedule.size, rows.shape[2], -1
-        )
-        self._weight = np.tile(slow_window(w).astype(np.float64), w.num_groups)
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
-        self._tx = np.ascontiguousarray((known.schedule + own).ravel())
-        self._time = known.times.ravel()
-        self._numbers = np.array(
-            [
-                w.carrier_frequency,
-                w.slope,
-                w.window_middle,
-                w.sampled_duration,
-                w.window_length,
-                w.num_samples,
-            ]
+        chirps, self._num_rx = known.schedule.size, rows.shape[1]
+        data = np.zeros((chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES))
+        _gather(rows, turn, data)
+        weight, time = np.zeros((2, chirps + -chirps % LANES))
+        weight.reshape(-1)[:chirps].reshape(w.num_groups, -1)[:] = slow_window(w)
+        time[:chirps] = known.times.ravel()
+        self._chirps = _Chirps(
+            data.ravel(),
+            data.shape[1],
+            data.shape[2],
+            weight,
+            time,
+            np.ascontiguousarray((known.schedule + own).ravel()),
+        )
+        self._axis = _Axis(
+            w.carrier_frequency,
+            w.slope,
+            w.window_middle,
+            w.sampled_duration,
+            w.window_length,
+            w.window_length / w.num_samples,
+            float(low),
         )
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
         amplitude; of separate groups the mean, each antenna turned into the phase that it has in
         the first one."""
-        sets = self._match(delay, delay_rate)[0]
+        sets = self._match(delay, delay_rate)
         turn = np.exp(-1j * np.angle((sets * sets[0].conj()).sum(axis=2, keepdims=True)))
         return (sets * turn).mean(axis=0)
 
-    def _match(self, delay: float, delay_rate: float) -> tuple[np.ndarray, np.ndarray]:
-        """Responses (sets, L_tx, L_rx) and the templates' energies (sets, L_tx, 1)."""
-        out = np.zeros((self._sets * self.waveform.num_tx, self._data.shape[2]), np.complex128)
-        energy = np.zeros(len(out))
-        _match(
-            self._data.view(np.float64),
-            self._weight,
-            self._tx,
-            self._time,
-            self._first,
-            self._numbers,
-            delay,
-            delay_rate,
-            out,
-            energy,
-        )
-        shape = self._sets, self.waveform.num_tx, -1
-        return out.reshape(shape), energy.reshape(shape)
+    def _match(self, delay: float, delay_rate: float) -> np.ndarray:
+        """Responses (sets, L_tx, L_rx)."""
+        out, energy = _match(self._chirps, self._axis, delay, delay_rate, self._antennas)
+        parts = out.reshape(self._antennas, -1, 2, LANES)
+        values = (parts[:, :, 0] + 1j * parts[:, :, 1]).reshape(self._antennas, -1)
+        values = values[:, : self._num_rx] / np.maximum(energy, 1e-30)[:, None]
+        return values.reshape(self._sets, self.waveform.num_tx, -1)
 
-    def power(self, delay: float, delay_rate: float) -> float:
-        """Energy that the template explains, summed over the virtual channels: what the estimate
+    @property
+    def _antennas(self) -> int:
+        """Transmit antennas, in every set anew."""
+        return self._sets * self.waveform.num_tx
+
+    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
+        """Energies (K,) that templates explain, summed over the virtual channels: what the estimate
         maximises. At the ends of the range axis part of a template lies outside, so that the
         amplitude alone would draw the estimate out."""
-        out, energy = self._match(delay, delay_rate)
-        return float(((out.real**2 + out.imag**2) * energy).sum())
+        return _powers(self._chirps, self._axis, delays, delay_rates, self._antennas)
+
+
+class _Chirps(NamedTuple):
+    """Samples of `rows` range rows, float64: of each chirp and row the real and imaginary parts of
+    `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
+    two filled up to a multiple of sixteen."""
+
+    data: np.ndarray
+    rows: int
+    blocks: int
+    weight: np.ndarray
+    time: np.ndarray
+    tx: np.ndarray
+
+
+class _Axis(NamedTuple):
+    """What a template depends on of the waveform, the window's cells to a range cell, and the first
+    row."""
+
+    carrier: float
+    slope: float
+    middle: float
+    duration: float
+    length: float
+    share: float
+    first: float
 
 
 @jit
-def _match(data, weight, tx, time, first, numbers, delay, delay_rate, out, energy):
-    """out[tx, rx] = sum of conj(template) * data over the energy[tx] of the
-    template: beat, phase and `hann_response` in one loop, which a test holds against them.
+def _gather(rows, turn, out):
+    """out[m P + p, i, :, :, :] = rows[m, :, i, p] turn[i]."""
+    groups, num_rx, count, num_chirps = rows.shape
+    for m in range(groups):
+        for r in range(num_rx):
+            for i in range(count):
+                for p in range(num_chirps):
+                    value, at = rows[m, r, i, p] * turn[i], m * num_chirps + p
+                    out[at, i, r // LANES, 0, r % LANES] = value.real
+                    out[at, i, r // LANES, 1, r % LANES] = value.imag
 
-    `data` alternates real and imaginary parts, and is turned so that the template's rows differ by
-    real factors.
-    """
-    carrier, slope, middle, duration, length, size = numbers
-    chirps, rows, width = data.shape
-    share = length / size
-    step_cos, step_sin = (
-        np.cos(np.pi * share * np.arange(rows)),
-        np.sin(np.pi * share * np.arange(rows)),
-    )
-    line = np.empty(width)
-    for i in range(chirps):
-        tau = delay + delay_rate * time[i]
+
+@jit
+def _template(chirps, axis, delay, delay_rate):
+    """Of a path every chirp's weighted cosine and sine (P,) and its rows' real factors (rows, P):
+    beat, phase and `hann_response`, which a test holds against them."""
+    carrier, slope, middle, duration, length, share, first = axis
+    size = chirps.time.size
+    near, cycles, cosines = np.empty(size), np.empty((2, size)), np.empty((2, size))
+    for i in range(size):
+        tau = delay + delay_rate * chirps.time[i]
         beat = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
         turns, chirp = carrier * tau, slope * tau * (middle - tau / 2)
-        cycles = 2 * np.pi * (turns - np.floor(turns) + chirp - np.floor(chirp))
-        near = (beat - first) * share
-        sine, cosine = np.sin(np.pi * near), np.cos(np.pi * near)
-        line[:] = 0.0
+        near[i] = (beat - first) * share
+        cycles[0, i] = turns - np.floor(turns) + chirp - np.floor(chirp)
+        cycles[1, i] = near[i] / 2
+    sines, shape = np.empty((2, size)), np.empty((chirps.rows, size))
+    for i in range(0, 2 * size, LANES):
+        angle = load(cycles.reshape(-1), i)
+        c, s = cos_sin_double(angle - floor(angle + splat(0.5)))
+        store(cosines.reshape(-1), i, c)
+        store(sines.reshape(-1), i, s)
+    for k in range(chirps.rows):
+        step_cos, step_sin = np.cos(np.pi * share * k), np.sin(np.pi * share * k)
+        for i in range(size):
+            d = near[i] - k * share
+            value = sines[1, i] * step_cos - cosines[1, i] * step_sin
+            under = np.pi * d * (1.0 - d * d)
+            regular = abs(under) > 1e-8
+            edge = 0.5 if abs(d) > 0.5 else 1.0
+            shape[k, i] = length / 2 * (value / under if regular else edge)
+    for i in range(size):
+        cosines[0, i] *= chirps.weight[i]
+        sines[0, i] *= chirps.weight[i]
+    return cosines[0], sines[0], shape
+
+
+@jit
+def _match(chirps, axis, delay, delay_rate, antennas):
+    """Of every transmit antenna the sum of conj(template) times data, as flat blocks of sixteen
+    real and imaginary parts, and the energy of the template."""
+    cosine, sine, shape = _template(chirps, axis, delay, delay_rate)
+    rows, blocks, flat = chirps.rows, chirps.blocks, chirps.data
+    line = 2 * LANES * blocks
+    out, energy = np.zeros(antennas * line), np.zeros(antennas)
+    for i in range(chirps.tx.size):
+        square = 0.0
         for k in range(rows):
-            d = near - k * share
-            if abs(abs(d) - 1.0) < 1e-6:
-                shape = length / 4
-            elif abs(d) < 1e-9:
-                shape = length / 2
-            else:
-                shape = (
-                    length
-                    / 2
-                    * (sine * step_cos[k] - cosine * step_sin[k])
-                    / (np.pi * d * (1.0 - d * d))
-                )
-            energy[tx[i]] += weight[i] * shape * shape
-            row = data[i, k]
-            for c in range(width):
-                line[c] += shape * row[c]
-        turn = weight[i] * complex(np.cos(cycles), -np.sin(cycles))
-        for c in range(width // 2):
-            out[tx[i], c] += turn * complex(line[2 * c], line[2 * c + 1])
-    for t in range(out.shape[0]):
-        out[t] /= max(energy[t], 1e-30)
+            square += shape[k, i] * shape[k, i]
+        energy[chirps.tx[i]] += chirps.weight[i] * square
+        c, s = splat(cosine[i]), splat(sine[i])
+        for b in range(blocks):
+            at = i * rows * line + 2 * LANES * b
+            re, im = splat(0.0), splat(0.0)
+            for k in range(rows):
+                factor = splat(shape[k, i])
+                re = re + factor * load(flat, at)
+                im = im + factor * load(flat, at + LANES)
+                at += line
+            to = chirps.tx[i] * line + 2 * LANES * b
+            store(out, to, load(out, to) + c * re + s * im)
+            store(out, to + LANES, load(out, to + LANES) + c * im - s * re)
+    return out, energy
+
+
+@jit
+def _powers(chirps, axis, delays, delay_rates, antennas):
+    """`LocalSpectra.powers`."""
+    total = np.zeros(delays.size)
+    for j in range(delays.size):
+        out, energy = _match(chirps, axis, delays[j], delay_rates[j], antennas)
+        line = out.size // antennas
+        for t in range(antennas):
+            square = 0.0
+            for c in range(t * line, (t + 1) * line):
+                square += out[c] * out[c]
+            total[j] += square / max(energy[t], 1e-30)
+    return total
 
 
 def start_point(
@@ -227,14 +301,13 @@ def refine(
     beat = delay / delay_unit + delay_rate / rate_unit * (w.sampled_duration / w.frame_duration)
     doppler = delay_rate / rate_unit
 
-    def split(b: float, d: float) -> tuple[float, float]:
+    def split(b: T, d: T) -> tuple[T, T]:
         return (b - d * (w.sampled_duration / w.frame_duration)) * delay_unit, d * rate_unit
 
+    down, across = np.arange(9) // 3 - 1, np.arange(9) % 3 - 1
     for step in steps:
-        at = np.array([-step, 0.0, step])
-        grid = np.log(
-            [[max(local.power(*split(beat + i, doppler + j)), 1e-300) for j in at] for i in at]
-        )
+        powers = local.powers(*split(beat + step * down, doppler + step * across))
+        grid = np.log(np.maximum(powers, 1e-300)).reshape(3, 3)
         gx, gy = (grid[2, 1] - grid[0, 1]) / (2 * step), (grid[1, 2] - grid[1, 0]) / (2 * step)
         hxx = (grid[2, 1] - 2 * grid[1, 1] + grid[0, 1]) / step**2
         hyy = (grid[1, 2] - 2 * grid[1, 1] + grid[1, 0]) / step**2
@@ -281,25 +354,51 @@ def direction_cosine(
     """
     a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
     limit = min(1.0, np.pi / (known.wavenumber * a.spacing))
-    values = channels[line.tx, line.rx].reshape(1 if echo else a.num_tx, -1).T
+    values = channels[line.tx, line.rx].reshape(1 if echo else a.num_tx, -1)
     # the receivers stand alike for every transmitter
-    apart = 1j * known.wavenumber * line.places[: len(values), axis]
-
-    def beam(u: np.ndarray) -> np.ndarray:
-        return (np.abs(np.exp(np.outer(u, apart)) @ values) ** 2).sum(axis=1)
-
+    apart = known.wavenumber * line.places[: values.shape[1], axis]
     count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
-    u = np.linspace(-limit, limit, count)
-    best = u[np.argmax(beam(u))]
-    for step in () if on_grid else ((u[1] - u[0]) / 2, (u[1] - u[0]) / 12, (u[1] - u[0]) / 60):
-        low, mid, high = np.log(np.maximum(beam(best + np.array([-step, 0.0, step])), 1e-300))
+    best = _strongest(values, apart, limit, count, not on_grid)
+    return best if abs(best) <= 1 else float("nan")
+
+
+@jit
+def _strongest(values, apart, limit, count, fine):
+    """Direction cosine of the most power, of `count` from -limit to `limit`, and `fine` about the
+    best of them by parabolas through the logarithm; `values` (T, L) of elements at `apart`
+    [rad]."""
+    step = 2 * limit / (count - 1)
+    turn, move = np.exp(-1j * limit * apart), np.exp(1j * step * apart)
+    best, most = -limit, -1.0
+    for i in range(count):
+        power = _beam(values, turn)
+        if power > most * (1 + TIE):
+            best, most = -limit + i * step, power
+        turn *= move
+    for part in (2.0, 12.0, 60.0):
+        if not fine:
+            break
+        near = step / part
+        low = np.log(max(_beam(values, np.exp(1j * (best - near) * apart)), 1e-300))
+        mid = np.log(max(_beam(values, np.exp(1j * best * apart)), 1e-300))
+        high = np.log(max(_beam(values, np.exp(1j * (best + near) * apart)), 1e-300))
         curve = low - 2 * mid + high
-        best += np.clip(
-            0.5 * (low - high) / curve * step if curve < 0 else step * np.sign(high - low),
-            -2 * step,
-            2 * step,
-        )
-    return float(best) if abs(best) <= 1 else float("nan")
+        up = 0.5 * (low - high) / curve * near if curve < 0 else near * np.sign(high - low)
+        best += min(max(up, -2 * near), 2 * near)
+    return best
+
+
+@jit
+def _beam(values, turn):
+    """Power of the rows of `values` (T, L), each turned by `turn` and added in phase."""
+    power = 0.0
+    for t in range(values.shape[0]):
+        re, im = 0.0, 0.0
+        for i in range(turn.size):
+            re += values[t, i].real * turn[i].real - values[t, i].imag * turn[i].imag
+            im += values[t, i].real * turn[i].imag + values[t, i].imag * turn[i].real
+        power += re * re + im * im
+    return power
 
 
 def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False) -> list[float]:

@@ -635,12 +635,12 @@ class Hill:
     def __init__(self, w: Waveform, top: tuple[float, float], bend: np.ndarray) -> None:
         self.waveform, self._top, self._bend = w, np.array(top), bend
 
-    def power(self, delay: float, delay_rate: float) -> float:
+    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
         w = self.waveform
-        doppler = delay_rate * w.effective_carrier * w.frame_duration
-        beat = (w.slope * delay + delay_rate * w.effective_carrier) * w.sampled_duration
-        off = np.array([beat, doppler]) - self._top
-        return float(np.exp(-off @ self._bend @ off / 2))
+        doppler = delay_rates * w.effective_carrier * w.frame_duration
+        beat = (w.slope * delays + delay_rates * w.effective_carrier) * w.sampled_duration
+        off = np.stack([beat, doppler], axis=-1) - self._top
+        return np.exp(-np.einsum("...i,ij,...j", off, self._bend, off) / 2)
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         return np.array([[delay, delay_rate]])
@@ -668,7 +668,7 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
         assert found.channels.tolist() == [[found.delay, found.delay_rate]]
     valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
     found = refine(valley, *start, steps=(0.2,))
-    assert valley.power(found.delay, found.delay_rate) > valley.power(*start)
+    assert valley.powers(found.delay, found.delay_rate) > valley.powers(*start)
     for far in ([4.3, -5.1], [-2.9, 3.7]):
         found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, steps=(0.2,))
         there = (

@@ -171,9 +171,10 @@ class BeamSpectra(LocalSpectra):
         super().__init__(spectra, known, row)
         self._beam = weights.conj()
 
-    def power(self, delay: float, delay_rate: float) -> float:
-        """Power of the beam: what the estimate maximises."""
-        return float(np.abs((self._beam * self.respond(delay, delay_rate)).sum()) ** 2)
+    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
+        """Powers (K,) of the beam: what the estimate maximises."""
+        heard = [self.respond(*at) for at in zip(delays, delay_rates, strict=True)]
+        return np.abs((self._beam * heard).sum(axis=(1, 2))) ** 2
 
 
 def beam_weights(known: Known, cosines: np.ndarray) -> np.ndarray:
