@@ -73,6 +73,7 @@ UNSEEN_BY_PATHS = (
     "receiver_preset",
     "receivers",
     "tracking",
+    "belief",
     "cooperation",
     "compare",
 )

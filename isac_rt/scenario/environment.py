@@ -4,11 +4,20 @@ a run has to come."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from isac_rt.scenario.node import Decibels, Fraction, Loss, Node, Positive, Problem, Vector
+from isac_rt.scenario.node import (
+    Decibels,
+    Finite,
+    Fraction,
+    Loss,
+    Node,
+    Positive,
+    Problem,
+    Vector,
+)
 
 
 class MaterialOverride(Node):
@@ -322,6 +331,40 @@ CLUTTER_KEYS: dict[str, frozenset[str]] = {
 }
 """Keys that each clutter model understands, beside model; the others may stand and are not written
 back."""
+
+
+def _four_numbers(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 4:
+        raise ValueError("must be four numbers [x_min, y_min, x_max, y_max]")
+    if value[0] >= value[2] or value[1] >= value[3]:
+        raise ValueError("holds nothing; state [x_min, y_min, x_max, y_max] in this order")
+    return value
+
+
+Rectangle = Annotated[tuple[Finite, Finite, Finite, Finite], BeforeValidator(_four_numbers)]
+
+
+class Belief(Node):
+    """What terminals believe wrongly of themselves and of the city, to see what it costs them. What
+    is sent, and what returns, is as it truly is."""
+
+    missing_m: tuple[Rectangle, ...] = ()
+    """Rectangles [x_min, y_min, x_max, y_max] on the ground whose buildings are missing in the
+    terminals' mesh [m]: all faces that lie wholly within one. By default none."""
+    position_m: Vector = (0.0, 0.0, 0.0)
+    """Error of the position that each terminal believes to be at: east, north, up [m]. By default
+    none."""
+    velocity_mps: Vector = (0.0, 0.0, 0.0)
+    """Error of the velocity that each terminal believes to have: east, north, up [m/s]. By default
+    none."""
+    attitude_deg: Vector = (0.0, 0.0, 0.0)
+    """Turn of the attitude that each terminal believes to have, about the axes east, north and up
+    [deg]. By default none."""
+    level_db: Decibels = 0.0
+    """Error of the clutter's level that active terminals expect [dB]. By default none."""
+    mesh_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """Standard deviation of the error of each face of the terminals' mesh along its normal [m], for
+    the clutter that they expect. By default none."""
 
 
 class Accuracy(Node):

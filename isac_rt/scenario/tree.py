@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from isac_rt.scenario.environment import Accuracy, City, Clutter, Propagation
+from isac_rt.scenario.environment import Accuracy, Belief, City, Clutter, Propagation
 from isac_rt.scenario.front_end import Elements, FrontEnd
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
@@ -76,6 +76,8 @@ class Scenario(Node):
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
     """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
+    belief: Belief = Belief()
+    """What terminals believe wrongly of themselves and of the city. By default nothing."""
     cooperation: Literal["none", "tracks"] = "none"
     """What terminals tell each other of what they see. `none`, the default: nothing. `tracks`:
     their confirmed tracks and their own position, an active terminal with its data, a passive one

@@ -46,7 +46,7 @@ class Cooperation:
         traffic = self._carry(frame, heard, symbols)
         for link, result in heard.items():
             self._see(frame, link, result)
-        poses = self._setup.swarm.poses(time)
+        poses = {n: self._setup.believed(p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
             notes.stand(time, of_itself(poses[name]))
         views = {
@@ -70,7 +70,7 @@ class Cooperation:
         """A terminal takes down the confirmed tracks of one of its links."""
         setup, tracks = self._setup, heard.tracks
         time = setup.timetable.epoch(frame, link.tx)
-        own = setup.swarm.trajectories[link.rx].pose(time)
+        own = setup.believed(setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
         if not link.own:
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from isac_rt.access import Clock, Connections, Network, establish
 from isac_rt.frame.antennas import Antennas, antennas_of
@@ -33,6 +34,7 @@ from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.document import ScenarioError
+from isac_rt.scenario.environment import Belief
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
@@ -50,7 +52,7 @@ from isac_rt.simulation.preflight import (
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
-from isac_rt.terminal.expectation import ClutterExpectation, make_expectation
+from isac_rt.terminal.expectation import ClutterExpectation, Mistakes, make_expectation
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
@@ -219,7 +221,20 @@ class Setup:
     @cached_property
     def walls(self) -> Walls:
         """The city as terminals hold births and tracks against it."""
-        return Walls(self.city)
+        return Walls(self.city.without(self.scenario.belief.missing_m))
+
+    def believed(self, pose: Pose) -> Pose:
+        """What a terminal believes of its pose."""
+        belief = self.scenario.belief
+        if belief == Belief():
+            return pose
+        turn = Rotation.from_rotvec(np.radians(belief.attitude_deg)).as_matrix()
+        return replace(
+            pose,
+            position=pose.position + np.array(belief.position_m),
+            velocity=pose.velocity + np.array(belief.velocity_mps),
+            rotation=turn @ pose.rotation,
+        )
 
     @cached_property
     def coverage(self) -> Coverage:
@@ -289,11 +304,13 @@ class Setup:
     def _expected_clutter(self, frame: int, active: list[str]) -> dict[str, ExpectedClutter]:
         if self.expectation is None:
             return {}
+        belief = self.scenario.belief
+        wrong = Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
         out = {}
         for name in active:
             when = self.timetable.epoch(frame, name)
-            pose = self.swarm.trajectories[name].pose(when)
-            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude)
+            pose = self.believed(self.swarm.trajectories[name].pose(when))
+            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude, wrong)
         return out
 
 
@@ -392,7 +409,14 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         timetable,
         Connections(),
         plan,
-        make_expectation(scenario.clutter, swarm, city, waveform, antennas, scenario.seed)
+        make_expectation(
+            scenario.clutter,
+            swarm,
+            city.without(scenario.belief.missing_m),
+            waveform,
+            antennas,
+            scenario.seed,
+        )
         if scenario.needs_mesh
         else None,
     )

@@ -84,7 +84,7 @@ class _Observer:
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
-        own = self.setup.swarm.trajectories[rx].pose(when)
+        own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
         state = int(TerminalState.TRACKING)
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)

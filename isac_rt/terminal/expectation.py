@@ -137,7 +137,9 @@ class MeshExpectation:
 class ClutterExpectation(Protocol):
     """What simulate needs of a terminal's copy of the mesh."""
 
-    def clutter(self, name: str, pose: Pose, time: float, amplitude: float) -> ExpectedClutter:
+    def clutter(
+        self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None
+    ) -> ExpectedClutter:
         """Clutter of the own link of a terminal at a pose, in world coordinates; amplitude is
         sqrt(transmit power) [sqrt(W)]."""
         ...

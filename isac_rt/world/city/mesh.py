@@ -161,7 +161,21 @@ class CityMesh:
         )
         if np.all(near):
             return self
-        faces, face_material = self.faces[near], self.face_material[near]
+        kept = self._of(np.asarray(near))
+        return replace(kept, num_beyond=self.num_beyond + int((~near).sum()))
+
+    def without(self, areas: Sequence[tuple[float, float, float, float]]) -> CityMesh:
+        """The city but for the faces that lie wholly within one of some rectangles (x_min, y_min,
+        x_max, y_max) in world coordinates [m]; this very city if there are none."""
+        if not len(areas):
+            return self
+        places = self.corners[..., :2] + self.origin[:2]
+        out = [((places > a[:2]) & (places < a[2:])).all(axis=(1, 2)) for a in map(np.array, areas)]
+        return self._of(~np.any(out, axis=0))
+
+    def _of(self, some: NDArray[np.bool_]) -> CityMesh:
+        """Some of the faces, with what they need."""
+        faces, face_material = self.faces[some], self.face_material[some]
         corners, numbers = np.unique(faces, return_inverse=True)
         materials, owner = np.unique(face_material, return_inverse=True)
         return replace(
@@ -170,7 +184,6 @@ class CityMesh:
             faces=numbers.reshape(-1, 3).astype(np.int32),
             face_material=owner.astype(np.int16),
             materials=tuple(self.materials[i] for i in materials),
-            num_beyond=self.num_beyond + int((~near).sum()),
         )
 
     def plain(self) -> dict[str, Any]:
