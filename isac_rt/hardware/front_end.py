@@ -7,7 +7,9 @@ from dataclasses import dataclass, fields
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.channels import Elements, elements_of
+from isac_rt.hardware.converter import Converter, converter_of, watts
 from isac_rt.hardware.oscillator import Oscillator, oscillator_of
+from isac_rt.hardware.sweep import Ramp, Response, ramp_of, response_of
 from isac_rt.scenario import front_end as scenario
 
 
@@ -19,11 +21,20 @@ class FrontEnd:
     ----------
     oscillator : its phase noise
     transmit, receive : errors of the elements
+    transmit_response, receive_response : gain over the chirp
+    ramp : errors of the chirp's frequency
+    converter : of the receiver
+    saturation : power at which the transmit amplifier saturates [W]
     """
 
     oscillator: Oscillator | None = None
     transmit: Elements | None = None
     receive: Elements | None = None
+    transmit_response: Response | None = None
+    receive_response: Response | None = None
+    ramp: Ramp | None = None
+    converter: Converter | None = None
+    saturation: float | None = None
 
     @property
     def ideal(self) -> bool:
@@ -62,4 +73,9 @@ def front_end_of(
         oscillator_of(node.oscillator, waveform.sampling_rate, seed, name),
         elements_of(node.transmit, antennas.tx_positions, wave, seed, name, "tx"),
         elements_of(node.receive, antennas.rx_positions, wave, seed, name, "rx"),
+        response_of(node.transmit_response, antennas.num_tx, seed, name, "tx"),
+        response_of(node.receive_response, antennas.num_rx, seed, name, "rx"),
+        ramp_of(node.ramp, waveform),
+        converter_of(node.converter),
+        None if node.saturation_dbm is None else watts(node.saturation_dbm),
     )

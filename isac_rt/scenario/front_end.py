@@ -122,6 +122,113 @@ class Elements(Node):
             yield "coupling", len(row)
 
 
+class Response(Node):
+    """Complex gain over the sampled part of the chirp, from its beginning to its end."""
+
+    table_db: tuple[Decibels, ...] = ()
+    """Gain at places evenly spread over the samples of a chirp, the first and the last among them
+    [dB]; straight lines between them. Empty, the default: 0."""
+    table_deg: tuple[Degrees, ...] = ()
+    """The same for the phase of the IF samples [degrees]."""
+    polynomial_db: tuple[Finite, ...] = ()
+    """Coefficients of a polynomial that adds to it [dB], the constant first, in a variable that
+    goes from -1 to 1 over the samples of a chirp. Empty, the default: 0."""
+    polynomial_deg: tuple[Finite, ...] = ()
+    """The same for the phase [degrees]."""
+    slope_std_db: Spread = 0.0
+    """Standard deviation of slopes that are drawn for each element [dB from the middle of the
+    chirp to its end]. By default all elements are alike."""
+    slope_std_deg: Spread = 0.0
+    """The same for phases [degrees]."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether it is 1 at all elements."""
+        return self == Response()
+
+    def problems(self) -> Iterator[Problem]:
+        for name in ("table_db", "table_deg"):
+            if len(getattr(self, name)) == 1:
+                yield Problem(((name,),), "one value is no table over the chirp; give two or more")
+        for name in ("polynomial_db", "polynomial_deg"):
+            if sum(map(abs, getattr(self, name))) > 3600:
+                said = "goes beyond 3600 at the ends, -1 and 1, of the chirp; give less"
+                yield Problem(((name,),), said)
+
+
+class Ramp(Node):
+    """How far the chirp's frequency is from a straight line: the error of the beat grows with the
+    delay."""
+
+    quadratic_hz: Finite = 0.0
+    """Frequency error at both ends of the chirp that grows with the square of the time from its
+    middle [Hz]. By default none."""
+    cubic_hz: Finite = 0.0
+    """Frequency error at the end of the chirp that grows with the cube of that time [Hz]. By
+    default none."""
+    ripple_hz: Finite = 0.0
+    """Swing of a sinusoidal frequency error [Hz]. By default none."""
+    ripple_period_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 10e-6
+    """Period of the ripple [s]. The default is that of a synthesiser's loop of 100 kHz."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the frequency is a straight line."""
+        return not (self.quadratic_hz or self.cubic_hz or self.ripple_hz)
+
+    def applies(self, name: str) -> bool:
+        return name != "ripple_period_s" or self.ripple_hz != 0
+
+
+class Converter(Node):
+    """What the receiver does behind its antennas: amplifier, mixer, converters, on signal and noise
+    alike."""
+
+    compression_dbm: Decibels | None = None
+    """Power at the receiver's input at which its gain is 1 dB lower [dBm]. null, the default: the
+    amplifier is linear."""
+    iq_gain_db: Annotated[float, Field(ge=-20, le=20, allow_inf_nan=False)] = 0.0
+    """Gain of the quadrature channel over the in-phase one [dB]. By default they are alike."""
+    iq_phase_deg: Annotated[float, Field(ge=-45, le=45, allow_inf_nan=False)] = 0.0
+    """How far the two are from a right angle [degrees]. By default none."""
+    dc_dbm: Decibels | None = None
+    """Power of a constant in the samples, as if it came in at the input [dBm]. null, the default:
+    none."""
+    real: bool = False
+    """Whether only the in-phase channel is sampled: every beat has an image at the sampling rate
+    less its own frequency, of the same level. Off by default."""
+    bits: Annotated[int, Field(ge=1, le=24)] | None = None
+    """Bits of each converter. null, the default: neither quantisation nor saturation."""
+    full_scale_dbm: Decibels | None = None
+    """Power at the input of a sine that just fills the converters [dBm]. null, the default: an
+    automatic gain sets it by `headroom_db` over the mean power of the strongest element in a chirp
+    before the frame's first."""
+    headroom_db: Annotated[float, Field(ge=-40, le=80, allow_inf_nan=False)] = 12.0
+    """Full scale of the automatic gain over that mean power [dB]. The default leaves room for four
+    equal waves."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether samples are kept as they come."""
+        return self == Converter()
+
+    def applies(self, name: str) -> bool:
+        if name == "headroom_db":
+            return self.bits is not None and self.full_scale_dbm is None
+        return name != "full_scale_dbm" or self.bits is not None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.full_scale_dbm is not None and self.bits is None:
+            said = "is the full scale of converters without bits; state bits, or leave it out"
+            yield Problem((("full_scale_dbm",), ("bits",)), said)
+
+    def powers(self) -> Iterator[str]:
+        """Keys that state a power at the input."""
+        for name in ("compression_dbm", "dc_dbm", "full_scale_dbm"):
+            if getattr(self, name) is not None:
+                yield name
+
+
 class FrontEnd(Node):
     """How far a terminal's hardware is from ideal. Each part is off by default and acts by
     itself."""
@@ -135,7 +242,28 @@ class FrontEnd(Node):
     receive: Elements = Elements()
     """Errors of the receive elements. None by default."""
 
+    transmit_response: Response = Response()
+    """Gain of what is sent over the chirp. By default it is flat."""
+    receive_response: Response = Response()
+    """Gain of what is received over the chirp. By default it is flat."""
+    ramp: Ramp = Ramp()
+    """Errors of the chirp's frequency. By default it is a straight line."""
+    converter: Converter = Converter()
+    """Amplifier, mixer and converters of the receiver. Ideal by default."""
+    saturation_dbm: Decibels | None = None
+    """Power at which the transmit amplifier saturates [dBm]; `noise.tx_power_dbm` is what it would
+    send if it did not. null, the default: it does not."""
+
     @property
     def ideal(self) -> bool:
         """Whether nothing departs from the ideal."""
-        return self.oscillator.ideal and self.transmit.ideal and self.receive.ideal
+        parts = (
+            self.oscillator,
+            self.transmit,
+            self.receive,
+            self.transmit_response,
+            self.receive_response,
+            self.ramp,
+            self.converter,
+        )
+        return self.saturation_dbm is None and all(part.ideal for part in parts)

@@ -386,6 +386,14 @@ class Scenario(Node):
         for key, one in stated.items():
             yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
             yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
+            powers: list[Key] = [("converter", name) for name in one.converter.powers()]
+            powers += [("saturation_dbm",)] if one.saturation_dbm is not None else []
+            if powers and self.noise.model == "snr":
+                said = (
+                    "states a power in dBm, which noise.model snr does not know; take link_budget, "
+                    "or leave it out"
+                )
+                yield Problem(((*key, *powers[0]), ("noise", "model")), said)
 
     @staticmethod
     def _element_problems(key: Key, elements: Elements, size: int) -> Iterator[Problem]:

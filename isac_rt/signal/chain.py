@@ -20,7 +20,7 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.noise import WhiteNoise, add_stream
+from isac_rt.signal.noise import add_stream
 
 
 @jit(fast=True)
@@ -91,57 +91,152 @@ def _turn_row(flat, at, plain, crossed):
         flat[at + i + 1] = im * plain[i + 1] + re * crossed[i + 1]
 
 
-class _Pass(NamedTuple):
-    """What one pass through the samples does.
+class Work(NamedTuple):
+    """What one pass through the samples does, in this order; arrays without rows: nothing.
 
     Attributes
     ----------
-    factors : (M P, 2 N) float32, complex factors of each chirp's samples, interleaved; (0, 0): none
+    reads, first, before : (T, 2 N) float32 weights with which samples are read at other places,
+        each twice; the first of the neighbours (`isac_rt.hardware.sweep.read_at`); factors as below
+        that bring their band to the middle first
+    factors : (M P, 2 N) float32, complex factors of each chirp's samples, interleaved
+    elements : (L_rx, 2 N) float32, the same of each element's
     power, key : of the noise per sample [W] (0: none), and its stream
+    saturation : power at which the amplifier saturates [W]
+    mixing : (7,) float32: I of I, I of Q, Q of I, Q of Q, the constant, the share of Q that is
+        kept (0 or 1), and whether any of these acts
+    step, most : of the converters [sqrt(W)], and half their number of steps; 0: none
     """
 
+    reads: np.ndarray
+    first: int
+    before: np.ndarray
     factors: np.ndarray
+    elements: np.ndarray
     power: float
     key: np.ndarray
+    saturation: float
+    mixing: np.ndarray
+    step: float
+    most: float
 
 
 @jit(fast=True)
-def _pass(flat, shape, job, room):
+def _spread_row(row, plain, crossed):
+    """Factors as `_turn_row` wants them."""
+    for n in range(row.shape[0] // 2):
+        plain[2 * n] = plain[2 * n + 1] = row[2 * n]
+        crossed[2 * n], crossed[2 * n + 1] = -row[2 * n + 1], row[2 * n + 1]
+
+
+@jit(fast=True)
+def _read_row(flat, at, reads, first, padded):
+    """Read one chirp's samples at other places; beyond its ends there are none."""
+    taps, size = reads.shape[0], reads.shape[1] // LANES * LANES
+    length = reads.shape[1]
+    margin = -2 * first
+    for i in range(length):
+        padded[margin + i] = flat[at + i]
+    weights = reads.reshape(-1)
+    for i in range(0, size, LANES):
+        total = splat(np.float32(0))
+        for tap in range(taps):
+            total = total + load(weights, tap * length + i) * load(padded, i + 2 * tap)
+        store(flat, at + i, total)
+    for i in range(size, length):
+        own = np.float32(0)
+        for tap in range(taps):
+            own += weights[tap * length + i] * padded[i + 2 * tap]
+        flat[at + i] = own
+
+
+@jit(fast=True)
+def _compress(own, saturation):
+    """Rapp's amplifier with p = 2."""
+    scale = np.float32(1.0 / saturation)
+    for n in range(own.shape[0] // 2):
+        re, im = own[2 * n], own[2 * n + 1]
+        z = (re * re + im * im) * scale
+        gain = np.float32(1) / np.sqrt(np.sqrt(np.float32(1) + z * z))
+        own[2 * n], own[2 * n + 1] = re * gain, im * gain
+
+
+@jit(fast=True)
+def _mix(own, mixing):
+    """Quadrature errors, constant, and Q kept or not."""
+    a, b, c, d, constant, kept = (
+        mixing[0],
+        mixing[1],
+        mixing[2],
+        mixing[3],
+        mixing[4],
+        mixing[5],
+    )
+    for n in range(own.shape[0] // 2):
+        re, im = own[2 * n], own[2 * n + 1]
+        own[2 * n] = a * re + b * im + constant
+        own[2 * n + 1] = kept * (c * re + d * im + constant)
+
+
+@jit(fast=True)
+def _quantise(own, step, most):
+    """The middle of each value's step, within `most` steps on both sides of zero."""
+    inverse, half, low = np.float32(1.0 / step), np.float32(0.5), np.float32(-most)
+    width, high = np.float32(step), np.float32(most - 1)
+    for i in range(own.shape[0]):
+        x = np.floor(own[i] * inverse)
+        x = low if x < low else x
+        x = high if x > high else x
+        own[i] = (x + half) * width
+
+
+@jit(fast=True)
+def _pass(flat, shape, work, room):
     """Do it chirp by chirp, while the chirp's samples lie in the first cache."""
     groups, elements, chirps, num_samples = shape
     size = 2 * num_samples
-    plain, crossed = room[0], room[1]
+    plain, crossed, padded = room[0], room[1], room[2 + 2 * elements]
+    for r in range(work.elements.shape[0]):
+        _spread_row(work.elements[r], room[2 + 2 * r], room[3 + 2 * r])
     for m in range(groups):
         for p in range(chirps):
-            turned = job.factors.shape[0] > 0
-            if turned:
-                row = job.factors[m * chirps + p]
-                for n in range(num_samples):
-                    plain[2 * n] = plain[2 * n + 1] = row[2 * n]
-                    crossed[2 * n], crossed[2 * n + 1] = -row[2 * n + 1], row[2 * n + 1]
+            if work.factors.shape[0]:
+                _spread_row(work.factors[m * chirps + p], plain, crossed)
+            if work.reads.shape[0]:
+                _spread_row(work.before[m * chirps + p], room[-2], room[-1])
             for r in range(elements):
                 at = size * ((m * elements + r) * chirps + p)
-                if turned:
-                    _turn_row(flat, at, plain, crossed)
-                if job.power > 0:
-                    own = flat[at : at + size]
-                    add_stream(
-                        own, np.float32(job.power), job.key[0], job.key[1], np.uint64(at // 2)
-                    )
+                own = flat[at : at + size]
+                if work.reads.shape[0]:
+                    _turn_row(flat, at, room[-2][:size], room[-1][:size])
+                    _read_row(flat, at, work.reads, work.first, padded)
+                if work.factors.shape[0]:
+                    _turn_row(flat, at, plain[:size], crossed[:size])
+                if work.elements.shape[0]:
+                    _turn_row(flat, at, room[2 + 2 * r][:size], room[3 + 2 * r][:size])
+                if work.power > 0:
+                    power = np.float32(work.power)
+                    add_stream(own, power, work.key[0], work.key[1], np.uint64(at // 2))
+                if work.saturation < np.inf:
+                    _compress(own, work.saturation)
+                if work.mixing[6] > 0:
+                    _mix(own, work.mixing)
+                if work.step > 0:
+                    _quantise(own, work.step, work.most)
+                    if work.mixing[5] == 0:
+                        own[1::2] = np.float32(0)
 
 
-def finish(samples: np.ndarray, factors: np.ndarray | None, noise: WhiteNoise) -> None:
-    """Do to samples (M, L_rx, P, N) complex64, in place, what hardware does behind antennas.
+def finish(samples: np.ndarray, work: Work) -> None:
+    """Do to samples (M, L_rx, P, N) complex64, in place, what hardware does behind antennas."""
+    size = 2 * samples.shape[3] + 4 * max(-work.first, 0) + LANES
+    room = np.zeros((5 + 2 * samples.shape[1], size), np.float32)
+    _pass(samples.reshape(-1).view(np.float32), samples.shape, work, room)
 
-    Parameters
-    ----------
-    factors : (M, P, N) complex64 by which the signal of every element is multiplied; None: none
-    noise : added next, the same as by `isac_rt.signal.noise.add_white_noise`
-    """
-    num_samples = samples.shape[3]
-    rows = np.zeros((0, 0), np.float32)
-    if factors is not None:
-        rows = factors.reshape(-1, num_samples).view(np.float32)
-    job = _Pass(rows, noise.power, np.asarray(noise.seed_words, np.uint32))
-    room = np.empty((2, 2 * num_samples), np.float32)
-    _pass(samples.reshape(-1).view(np.float32), samples.shape, job, room)
+
+def rows_of(factors: np.ndarray | None) -> np.ndarray:
+    """Complex factors (..., N) as rows for `Work`."""
+    if factors is None:
+        return np.zeros((0, 0), np.float32)
+    flat = np.ascontiguousarray(factors, np.complex64)
+    return flat.reshape(-1, factors.shape[-1]).view(np.float32)

@@ -25,9 +25,11 @@ import numpy as np
 
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.waveform import Waveform
-from isac_rt.hardware.front_end import Ends
+from isac_rt.hardware.converter import saturated
+from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
-from isac_rt.signal.chain import add_phases, finish, phasors
+from isac_rt.hardware.sweep import Ramp, read_at
+from isac_rt.signal.chain import Work, add_phases, finish, phasors, rows_of
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.if_signal import heard
 from isac_rt.signal.methods import Method
@@ -64,7 +66,7 @@ def received(
     tones = _with_elements(tones, waveform, links, receiver, ends, middle)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
     flicker = _Flicker.of(waveform, reference, ends, tones, delays)
-    factors = None
+    factors = _chirp_factors(waveform, tones, ends)
     if flicker is None:
         samples = method.samples(waveform, tones)
     else:
@@ -73,14 +75,126 @@ def received(
         samples = method.samples(waveform, rest)
         for k in alone:
             add_direct(samples, waveform, tones.select(np.array([k])), turn=flicker.apart(int(k)))
-        factors = phasors(flicker.common())
-    finish(samples, factors, noise)
+        turns = phasors(flicker.common())
+        factors = turns if factors is None else turns * factors
+    finish(samples, _work(waveform, tones, ends, factors, noise, samples))
     return IFCube(
         samples=samples,
         waveform=waveform,
         schedule=schedule,
         start_time=reference.start_time,
     )
+
+
+def _main(tones: Tones) -> int | None:
+    """The strongest path of the first link."""
+    of_first = np.flatnonzero(tones.link == 0)
+    return int(of_first[np.argmax(tones.power[of_first])]) if of_first.size else None
+
+
+def _lag(tones: Tones) -> np.ndarray:
+    """(M, P) how much later than the reference the chirps of the strongest path arrive [s]."""
+    main = _main(tones)
+    return np.zeros((1, 1)) if main is None else tones.delay[main] + tones.symbol_delay[0]
+
+
+def _chirp_factors(w: Waveform, tones: Tones, ends: Ends) -> np.ndarray | None:
+    """(M, P, N) complex64 or what broadcasts to it: gains over the chirp that all receive elements
+    share, and the difference of the two ramps; None: 1."""
+    sender = ends.senders[0] if ends.senders else IDEAL
+    out: np.ndarray | None = None
+    if sender.transmit_response is not None:
+        late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
+        most = max(int(late.max()), 0)
+        place = 2 * np.arange(-most, w.num_samples) / (w.num_samples - 1) - 1
+        table = sender.transmit_response.at(place).astype(np.complex64)
+        rows = np.lib.stride_tricks.sliding_window_view(table, w.num_samples, axis=1)
+        antenna = tones.antenna[0] if len(tones.antenna) else np.zeros((1, 1), np.int64)
+        out = rows[antenna, np.clip(most - late, 0, most)]
+    own = ends.receiver.receive_response
+    if own is not None and own.common:
+        gain = own.at(2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1)[0]
+        out = gain.astype(np.complex64) if out is None else out * gain.astype(np.complex64)
+    ramps = sender.ramp, ends.receiver.ramp
+    if any(ramps):
+        theirs, mine = (0.0 if r is None else r.cycles(w.fast_time) for r in ramps)
+        turn = np.exp(2j * np.pi * (mine - theirs + np.zeros(w.num_samples))).astype(np.complex64)
+        if sender.ramp is not None:
+            place = np.arange(w.num_samples) + _shift(w, tones, sender.ramp)
+            turn = turn * phasors(_band(w, tones)[..., None] * place)
+        out = turn if out is None else out * turn
+    if out is None:
+        return None
+    return np.broadcast_to(out, (w.num_groups, w.num_chirps, w.num_samples))
+
+
+def _shift(w: Waveform, tones: Tones, ramp: Ramp) -> np.ndarray:
+    """(N,) how many samples later than they are taken a transmitter's ramp has them."""
+    middle = w.fast_time - float(_lag(tones).mean()) / 2
+    return ramp.frequency(middle) / w.slope * w.sampling_rate
+
+
+_HEARD = 0.28
+"""Middle of the beats that receivers look at, without data, over the sampling rate."""
+
+
+def _band(w: Waveform, tones: Tones) -> np.ndarray:
+    """(M, P) middle of the beats in each chirp [cycles per sample]."""
+    data = tones.symbol_delay[0] if len(tones.symbol_delay) else np.zeros((1, 1))
+    return data * w.slope / w.sampling_rate + _HEARD
+
+
+def _work(
+    w: Waveform,
+    tones: Tones,
+    ends: Ends,
+    factors: np.ndarray | None,
+    noise: WhiteNoise,
+    samples: np.ndarray,
+) -> Work:
+    """What the pass through the `samples` has to do."""
+    first, reads, before = 0, np.zeros((0, 0), np.float32), rows_of(None)
+    ramp = ends.senders[0].ramp if ends.senders else None
+    if ramp is not None:
+        first, weights = read_at(_shift(w, tones, ramp))
+        reads = np.repeat(weights, 2, axis=1).astype(np.float32)
+        back = phasors(-_band(w, tones)[..., None] * np.arange(w.num_samples))
+        before = rows_of(np.broadcast_to(back, (w.num_groups, w.num_chirps, w.num_samples)))
+    elements, own = None, ends.receiver.receive_response
+    if own is not None and not own.common:
+        elements = own.at(2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1)
+    c = ends.receiver.converter
+    key = np.asarray(noise.seed_words, np.uint32)
+    work = Work(
+        reads,
+        first,
+        before,
+        rows_of(factors),
+        rows_of(elements),
+        float(noise.power),
+        key,
+        np.inf if c is None else c.saturation,
+        np.zeros(7, np.float32),
+        0.0,
+        0.0,
+    )
+    if c is None:
+        return work
+    acts = c.mixing != ((1.0, 0.0), (0.0, 1.0)) or c.constant != 0 or c.real
+    mixing = np.array([*c.mixing[0], *c.mixing[1], c.constant, not c.real, acts], np.float32)
+    work = work._replace(mixing=mixing)
+    if not c.bits:
+        return work
+    full = c.full_scale or c.headroom * _level(samples, work, w.num_chirps)
+    return work._replace(step=2 * full / 2**c.bits, most=2.0 ** (c.bits - 1))
+
+
+def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
+    """RMS of the strongest element in a chirp like the first of each group, noise included."""
+    trial = np.ascontiguousarray(samples[:, :, :1])
+    rows = [np.ascontiguousarray(rows[::num_chirps]) for rows in (work.before, work.factors)]
+    finish(trial, work._replace(before=rows[0], factors=rows[1]))
+    return float(np.sqrt((np.abs(trial) ** 2).mean(axis=(0, 2, 3)).max())) or 1.0
 
 
 def _with_elements(
@@ -97,6 +211,10 @@ def _with_elements(
             rx_delay=tones.rx_delay + own.delays(arrival),
             rx_gain=own.factors(arrival, at.rx_positions, at, frequency, middle),
         )
+    powers = [sent.amplitude**2 for sent, _ in links]
+    driven = [saturated(p, one.saturation) for p, one in zip(powers, ends.senders, strict=True)]
+    if set(driven) - {1.0}:
+        tones = tones._replace(send=tones.send * np.array(driven)[:, None, None])
     if all(one.transmit is None for one in ends.senders) or not tones.size:
         return tones
     delay, gain = tones.tx_delay.copy(), np.ones(tones.tx_delay.shape, complex)
@@ -155,10 +273,8 @@ class _Flicker:
     @property
     def main(self) -> float:
         """Delay of the strongest path of the first link [s]."""
-        of_first = np.flatnonzero(self.tones.link == 0)
-        if not of_first.size:
-            return 0.0
-        return float(self.delays[of_first[np.argmax(self.tones.power[of_first])]])
+        main = _main(self.tones)
+        return 0.0 if main is None else float(self.delays[main])
 
     def _cycles(self, parts: list[tuple[Record | None, float, float]]) -> np.ndarray:
         """(M, P, N) sum of phases: records, delays [s], signs."""

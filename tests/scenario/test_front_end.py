@@ -72,6 +72,32 @@ def test_elements_that_do_not_match_the_array_are_refused(elements, said):
         Scenario(swarm=SWARM | {"PT": SWARM["PT"] | {"front_end": elements}})
 
 
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"transmit_response": {"table_db": [1]}}, "one value is no table"),
+        ({"receive_response": {"polynomial_deg": [0, 1e4]}}, "goes beyond 3600"),
+        ({"receive_response": {"table_deg": [0, float("nan")]}}, "finite number"),
+        ({"ramp": {"ripple_period_s": 0}}, "greater than 0"),
+        ({"converter": {"bits": 0}}, "greater than or equal to 1"),
+        ({"converter": {"full_scale_dbm": -10}}, "converters without bits"),
+        ({"converter": {"iq_phase_deg": 60}}, "less than or equal to 45"),
+    ],
+)
+def test_sweeps_and_converters_that_are_none_are_refused(stated, said):
+    """Planted bug: a table of one value accepted."""
+    with pytest.raises(ValidationError, match=said):
+        FrontEnd(**stated)
+
+
+@pytest.mark.parametrize("stated", [{"converter": {"dc_dbm": -60}}, {"saturation_dbm": 10}])
+def test_powers_need_a_link_budget(stated):
+    """Planted bug: `noise.model == "link_budget"`."""
+    Scenario(swarm=SWARM, radio={"front_end": stated})
+    with pytest.raises(ValidationError, match=r"which noise\.model snr does not know"):
+        Scenario(swarm=SWARM, radio={"front_end": stated}, noise={"model": "snr"})
+
+
 def test_what_is_stated_is_written_and_read_again(tmp_path):
     """Planted bug: a tuple of points written as one list."""
     mask = {"oscillator": {"mask_dbc_hz": [[1e4, -80.0], [1e6, -100.5]], "locked": False}}

@@ -10,8 +10,10 @@ from test_ifsignal import SMALL, START, antennas, paths, pose, sender
 
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.hardware.channels import elements_of
+from isac_rt.hardware.converter import converter_of
 from isac_rt.hardware.front_end import IDEAL, Ends, FrontEnd
 from isac_rt.hardware.oscillator import Mask, Oscillator, spread
+from isac_rt.hardware.sweep import Ramp, response_of
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario import front_end as scenario
 from isac_rt.signal.gridded import ACCURATE
@@ -180,3 +182,81 @@ def test_one_path_by_hand():
     strong = np.abs(ideal[:, 0]) > 0.5 * np.abs(ideal).max()
     truth = np.broadcast_to(np.exp(2j * np.pi * 80e-12 * frequency), line.shape)
     assert np.abs(line - truth)[strong].max() < 0.02
+
+
+def ramped(links, ear, mine, theirs):
+    """The oracle of a bent ramp: each path by itself, turned by the phases of both chirps."""
+    out = 0.0
+    sent, found = links[0]
+    for k in range(len(found)):
+        one = found.select(np.array([k]))
+        alone = if_signal(W, [(sent, one)], ear, Reference(START), Exact()).samples
+        later = W.chirp_time[:, :, None] + W.fast_time - W.frame_duration / 2
+        data = sent.payload.delay_symbols[..., None] * W.delay_step
+        delay = found.delay[k] + found.delay_rate[k] * later + data
+        time = np.broadcast_to(W.fast_time, delay.shape)
+        cycles = mine.cycles(time) - theirs.cycles(time - delay)
+        out = out + alone * np.exp(2j * np.pi * cycles)[:, None]
+    return out
+
+
+@pytest.mark.parametrize("both_ways", [True, False], ids=["one ramp", "two"])
+def test_a_bent_ramp_against_the_phases_of_both_chirps(both_ways):
+    """Away from the ends of the chirp, where samples beyond it would be needed: what is
+    left is that tau/2 is that of one path and the mean symbol for all. Planted bugs: read earlier
+    in place of later; the band's middle without the data."""
+    links, ear = scene(6, seed=9, reach=0.5)
+    theirs = Ramp(1e6, 4e5, 3e5, 4e-6, W.chirp_duration)
+    mine = theirs if both_ways else Ramp(-4e4, 2e4, 0.0, 1e-5, W.chirp_duration)
+    ends = Ends(FrontEnd(ramp=mine), (FrontEnd(ramp=theirs),))
+    found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
+    truth, inner = ramped(links, ear, mine, theirs), slice(10, -10)
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    assert error(found[..., inner], truth[..., inner]) < 0.04
+    assert error(ideal[..., inner], truth[..., inner]) > 0.2
+
+
+def test_gains_over_the_chirp_follow_what_was_sent():
+    """A receiver that falls by 4 dB over the chirp and a transmitter that rises by 6 dB, of which
+    an echo shows what was sent its whole delay, data and all, earlier. Planted bugs: the data's
+    delay left out; the receiver's gain by element 0."""
+    links, ear = scene(1, seed=10)
+    rx = response_of(scenario.Response(polynomial_db=(0, -2), slope_std_db=1.0), 4, 3, "rx")
+    tx = response_of(scenario.Response(polynomial_db=(0, 3), slope_std_deg=30.0), 5, 3, "tx")
+    ends = Ends(FrontEnd(receive_response=rx), (FrontEnd(transmit_response=tx),))
+    found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    sent, path = links[0]
+    x = 2 * np.arange(W.num_samples) / (W.num_samples - 1) - 1
+    for m, p in np.ndindex(sent.schedule.shape):
+        late = path.delay[0] + sent.payload.delay_symbols[m, p] * W.delay_step
+        step = 2 * W.sampling_rate / (W.num_samples - 1)
+        gain = tx.at(x - late * step)[sent.schedule[m, p]] * rx.at(x)
+        strong = np.abs(ideal[m, :, p]) > 0.5 * np.abs(ideal).max()
+        # half a sample of 90 is 0.6 % of the slope over half the chirp: 6 dB and 30 degrees
+        np.testing.assert_allclose(
+            (found[m, :, p] / ideal[m, :, p])[strong], gain[strong], rtol=0.02
+        )
+
+
+def test_the_automatic_gain_fills_the_converter():
+    """A twelve-bit converter 12 dB over the mean power leaves noise of -62 dB of it: 6.02 b + 1.76
+    less 12 dB, of complex samples. With a leakage 40 dB over the echoes it is 22 dB under them.
+    Planted bug: the gain set by the sum of all elements."""
+    links, ear = scene(3, seed=11)
+    c = converter_of(scenario.Converter(bits=12))
+    ends = Ends(FrontEnd(converter=c), (IDEAL,))
+    found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    noise = np.mean(np.abs(found - ideal) ** 2)
+    level = np.mean(np.abs(ideal[:, :, 0]) ** 2, axis=(0, 2)).max()
+    assert 10 * np.log10(noise / level) == pytest.approx(-6.02 * 12 - 1.76 + 12, abs=0.2)
+
+
+def test_a_driven_amplifier_sends_less():
+    """At its saturation 1.5 dB less, in all that is received. Planted bug: once for each chirp."""
+    links, ear = scene(2, seed=12)
+    ends = Ends(IDEAL, (FrontEnd(saturation=links[0][0].amplitude ** 2),))
+    found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    np.testing.assert_allclose(found, ideal * 2**-0.25, rtol=1e-5, atol=1e-5)

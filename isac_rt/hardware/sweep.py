@@ -1,0 +1,135 @@
+r"""What changes over a chirp: the complex gain of the front ends, and the chirp's own frequency.
+
+A chirp whose frequency is e(u) off a straight line has the phase :math:`\epsilon = 2\pi\int e`
+more. A wave of delay tau, data and all, then has in the IF
+
+.. math::
+
+    \epsilon_{rx}(u) - \epsilon_{tx}(u - \tau) \approx \epsilon_{rx}(u) - \epsilon_{tx}(u)
+    + 2\pi\tau\, e_{tx}(u - \tau/2)
+
+of which the last term is that of an ideal chirp at the time :math:`u + e_{tx}(u -
+\tau/2)/\alpha`: the samples are read at other places. Left out: that tau/2 is taken of one path and
+the mean data symbol for all, which turns the others by :math:`\pi\tau\,\Delta\tau\,e'` (0.05 rad
+for 64 kHz of quadratic error and the longest delay), and third orders of tau.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isac_rt.frame.waveform import Waveform
+from isac_rt.randomness import generator
+from isac_rt.scenario import front_end as scenario
+
+
+@dataclass(frozen=True)
+class Response:
+    """Complex gain over the chirp of each element of an array.
+
+    Attributes
+    ----------
+    of : the stated table and polynomial
+    slopes : (L,) complex128, of the logarithm from the middle of the chirp to its end
+    """
+
+    of: scenario.Response
+    slopes: np.ndarray
+
+    @property
+    def common(self) -> bool:
+        """Whether all elements have the same."""
+        return not self.slopes.any()
+
+    def at(self, place: np.ndarray) -> np.ndarray:
+        """Gain of the elements at places from -1 to 1 over the samples: (L, ...) complex128. Beyond
+        the ends a table is held."""
+        o, x = self.of, np.asarray(place, float)
+        db, deg = np.zeros(x.shape), np.zeros(x.shape)
+        for total, table, polynomial in (
+            (db, o.table_db, o.polynomial_db),
+            (deg, o.table_deg, o.polynomial_deg),
+        ):
+            if table:
+                total += np.interp(x, np.linspace(-1, 1, len(table)), table)
+            if polynomial:
+                total += np.polynomial.polynomial.polyval(x, polynomial)
+        exponent = db * (np.log(10) / 20) + 1j * np.radians(deg)
+        return np.exp(exponent + np.multiply.outer(self.slopes, x))
+
+
+def response_of(o: scenario.Response, size: int, seed: int, *name: str) -> Response | None:
+    """The response that a scenario states of so many elements; None where it is flat."""
+    if o.ideal:
+        return None
+    rng = generator(seed, "response", *name)
+    db, deg = rng.normal(size=(2, size))
+    slopes = db * o.slope_std_db * (np.log(10) / 20) + 1j * np.radians(deg * o.slope_std_deg)
+    return Response(o, slopes)
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Errors of a chirp's frequency.
+
+    Attributes
+    ----------
+    quadratic, cubic : at the ends of the chirp [Hz]
+    ripple, period : swing [Hz] and period [s] of a sine from the start of the chirp on
+    duration : of the chirp [s]
+    """
+
+    quadratic: float
+    cubic: float
+    ripple: float
+    period: float
+    duration: float
+
+    def frequency(self, time: np.ndarray) -> np.ndarray:
+        """e at times since the start of the chirp [Hz]."""
+        x = 2 * time / self.duration - 1
+        wave = self.ripple * np.sin(2 * np.pi * time / self.period)
+        return self.quadratic * x**2 + self.cubic * x**3 + wave
+
+    def cycles(self, time: np.ndarray) -> np.ndarray:
+        """Its integral from the middle of the chirp on [cycles]."""
+        x, half = 2 * time / self.duration - 1, self.duration / 2
+        wave = np.cos(np.pi * self.duration / self.period) - np.cos(2 * np.pi * time / self.period)
+        wave = wave * self.ripple * self.period / (2 * np.pi)
+        return half * (self.quadratic * x**3 / 3 + self.cubic * x**4 / 4) + wave
+
+
+def ramp_of(o: scenario.Ramp, waveform: Waveform) -> Ramp | None:
+    """The errors that a scenario states; None where there are none."""
+    if o.ideal:
+        return None
+    parts = o.quadratic_hz, o.cubic_hz, o.ripple_hz, o.ripple_period_s
+    return Ramp(*parts, waveform.chirp_duration)
+
+
+REACH = 6
+"""Samples to each side from which one between them is made."""
+_SHAPE = 6.0  # Kaiser's beta
+
+
+def read_at(shift: np.ndarray) -> tuple[int, np.ndarray]:
+    """How samples are read at other places, for a band of two thirds of the sampling rate about
+    zero: Kaiser's window of `REACH` samples to each side.
+
+    Parameters
+    ----------
+    shift : (N,) of each sample [samples]
+
+    Returns
+    -------
+    first : of the neighbours, relative to the sample
+    weights : (T, N) float64 of the neighbours `first` .. `first` + T - 1
+    """
+    most = int(np.ceil(np.abs(shift).max(initial=0.0)))
+    first, count = -REACH - most, 2 * (REACH + most) + 1
+    apart = shift - np.arange(first, first + count)[:, None]
+    inside = np.clip(1 - (apart / (REACH + 0.5)) ** 2, 0, None)
+    window = np.where(inside > 0, np.i0(_SHAPE * np.sqrt(inside)) / np.i0(_SHAPE), 0.0)
+    return first, np.sinc(apart) * window
