@@ -162,6 +162,13 @@ def test_data_come_back_or_are_not_there(tmp_path):
         assert load_data(file, "key") is None
 
 
+@pytest.mark.parametrize("dtype", ["O", "<U1", "S4", "V8", "<M8[s]", "<m8[s]"])
+def test_arrays_are_of_numbers(dtype):
+    """Planted bug: any type that numpy makes of bytes."""
+    with pytest.raises(ValueError, match="an array of"):
+        unpack(f'{{"array": ["{dtype}", [1], "C", 0]}}', bytes(8))
+
+
 def test_an_array_larger_than_its_bytes_is_refused():
     with pytest.raises(ValueError, match="buffer"):
         unpack('{"array": ["<f8", [9000000000], "C", 0]}', bytes(16))

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isac_rt.capture.types import CaptureError
-from isac_rt.storage import read_whole
+from isac_rt.runtime import shortly
+from isac_rt.storage import BAD_DATA, read_whole
 
 Tree = dict[str, Any]
 """Names to arrays, and to the arrays of a struct by name."""
@@ -64,10 +65,10 @@ def read_mat(file: Path) -> Tree:
         if content[:8] == _HDF5 or content[512:520] == _HDF5:
             return _read_hdf5(content)
         return _Reader(content).tree()
-    except (ValueError, struct.error, zlib.error, OSError, KeyError, OverflowError) as problem:
+    except (OSError, MemoryError, struct.error, zlib.error, *BAD_DATA) as problem:
         raise CaptureError(
-            f"{file}: is no MATLAB file of version 5 or 7.3 that can be read ({problem}); save the "
-            "variables again with save -v7"
+            f"{file}: is no MATLAB file of version 5 or 7.3 that can be read ({shortly(problem)}); "
+            "save the variables again with save -v7"
         ) from None
 
 

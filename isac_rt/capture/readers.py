@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -193,9 +194,9 @@ def _joined(first: np.ndarray, second: np.ndarray, d: Description) -> np.ndarray
 def _numpy(file: Path, d: Description) -> Capture:
     try:
         array = np.load(io.BytesIO(_read(file)), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as problem:
+    except (OSError, EOFError, MemoryError, SyntaxError, TokenError, *BAD_DATA):
         raise CaptureError(
-            f"{file}: is no NumPy file of numbers ({problem}); save an array with numpy.save"
+            f"{file}: is no NumPy file of numbers; save an array with numpy.save"
         ) from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufc":
         raise CaptureError(f"{file}: holds no array of numbers; save one with numpy.save")
@@ -208,8 +209,8 @@ def _sigmf(file: Path, d: Description) -> Capture:
     try:
         info = json.loads(_read(meta))["global"]
         kind = str(info["core:datatype"])
-    except (ValueError, KeyError, TypeError) as problem:
-        raise CaptureError(f"{meta}: is no SigMF description ({problem})") from None
+    except BAD_DATA as problem:
+        raise CaptureError(f"{meta}: is no SigMF description ({shortly(problem)})") from None
     if "isac_rt:waveform" in info:
         return Capture(cube=read_sigmf(base), source={"file": file.name, "format": "sigmf"})
     if kind not in _SIGMF_TYPES:

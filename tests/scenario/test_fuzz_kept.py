@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import random
-import re
 import sqlite3
 import warnings
 from contextlib import closing
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from bending import bent
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_fuzz import JUNK, PROFILE, broken, one_message
@@ -54,13 +54,6 @@ swarm:
   P: {role: passive, position_m: [-1.9, 5.3, 50.7], boresight: [0, -1, 0], rcs: {model: constant}}
 """
 SWEEP = "scenario: s.yaml\nname: w\naxes: {snr: {key: noise.snr_db, values: [1, 9]}}\n"
-WORDS = (
-    *b'NaN -Infinity 1e999 null true [] {} "x" -1 0 1e9 9223372036854775808 0.5 [[1]]'.split(),
-    b"9" * 5000,
-    b"[" * 100_000,
-    b'{"array": ["<f8", [4294967296, 8], "C", 0]}',
-)
-"""What may stand in the place of a number of a text."""
 CURVE = [{"ser": [3, 40]}, {"ser": [0, 40]}]
 
 
@@ -135,38 +128,6 @@ def simulate_paths(setup):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Whole:
     return Whole(tmp_path_factory.mktemp("kept"))
-
-
-def bent(data: bytes, others: list[bytes], chance: random.Random) -> bytes:
-    """Cut, flipped, moved, doubled, overwritten, taken from another file, numbers replaced."""
-    out = bytearray(data)
-    for _ in range(chance.choice([1, 1, 1, 2, 4])):
-        a, b = sorted(chance.randrange(len(out) + 1) for _ in "ab")
-        match chance.randrange(10):
-            case 0:
-                out = out[:a]
-            case 1 | 2 | 3:
-                for _ in range(chance.choice([1, 1, 8, 64])):
-                    if out:
-                        out[chance.randrange(len(out))] ^= 1 << chance.randrange(8)
-            case 4:
-                c = chance.randint(b, len(out))
-                out = out[:a] + out[b:c] + out[a:b] + out[c:]
-            case 5:
-                out[a : chance.choice([a, b])] = out[a:b]
-            case 6:
-                out[a:b] = chance.choice([b"\0", b"\xff"]) * (b - a)
-            case 7:
-                other = chance.choice(others)
-                c, d = sorted(chance.randrange(len(other) + 1) for _ in "cd")
-                out[a:b] = other[c:d]
-            case 8:
-                out = bytearray(chance.choice(others))
-            case _:
-                if numbers := [*re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", bytes(out[:200_000]))]:
-                    found = chance.choice(numbers)
-                    out[found.start() : found.end()] = chance.choice(WORDS)
-    return bytes(out)
 
 
 def spoil(whole: Whole, name: str, chance: random.Random) -> Path:

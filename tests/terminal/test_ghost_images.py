@@ -166,9 +166,12 @@ def test_an_active_terminal_sees_three_echoes_and_an_image_in_each_wall():
 
 
 def test_a_wall_between_two_is_no_mirror():
-    """The end before the wall, the body behind it. Planted bug: either side taken."""
-    behind = image(BODY, "east")
-    assert echoes(behind - HERE, OWN, corner(north=(-25.0, -20.0))) == []
+    """The end before the wall, the body behind it; where it is half a metre behind, the line to its
+    image goes on to the wall. Planted bug: either side taken."""
+    close = BODY.copy()
+    close[0] = EAST + 0.5
+    for behind in (image(BODY, "east"), close):
+        assert echoes(behind - HERE, OWN, corner(north=(-25.0, -20.0))) == []
 
 
 def test_what_is_a_mirror():
