@@ -454,8 +454,8 @@ OF_CASES = {
     ),
     "each part of a board counts": Bug(
         "capture/calibrate.py",
-        "out = out * (1 + one.response_slope * off / one.half_sweep_hz)",
-        "out = out * (1 + 0 * one.response_slope * off / one.half_sweep_hz)",
+        "out = out * turn * (1 + one.response_slope * off / one.half_sweep_hz)",
+        "out = out * turn * (1 + 0 * one.response_slope * off / one.half_sweep_hz)",
     ),
     "people in a measured frame": Bug(
         "capture/readers.py",

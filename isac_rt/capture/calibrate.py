@@ -63,6 +63,8 @@ class Calibration:
     pair_gain, pair_delay : (L_rx, L_tx) what the best fit with the response has besides these in
         every pair of antennas; of the scene as well as of the board, so `apply` leaves it
     response_slope : complex, over half of the sampled sweep
+    response_delay : [s] that goes with it, so that the response as a whole delays nothing: to first
+        order an imaginary slope is a delay
     sweep : (3, `SWEEP_POINTS`) frequency [Hz], mean complex response of all channels, and its
         standard deviation; 1 at the middle
     carrier_hz, half_sweep_hz : middle and half width of the sampled sweep
@@ -90,9 +92,24 @@ class Calibration:
     pair_gain: np.ndarray
     pair_delay: np.ndarray
     response_slope: complex
+    response_delay: float
     sweep: np.ndarray
     carrier_hz: float
     half_sweep_hz: float
+
+    def check_size(self, num_rx: int, num_tx: int) -> None:
+        """Refuse samples of other antennas.
+
+        Raises
+        ------
+        CaptureError
+        """
+        known = self.rx_gain.size, self.tx_gain.size
+        if (num_rx, num_tx) != known:
+            raise CaptureError(
+                f"the calibration is of {known[0]} receivers and {known[1]} transmitters, the "
+                f"samples of {num_rx} and {num_tx}; calibrate this board"
+            )
 
 
 def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Calibration:
@@ -150,8 +167,9 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
         rx_delay_std=np.full(rx.size, scatter / np.sqrt(tx.size)),
         tx_delay_std=np.full(tx.size, scatter / np.sqrt(rx.size)),
         pair_gain=pair,
-        pair_delay=pair_late,
+        pair_delay=_centred(pair_late),
         response_slope=fit.slope,
+        response_delay=float(pair_late.mean()),
         sweep=_sweep(y, cells, w),
         carrier_hz=float(w.effective_carrier),
         half_sweep_hz=w.slope * w.sampled_duration / 2,
@@ -395,6 +413,8 @@ def _sweep(y: np.ndarray, cells: np.ndarray, w: Waveform) -> np.ndarray:
 
 PARTS = ("gains", "delays", "response", "pairs")
 """What a board does, by name."""
+ANTENNAS_AND_SWEEP = PARTS[:3]
+"""What of it belongs to the board whatever the scene is."""
 
 
 def apply(calibration: Calibration, capture: Capture) -> Capture:
@@ -406,7 +426,7 @@ def apply(calibration: Calibration, capture: Capture) -> Capture:
     CaptureError  If the board has other antennas.
     """
     cube = capture.cube
-    ideal = cube.samples / board(calibration, cube, PARTS[:3])
+    ideal = cube.samples / board(calibration, cube, ANTENNAS_AND_SWEEP)
     return replace(
         capture,
         cube=replace(cube, samples=ideal.astype(np.complex64)),
@@ -422,17 +442,11 @@ def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.nd
     CaptureError  If the board has other antennas.
     """
     w, senders, one = cube.waveform, cube.schedule, calibration
-    seen = cube.samples.shape[1], w.num_tx
-    known = one.rx_gain.size, one.tx_gain.size
-    if seen != known:
-        raise CaptureError(
-            f"the calibration is of {known[0]} receivers and {known[1]} transmitters, the samples "
-            f"of {seen[0]} and {seen[1]}; calibrate this board"
-        )
+    one.check_size(cube.samples.shape[1], w.num_tx)
     sweep = _places(w.num_samples) * w.slope / w.sampling_rate
     off = w.effective_carrier - one.carrier_hz + sweep
-    gain = np.ones(known, complex)
-    delay = np.zeros(known)
+    gain = np.ones((one.rx_gain.size, one.tx_gain.size), complex)
+    delay = np.zeros(gain.shape)
     if "gains" in parts:
         gain = gain * one.rx_gain[:, None] * one.tx_gain
     if "delays" in parts:
@@ -443,7 +457,8 @@ def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.nd
     level, late = by_chirp  # (M, L_rx, P, 1)
     out = level * np.exp(2j * np.pi * late * off)
     if "response" in parts:
-        out = out * (1 + one.response_slope * off / one.half_sweep_hz)
+        turn = np.exp(2j * np.pi * one.response_delay * off)
+        out = out * turn * (1 + one.response_slope * off / one.half_sweep_hz)
     return np.asarray(out)
 
 

@@ -96,16 +96,16 @@ def path_content(tree: Mapping[str, Any], city: str) -> str:
 
 
 def _without_front_end(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The hardware shows in the samples, not in the paths."""
-    return {key: value for key, value in node.items() if key != "front_end"}
+    """The hardware and its calibration show in the samples, not in the paths."""
+    return {key: value for key, value in node.items() if key not in ("front_end", "calibration")}
 
 
 def run_content(scenario: Scenario, snapshots: int) -> str:
     """All that the results of a run depend on, as text."""
-    costs = scenario.cost_model_path()
+    named = scenario.cost_model_path(), scenario.calibration_path()
     files = [
         city_digest(scenario.city, scenario.folder),
-        "" if costs is None else file_digest(costs),
+        *("" if file is None else file_digest(file) for file in named),
     ]
     return json.dumps(
         [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],

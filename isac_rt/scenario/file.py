@@ -71,6 +71,10 @@ def load(
     if costs is not None and not os.path.isfile(costs):
         said = f"no such file in {folder}; make one with isac-rt bench --fit {costs}"
         raise ScenarioError(document.complaint(Problem((("accuracy", "cost_model"),), said)))
+    board = scenario.calibration_path()
+    if board is not None and not os.path.isfile(board):
+        said = f"no such file in {folder}; make one with isac-rt calibrate --out {board}"
+        raise ScenarioError(document.complaint(Problem((("radio", "calibration"),), said)))
     for doubt in doubts(scenario):
         warnings.warn(document.complaint(doubt), ScenarioWarning, stacklevel=2)
     return scenario
@@ -128,7 +132,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     ----------
     scenario : Scenario
     folder : where the text will be saved, if not beside the original: `city.file` and
-        `accuracy.cost_model` are then written relative to it
+        `accuracy.cost_model` are then written relative to it, and `radio.calibration` too
 
     Returns
     -------
@@ -140,4 +144,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     costs = scenario.cost_model_path()
     if folder is not None and costs is not None:
         data["accuracy"]["cost_model"] = os.path.relpath(costs, folder)
+    board = scenario.calibration_path()
+    if folder is not None and board is not None:
+        data["radio"]["calibration"] = os.path.relpath(board, folder)
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)

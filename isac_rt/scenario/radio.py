@@ -137,6 +137,10 @@ class Radio(Node):
     front_end: FrontEnd = FrontEnd()
     """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. By
     default it is ideal."""
+    calibration: str | None = None
+    """File of a calibration that `isac-rt calibrate --out` wrote, relative to the scenario's
+    folder: what every receiver takes out of its samples before anything else. All terminals have a
+    board of this kind. null, the default: samples are taken as they are."""
     mode: Literal["isac", "fmcw"] = "isac"
     """What the chirps are for. `isac`, the default and the paper's, carries data to passive
     terminals; `fmcw` is a plain radar without data, which sees all range cells."""

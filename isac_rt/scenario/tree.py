@@ -105,8 +105,8 @@ class Scenario(Node):
 
     @property
     def folder(self) -> Path:
-        """Folder of the scenario file, to which `city.file` and `accuracy.cost_model` are relative;
-        the working folder for a tree made in Python."""
+        """Folder of the scenario file, to which `city.file`, `accuracy.cost_model` and
+        `radio.calibration` are relative; the working folder for a tree made in Python."""
         return self._folder
 
     def in_folder(self, folder: Path) -> Scenario:
@@ -131,6 +131,10 @@ class Scenario(Node):
         """The file of accuracy.cost_model, found from the scenario's folder; None for the costs
         that ship with the program."""
         return None if self.accuracy.cost_model is None else self.folder / self.accuracy.cost_model
+
+    def calibration_path(self) -> Path | None:
+        """The file of radio.calibration, found from the scenario's folder; None without one."""
+        return None if self.radio.calibration is None else self.folder / self.radio.calibration
 
     @property
     def num_tx(self) -> int:
@@ -371,6 +375,9 @@ class Scenario(Node):
             for name, uav in self.swarm.items()
             if uav.role != "target" and not self.front_end_of(name).ideal
         ]
+        if self.radio.calibration is not None and self.receivers.active_input == "profiles":
+            said = "profiles are made past the samples, which a calibration corrects; take samples"
+            yield Problem((("receivers", "active_input"), ("radio", "calibration")), said)
         if real and self.receivers.active_input == "profiles":
             said = (
                 f"profiles are made past the samples, in which the front end of {real[0]} shows; "

@@ -11,6 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isac_rt.access import Clock, Connections, Network, establish
+from isac_rt.capture.calibrate import (
+    ANTENNAS_AND_SWEEP,
+    Calibration,
+    board,
+    load_calibration,
+)
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
@@ -138,7 +144,7 @@ class Frame:
         the active terminal range profiles."""
         link, s = Link(*link), self._setup
         if not link.own or s.scenario.receivers.active_input == "samples":
-            return self.samples(link)
+            return s.calibrated(self.samples(link))
         return range_profiles(
             s.waveform,
             self._arriving(link),
@@ -217,6 +223,28 @@ class Setup:
             for name, uav in s.swarm.items()
             if uav.role != "target"
         }
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Of the terminals' boards, as `radio.calibration` names it.
+
+        Raises
+        ------
+        isac_rt.capture.types.CaptureError  If the file is none, or of another board.
+        """
+        file = self.scenario.calibration_path()
+        if file is None:
+            return None
+        found = load_calibration(file)
+        found.check_size(self.antennas.num_rx, self.antennas.num_tx)
+        return found
+
+    def calibrated(self, cube: IFCube) -> IFCube:
+        """Samples without what the calibration says of the board."""
+        if self.calibration is None:
+            return cube
+        ideal = cube.samples / board(self.calibration, cube, ANTENNAS_AND_SWEEP)
+        return replace(cube, samples=ideal.astype(np.complex64))
 
     @cached_property
     def walls(self) -> Walls:
@@ -420,6 +448,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         if scenario.needs_mesh
         else None,
     )
+    _ = setup.calibration  # a file that is none is refused here
     setup = _connected(setup)
     warn_of_unseen(setup.coverage)
     return replace(setup, seconds=Seconds.of_process() - begin)

@@ -252,6 +252,7 @@ def _ground(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> di
         "versions": json.dumps(versions()),
         "city": files(json.dumps(city), None) if city else "",
         "cost model": files("", (tree.get("accuracy") or {}).get("cost_model")),
+        "calibration": files("", (tree.get("radio") or {}).get("calibration")),
     }
 
 
@@ -312,7 +313,7 @@ def _digest(value: Any) -> str:
 
 
 def _files_digest(folder: Path, city: str, costs: str | None) -> str:
-    """Digest of the files of a city, as JSON, or of a cost model; "" where one is missing: the
+    """Digest of the files of a city, as JSON, or of another file; "" where one is missing: the
     point's own check says so."""
     try:
         if city:
