@@ -137,8 +137,8 @@ def test_the_program_is_every_source_and_table(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["house.obj", "costs.json", "board.cal"])
 def test_keys_hold_the_files_that_a_scenario_names(folder, name):
-    """Paths and studies do not depend on the costs of synthesis and on the board. Planted bug: the digest kept from
-    the last look."""
+    """Paths and studies do not depend on the costs of synthesis and on the board. Planted bug:
+    the digest kept from the last look."""
     before = keys(folder)
     text = (folder / name).read_text()
     (folder / name).write_text(text.replace("v 1 0", "v 2 0") + " ")
