@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from isac_rt.capture.store import load_cube, save_cube
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
@@ -109,3 +110,13 @@ def test_what_stands_still_goes_with_all_codes():
     # the mean over the chirps takes a little of the moving echo too: 39 dB less of it at rest
     assert (notched.detections.snr[1:] < 1e-3 * notched.detections.snr[0]).all()
     assert notched.detections.velocity[0] == pytest.approx(VELOCITY, abs=0.05)
+
+
+def test_a_cube_of_a_plain_radar_is_kept(tmp_path):
+    """With its timing and its codes; bug: a sweep that comes back as a list."""
+    w = waveform("ddm", 4)
+    cube = by_formula(w, Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5 * w.wavelength))
+    save_cube(cube, tmp_path / "cube.nc")
+    again = load_cube(tmp_path / "cube.nc")
+    assert again.waveform == w and (again.samples == cube.samples).all()
+    assert hash(again.waveform) == hash(w)
