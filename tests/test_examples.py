@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from isac_rt.scenario.file import load
+from isac_rt.simulation.simulate import run
+
 PACKAGE = Path(__file__).parents[1] / "isac_rt"
 NAMES = sorted(
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
@@ -27,3 +30,12 @@ def test_examples_show_what_they_say(name, monkeypatch):
 
 def test_there_are_examples():
     assert "isac_rt.frame.link" in NAMES
+
+
+def test_the_own_sensor_of_the_docs_sees_its_targets():
+    """scenes/fmcw_sensor.yaml as docs/radar.md has it, without its clutter."""
+    scene = PACKAGE.parent / "scenes" / "fmcw_sensor.yaml"
+    scenario = load(scene, ["clutter.model=none", "noise.noise_figure_db=8"], frames=4)
+    radar = run(scenario, threads=1).summary["terminals"]["radar"]
+    assert radar["ser_dpsk"] is None and radar["hit_rate"] >= 0.75
+    assert radar["rmse"]["range_m"] < 0.1 and radar["rmse"]["velocity_mps"] < 0.1

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.scenario.radio import Array
+from isac_rt.scenario.radio import Array, Elements
 
 PatternModel = Literal["isotropic", "sector", "cosine"]
 Places = tuple[tuple[float, float], ...]
@@ -162,12 +162,20 @@ class Antennas:
         element: the sums of both ends' places."""
         return (self.tx_positions[:, None] + self.rx_positions[None]).reshape(-1, 3)
 
+    def step(self, passes: int) -> float:
+        """Least distance [m] along X between the channels of an echo (passes = 2) or the receive
+        elements, beyond whose half wavelengths directions are ambiguous; 0 where there is none."""
+        if self.is_l:
+            return self.spacing
+        places = self.virtual_positions if passes == 2 else self.rx_positions
+        apart = np.diff(np.sort(places[:, 0]))
+        apart = apart[apart > SAME_PLACE_M]
+        return float(apart.min()) if apart.size else 0.0
+
     def observes(self, passes: int) -> tuple[bool, bool]:
         """Whether directions along X and along Z can be told at all: the channels of an echo
         (passes = 2), or the receive elements for one pass, do not all stand at one place there."""
-        places = self.virtual_positions if passes == 2 else self.rx_positions
-        span = np.ptp(places, axis=0)
-        return bool(span[0] > SAME_PLACE_M), bool(span[2] > SAME_PLACE_M)
+        return _observes(self, passes)
 
     @property
     def view_limit(self) -> float:
@@ -194,9 +202,32 @@ class Antennas:
         return self.gain * np.where(forward > 0, forward**exponent, 0.0)
 
 
+@lru_cache(maxsize=64)
+def _observes(antennas: Antennas, passes: int) -> tuple[bool, bool]:
+    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    span = np.ptp(places, axis=0)
+    return bool(span[0] > SAME_PLACE_M), bool(span[2] > SAME_PLACE_M)
+
+
+def _places_of(elements: Elements | None, waveform: Waveform, cascade: int) -> Places | None:
+    """Elements that a scenario states; `cascade`: 0 for sending, 1 for receiving."""
+    if elements is None:
+        return None
+    if elements.shape == "ti_cascade":
+        return ti_cascade()[cascade]
+    unit = waveform.wavelength if elements.unit == "wavelengths" else 1.0
+    if elements.shape == "positions":
+        return tuple((unit * x, unit * z) for x, z in elements.positions or ())
+    rows = elements.rows if elements.shape == "planar" else 1
+    d_x, d_z = (unit * d for d in elements.spacing)
+    return tuple((d_x * i, d_z * k) for k in range(rows) for i in range(elements.columns))
+
+
 def antennas_of(a: Array, waveform: Waveform) -> Antennas:
     """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
     return Antennas(
+        tx_places=_places_of(a.tx, waveform, 0),
+        rx_places=_places_of(a.rx, waveform, 1),
         tx_x=a.tx_x,
         tx_z=a.tx_z,
         rx_x=a.rx_x,

@@ -24,6 +24,7 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, cos_sin_double, floor, load, splat, store
+from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -353,6 +354,8 @@ def direction_cosine(
     ambiguous.
     """
     a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
+    if not a.observes(known.passes)[axis // 2]:
+        return float("nan")
     limit = min(1.0, np.pi / (known.wavenumber * a.spacing))
     values = channels[line.tx, line.rx].reshape(1 if echo else a.num_tx, -1)
     # the receivers stand alike for every transmitter
@@ -409,18 +412,32 @@ def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False
     estimated range; behind a reflector on the way to a PT the true radius is shorter.
     """
     channels = estimate.channels
-    u = [direction_cosine(channels, known, axis, on_grid=on_grid) for axis in (0, 2)]
+    u = _cosines(channels, known, on_grid=on_grid)
     radius = estimate.delay * SPEED_OF_LIGHT / known.passes
-    if not np.all(np.isfinite(u)) or u[0] ** 2 + u[1] ** 2 > 1 or radius <= 0:
+    flat_u = in_plane(u, known)
+    if not np.all(np.isfinite(flat_u)) or flat_u[0] ** 2 + flat_u[1] ** 2 > 1 or radius <= 0:
         return u
-    towards = unit_vector(u)
+    towards = unit_vector(flat_u)
     scale = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
     tx, rx = (
         scale * ((r**2).sum(1) - (r @ towards) ** 2)
         for r in (known.antennas.tx_positions, known.antennas.rx_positions)
     )
     flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
-    return [direction_cosine(flat, known, axis, on_grid=on_grid) for axis in (0, 2)]
+    return _cosines(flat, known, on_grid=on_grid)
+
+
+def _cosines(channels: np.ndarray, known: Known, *, on_grid: bool) -> list[float]:
+    """u_x and u_z of plane waves: by the arms of an L one by one, or by all channels."""
+    if not known.antennas.is_l:
+        return planar.cosines(channels, known, on_grid=on_grid)
+    return [direction_cosine(channels, known, axis, on_grid=on_grid) for axis in (0, 2)]
+
+
+def in_plane(u: Sequence[float], known: Known) -> list[float]:
+    """Direction cosines with 0 on an axis that the array does not observe."""
+    seen = known.antennas.observes(known.passes)
+    return [value if observed else 0.0 for value, observed in zip(u, seen, strict=True)]
 
 
 def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Known) -> float:
@@ -430,7 +447,7 @@ def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Kn
     A wave has one amplitude at the active terminal and one for each transmit antenna at a passive
     one. What is left comes from other paths in the cell.
     """
-    u = np.asarray(direction, float)
+    u = np.asarray(in_plane(direction, known), float)
     if not np.isfinite(u).all() or (u**2).sum() > 1:
         return 0.0
     a, radius = known.antennas, known.radius(estimate.delay)
@@ -450,7 +467,8 @@ def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Kn
 
 
 def standard_deviations(snr: float, excess: float, known: Known) -> np.ndarray:
-    """Standard deviations of range, velocity, u_x, u_z of a path.
+    """Standard deviations of range, velocity, u_x, u_z of a path; infinite on an axis that the
+    array does not observe.
 
     Cramer-Rao of a tone, with Hann's loss of 2 on the two windowed axes, and never below the floors
     at which other paths' sidelobes usually end the gain. Other paths in the cell count twice: as
@@ -469,7 +487,13 @@ def standard_deviations(snr: float, excess: float, known: Known) -> np.ndarray:
         np.hypot(max(tone, 4e-3), pull) * w.velocity_cell(known.passes),
     ]
     angles = []
-    for axis in (0, 2):
+    if not known.antennas.is_l:
+        variance = np.diag(planar.direction_covariance(max(total, 1.0), known))
+        return np.array([*spread, *np.maximum(np.sqrt(variance), 2e-4)])
+    for axis, observed in zip((0, 2), known.antennas.observes(known.passes), strict=True):
+        if not observed:
+            angles.append(np.inf)
+            continue
         place = arm(known.antennas, axis, known.passes).places[:, axis]
         slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
         share = place.size / known.channels

@@ -57,7 +57,8 @@ class Detections:
     direction : (Q, 2) direction cosines (u_x, u_z) of arrival in the receiver's body frame; NaN
         where it was not found
     snr : (Q,) linear, of the range-Doppler cell after accumulation over antennas
-    std : (Q, 4) standard deviations of range, velocity, u_x, u_z
+    std : (Q, 4) standard deviations of range, velocity, u_x, u_z; infinite on an axis that the
+        array does not observe
     is_reference : (Q,) bool, the line of sight at a PT
     starts : (Q,) bool, whether it may start a track; the others only carry on one. By default all
 

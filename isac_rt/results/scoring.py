@@ -67,6 +67,7 @@ class Scorer:
         self.link, self._antennas, self._swarm, self._timetable = link, antennas, swarm, timetable
         self._passes = 2 if link[0] == link[1] else 1
         self._resolution = resolutions(timetable.waveform, antennas, self._passes)
+        self._observed = antennas.observes(self._passes)
         self._receivers = receivers
         self._labels: dict[int, list[int]] = {}
         self._followed: dict[int, int] = {}
@@ -118,8 +119,8 @@ class Scorer:
             reception=reception,
             paths=paths,
             truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
-            detected=_estimates(len(hit), _points(reception.detections), best),
-            tracked=_estimates(len(hit), _points(tracks), followed),
+            detected=_estimates(len(hit), _points(reception.detections), best, self._observed),
+            tracked=_estimates(len(hit), _points(tracks), followed, self._observed),
             in_view=view.inside,
             shadowed=view.inside & ~view.direct,
             tracks=table,
@@ -192,8 +193,9 @@ class Scorer:
 
     def _off(self, truth: Truth, points: np.ndarray) -> np.ndarray:
         """(Q,) largest distance on any axis in resolutions; a direction that was not found counts
-        as `GATE_RESOLUTIONS`."""
+        as `GATE_RESOLUTIONS`, one that is not observed not at all."""
         off = np.abs(points - np.array(truth[:4])) / self._resolution
+        off[:, 2:][:, np.logical_not(self._observed)] = 0.0
         return np.where(np.isnan(off), GATE_RESOLUTIONS, off).max(axis=1)
 
     def _found(
@@ -321,10 +323,16 @@ def _values(rows: list[np.ndarray | None]) -> UavValues:
     )
 
 
-def _estimates(count: int, points: np.ndarray, of_uav: dict[int, int]) -> UavValues:
-    """Estimates by UAV; direction cosines become azimuth and elevation of the front half-space."""
+def _estimates(
+    count: int, points: np.ndarray, of_uav: dict[int, int], observed: tuple[bool, bool]
+) -> UavValues:
+    """Estimates by UAV; direction cosines become azimuth and elevation of the front half-space.
+
+    On an axis that is not observed the angle is NaN, and the other is that in the array's plane.
+    """
     rows: list[np.ndarray | None] = [None] * count
     for i, j in of_uav.items():
         r, v, u_x, u_z = points[j]
-        rows[i] = np.array([r, v, *azimuth_elevation([u_x, u_z])])
+        u = np.where(observed, [u_x, u_z], 0.0)
+        rows[i] = np.array([r, v, *np.where(observed, azimuth_elevation(u), np.nan)])
     return _values(rows)

@@ -14,6 +14,7 @@ import yaml
 from isac_rt.scenario.document import TAG, Document, Loader, ScenarioError
 from isac_rt.scenario.doubts import doubts
 from isac_rt.scenario.node import Node, Problem
+from isac_rt.scenario.tables import TableError, with_tables
 from isac_rt.scenario.tree import Scenario
 
 
@@ -63,6 +64,10 @@ def load(
             document.data[name] = value
             document.places[(name,)] = f"--{name} {value}"
     folder = document.path.parent
+    try:
+        document.data = with_tables(document.data, folder)
+    except TableError as problem:
+        raise ScenarioError(document.complaint(Problem((problem.key,), str(problem)))) from None
     scenario = document.check(Scenario).in_folder(folder)
     city, costs = scenario.city, scenario.cost_model_path()
     if city is not None and city.file is not None and not os.path.isfile(scenario.city_path()):

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, model_validator
 
 from isac_rt.scenario.front_end import FrontEnd
-from isac_rt.scenario.node import Decibels, Node, Positive, Problem
+from isac_rt.scenario.node import Decibels, Finite, Node, Positive, Problem
 
 
 class ChirpTimes(NamedTuple):
@@ -74,6 +74,10 @@ STATED_SHARE = 1e-2
 """A bandwidth or a duration that is stated twice may differ by this share."""
 
 
+SKIRT_SHARE = 0.02
+"""Width of the IF filter's skirts over the sampling rate, where a data sheet states none."""
+
+
 class Chirp(Node):
     """Timing of a plain FMCW chirp as a data sheet states it."""
 
@@ -133,7 +137,7 @@ class Radio(Node):
     filter_transition_hz: Positive = 0.4e6
     """Width of the IF filter's skirts on each side of its passband, which reaches from zero to the
     sampling rate [Hz]. Wider skirts let in more of the neighbouring resource blocks. The default is
-    2 % of the default sampling rate; the paper names none."""
+    2 % of the default sampling rate, or of a data sheet's; the paper names none."""
     front_end: FrontEnd = FrontEnd()
     """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. By
     default it is ideal."""
@@ -179,6 +183,8 @@ class Radio(Node):
         default = cls.model_fields
         size = out.get("samples_per_chirp", default["samples_per_chirp"].default)
         rate = out.get("sampling_rate_hz", default["sampling_rate_hz"].default)
+        if type(rate) in (int, float) and 0 < rate < 1e12:
+            out.setdefault("filter_transition_hz", SKIRT_SHARE * rate)
         if type(size) is int and type(rate) in (int, float) and rate > 0:
             last = numbers.get("adc_start_us", 0.0) + size / rate * 1e6
             ramp = numbers.get("ramp_end_us", last)
@@ -319,6 +325,71 @@ class Radio(Node):
             )
 
 
+MAX_ELEMENTS = 1024
+
+
+class Elements(Node):
+    """The elements of one array in its plane, X to the right and Z upwards, in place of an L."""
+
+    shape: Literal["positions", "linear", "planar", "ti_cascade"] = "positions"
+    """How the elements stand. `positions`, the default: one by one, as `positions` or `file` say.
+    `linear`: `columns` elements in a row along X. `planar`: `columns` times `rows`. `ti_cascade`:
+    those of TI's 4-chip cascade board, 12 for sending and 16 for receiving."""
+    positions: (
+        Annotated[tuple[tuple[Finite, Finite], ...], Field(max_length=MAX_ELEMENTS)] | None
+    ) = None
+    """Place (x, z) of each element from any origin, in the order of the channels, for `shape:
+    positions`."""
+    file: str | None = None
+    """CSV file with the columns x and z and a row for each element, in place of `positions`; the
+    path is relative to the scenario's folder. null, the default: none."""
+    columns: Annotated[int, Field(ge=1, le=64)] = 4
+    """Elements along X, for `linear` and `planar`. The default is what most radar chips receive
+    with."""
+    rows: Annotated[int, Field(ge=1, le=64)] = 1
+    """Elements along Z, for `planar`. By default one."""
+    spacing: tuple[Positive, Positive] = (0.5, 0.5)
+    """Distance of neighbours along X and along Z, for `linear` and `planar`. The default is half a
+    wavelength, unambiguous in all directions in front."""
+    unit: Literal["wavelengths", "metres"] = "wavelengths"
+    """Unit of `positions`, `file` and `spacing`: wavelengths at `radio.carrier_hz`, the default, or
+    metres."""
+
+    def applies(self, name: str) -> bool:
+        named = {
+            "positions": ("positions", "file", "unit"),
+            "linear": ("columns", "spacing", "unit"),
+            "planar": ("columns", "rows", "spacing", "unit"),
+            "ti_cascade": (),
+        }
+        return name == "shape" or name in named[self.shape]
+
+    def count(self, sending: bool) -> int:
+        """Elements of the array."""
+        match self.shape:
+            case "ti_cascade":
+                return 12 if sending else 16
+            case "linear":
+                return self.columns
+            case "planar":
+                return self.columns * self.rows
+        return len(self.positions or ())
+
+    def problems(self) -> Iterator[Problem]:
+        if self.file is not None:
+            said = "is read by isac_rt.load, which was not used; state positions"
+            yield Problem((("file",),), said)
+        elif self.shape == "positions" and not self.positions:
+            said = "missing: shape positions needs one element or more; add positions or file"
+            yield Problem((("positions",), ("shape",)), said)
+        if self.shape != "positions" and self.positions is not None:
+            said = f"has no meaning with shape {self.shape}; leave it out, or set shape: positions"
+            yield Problem((("positions",), ("shape",)), said)
+        if self.count(True) > MAX_ELEMENTS:
+            said = f"{self.count(True)} elements are more than {MAX_ELEMENTS}; take fewer"
+            yield Problem((("columns",), ("rows",)), said)
+
+
 class Array(Node):
     """The antenna arrays of every terminal: an L of elements along X and Z for sending and one for
     receiving."""
@@ -340,6 +411,12 @@ class Array(Node):
     """Distance between neighbouring receive elements, in wavelengths at `radio.carrier_hz`;
     transmit elements stand one receive arm apart. The default makes directions unambiguous within
     60 degrees of the boresight."""
+    tx: Elements | None = None
+    """Transmit elements one by one or by a shape, in place of the L of `tx_x` and `tx_z`. null, the
+    default: the L."""
+    rx: Elements | None = None
+    """Receive elements one by one or by a shape, in place of the L of `rx_x` and `rx_z`. null, the
+    default: the L."""
     schedule: Literal["pseudo_random", "conventional"] = "pseudo_random"
     """Order in which the transmit antennas take the slots. `pseudo_random`, the default and the
     paper's, keeps the full unambiguous velocity; `conventional` goes round the antennas, which
@@ -363,7 +440,24 @@ class Array(Node):
     @property
     def num_tx(self) -> int:
         """L_tx, transmit elements."""
-        return self.tx_x + self.tx_z - 1
+        return self.tx_x + self.tx_z - 1 if self.tx is None else self.tx.count(sending=True)
+
+    @property
+    def is_l(self) -> bool:
+        """Whether both arrays are an L."""
+        return self.tx is None and self.rx is None
+
+    @property
+    def is_full_l(self) -> bool:
+        """Whether both arrays are an L whose receive arms tell directions on both axes."""
+        return self.is_l and self.rx_x > 1 and self.rx_z > 1
+
+    def applies(self, name: str) -> bool:
+        if name in ("tx_x", "tx_z"):
+            return self.tx is None
+        if name in ("rx_x", "rx_z"):
+            return self.rx is None
+        return name != "spacing_wavelengths" or self.tx is None or self.rx is None
 
     @property
     def largest_gain_dbi(self) -> float:

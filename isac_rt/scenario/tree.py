@@ -20,6 +20,7 @@ from isac_rt.scenario.front_end import Elements, FrontEnd
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
+from isac_rt.scenario.sensors import Sensor, with_sensor
 from isac_rt.scenario.swarm import Access, RoleChange, Uav
 
 OWN = "own"
@@ -42,6 +43,10 @@ class Scenario(Node):
     frame_interval_s: Positive | None = None
     """Time from the start of a frame to the start of the next [s], at least a frame long. null, the
     default: frames follow each other without a pause."""
+    sensor: Sensor | None = None
+    """A plain FMCW sensor by name, whose `radio`, `array` and `noise` the keys stated there
+    override: `awr1843` and `awr2944` at 77 GHz, `iwr6843` at 60 GHz, `bgt24mtr12` at 24 GHz. null,
+    the default: none."""
     radio: Radio = Radio()
     """The chirp and the frame. By default the paper's."""
     array: Array = Array()
@@ -91,10 +96,10 @@ class Scenario(Node):
     @model_validator(mode="before")
     @classmethod
     def _presets(cls, data: Any) -> Any:
-        """Fill in what presets say, and what the sets to compare take over."""
+        """Fill in what a sensor and presets say, and what the sets to compare take over."""
         if not isinstance(data, dict):
             return data
-        out = with_preset(data, data.get("receiver_preset"), {})
+        out = with_preset(with_sensor(data), data.get("receiver_preset"), {})
         own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
         if isinstance(sets := out.get("compare"), dict):
             out["compare"] = {
@@ -165,6 +170,7 @@ class Scenario(Node):
     def problems(self) -> Iterator[Problem]:
         yield from self._timing_problems()
         yield from self._fmcw_problems()
+        yield from self._array_problems()
         yield from self._swarm_problems()
         yield from self._role_problems()
         yield from self._block_problems()
@@ -272,6 +278,28 @@ class Scenario(Node):
                         ((*at, key), ("radio", "scheme")),
                         f"{value} is not made for mode fmcw with scheme {r.scheme}; use "
                         f"{' or '.join(values)}, or another scheme",
+                    )
+
+    def _array_problems(self) -> Iterator[Problem]:
+        """Receivers that look at the arms of an L one by one, beside other arrays."""
+        if self.array.is_full_l:
+            return
+        sets: dict[Key, Receivers] = {("receivers",): self.receivers}
+        sets |= {("compare", n, "receivers"): one.receivers for n, one in self.compare.items()}
+        usual = {
+            "clutter_detector": ("cfar", "looks at the two arms of an L"),
+            "refinement": ("local", "needs an L with two receive arms"),
+            "symbol_decision": ("powers", "needs an L with two receive arms"),
+        }
+        unlike = {"clutter_detector": ("cfar",), "refinement": ("local", "grid")}
+        unlike["symbol_decision"] = ("powers", "profile")
+        for at, receivers in sets.items():
+            for key, (use, why) in usual.items():
+                if (value := getattr(receivers, key)) not in unlike[key]:
+                    yield Problem(
+                        ((*at, key), ("array",)),
+                        f"{value} {why}, and the arrays are another; set {key}: {use}, or leave "
+                        "array.tx and array.rx out",
                     )
 
     def _swarm_problems(self) -> Iterator[Problem]:

@@ -158,7 +158,7 @@ def _link_coverage(
 ) -> LinkCoverage:
     w, passes = timetable.waveform, link.passes
     cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
-    apart = SPEED_OF_LIGHT / (float(w.carrier()) * antennas.spacing)
+    apart = SPEED_OF_LIGHT / (float(w.carrier()) * max(antennas.step(passes), 1e-9))
     return LinkCoverage(
         link=str(link),
         max_range_m=w.num_range_cells * cell,

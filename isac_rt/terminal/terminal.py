@@ -37,7 +37,7 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import Doubts
-from isac_rt.terminal.tracker import Track, Tracker, TrackSet
+from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane
 from isac_rt.world.swarm import Pose
 
 LEVEL_DROP = 10.0
@@ -136,11 +136,12 @@ class ActiveTerminal:
             before = self._correction or Correction(0.0, np.zeros(3))
             self._correction = before.then(reception.correction)
         self.tracker.predict(time)
+        found = in_plane(reception.detections)
         if self._doubts is None:
-            self.tracker.update(reception.detections, own_pose)
+            self.tracker.update(found, own_pose)
         else:
             new = {track.id for track in self.tracker.tracks if not track.confirmed}
-            self.tracker.update(self._doubts.births(reception.detections, own_pose), own_pose)
+            self.tracker.update(self._doubts.births(found, own_pose), own_pose)
             self._doubts.remove_ghosts(self.tracker, new, own_pose)
         return reception, self.tracker.snapshot(own_pose)
 
@@ -230,7 +231,7 @@ class PassiveTerminal:
             self._profile = self._receiver.reader.learn(cube, reception.detections)
         self._follow(reception, own_pose, modulated)
         if self.reference is not None and reception.line_of_sight:
-            self.tracker.update(reception.detections, own_pose, self.reference.state)
+            self.tracker.update(in_plane(reception.detections), own_pose, self.reference.state)
         return reception, self.tracker.snapshot(own_pose, self.reference)
 
     def memory(self) -> dict[str, Any]:
@@ -289,7 +290,7 @@ class PassiveTerminal:
                 self.reference.missed += 1
                 self.state = TerminalState.LOST
             return
-        d = reception.detections
+        d = in_plane(reception.detections)
         q = int(np.flatnonzero(d.is_reference)[0])
         z = np.array([d.range[q], d.velocity[q], *d.direction[q]])
         std = np.maximum(d.std[q], REFERENCE_STD_CELLS * np.array([*self._cells, 0.0, 0.0]))

@@ -8,7 +8,7 @@ outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,22 @@ from isac_rt.world.swarm import Pose
 
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
+
+
+FLAT_STD = 0.1
+"""Standard deviation of the direction cosine that is taken for 0 where an array does not observe
+an axis: bodies fly within some six degrees of the array's plane."""
+
+
+def in_plane(detections: Detections) -> Detections:
+    """Detections with a direction on the axes that the array does not observe: that of its plane,
+    with `FLAT_STD`."""
+    unseen = np.isinf(detections.std[:, 2:])
+    if not unseen.any():
+        return detections
+    std = detections.std.copy()
+    std[:, 2:][unseen] = FLAT_STD
+    return replace(detections, direction=np.where(unseen, 0.0, detections.direction), std=std)
 
 
 def assign(cost: np.ndarray) -> list[tuple[int, int]]:

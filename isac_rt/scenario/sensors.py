@@ -1,0 +1,127 @@
+"""Common FMCW sensors: what a scenario's `sensor` says of `radio`, `array` and `noise`.
+
+Band, power, noise figure and converters are typical values of the data sheets named at each. Where
+no source is named the chirps are settings within these limits that suit a swarm. Arrays and antenna
+gains are like those of the makers' evaluation boards, gains to a decibel or two.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+Sensor = Literal["awr1843", "awr2944", "iwr6843", "bgt24mtr12"]
+
+_TI_BOARD = {
+    "tx": {"shape": "positions", "positions": [[0.0, 0.0], [1.0, 0.5], [2.0, 0.0]]},
+    "rx": {"shape": "linear", "columns": 4},
+}
+"""TI's AWR1843BOOST and IWR6843ISK: four receivers half a wavelength apart, two transmitters two
+wavelengths apart and a third between them half a wavelength higher."""
+
+SENSORS: dict[Sensor, dict[str, dict[str, Any]]] = {
+    # SWRS222: 76 to 81 GHz, 3 TX of 12 dBm, 4 RX, noise figure 15 dB from 77 GHz on, up to
+    # 100 MHz/us, IF of 10 MHz, complex converters of 12.5 Msps
+    "awr1843": {
+        "radio": {
+            "mode": "fmcw",
+            "scheme": "tdm",
+            "carrier_hz": 77e9,
+            "chirps_per_frame": 192,
+            "chirp": {
+                "slope_mhz_per_us": 15.0,
+                "idle_us": 7.0,
+                "adc_start_us": 6.0,
+                "ramp_end_us": 33.0,
+                "samples": 256,
+                "sampling_msps": 10.0,
+            },
+        },
+        "array": {**_TI_BOARD, "element_gain_dbi": 9.0},
+        "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 15.0},
+    },
+    # SWRS273: 76 to 81 GHz, 4 TX of 12 dBm with phase shifters, 4 RX, noise figure 12 dB, real
+    # converters of 37.5 Msps; DDMA with two empty bands as in TI's demonstration
+    "awr2944": {
+        "radio": {
+            "mode": "fmcw",
+            "scheme": "ddm",
+            "sub_bands": 6,
+            "carrier_hz": 76e9,
+            "chirps_per_frame": 192,
+            "chirp": {
+                "slope_mhz_per_us": 15.0,
+                "idle_us": 7.0,
+                "adc_start_us": 6.0,
+                "ramp_end_us": 33.0,
+                "samples": 384,
+                "sampling_msps": 15.0,
+            },
+        },
+        "array": {
+            "tx": {
+                "shape": "positions",
+                "positions": [[0.0, 0.0], [2.0, 0.0], [4.0, 0.0], [1.0, 0.8]],
+            },
+            "rx": {"shape": "linear", "columns": 4},
+            "element_gain_dbi": 12.0,
+        },
+        "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 12.0},
+    },
+    # SWRS219: 60 to 64 GHz, 3 TX of 12 dBm, 4 RX, noise figure 12 dB; the chirp of TI's
+    # profile_iwr6843_ods_3d.cfg, which reaches 12 m
+    "iwr6843": {
+        "radio": {
+            "mode": "fmcw",
+            "scheme": "tdm",
+            "carrier_hz": 60.25e9,
+            "chirps_per_frame": 96,
+            "chirp": {
+                "slope_mhz_per_us": 156.0,
+                "idle_us": 7.0,
+                "adc_start_us": 3.0,
+                "ramp_end_us": 24.0,
+                "samples": 256,
+                "sampling_msps": 12.5,
+            },
+        },
+        "array": {**_TI_BOARD, "element_gain_dbi": 7.0},
+        "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 12.0},
+    },
+    # BGT24MTR12: 24.00 to 24.25 GHz, 1 TX of 11 dBm, 2 RX, noise figure 12 dB; 200 MHz as on
+    # Infineon's Position2Go (AN553), which has one row of antennas
+    "bgt24mtr12": {
+        "radio": {
+            "mode": "fmcw",
+            "scheme": "simo",
+            "carrier_hz": 24.025e9,
+            "chirps_per_frame": 64,
+            "chirp": {
+                "slope_mhz_per_us": 0.6667,
+                "repetition_us": 400.0,
+                "adc_start_us": 10.0,
+                "ramp_end_us": 300.0,
+                "samples": 256,
+                "sampling_msps": 1.0,
+            },
+        },
+        "array": {
+            "tx": {"shape": "linear", "columns": 1},
+            "rx": {"shape": "linear", "columns": 2},
+            "element_gain_dbi": 12.0,
+        },
+        "noise": {"tx_power_dbm": 11.0, "noise_figure_db": 12.0},
+    },
+}
+
+
+def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
+    """What a file states, with what its `sensor` says of the rest. What is malformed stays as it
+    is, for whoever checks it."""
+    name = stated.get("sensor")
+    said = SENSORS.get(name, {}) if isinstance(name, str) else {}  # type: ignore[call-overload]
+    out = dict(stated)
+    for key, values in said.items():
+        own = stated.get(key, {})
+        if isinstance(own, dict):
+            out[key] = {**values, **own}
+    return out

@@ -1,0 +1,163 @@
+"""Tables that a scenario names as CSV files: read into its tree, so that what is kept of a run, a
+path or a point of a sweep depends on their numbers and needs the files no more."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+import math
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from isac_rt.scenario.node import Key
+
+MAX_BYTES = 4_000_000
+MAX_ROWS = 20_000
+
+
+class TableError(ValueError):
+    """A table cannot be used; the key that names it, and what is wrong."""
+
+    def __init__(self, key: Key, text: str) -> None:
+        super().__init__(text)
+        self.key = key
+
+
+def read_csv(
+    path: Path, needed: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, list[float]]:
+    r"""Columns of a CSV file with a header: finite numbers, by comma or semicolon.
+
+    Parameters
+    ----------
+    path : of a regular file of at most 4 MB and 20,000 rows; lines that begin with # are passed
+        over
+    needed, optional : names of the columns, in any order
+
+    Raises
+    ------
+    ValueError  With the line.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "rx.csv"
+    ...     _ = file.write_text("x, z\n0, 0\n0.5, 0\n")
+    ...     read_csv(file, ("x", "z"))
+    {'x': [0.0, 0.5], 'z': [0.0, 0.0]}
+    """
+    text = _text_of(path)
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), start=1)]
+    lines = [(i, line) for i, line in lines if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise ValueError("is empty; a table needs a header and rows")
+    mark = ";" if ";" in lines[0][1] else ","
+    header = [name.strip().lower() for name in _split(lines[0], mark)]
+    known = {*needed, *optional}
+    if missing := [name for name in needed if name not in header]:
+        wanted = ", ".join((*needed, *(f"[{name}]" for name in optional)))
+        raise ValueError(
+            f"line {lines[0][0]}: no column {missing[0]}; its header must be {wanted}, not "
+            f"{', '.join(header)[:80]!r}"
+        )
+    if strange := [name for name in header if name not in known or header.count(name) > 1]:
+        raise ValueError(f"line {lines[0][0]}: the column {strange[0][:40]!r} is not known here")
+    if len(lines) > MAX_ROWS + 1:
+        raise ValueError(f"has {len(lines) - 1} rows, at most {MAX_ROWS} are read; thin it out")
+    columns: dict[str, list[float]] = {name: [] for name in header}
+    for line in lines[1:]:
+        fields = _split(line, mark)
+        if len(fields) != len(header):
+            raise ValueError(f"line {line[0]}: {len(fields)} fields, the header has {len(header)}")
+        for name, field in zip(header, fields, strict=True):
+            columns[name].append(_number(field, line[0], name))
+    if len(lines) == 1:
+        raise ValueError("has a header and no rows")
+    return columns
+
+
+def _text_of(path: Path) -> str:
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise ValueError("is not a regular file; name a CSV file")
+        if about.st_size > MAX_BYTES:
+            raise ValueError(f"has {about.st_size} bytes, a table has at most {MAX_BYTES}")
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError("is not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise ValueError(
+            f"cannot be read: {error.strerror}; the path is relative to the scenario's folder"
+        ) from None
+
+
+def _split(line: tuple[int, str], mark: str) -> list[str]:
+    try:
+        return next(csv.reader(io.StringIO(line[1]), delimiter=mark, strict=True))
+    except csv.Error as error:
+        raise ValueError(f"line {line[0]}: {error}") from None
+
+
+def _number(field: str, line: int, name: str) -> float:
+    try:
+        value = float(field)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"line {line}: {name} = {field.strip()[:40]!r} is no finite number")
+    return value
+
+
+Reader = Callable[[Path], dict[str, Any]]
+
+
+def _places(path: Path) -> dict[str, Any]:
+    columns = read_csv(path, ("x", "z"))
+    rows = zip(columns["x"], columns["z"], strict=True)
+    return {"positions": [list(row) for row in rows]}
+
+
+def _tables_of(tree: dict[str, Any]) -> Iterator[tuple[Key, str, Reader]]:
+    """Mappings of a tree that may name a table, the key that does, and how it is read."""
+    yield ("array", "tx"), "file", _places
+    yield ("array", "rx"), "file", _places
+
+
+def with_tables(tree: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A scenario's tree with the numbers of the files that it names in place of their names.
+
+    What is malformed stays as it is, for whoever checks it.
+
+    Raises
+    ------
+    TableError  If a file is none, is not readable as a table, or numbers are stated beside it.
+    """
+    out = tree
+    for key, name, reader in _tables_of(tree):
+        here = _at(out, key)
+        file = here.get(name) if isinstance(here, dict) else None
+        if not isinstance(file, str):
+            continue
+        if out is tree:
+            out = copy.deepcopy(tree)
+            here = _at(out, key)
+        try:
+            found = reader(folder / file)
+        except ValueError as problem:
+            raise TableError((*key, name), str(problem)) from None
+        if double := [k for k in found if here.get(k) is not None]:
+            raise TableError((*key, name), f"stands beside {double[0]}; leave one of the two out")
+        del here[name]
+        here.update(found)
+    return out
+
+
+def _at(tree: Any, key: Key) -> Any:
+    for part in key:
+        tree = tree.get(part) if isinstance(tree, dict) else None
+    return tree
