@@ -18,7 +18,7 @@ _TI_BOARD = {
 """TI's AWR1843BOOST and IWR6843ISK: four receivers half a wavelength apart, two transmitters two
 wavelengths apart and a third between them half a wavelength higher."""
 
-SENSORS: dict[Sensor, dict[str, dict[str, Any]]] = {
+SENSORS: dict[str, dict[str, dict[str, Any]]] = {
     # SWRS222: 76 to 81 GHz, 3 TX of 12 dBm, 4 RX, noise figure 15 dB from 77 GHz on, up to
     # 100 MHz/us, IF of 10 MHz, complex converters of 12.5 Msps
     "awr1843": {
@@ -118,7 +118,7 @@ def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
     """What a file states, with what its `sensor` says of the rest. What is malformed stays as it
     is, for whoever checks it."""
     name = stated.get("sensor")
-    said = SENSORS.get(name, {}) if isinstance(name, str) else {}  # type: ignore[call-overload]
+    said = SENSORS.get(name, {}) if isinstance(name, str) else {}
     out = dict(stated)
     for key, values in said.items():
         own = stated.get(key, {})
