@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from scipy.stats import ncx2
+from scipy.special import chndtr
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import Transmission
@@ -102,7 +102,7 @@ class Sensitivity:
         """Of a steady path with this SNR in its cell, in noise and a background of so many times
         its power in the cells around."""
         degrees, threshold = 2 * self.rule.looks, self.rule.threshold * (1 + background)
-        return float(ncx2.sf(degrees * threshold, degrees, degrees * snr))
+        return float(1 - chndtr(degrees * threshold, degrees, degrees * snr))
 
     def clutter_free(self, snr: float) -> float:
         """Probability that this detector would find a steady path with this SNR in a channel's cell
@@ -120,7 +120,7 @@ class Sensitivity:
 def single_look(snr: float, rate: float) -> float:
     """Probability of detection of a steady path by one coherent test with a rate of false
     alarms."""
-    return float(ncx2.sf(-2 * np.log(rate), 2, 2 * snr))
+    return float(1 - chndtr(-2 * np.log(rate), 2, 2 * snr))
 
 
 @dataclass(frozen=True)

@@ -294,3 +294,37 @@ def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
         assert seen[-1] == (crossing < 2), t
     assert True in seen
     assert False in seen
+
+
+def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path, monkeypatch):
+    """A second tracer of the same flight and city sends no ray and has the same chains; other rays,
+    another flight and another mesh are searched anew. Planted bug: a key without the places."""
+    from isac_rt.propagation.legs.chains import Search
+    from isac_rt.storage import KEPT
+
+    frames, s, city = streets
+    few = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 500})})
+    times, sent, search = [frames[k][0] for k in (0, 6, 12)], [], Search._sent
+
+    def chains(scene, mesh, spacing=2.0) -> list[np.ndarray]:
+        sent.clear()
+        model, swarm = tracer(scene, mesh, spacing), swarm_of(scene)
+        found = []
+        for t in times:
+            pose = model._local(swarm.poses(t))["A"]
+            found += [*model._search.chains("A", pose, t)]
+        return found
+
+    plain = chains(few, city)
+    monkeypatch.setattr(Search, "_sent", lambda *at: sent.append(at) or search(*at))
+    monkeypatch.setenv(KEPT, str(tmp_path))
+    for again in (False, True):
+        found = chains(few, city)
+        assert all(map(np.array_equal, found, plain))
+        assert bool(sent) is not again
+    more = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 600})})
+    taller = s.city.model_copy(update={"building_height_m": 14.5})
+    other = load_city(taller, ".", F_C, (0.0, 0.0, 9.0))
+    for change in ((more, city), (few, city, 1.5), (few, other)):
+        chains(*change)
+        assert sent

@@ -24,12 +24,15 @@ import numpy as np
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.rays import LIFT, rays
+from isac_rt.storage import kept
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import SceneHandle
 from isac_rt.world.swarm import Pose
 
 AROUND = 2
 """Knots on each side of the nearest one whose chains are pooled."""
+TOGETHER = 8
+"""Knots whose chains are sought, and kept for later runs, at once."""
 FAR = 1e6
 """Reach of the rays [m]."""
 _TURN, _SHIFT = 0.5698402909980532, 0.7548776662466927
@@ -96,7 +99,8 @@ class Search:
         if name not in self._pools or self._pools[name][0] != knot:
             found = [self._knot(name, flight, n) for n in self._window(knot)]
             self._pools[name] = knot, self._pool(found)
-            for key in [k for k in self._kept if k[0] == name and abs(k[1] - knot) > 2 * AROUND]:
+            far = TOGETHER + AROUND
+            for key in [k for k in self._kept if k[0] == name and abs(k[1] - knot) > far]:
                 del self._kept[key]
         return self._pools[name][1]
 
@@ -108,8 +112,18 @@ class Search:
 
     def _knot(self, name: str, flight: Flight, number: int) -> Chains:
         if (name, number) not in self._kept:
-            place = flight.knots[np.clip(number, 0, len(flight.knots) - 1)]
-            self._kept[name, number] = self._sent(place, number)
+            first, count = number // TOGETHER * TOGETHER, len(flight.knots)
+            near = range(max(first, -AROUND), min(first + TOGETHER, count + AROUND))
+            places = flight.knots[np.clip(near, 0, count - 1)]
+
+            def found() -> list[list[np.ndarray]]:
+                return [[*self._sent(*knot)] for knot in zip(places, near, strict=True)]
+
+            city = self._city
+            mesh = [city.vertices, city.faces, city.plane_of_face]
+            search = [places, [*near], self._num_rays, self._depth, mi.variant()]
+            for n, tree in zip(near, kept("chains", [*mesh, *search], found), strict=True):
+                self._kept[name, n] = Chains(*tree)
         return self._kept[name, number]
 
     def _pool(self, parts: Sequence[Chains]) -> Chains:
