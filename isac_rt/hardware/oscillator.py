@@ -169,8 +169,7 @@ class Oscillator:
         for i, (offset, level) in enumerate(self.spurs):
             phase = generator(self.seed, "spur", self.name, i).uniform(0, 2 * np.pi)
             turn = 2 * np.pi * ((offset * start) % 1.0) + phase
-            swing = 2 * 10 ** (level / 20)
-            values += swing * np.sin(2 * np.pi * offset * step * np.arange(count) + turn)
+            values += 2 * 10 ** (level / 20) * _sine(2 * np.pi * offset * step, turn, count)
         return Record(start, step, values)
 
     def _slower(self, bands: list[_Band], first: int, count: int, step: float) -> np.ndarray:
@@ -206,6 +205,15 @@ class Oscillator:
             drawn = _block(self, number, index)
             out[low - first : high - first] += weight[inside] * drawn[inside]
         return out
+
+
+def _sine(angle: float, first: float, count: int) -> np.ndarray:
+    """sin(`first` + n `angle`) for n = 0 .. count - 1: of sums of two angles, each of a few."""
+    few = int(np.ceil(np.sqrt(count)))
+    coarse, fine = first + few * angle * np.arange(few), angle * np.arange(few)
+    out = np.outer(np.sin(coarse), np.cos(fine))
+    out += np.outer(np.cos(coarse), np.sin(fine))
+    return out.ravel()[:count]
 
 
 @lru_cache(maxsize=48)
