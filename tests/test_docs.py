@@ -151,7 +151,7 @@ def test_every_key_of_a_summary_has_a_sentence():
     written: dict[str, set[str]] = {"all": set(with_access)}
     blocks = [*with_access["terminals"].values(), *with_access["links"].values()]
     written["every terminal and link"] = {key for block in blocks for key in keys_of(block)}
-    for part in ("timing_s", "fidelity", "access"):
+    for part in ("city", "timing_s", "fidelity", "access"):
         written[part] = set(keys_of(with_access[part]))
     talked = simulate.run(talking(frames=3), snapshots=0).summary["swarm"]
     assert talked["terminals"].keys() == {"AT", "PT"}

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from isac_rt.cli.arguments import InputProblem
 from isac_rt.cli.console import say, say_table, working
 
 
@@ -40,13 +41,31 @@ def schema() -> None:
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The scenario to write.")],
     footprints: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Buildings, as GeoJSON or CityJSON.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Buildings: GeoJSON, CityJSON, GeoPackage, Shapefile, OpenStreetMap.",
+        ),
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(metavar="EPSG:N", help="Their coordinates, where the file does not say."),
+    ] = None,
+    terrain: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Heights of the ground, as GeoTIFF.")
     ] = None,
 ) -> None:
     """Write a commented scenario to start from, over a street canyon or over your own buildings,
-    and the schema for editors."""
+    and the schema for editors; over buildings also a picture."""
+    if footprints is None and (crs or terrain):
+        raise InputProblem("--crs and --terrain are of --footprints; give it too")
     with working("writing the scenario"):
-        from isac_rt.cli.starter import write_starter
+        from isac_rt.cli.starter import OwnCity, write_picture, write_starter
 
-        files, notes = write_starter(file, footprints)
+        own = None if footprints is None else OwnCity(footprints, crs, terrain)
+        files, notes = write_starter(file, own), tuple[str, ...]()
+    if own is not None:
+        with working("drawing the scene"):
+            picture, notes = write_picture(file)
+            files.append(picture)
     say(*files, *notes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -77,6 +77,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     with working("setting up"):
         setup = prepare(loaded)
         budget = link_budgets(setup)
+    _say_city(setup.city.notes)
     _say_coverage(asdict(setup.coverage))
     _say_budget(budget)
     if resume.begun:
@@ -102,6 +103,11 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         write_report(results, folder, pictures, setup.city)
     resume.remove()
     _say_summary(results)
+
+
+def _say_city(notes: Sequence[str]) -> None:
+    """What was assumed of the city and left out of its file."""
+    say(*(f"city: {note}" for note in notes))
 
 
 def _say_coverage(seen: Mapping[str, Any]) -> None:
@@ -212,10 +218,12 @@ def plan(
         from isac_rt.simulation.audit import make_plan
         from isac_rt.simulation.setup import prepare
 
-        found = make_plan(prepare(loaded), receivers)
+        setup = prepare(loaded)
+        found = make_plan(setup, receivers)
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(json.dumps(found | {"city": setup.city.record()}, indent=1))
     else:
+        _say_city(setup.city.notes)
         _say_plan(found, loaded.frames)
 
 

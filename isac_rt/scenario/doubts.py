@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import combinations, pairwise
+from statistics import median
 
 from isac_rt.scenario.node import Key, Problem
 from isac_rt.scenario.tree import Scenario
@@ -70,6 +71,10 @@ def doubts(scenario: Scenario) -> Iterator[Problem]:
 
 def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
     low, high = PLAUSIBLE_RCS
+    centre, what = (0.0, 0.0, 0.0), "the origin"
+    if scenario.city is not None and scenario.city.file is not None:
+        # a map may have any origin, and the swarm is over it
+        centre, what = _middle(scenario), "the middle of the swarm"
     for name, uav in scenario.swarm.items():
         if not low <= uav.rcs.value_dbsm <= high:
             yield Problem(
@@ -93,9 +98,20 @@ def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
                 said = f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}"
                 yield Problem((key,), f"{said}; is it in metres and seconds?")
         for key, place in places.items():
-            if math.hypot(*place) > FARTHEST_M:
-                said = f"lies {math.hypot(*place):.4g} m from the origin, more than {FARTHEST_M:g}"
+            if math.dist(place, centre) > FARTHEST_M:
+                said = (
+                    f"lies {math.dist(place, centre):.4g} m from {what}, more than {FARTHEST_M:g}"
+                )
                 yield Problem((key,), f"{said}; is it in metres?")
+
+
+def _middle(scenario: Scenario) -> tuple[float, float, float]:
+    """The median of the places at which the swarm starts. [m]"""
+    x, y, z = (
+        median(axis)
+        for axis in zip(*(uav.place(0.0) for uav in scenario.swarm.values()), strict=True)
+    )
+    return x, y, z
 
 
 def _can_fall_back(scenario: Scenario) -> bool:

@@ -272,6 +272,7 @@ def run(
     materials = {m.name: vars(m) for m in run.setup.city.materials}
     attributes = {
         "fidelity": summary["fidelity"],
+        "city": summary["city"],
         "materials": {
             name: {key: value for key, value in entry.items() if key != "name"}
             for name, entry in materials.items()
@@ -481,7 +482,7 @@ class _Run:
             compared={name: one.blocks() for name, one in self.compared.items()},
             costs={name: one.costs() for name, one in sets.items()},
         )
-        named = {"scenario": s.scenario.name, "seed": s.scenario.seed}
+        named = {"scenario": s.scenario.name, "seed": s.scenario.seed, "city": s.city.record()}
         return named | self.recorder.summary(figures)
 
     def _access(self) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ paths can be drawn faintly, and so that no ray tracer is needed for a look at a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_figure
 from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.passage import hits
 from isac_rt.world.swarm import Pose, Swarm
 
 ELEVATION = np.deg2rad(38.0)
@@ -31,6 +32,9 @@ SUN = np.array([-0.45, -0.35, 0.82]) / np.linalg.norm([-0.45, -0.35, 0.82])
 _SKY, _GROUND, _ROOF, _WALL = (
     np.array(c) / 255 for c in ((236, 241, 246), (222, 220, 212), (214, 190, 170), (226, 224, 220))
 )
+FAR_DOWN_M = 1e4
+"""The ground is looked for so far below."""
+Below = Callable[[np.ndarray], float]
 _SUPERSAMPLING = 2
 _LINES_PER_KIND = 40
 _HIDDEN_ALPHA = 0.18
@@ -248,7 +252,7 @@ class _Picture:
             for name in [kind.name.lower()]
         ]
 
-    def swarm(self, swarm: Swarm, times: np.ndarray, time: float, ground: float) -> list[Line2D]:
+    def swarm(self, swarm: Swarm, times: np.ndarray, time: float, below: Below) -> list[Line2D]:
         """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`.
         Returns the legend."""
         poses, legend = swarm.poses(time), []
@@ -256,7 +260,7 @@ class _Picture:
             colour, marker, here = colour_of(u), ROLE_MARKERS[uav.role], poses[name].position
             track = swarm.trajectories[name]
             self.line(np.array([track.pose(t).position for t in times]), colour, 2.2)
-            foot = self.view.project(np.stack([here, [here[0], here[1], ground]]))
+            foot = self.view.project(np.stack([here, [here[0], here[1], below(here)]]))
             self.ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
             big, edge = 15 if uav.role == "active" else 8, "white"
             x, y = foot[0, :2]
@@ -306,12 +310,14 @@ def view_scene(
     ax.imshow(np.clip(picture, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
     drawn = _Picture(ax, view, depth)
     legend = drawn.paths(paths, swarm.poses(time))
-    ground = (
-        float((city.corners + city.origin)[..., 2].min())
-        if city.num_faces
-        else float(tracks[..., 2].min() - 10)
-    )
-    legend = drawn.swarm(swarm, times, time, ground) + legend
+    level = float(tracks[..., 2].min() - 10)
+
+    def below(place: np.ndarray) -> float:
+        far = np.array([0.0, 0.0, FAR_DOWN_M])
+        _, share = hits(city.corners, place - city.origin, place - city.origin - far)
+        return float(place[2] - share.min() * FAR_DOWN_M) if share.size else level
+
+    legend = drawn.swarm(swarm, times, time, below) + legend
     ax.legend(
         handles=legend,
         loc="upper left",

@@ -10,13 +10,13 @@ import pytest
 from test_interchange import flight
 
 from isac_rt.cli.cli import main
-from isac_rt.cli.starter import schema_text, starter_text
+from isac_rt.cli.starter import schema_text
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.results.files import ResultsError, save
 from isac_rt.results.recorder import Results
 from isac_rt.scenario.file import load
-from isac_rt.simulation.setup import city_of, prepare, trace
+from isac_rt.simulation.setup import prepare, trace
 from isac_rt.views.animate import animate, tracked_positions, write_animation
 
 ROOT = Path(__file__).parents[2]
@@ -105,20 +105,6 @@ def test_new_writes_a_scenario_that_is_right(tmp_path, capsys):
     assert json.loads((tmp_path / "scenario.schema.json").read_text())["title"] == "Scenario"
     assert main(["new", str(file)]) == 2
     assert "already" in capsys.readouterr().err
-
-
-def test_new_over_ones_own_buildings(tmp_path):
-    """The swarm starts ten metres over the highest roof of the file's buildings."""
-    file = tmp_path / "quarter.yaml"
-    assert (
-        main(["new", str(file), "--footprints", str(ROOT / "scenes" / "data" / "quarter.geojson")])
-        == 0
-    )
-    scenario = load(file)
-    city = city_of(scenario)
-    top = (city.corners + city.origin)[..., 2].max()
-    assert scenario.swarm["AT"].position_m[2] == pytest.approx(top + 10, abs=0.1)
-    assert starter_text("x").count("\n") > 30
 
 
 def test_every_scene_names_the_schema_and_the_schema_is_today_s():

@@ -186,6 +186,18 @@ class CityMesh:
             materials=tuple(self.materials[i] for i in materials),
         )
 
+    def record(self) -> dict[str, Any]:
+        """What people and other programs ask of a city: its name, where it lies, what was
+        assumed."""
+        place = self.place
+        return {
+            "name": self.name,
+            "crs": (place and place.crs) or None,
+            "origin": None if place is None else list(place.origin),
+            "plane": (place and place.plane) or None,
+            "notes": list(self.notes),
+        }
+
     def plain(self) -> dict[str, Any]:
         """All of it as plain data and arrays, for `of_plain`."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}

@@ -6,6 +6,7 @@ import base64
 import logging
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,6 +34,8 @@ _PLAIN_PLY = re.compile(
 """The header of a mesh with nothing but places and faces, as of Sionna's thousands of
 buildings."""
 _PLAIN_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+_NAMED = 20
+"""Most names that a message lists."""
 _SOLID = re.compile(r"^[ \t]*solid\b", re.MULTILINE | re.IGNORECASE)
 _VERTEX = re.compile(r"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -305,12 +308,14 @@ def mesh_files(path: Path) -> list[Path]:
     return list(dict.fromkeys([path, *(file for file in named if file is not None)]))
 
 
-def _use(labels: tuple[str, ...], city: scenario.City) -> MaterialUse:
+def _use(labels: tuple[str, ...], city: scenario.City) -> MaterialUse | None:
+    """The material of a piece; None if no name of it says."""
     for label in labels:
         if label in city.material_map:
             return MaterialUse(city.material_map[label])
     known = (canonical_name(label) for label in reversed(labels))
-    return MaterialUse(next((name for name in known if name is not None), city.material))
+    name = next((name for name in known if name is not None), None)
+    return None if name is None else MaterialUse(name)
 
 
 def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
@@ -319,7 +324,7 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
 
     A piece's material is what `material_map` says of its node, geometry or material name, else a
     known material of that name, else `material`."""
-    seen, notes = set[str](), list[str]()
+    seen, notes, unknown = set[str](), list[str](), Counter[str]()
 
     def surfaces() -> Iterator[Surface]:
         for piece in pieces(path):
@@ -330,7 +335,10 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
             if city.up_axis == "y":
                 vertices = vertices @ _Y_UP_TO_Z_UP.T
             seen.update(piece.labels)
-            yield Surface(vertices, piece.faces, _use(piece.labels, city))
+            use = _use(piece.labels, city)
+            if use is None:
+                unknown[piece.labels[-1] if piece.labels else "no name"] += len(piece.faces)
+            yield Surface(vertices, piece.faces, use or MaterialUse(city.material))
 
     found = gathered(surfaces(), path.name)
     if not found:
@@ -340,6 +348,13 @@ def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]
         raise CityError(
             f"{path.name}: city.material_map names {', '.join(unused)}, which the file lacks; "
             f"it has {', '.join(sorted(seen)) or 'no names'}"
+        )
+    if unknown:
+        named = [f"{name[:60]} ({count} faces)" for name, count in unknown.most_common(_NAMED)]
+        rest = f" and {len(unknown) - _NAMED} more" if len(unknown) > _NAMED else ""
+        notes.append(
+            f"names that are no known material became {city.material}: {', '.join(named)}{rest}; "
+            "city.material_map says what they are"
         )
     if path.suffix.lower() in (".glb", ".gltf") and city.up_axis == "z":
         notes.append("glTF is y-up by its standard, and city.up_axis is z")

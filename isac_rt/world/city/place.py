@@ -62,6 +62,11 @@ class Place:
 
         return Proj(self.plane)
 
+    @property
+    def is_lonlat(self) -> bool:
+        """Whether the file's coordinates are longitude and latitude."""
+        return bool(self.plane) and self._geodetic is None
+
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 2) or (N, 3) of the file to metres about the origin."""
         out = np.array(points, dtype=np.float64)
@@ -245,7 +250,7 @@ def local_origin(place: Place, point: NDArray[np.float64]) -> tuple[float, float
     """An origin near a world point (3,) in coordinates of the file: in a grid at whole hundreds of
     metres, so that people can add it."""
     found = place.to_file(point[None])[0]
-    if place.plane and place._geodetic is None:
+    if place.is_lonlat:
         return round(float(found[0]), 7), round(float(found[1]), 7), round(float(found[2]))
     x, y = np.round(found[:2] / _WHOLE_M) * _WHOLE_M
     return float(x), float(y), round(float(found[2]))
