@@ -71,6 +71,18 @@ def test_planted_slips_are_repaired_by_the_next_feedback(slip):
     assert wrong == [False, False, True, True, True, False, False, False]
 
 
+def test_one_wrong_decision_at_either_end_does_no_harm():
+    """The surest two symbols of a frame read far outside the alphabet: the ends are those of all
+    others. Planted bugs: the lowest and the highest taken; the third ones."""
+    got, _ = decoded(1, 0)
+    raw, order = got.raw_delay_symbols.copy(), np.argsort(got.delay_confidence, axis=None)
+    others = np.sort(raw.ravel()[order[:-2]])
+    raw.ravel()[order[-2:]] = -41, 733
+    told = summarise(replace(got, raw_delay_symbols=raw), 21.3, 0.01, 3, W)
+    assert told.decided == raw.size
+    assert (told.lowest, told.highest) == (others[0], others[-1])
+
+
 @pytest.mark.parametrize("share", [0.21, 0.33])
 def test_without_symbols_the_echo_decides_as_the_normal_law_says(share):
     """The likeliest slip is wrong with 2 Q(1/2 cell / sigma), and is sure only when its posterior

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.scenario.file import ScenarioError, load
@@ -155,6 +156,19 @@ def test_draws_repeat_from_the_seed_and_by_frame_or_once():
     assert turn.real == pytest.approx(turn.real.mean(), rel=1e-14, abs=0)
     one_direction = diffuse(scene("clutter.direction=reference"), 1, link)
     assert np.ptp(one_direction.arrival, axis=0).max() == 0
+
+
+def test_every_link_has_a_draw_of_its_own():
+    """Two transmitters at one receiver, one at two, and both ways. Planted bugs: the transmitter,
+    or the receiver, left out of the name of the generator."""
+    setup = prepare(scene())
+    links = [Link(*ends) for ends in (("AT", "PT1"), ("PT2", "PT1"), ("AT", "PT2"), ("PT1", "AT"))]
+    found = setup.propagation.trace(setup.swarm.poses(0.0), 0.0, links).paths
+    phases = [
+        np.angle(found[link].gain[found[link].kind == PathKind.DIFFUSE])[:40] for link in links
+    ]
+    for i, one in enumerate(phases):
+        assert all(np.abs(one - other).min() > 0 for other in phases[:i])
 
 
 def test_gaussian_clutter_is_noise_beside_the_noise():

@@ -112,7 +112,7 @@ def differences(a, b, at=""):
         for key in a.keys() & b.keys():
             yield from differences(a[key], b[key], f"{at}[{key}]")
     elif isinstance(a, list | tuple | deque):
-        if len(a) != len(b):
+        if len(a) != len(b) or (isinstance(a, deque) and a.maxlen != b.maxlen):
             yield f"{at}: length"
         for i, (one, other) in enumerate(zip(a, b, strict=False)):
             yield from differences(one, other, f"{at}[{i}]")
@@ -374,6 +374,30 @@ def test_frames_that_could_not_be_kept_are_kept_with_the_next(tmp_path, monkeypa
     assert [len(entry["rows"]) for entry in resume.entries()] == [2, 2]
     again = Resume(tmp_path, run_content(scenario, 1), every=1e3)
     assert_equal_results(simulate.run(scenario, snapshots=1, resume=again), whole)
+
+
+def test_frames_that_two_calls_kept_are_taken_up_once(tmp_path):
+    """Two calls of one run at the same time keep the same frames, each in pieces of its own:
+    what does not follow on is passed over. Planted bug: every entry taken."""
+    scenario = dense_scenario(frames=5)
+    whole = simulate.run(scenario, snapshots=1)
+    folders = [tmp_path / name for name in ("one", "two", "both")]
+    for folder in folders:
+        folder.mkdir()
+    one, two, both = (Resume(f, run_content(scenario, 1), every=0.0) for f in folders)
+    simulate.run(scenario, snapshots=1, resume=one)
+    tries = iter([False, True, True, True])
+    append = two.append
+    two.append = lambda entry: next(tries) and append(entry)
+    simulate.run(scenario, snapshots=1, resume=two)
+    (a, b, *_), (c, *_) = (list(r.entries()) for r in (one, two))
+    assert [(len(e["rows"]), e["first"]) for e in (a, b, c)] == [(1, 0), (1, 1), (2, 0)]
+    for entry in (a, c, b, b, c):
+        both.append(entry)
+    run = simulate._Run.begin(scenario, prepare(scenario), 1, simulate.standard_terminal)
+    assert run.restore(both) == 2
+    assert [row["frame"] for row in run.recorder.rows] == [0, 1]
+    assert_equal_results(simulate.run(scenario, snapshots=1, resume=both), whole)
 
 
 def test_entries_are_some_time_apart(tmp_path):
