@@ -105,8 +105,7 @@ def warm_up(folder: Path) -> None:
 
     def two(dataset, _):
         for name in ("one", "two"):
-            draw = partial(figures.reference_snr, dataset=dataset)
-            yield name, figures._figure([draw], 2.7)
+            yield figures.Drawing(name, [partial(figures.reference_snr, dataset=dataset)], 2.7)
 
     figures._all = two
     results = simulate.run(load(folder / "base.yaml"), threads=1)

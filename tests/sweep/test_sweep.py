@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -334,6 +335,10 @@ def test_an_unfinished_sweep_can_be_read_and_a_failed_point_does_not_stop_it(fol
         plan, out, points[:2]
     )  # Dask repeats tasks of a worker that died; outcomes that are there stay
     assert stamps == [outcomes.file(p.key).stat().st_mtime_ns for p in points[:2]]
+    for p, again in zip(points[:2], (True, False), strict=True):  # a failed one, a done one
+        before = outcomes.file(p.key).stat().st_mtime_ns
+        run_job(replace(job_of(plan, out, p), retry_failed=True))
+        assert (outcomes.file(p.key).stat().st_mtime_ns != before) is again
     assert (
         outcomes.done(points[0].key, False)
         and not outcomes.done(points[0].key, True)
