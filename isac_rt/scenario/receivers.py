@@ -167,7 +167,8 @@ class Tracking(Node):
     births: Literal["all", "unexplained"] = "all"
     """Detections that start tracks at an active terminal. `all`, the default. `unexplained`: not
     those where the city's mesh shows the terminal itself by one or two walls, nor those at the edge
-    of the view, and no track is confirmed that is a wall's image of a nearer one or lies behind a
+    of the view, nor those that stand still beside each other as a building does that the mesh
+    lacks; and no track is confirmed that is a wall's image of a nearer one or lies behind a
     wall."""
 
     @property

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
@@ -37,6 +38,7 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import Doubts
+from isac_rt.terminal.standing import Standing
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane
 from isac_rt.world.swarm import Pose
 
@@ -115,6 +117,7 @@ class ActiveTerminal:
             if walls is None:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
             self._doubts = Doubts(walls, antennas, waveform)
+        self._standing = Standing()
         self._correction: Correction | None = None
 
     def step(
@@ -141,8 +144,13 @@ class ActiveTerminal:
             self.tracker.update(found, own_pose)
         else:
             new = {track.id for track in self.tracker.tracks if not track.confirmed}
-            self.tracker.update(self._doubts.births(found, own_pose), own_pose)
+            found = self._doubts.births(found, own_pose)
+            crowd = self._standing.look(found, own_pose, time, self.tracker.velocity_period)
+            found = replace(found, starts=found.starts & ~crowd)
+            self.tracker.update(found, own_pose)
             self._doubts.remove_ghosts(self.tracker, new, own_pose)
+            kept = [t for t in self.tracker.tracks if not self._standing.holds(t)]
+            self.tracker.tracks = kept
         return reception, self.tracker.snapshot(own_pose)
 
     def receive(
@@ -161,11 +169,13 @@ class ActiveTerminal:
         return {
             "tracker": self.tracker.memory(),
             "correction": None if found is None else [found.level, found.velocity],
+            "standing": self._standing.memory(),
         }
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
         self.tracker.restore(memory["tracker"])
+        self._standing.restore(memory["standing"])
         found = memory["correction"]
         self._correction = None if found is None else Correction(*found)
 

@@ -1,0 +1,78 @@
+"""Echoes that stand still beside each other: a building that the terminal's mesh lacks.
+
+A UAV may hover, but it hovers alone and in one place. What stands still in the world at several
+places near each other, and is explained by nothing that the terminal knows, is a surface. The
+terminal remembers such echoes for a while, because each frame shows other parts of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from isac_rt.frame.antennas import unit_vector
+from isac_rt.receive.types import Detections
+from isac_rt.terminal.tracker import Track
+from isac_rt.world.swarm import Pose
+
+STILL_MPS = 0.5
+"""Off the rate of what stands still by no more than this, and three deviations, an echo may stand
+still [m/s]: the own velocity's error, and twice the spread of a wall within its cell."""
+MEMORY_S = 1.0
+"""How long an echo that stood still is remembered [s]."""
+BESIDE_M = (1.5, 16.0)
+"""Echoes that far apart are beside each other [m]: not one and the same place, and not another
+building's."""
+STANDS = 11.3
+"""Squared distance of a velocity from nothing within which a track may stand still: 0.99 of chi
+squared of three."""
+CROWD = 3
+"""So many beside it make an echo part of a surface."""
+
+
+class Standing:
+    """Where echoes stood still that nothing explains."""
+
+    def __init__(self) -> None:
+        self._seen = np.zeros((0, 4))
+
+    def memory(self) -> np.ndarray:
+        """(n, 4) times and places, for `restore`."""
+        return self._seen
+
+    def restore(self, memory: np.ndarray) -> None:
+        """Go on from a `memory`."""
+        self._seen = memory
+
+    def look(self, d: Detections, own: Pose, time: float, period: float) -> np.ndarray:
+        """Take down a frame's echoes that stand still, of those that may start a track.
+
+        Parameters
+        ----------
+        time : of the frame [s]
+        period : span of unambiguous velocities [m/s]
+
+        Returns
+        -------
+        (Q,) which of all detections stand still within a crowd
+        """
+        known = np.isfinite(d.direction).all(axis=1) & ((d.direction**2).sum(axis=1) < 1)
+        towards = own.to_world(unit_vector(np.where(known[:, None], d.direction, 0.0)))
+        off = d.velocity + towards @ own.velocity
+        off -= period * np.round(off / period)
+        across = np.linalg.norm(own.velocity) * np.linalg.norm(d.std[:, 2:], axis=1)
+        still = known & (np.abs(off) < STILL_MPS + 3 * np.hypot(d.std[:, 1], across))
+        place = own.position + d.range[:, None] * towards
+        new = np.column_stack([np.full(len(d), time), place])[still & d.starts]
+        self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
+        return still & self.crowded(place)
+
+    def crowded(self, places: np.ndarray) -> np.ndarray:
+        """(n,) whether places (n, 3) lie among echoes that stood still."""
+        apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:], axis=-1)
+        return ((apart > BESIDE_M[0]) & (apart < BESIDE_M[1])).sum(axis=1) >= CROWD
+
+    def holds(self, track: Track) -> bool:
+        """Whether a track stands still, as far as is known of it, within a crowd."""
+        velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
+        d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
+        return bool(d2 < STANDS and self.crowded(track.state.mean[None, :3])[0])

@@ -1,0 +1,104 @@
+"""Echoes that stand still beside each other, by hand: a wall, a UAV that hovers, one that flies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.receive.types import Detections
+from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.standing import MEMORY_S, Standing
+from isac_rt.terminal.tracker import Track
+from isac_rt.world.swarm import Pose
+
+PERIOD = 60.0
+FLIGHT = np.array([3.0, 6.0, 0.5])
+
+
+def own(time: float) -> Pose:
+    """A terminal that looks north and flies to the north-east."""
+    return Pose(FLIGHT * time, FLIGHT, np.zeros(3), np.eye(3))
+
+
+def seen(time, places, velocities=None, starts=None) -> Detections:
+    """What a radar at `own` measures of bodies: geometry by hand."""
+    offset = np.array(places, float) - own(time).position
+    distance = np.linalg.norm(offset, axis=1)
+    e = offset / distance[:, None]
+    moving = np.zeros_like(offset) if velocities is None else np.array(velocities, float)
+    return Detections(
+        range=distance,
+        velocity=((moving - FLIGHT) * e).sum(axis=1),
+        direction=e[:, [0, 2]],
+        snr=np.full(len(e), 40.0),
+        std=np.tile([0.01, 0.01, 2e-3, 2e-3], (len(e), 1)),
+        is_reference=np.zeros(len(e), bool),
+        starts=np.ones(len(e), bool) if starts is None else np.array(starts),
+    )
+
+
+WALL = [(-9.0 + 4 * k, 31.0, 5.0 + k) for k in range(5)]
+
+
+def test_a_wall_is_a_crowd_and_who_flies_before_it_is_not():
+    """Five places of a wall 4 m apart, a UAV among them that closes at 2 m/s more than they do, and
+    another one that stands still 60 m away. Planted bugs: the rate not held against the flight; a
+    crowd anywhere."""
+    d = seen(
+        0.0, [*WALL, (0.0, 28.0, 6.0), (10.0, 90.0, 5.0)], [(0, 0, 0)] * 5 + [(0, -2, 0), (0, 0, 0)]
+    )
+    assert Standing().look(d, own(0.0), 0.0, PERIOD).tolist() == [True] * 5 + [False] * 2
+
+
+def test_velocities_are_folded():
+    d = seen(0.0, WALL)
+    folded = Detections(**{**vars(d), "velocity": d.velocity + PERIOD})
+    assert Standing().look(folded, own(0.0), 0.0, PERIOD).all()
+
+
+def test_a_uav_that_hovers_alone_is_no_crowd():
+    """Thirty frames with errors of 0.3 m on each axis. Planted bug: echoes of one place count."""
+    rng, standing = np.random.default_rng(4), Standing()
+    for frame in range(30):
+        place = np.array([2.0, 25.0, 6.0]) + rng.normal(0, 0.3, 3)
+        time = 0.05 * frame
+        assert not standing.look(seen(time, [place]), own(time), time, PERIOD).any()
+
+
+def test_a_wall_that_shows_itself_piece_by_piece():
+    """One place a frame: the fourth has three beside it. Long after, it is forgotten; kept by its
+    memory it is not. Planted bugs: no memory; no end of it."""
+    standing = Standing()
+    found = [
+        bool(standing.look(seen(t := 0.1 * k, [WALL[k]]), own(t), t, PERIOD)[0]) for k in range(4)
+    ]
+    assert found == [False, False, False, True]
+    again = Standing()
+    again.restore(standing.memory())
+    assert again.look(seen(0.4, [WALL[4]]), own(0.4), 0.4, PERIOD).all()
+    late = 0.4 + MEMORY_S + 0.01
+    assert not again.look(seen(late, [WALL[0]]), own(late), late, PERIOD).any()
+
+
+def test_only_what_could_start_a_track_makes_a_crowd():
+    """What the city explains is no surface that it lacks."""
+    d = seen(0.0, WALL, starts=[False] * 5)
+    assert not Standing().look(d, own(0.0), 0.0, PERIOD).any()
+
+
+@pytest.mark.parametrize(
+    ("place", "velocity", "std", "expected"),
+    [
+        ((0.0, 30.0, 6.0), (0.2, -0.1, 0.0), 0.3, True),
+        ((0.0, 30.0, 6.0), (4.0, 0.0, 0.0), 5.0, True),  # still, for all that is known
+        ((0.0, 30.0, 6.0), (4.0, 0.0, 0.0), 0.3, False),
+        ((0.0, 90.0, 6.0), (0.2, -0.1, 0.0), 0.3, False),
+    ],
+)
+def test_a_track_that_stands_still_within_a_crowd(place, velocity, std, expected):
+    """Planted bugs: the speed alone; the place alone."""
+    standing = Standing()
+    standing.look(seen(0.0, WALL), own(0.0), 0.0, PERIOD)
+    P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
+    track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 10.0)
+    assert standing.holds(track) is expected
