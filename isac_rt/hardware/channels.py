@@ -138,7 +138,7 @@ def elements_of(
     return Elements(
         gain=np.exp(gain + 1j * phase),
         drift=faster + 1j * turning,
-        delay=factor("delay", 1e-12, o.delay_ps, o.delay_std_ps),
+        delay=factor("delay", 1e-12, o.delay_ps, o.delay_std_ps) + 1e-12 * o.common_delay_ps,
         place=1e-3 * drawn("place", o.position_mm, o.position_std_mm, 3),
         tilt=turn * drawn("tilt", o.tilt_deg, o.tilt_std_deg, 2),
         coupling=coupling_of(o, positions, wavelength),

@@ -37,9 +37,18 @@ class FrontEnd:
     saturation: float | None = None
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that are not ideal."""
+        return tuple(part.name for part in fields(self) if getattr(self, part.name) is not None)
+
+    @property
     def ideal(self) -> bool:
         """Whether all parts are."""
-        return all(getattr(self, part.name) is None for part in fields(self))
+        return not self.parts
+
+    def only(self, part: str) -> FrontEnd:
+        """The same with all other parts ideal."""
+        return FrontEnd(**{part: getattr(self, part)})
 
 
 IDEAL = FrontEnd()
@@ -57,6 +66,10 @@ class Ends:
 
     receiver: FrontEnd
     senders: tuple[FrontEnd, ...]
+
+    def only(self, part: str) -> Ends:
+        """The same with all other parts ideal."""
+        return Ends(self.receiver.only(part), tuple(one.only(part) for one in self.senders))
 
     @property
     def ideal(self) -> bool:

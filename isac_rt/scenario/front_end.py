@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
@@ -74,6 +74,9 @@ class Elements(Node):
     delay_ps: tuple[Picoseconds, ...] = ()
     """Delay of each element's line [ps]: it shifts the range of what the element hears or sends.
     Empty, the default: 0."""
+    common_delay_ps: Picoseconds = 0.0
+    """Delay that all elements have more [ps], such as that of a board: a bias of all ranges. By
+    default none."""
     position_mm: tuple[Vector, ...] = ()
     """How far each element is from where it should be, in body axes [mm]. Empty, the default:
     nowhere."""
@@ -229,10 +232,37 @@ class Converter(Node):
                 yield name
 
 
+_AWR_MASK = [[3e5, -85.0], [1e7, -115.5]]
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "ideal": {},
+    "pll_good": {"oscillator": {"mask_dbc_hz": [[3e5, -90.0], [1e7, -120.5]]}},
+    "pll_poor": {"oscillator": {"mask_dbc_hz": [[3e5, -80.0], [1e7, -110.5]]}},
+    "awr1443": {
+        "oscillator": {"mask_dbc_hz": _AWR_MASK},
+        "transmit": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "common_delay_ps": 228.0},
+        "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "common_delay_ps": 228.0},
+        "transmit_response": {"slope_std_deg": 1.6},
+        "receive_response": {"slope_std_deg": 1.6},
+    },
+    "awr2243_cascade": {
+        "oscillator": {"mask_dbc_hz": _AWR_MASK},
+        "transmit": {"gain_std_db": 0.68, "phase_std_deg": 1.4},
+        "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4},
+        "transmit_response": {"polynomial_db": [0.0, -0.6]},
+        "receive_response": {"polynomial_db": [0.0, -0.6]},
+    },
+}
+"""What each preset says of the parts; where the numbers are from stands in `docs/hardware.md`."""
+
+
 class FrontEnd(Node):
     """How far a terminal's hardware is from ideal. Each part is off by default and acts by
     itself."""
 
+    preset: Literal["ideal", "pll_good", "pll_poor", "awr1443", "awr2243_cascade"] = "ideal"
+    """Settings by name, which the keys stated beside it override. `pll_good`, `pll_poor`: a locked
+    oscillator alone. `awr1443`, `awr2243_cascade`: boards as measured, after calibration of their
+    phases, with an oscillator as of data sheets. The default says nothing."""
     oscillator: Oscillator = Oscillator()
     """Phase noise and spurs. At an active terminal one oscillator serves both ways, so that near
     echoes hardly show its noise; at a passive one its own and the transmitter's add up."""
@@ -253,6 +283,19 @@ class FrontEnd(Node):
     saturation_dbm: Decibels | None = None
     """Power at which the transmit amplifier saturates [dBm]; `noise.tx_power_dbm` is what it would
     send if it did not. null, the default: it does not."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, data: Any) -> Any:
+        """Fill in what the preset says of keys that are not stated."""
+        said = PRESETS.get(data.get("preset", ""), {}) if isinstance(data, dict) else {}
+        out = dict(data) if said else data
+        for part, keys in said.items():
+            stated = out.get(part, {})
+            stated = stated.model_dump() if isinstance(stated, Node) else stated
+            if isinstance(stated, dict):
+                out[part] = {**keys, **stated}
+        return out
 
     @property
     def ideal(self) -> bool:

@@ -328,22 +328,52 @@ class _Flicker:
 
     def alone(self, noise_power: float) -> np.ndarray:
         """The paths that are made by themselves, strongest first."""
-        t, w = self.tones, self.waveform
-        first = self.ends.senders[0].oscillator if self.ends.senders else None
-        power = np.zeros(t.size)
-        for q, end in enumerate(self.ends.senders):
-            of_link = t.link == q
-            apart = np.abs(self.delays[of_link] - self.main)
-            if end.oscillator is first:
-                variance = within(first, w.sampled_duration, apart)
-            else:
-                two = [one for one in (first, end.oscillator) if one is not None]
-                never = np.full(apart.shape, np.inf)
-                parts = [within(one, w.sampled_duration, never) / 2 for one in two]
-                variance = np.sum(parts, axis=0)
-            power[of_link] = t.power[of_link] * variance
-        strongest = np.argsort(-power, kind="stable")[:MOST_ALONE]
-        return strongest[power[strongest] > SHARE * noise_power]
+        t = self.tones
+        power = noise_within(self.waveform, self.ends, t.link, t.power, self.delays)
+        return _strongest(power, noise_power)
+
+
+def _strongest(power: np.ndarray, noise_power: float) -> np.ndarray:
+    """Which paths' noise within a chirp (K,) [W] asks for samples of their own."""
+    strongest = np.argsort(-power, kind="stable")[:MOST_ALONE]
+    return strongest[power[strongest] > SHARE * noise_power]
+
+
+def noise_within(
+    w: Waveform, ends: Ends, link: np.ndarray, power: np.ndarray, delays: np.ndarray
+) -> np.ndarray:
+    """Noise that oscillators make of each path within a chirp beside what they make of the
+    strongest path of the first link: (K,) [W].
+
+    Parameters
+    ----------
+    link, power, delays : (K,) of each path: its link, received power [W], delay [s]
+    """
+    first = ends.senders[0].oscillator if ends.senders else None
+    of_first = np.flatnonzero(link == 0)
+    main = delays[of_first[np.argmax(power[of_first])]] if of_first.size else 0.0
+    out = np.zeros(power.size)
+    for q, end in enumerate(ends.senders):
+        of_link = link == q
+        apart = np.abs(delays[of_link] - main)
+        if end.oscillator is first:
+            variance = within(first, w.sampled_duration, apart)
+        else:
+            two = [one for one in (first, end.oscillator) if one is not None]
+            never = np.full(apart.shape, np.inf)
+            parts = [within(one, w.sampled_duration, never) / 2 for one in two]
+            variance = np.sum(parts, axis=0)
+        out[of_link] = power[of_link] * variance
+    return out
+
+
+def noise_left_out(w: Waveform, links: Links, ends: Ends, noise_power: float) -> float:
+    """Noise of oscillators that the samples of `received` leave out, over the thermal noise."""
+    link = np.repeat(np.arange(len(links)), [len(s) for _, s in links])
+    power = np.concatenate([t.amplitude**2 * s.power for t, s in links])
+    noise = noise_within(w, ends, link, power, np.concatenate([s.delay for _, s in links]))
+    noise[_strongest(noise, noise_power)] = 0.0
+    return float(noise.sum() / noise_power)
 
 
 def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) -> np.ndarray:

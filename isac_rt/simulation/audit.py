@@ -22,6 +22,7 @@ import numpy as np
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
@@ -143,6 +144,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link, stages.get(link))
     items += _standing_items(setup, light, late, short_lived / len(frames))
+    items += [] if all(e.ideal for e in setup.front_ends.values()) else _hardware_items(last)
     seconds = {
         "trace": tracing,
         "synthesis": sum(s["synthesis"] for s in stages.values()),
@@ -184,6 +186,33 @@ def _standing_items(setup: Setup, light: float, late: float, short_lived: float)
         share = 1 / (2 * setup.waveform.num_chirps)
         out.append(Item("births and deaths", said, "half a chirp", share, "of a path's amplitude"))
     return out
+
+
+def _hardware_items(frame: Frame) -> list[Item]:
+    """A line for each part of the hardware of each link that is not ideal: the seconds that it adds
+    to the samples by itself, and the noise of oscillators that is left out of the paths."""
+    out = []
+    for link in frame.paths:
+        ends = frame.ends(link)
+        ideal = _synthesis_seconds(frame, link, Ends(IDEAL, (IDEAL,) * len(ends.senders)))
+        for part in dict.fromkeys(p for one in (ends.receiver, *ends.senders) for p in one.parts):
+            seconds = max(_synthesis_seconds(frame, link, ends.only(part)) - ideal, 0.0)
+            left, error = "nothing", None
+            if part == "oscillator":
+                left = "noise within a chirp of weak paths"
+                error = decibels(frame.oscillator_noise_left_out(link))
+            words, unit = part.replace("_", " "), "dB" if part == "oscillator" else ""
+            out.append(Item("hardware", words, left, error, unit, str(link), seconds))
+    return out
+
+
+def _synthesis_seconds(frame: Frame, link: Link, ends: Ends) -> float:
+    """Processor seconds of a link's samples behind some hardware, the second time."""
+    for _ in range(2):
+        begin = time.thread_time()
+        frame.samples(link, ends)
+        spent = time.thread_time() - begin
+    return spent
 
 
 def _seconds_after(setup: Setup, frame: int) -> list[float]:

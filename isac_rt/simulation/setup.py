@@ -46,7 +46,7 @@ from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.signal.received import received
+from isac_rt.signal.received import noise_left_out, received
 from isac_rt.simulation.coverage import Coverage, coverage
 from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
@@ -122,9 +122,20 @@ class Frame:
         """E|n|^2 of a sample at a link's receiver [W], Gaussian clutter included."""
         return self._setup.noise_power(self.poses, Link(*link))
 
-    def samples(self, link: tuple[str, str]) -> IFCube:
+    def ends(self, link: tuple[str, str]) -> Ends:
+        """The hardware that shows in the samples of a link's receiver."""
+        link, all_of = Link(*link), self._setup.front_ends
+        senders = dict.fromkeys([link.tx, *self.sent])
+        return Ends(all_of[link.rx], tuple(all_of[name] for name in senders))
+
+    def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
+        """Noise within a chirp that `samples` leave out, over the thermal noise."""
+        link, power = Link(*link), self.noise_power(link)
+        return noise_left_out(self._setup.waveform, self._arriving(link), self.ends(link), power)
+
+    def samples(self, link: tuple[str, str], ends: Ends | None = None) -> IFCube:
         """IF samples of a link's receiver, dechirped in the resource blocks of the link's
-        transmitter, with noise.
+        transmitter, with noise; by other `ends` than the terminals' own hardware if there are some.
 
         What the other active terminals' chirps leave in these blocks is in the samples. They depend
         on nothing but the frame and the link.
@@ -132,7 +143,7 @@ class Frame:
         link, s = Link(*link), self._setup
         arriving, noise = self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
-        ends = Ends(s.front_ends[link.rx], tuple(s.front_ends[t.name] for t, _ in arriving))
+        ends = self.ends(link) if ends is None else ends
         if not ends.ideal:
             heard = self._listening(link)
             return received(s.waveform, arriving, *heard, ends, method, noise)

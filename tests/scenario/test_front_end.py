@@ -98,6 +98,21 @@ def test_powers_need_a_link_budget(stated):
         Scenario(swarm=SWARM, radio={"front_end": stated}, noise={"model": "snr"})
 
 
+def test_presets_give_way_to_what_is_stated(tmp_path):
+    """Key by key; what is written holds both and reads back. Planted bug: a part that is stated
+    replaces the preset's whole."""
+    one = FrontEnd(preset="awr1443", transmit={"gain_std_db": 0.2})
+    assert one.transmit.gain_std_db == 0.2
+    assert one.transmit.common_delay_ps == 228
+    assert one.oscillator.mask_dbc_hz[0] == (3e5, -85.0)
+    scenario = Scenario(swarm=SWARM, radio={"front_end": {"preset": "pll_poor"}})
+    (tmp_path / "s.yaml").write_text(to_yaml(scenario))
+    assert load(tmp_path / "s.yaml").radio.front_end == scenario.radio.front_end
+    assert FrontEnd(preset="ideal").ideal
+    with pytest.raises(ValidationError, match="Input should be 'ideal'"):
+        FrontEnd(preset="perfect")
+
+
 def test_what_is_stated_is_written_and_read_again(tmp_path):
     """Planted bug: a tuple of points written as one list."""
     mask = {"oscillator": {"mask_dbc_hz": [[1e4, -80.0], [1e6, -100.5]], "locked": False}}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import isac_rt as irt
+from isac_rt.simulation.audit import make_plan
 
 FREE = "radio.front_end.oscillator={mask_dbc_hz: [[1e4, -45], [1e7, -105]], locked: false}"
 
@@ -36,3 +37,22 @@ def test_no_phase_symbol_survives_a_free_walk(scenes):
     good, bad = (irt.run(scene).summary["terminals"]["PT1"]["ser_dpsk"] for scene in scenes)
     assert good < 0.05
     assert bad > 0.7
+
+
+def test_the_plan_states_each_part_by_itself(scenes):
+    """By link the parts that are not ideal, and none where all are. Planted bug: the parts of the
+    receiver alone."""
+    scene = irt.load(
+        "scenes/paper_swarm_consistent.yaml",
+        ["frames=4", "swarm.AT.front_end={preset: pll_poor, saturation_dbm: null}"],
+    )
+    found = [
+        (item["link"], item["modelled"], item["estimate"])
+        for item in make_plan(irt.prepare(scene))["items"]
+        if item["what"] == "hardware"
+    ]
+    assert {link for link, _, _ in found} >= {"AT->PT1", "AT->PT2"}
+    assert {part for _, part, _ in found} == {"oscillator"}
+    assert all(error < 0 for *_, error in found)
+    ideal = make_plan(irt.prepare(scenes[0]))["items"]
+    assert not [item for item in ideal if item["what"] == "hardware"]
