@@ -130,8 +130,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
             f"{y.shape[0]} receivers and {y.shape[1]} transmitters: a rank is seen from 2 and 2; "
             "calibrate with more antennas"
         )
-    one_sided = capture.source.get("sampling") in ("real", "complex_2x")
-    cell, snr_db = _reflector(y, w, one_sided)
+    cell, snr_db = _reflector(y, w, capture.one_sided)
     cells = _peaks(y, cell)
     amplitude = _amplitudes(y, cells.mean())
     rx, tx, share = _rank_one(amplitude)

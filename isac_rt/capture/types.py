@@ -44,6 +44,11 @@ class Capture:
     antennas: Antennas | None = None
     source: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def one_sided(self) -> bool:
+        """Whether the upper half of the range cells holds images."""
+        return self.source.get("sampling") in ("real", "complex_2x")
+
     def channels(self) -> np.ndarray:
         """Mean of the chirps of every pair of antennas (L_rx, L_tx, N) complex128.
 

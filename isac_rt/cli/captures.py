@@ -1,4 +1,4 @@
-"""Commands on measured samples: `import` and `calibrate`."""
+"""Commands on measured samples: `import`, `calibrate` and `receive`."""
 
 from __future__ import annotations
 
@@ -158,6 +158,45 @@ def _per_channel(found: Any) -> dict[str, Any]:
         "relative_std": spread.real.tolist(),
     }
     return out
+
+
+def receive(
+    cube: Annotated[
+        Path, typer.Argument(metavar="CUBE", help="A cube, or a file that `import` reads.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")],
+    calibration: CalibrationFile = None,
+    description: DescriptionFile = None,
+    receivers: Annotated[
+        Path | None,
+        typer.Option(metavar="YAML", help="Keys of a scenario's `receivers`; default: its own."),
+    ] = None,
+) -> None:
+    """Sense with the active terminal's receiver in measured samples: detections, the range-Doppler
+    map and a picture over azimuth."""
+    import numpy as np
+
+    from isac_rt.capture.sense import as_dataset, range_azimuth, sense
+    from isac_rt.results.files import check_folder, write_dataset, write_figure
+    from isac_rt.scenario.document import Document
+    from isac_rt.scenario.receivers import Receivers
+    from isac_rt.views.measured import drawn
+
+    settings = Receivers()
+    if receivers is not None:
+        settings = Document(receivers, "state keys of `receivers`").check(Receivers)
+    check_folder(out)
+    with working("sensing"):
+        capture = _calibrated(_opened(cube, description), calibration)
+        found = sense(capture, settings)
+        dataset = as_dataset(found)
+        write_dataset(dataset, out / "reception.nc")
+        write_figure(out / "range_doppler.png", drawn(dataset.map_power, dataset))
+        view = np.deg2rad(np.linspace(-60, 60, 241))
+        farthest = float(dataset.map_range[-1]) / (2 if capture.one_sided else 1)
+        write_figure(out / "range_azimuth.png", drawn(range_azimuth(capture, view, farthest)))
+    say(repr(found.detections))
+    say(f"in {out}: reception.nc, range_doppler.png, range_azimuth.png")
 
 
 def _imported(file: Path, description: Path | None, format: str | None) -> Capture:

@@ -38,6 +38,7 @@ COMMANDS: dict[Callable[..., None], str] = {
     studies.bench: "bench synthesis --quick",
     captures.import_: "import adc_data.bin --description board.yaml --out cube.nc",
     captures.calibrate: "calibrate cube.nc --out board.cal --json",
+    captures.receive: "receive cube.nc --calibration board.cal --out runs/measured",
     setting_up.doctor: "doctor",
     setting_up.new: "new mine.yaml --footprints buildings.geojson",
     setting_up.schema: "schema > scenario.schema.json",
