@@ -15,9 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.scenario.aspect import AspectTable
 from isac_rt.scenario.radio import Array, Elements
+from isac_rt.world.aspect import in_table
 
-PatternModel = Literal["isotropic", "sector", "cosine"]
+PatternModel = Literal["isotropic", "sector", "cosine", "table"]
 Places = tuple[tuple[float, float], ...]
 """Elements of an array by (x, z) in its plane [m], from any origin."""
 
@@ -83,7 +85,8 @@ class Antennas:
     gain : power gain of an element on boresight (linear); with ``isotropic`` everywhere
     pattern : "isotropic"; "sector": `gain` inside the field of view, nothing outside;
         "cosine": gain * cos(angle)^q in the front hemisphere, q = gain/2 - 1 so that it radiates
-        its own power, and at least 0
+        its own power, and at least 0; "table": gain times that of `table`
+    table : decibels over `gain` by direction, for "table"
     half_view : half of the field of view per axis [rad]; what lies outside has no place in the
         estimates (for "sector" nothing is sent or received there)
 
@@ -106,6 +109,7 @@ class Antennas:
     gain: float = 1.0
     pattern: PatternModel = "isotropic"
     half_view: float = np.pi / 3
+    table: AspectTable | None = None
 
     @classmethod
     def placed(cls, tx: npt.ArrayLike, rx: npt.ArrayLike, **element: Any) -> Antennas:
@@ -197,6 +201,8 @@ class Antennas:
             return np.full(direction.shape[:-1], self.gain)
         if self.pattern == "sector":
             return np.where(self.in_view(direction), self.gain, 0.0)
+        if self.table is not None:
+            return self.gain * 10 ** (in_table(self.table, direction) / 10)
         exponent = max(self.gain / 2 - 1, 0.0)
         forward = np.clip(direction[..., 1], 0.0, None)
         return self.gain * np.where(forward > 0, forward**exponent, 0.0)
@@ -235,6 +241,7 @@ def antennas_of(a: Array, waveform: Waveform) -> Antennas:
         spacing=a.spacing_wavelengths * waveform.wavelength,
         gain=10 ** (a.element_gain_dbi / 10),
         pattern=a.element_pattern,
+        table=a.pattern,
         half_view=np.deg2rad(a.field_of_view_deg) / 2,
     )
 

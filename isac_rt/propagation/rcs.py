@@ -8,6 +8,7 @@ from scipy.special import i0
 
 from isac_rt.randomness import generator
 from isac_rt.scenario.swarm import Rcs
+from isac_rt.world.aspect import in_table
 
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
 TR38901_STD_DB = {"small": 3.74, "large": 2.50}
@@ -72,6 +73,8 @@ class CrossSection:
         return 10 ** ((mean_db + std * field) / 10)
 
     def _mean_db(self, bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
+        if self._rcs.table is not None:
+            return in_table(self._rcs.table, bisector)
         if self._rcs.model != "tr38901":
             return np.full(half_bistatic.shape, self._rcs.value_dbsm)
         if self._rcs.size == "small":

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
+from isac_rt.scenario.aspect import AspectTable
 from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Decibels, Finite, Node, Positive, Problem
 
@@ -425,10 +426,16 @@ class Array(Node):
     """Whether a transmitter sends the conventional schedule in place of the pseudo-random one as
     long as a receiver finds too many paths for sparse recovery. Off by default: with the default
     number of groups there is no need of sparse recovery."""
-    element_pattern: Literal["isotropic", "sector", "cosine"] = "cosine"
+    element_pattern: Literal["isotropic", "sector", "cosine", "table"] = "cosine"
     """Pattern of one element: `isotropic` in all directions; `sector` the same gain within the
     field of view and none outside; `cosine`, the default, falls off from the boresight as a patch
-    antenna does."""
+    antenna does; `table` is as `pattern` or `pattern_file` say, over `element_gain_dbi`."""
+    pattern: AspectTable | None = None
+    """Gain of one element by azimuth and elevation, relative to `element_gain_dbi` [dB], for
+    `table`."""
+    pattern_file: str | None = None
+    """CSV file with the columns azimuth_deg, elevation_deg and dbi, a row for each direction of a
+    grid, in place of `pattern`; the path is relative to the scenario's folder."""
     element_gain_dbi: Decibels = 5.0
     """Gain of one element on boresight over an isotropic one [dBi]. At most 0 with `isotropic` and
     what the field of view leaves with `sector` (4.36 for 120 degrees), or the element would radiate
@@ -453,6 +460,8 @@ class Array(Node):
         return self.is_l and self.rx_x > 1 and self.rx_z > 1
 
     def applies(self, name: str) -> bool:
+        if name in ("pattern", "pattern_file"):
+            return self.element_pattern == "table"
         if name in ("tx_x", "tx_z"):
             return self.tx is None
         if name in ("rx_x", "rx_z"):
@@ -463,7 +472,7 @@ class Array(Node):
     def largest_gain_dbi(self) -> float:
         """Gain on boresight at which an element radiates just its power [dBi]: 4 pi over the solid
         angle of its beam. A `cosine` narrows with its gain and has no limit."""
-        if self.element_pattern == "cosine":
+        if self.element_pattern in ("cosine", "table"):
             return math.inf
         beam = 4 * math.pi
         if self.element_pattern == "sector":
@@ -471,6 +480,12 @@ class Array(Node):
         return 10 * math.log10(4 * math.pi / beam)
 
     def problems(self) -> Iterator[Problem]:
+        if self.pattern_file is not None:
+            said = "is read by isac_rt.load, which was not used; state pattern"
+            yield Problem((("pattern_file",),), said)
+        elif (self.pattern is None) == (self.element_pattern == "table"):
+            said = "goes with element_pattern table, which needs it or pattern_file"
+            yield Problem((("pattern",), ("element_pattern",)), said)
         excess = self.element_gain_dbi - self.largest_gain_dbi
         if excess > GAIN_ROUNDING_DB:
             yield Problem(

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
+from isac_rt.scenario.aspect import AspectTable
 from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
 
@@ -20,10 +21,16 @@ MAX_SPEED_MPS = 1e4
 class Rcs(Node):
     """Radar cross-section of a UAV: how strong its echo is."""
 
-    model: Literal["constant", "tr38901", "relative"] = "tr38901"
+    model: Literal["constant", "tr38901", "relative", "table"] = "tr38901"
     """Where the cross-section comes from: `constant` is `value_dbsm`; `tr38901`, the default, is
     the UAV of 3GPP TR 38.901 of the given `size`; `relative` sets the echo's level by `level_db`
-    whatever the geometry, as the paper does."""
+    whatever the geometry, as the paper does; `table` is that of `table` or `file` towards the
+    bisector of both directions."""
+    table: AspectTable | None = None
+    """Cross-section by azimuth and elevation in the UAV's frame [dBsm], for `table`."""
+    file: str | None = None
+    """CSV file with the columns azimuth_deg, elevation_deg and dbsm, a row for each direction of a
+    grid, in place of `table`; the path is relative to the scenario's folder."""
     value_dbsm: Decibels = -12.81
     """Cross-section over one square metre [dBsm], for `constant`. The default is the mean of TR
     38.901's small UAV."""
@@ -40,6 +47,16 @@ class Rcs(Node):
     line of sight at a passive terminal, the strongest other target at an active one. The default
     leaves the reference path far stronger."""
 
+    def applies(self, name: str) -> bool:
+        return name not in ("table", "file") or self.model == "table"
+
+    def problems(self) -> Iterator[Problem]:
+        if self.file is not None:
+            yield Problem((("file",),), "is read by isac_rt.load, which was not used; state table")
+        elif (self.table is None) == (self.model == "table"):
+            said = "goes with model table, and model table with it or with file"
+            yield Problem((("table",), ("model",)), said)
+
 
 class Waypoint(Node):
     """Where a UAV is at one time."""
@@ -48,6 +65,41 @@ class Waypoint(Node):
     """Time after the start of the run [s]; later than that of the waypoint before."""
     position_m: Vector
     """Position at that time: x east, y north, z up [m]."""
+    attitude_deg: Vector | None = None
+    """How the UAV is turned at that time: yaw (of its nose, clockwise from north), pitch (nose up)
+    and roll (right side down) [degrees]; at all waypoints or at none. It turns smoothly in between.
+    null, the default: `boresight` says it."""
+
+
+class Formation(Node):
+    """Several UAVs from one: all fly the same way, apart from each other."""
+
+    shape: Literal["line", "column", "wedge", "grid"]
+    """How they stand about the direction in which they set out: `line` to the right and left in
+    turn, `column` behind each other, `wedge` behind to the right and left in turn, `grid` in rows
+    to the right, each behind the one before."""
+    spacing_m: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+    """Distance of neighbours along the line, the column and the rows, and sideways and behind in
+    the wedge [m]."""
+    count: Annotated[int, Field(ge=2, le=200)]
+    """How many there are, the one that is stated included; they get its name with _1, _2 and so
+    on."""
+
+    def places(self) -> list[tuple[float, float]]:
+        """(right, ahead) of each [m], the first at (0, 0)."""
+        out = []
+        width = math.ceil(math.sqrt(self.count))
+        for i in range(self.count):
+            step = (i + 1) // 2
+            side = step if i % 2 else -step
+            right, ahead = {
+                "line": (side, 0),
+                "column": (0, -i),
+                "wedge": (side, -step),
+                "grid": (i % width, -(i // width)),
+            }[self.shape]
+            out.append((right * self.spacing_m, ahead * self.spacing_m))
+        return out
 
 
 class Uav(Node):
@@ -66,6 +118,14 @@ class Uav(Node):
     waypoints: tuple[Waypoint, ...] | None = None
     """Two places or more with their times, which the UAV flies through on a smooth curve; in place
     of `position_m` and `velocity_mps`."""
+    flight: str | None = None
+    """CSV file with the columns time_s, x, y, z [m] and, if known, yaw_deg, pitch_deg, roll_deg, in
+    place of `waypoints`, at most 5000 rows; the path is relative to the scenario's folder."""
+    mount_deg: Vector = (0.0, 0.0, 0.0)
+    """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
+    [degrees], as of a radar that looks sideways from a car. By default they look ahead."""
+    formation: Formation | None = None
+    """Further UAVs of the same kind that fly beside this one. null, the default: none."""
     boresight: Literal["velocity"] | Vector = "velocity"
     """Direction [x, y, z] that the arrays look in, of any length, or `velocity`, the default: where
     the UAV flies to. Targets outside the field of view about it are not seen."""
@@ -116,6 +176,19 @@ class Uav(Node):
         if self.front_end is not None and self.role == "target":
             said = "has no meaning for a target, which neither sends nor receives; remove it"
             yield Problem((("front_end",), ("role",)), said)
+        if self.flight is not None:
+            said = "is read by isac_rt.load, which was not used; state waypoints"
+            yield Problem((("flight",),), said)
+        if self.formation is not None:
+            said = "is unfolded in the swarm of a scenario; state UAVs one by one here"
+            yield Problem((("formation",),), said)
+        turned = [w.attitude_deg is not None for w in self.waypoints or ()]
+        if any(turned) and not all(turned):
+            said = "some have attitude_deg and some have not; state it at all or at none"
+            yield Problem((("waypoints",),), said)
+        if any(turned) and self.boresight != "velocity":
+            said = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
+            yield Problem((("boresight",), ("waypoints",)), said)
         if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
             yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:
@@ -167,6 +240,63 @@ class Uav(Node):
                     p + share * (q - p) for p, q in zip(a.position_m, b.position_m, strict=True)
                 )
         raise AssertionError("two waypoints at least")
+
+
+def unfolded(swarm: dict[Any, Any]) -> dict[Any, Any]:
+    """A swarm with the UAVs of every `formation` one by one, as plain values. What is malformed
+    stays as it is, for whoever checks it."""
+    out: dict[Any, Any] = {}
+    for name, uav in swarm.items():
+        found = _members(name, uav) if isinstance(uav, dict) and uav.get("formation") else None
+        for key, one in ({name: uav} if found is None else found).items():
+            if key in out or (key != name and key in swarm):
+                raise ValueError(f"swarm.{name}.formation: there is a {key} already; rename one")
+            out[key] = one
+    return out
+
+
+def _members(name: Any, uav: dict[str, Any]) -> dict[str, Any] | None:
+    """The UAVs of one formation; None where what is stated is no formation or no flight."""
+    try:
+        stated = uav["formation"]
+        formation = stated if isinstance(stated, Formation) else Formation.model_validate(stated)
+        alone = {key: value for key, value in uav.items() if key != "formation"}
+        ahead = _heading(Uav.model_validate(alone))
+    except ValueError:
+        return None
+    out = {}
+    for i, (right, front) in enumerate(formation.places(), start=1):
+        east = right * ahead[1] + front * ahead[0]
+        north = -right * ahead[0] + front * ahead[1]
+        out[f"{name}_{i}"] = _moved(alone, east, north)
+    return out
+
+
+def _heading(uav: Uav) -> tuple[float, float]:
+    """Horizontal unit vector (east, north) in which a UAV sets out; north where it hovers."""
+    way = uav.velocity_mps
+    if uav.waypoints is not None:
+        first, second = uav.waypoints[0], uav.waypoints[1]
+        pairs = zip(first.position_m, second.position_m, strict=True)
+        east, north, up = (b - a for a, b in pairs)
+        way = (east, north, up)
+    size = math.hypot(way[0], way[1])
+    return (way[0] / size, way[1] / size) if size > 1e-9 else (0.0, 1.0)
+
+
+def _moved(uav: dict[str, Any], east: float, north: float) -> dict[str, Any]:
+    """A UAV as plain values, somewhere else."""
+
+    def beside(place: Any) -> list[float]:
+        return [place[0] + east, place[1] + north, place[2]]
+
+    out = dict(uav)
+    if out.get("position_m") is not None:
+        out["position_m"] = beside(out["position_m"])
+    if out.get("waypoints") is not None:
+        plain = [w.model_dump() if isinstance(w, Waypoint) else w for w in out["waypoints"]]
+        out["waypoints"] = [{**w, "position_m": beside(w["position_m"])} for w in plain]
+    return out
 
 
 def _too_fast(speed: float) -> str:

@@ -16,6 +16,7 @@ from isac_rt.scenario.node import Key
 
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000
+MAX_WAYPOINTS = 5_000
 
 
 class TableError(ValueError):
@@ -122,16 +123,67 @@ def _places(path: Path) -> dict[str, Any]:
     return {"positions": [list(row) for row in rows]}
 
 
+def _flight(path: Path) -> dict[str, Any]:
+    turned = ("yaw_deg", "pitch_deg", "roll_deg")
+    c = read_csv(path, ("time_s", "x", "y", "z"), turned)
+    if len(c["time_s"]) > MAX_WAYPOINTS:
+        raise ValueError(
+            f"has {len(c['time_s'])} rows, a flight has at most {MAX_WAYPOINTS}; thin it out"
+        )
+    some = [name for name in turned if name in c]
+    if some and len(some) < len(turned):
+        raise ValueError(f"has {' and '.join(some)} alone of {', '.join(turned)}; add the others")
+    places = zip(c["x"], c["y"], c["z"], strict=True)
+    out: list[dict[str, Any]] = [
+        {"time_s": time, "position_m": list(place)}
+        for time, place in zip(c["time_s"], places, strict=True)
+    ]
+    for point, angles in zip(out, zip(*(c[name] for name in some), strict=True), strict=False):
+        point["attitude_deg"] = list(angles)
+    return {"waypoints": out}
+
+
+def _by_aspect(unit: str) -> Reader:
+    """A grid of directions, in any order of rows; `unit`: name of the column of values."""
+
+    def read(path: Path) -> dict[str, Any]:
+        c = read_csv(path, ("azimuth_deg", "elevation_deg", unit))
+        places = list(zip(c["elevation_deg"], c["azimuth_deg"], strict=True))
+        values = dict(zip(places, c[unit], strict=True))
+        rows, columns = sorted({e for e, _ in places}), sorted({a for _, a in places})
+        if len(values) != len(places):
+            raise ValueError("holds a direction twice")
+        if len(values) != len(rows) * len(columns):
+            raise ValueError(
+                f"{len(values)} directions are no grid of {len(columns)} azimuths and {len(rows)} "
+                "elevations; add those that are missing"
+            )
+        table = [[values[e, a] for a in columns] for e in rows]
+        return {"table": {"azimuth_deg": columns, "elevation_deg": rows, "values_db": table}}
+
+    return read
+
+
+def _pattern(path: Path) -> dict[str, Any]:
+    return {"pattern": _by_aspect("dbi")(path)["table"]}
+
+
 def _tables_of(tree: dict[str, Any]) -> Iterator[tuple[Key, str, Reader]]:
     """Mappings of a tree that may name a table, the key that does, and how it is read."""
     yield ("array", "tx"), "file", _places
     yield ("array", "rx"), "file", _places
+    yield ("array",), "pattern_file", _pattern
+    swarm = tree.get("swarm")
+    for name in swarm if isinstance(swarm, dict) else ():
+        yield ("swarm", name), "flight", _flight
+        yield ("swarm", name, "rcs"), "file", _by_aspect("dbsm")
 
 
-def with_tables(tree: dict[str, Any], folder: Path) -> dict[str, Any]:
+def with_tables(tree: dict[str, Any], folder: Path, *, replace: bool = False) -> dict[str, Any]:
     """A scenario's tree with the numbers of the files that it names in place of their names.
 
-    What is malformed stays as it is, for whoever checks it.
+    What is malformed stays as it is, for whoever checks it. `replace`: numbers that stand beside
+    the file give way, as those of a sweep's base do.
 
     Raises
     ------
@@ -150,7 +202,8 @@ def with_tables(tree: dict[str, Any], folder: Path) -> dict[str, Any]:
             found = reader(folder / file)
         except ValueError as problem:
             raise TableError((*key, name), str(problem)) from None
-        if double := [k for k in found if here.get(k) is not None]:
+        double = [k for k in found if here.get(k) is not None]
+        if double and not replace:
             raise TableError((*key, name), f"stands beside {double[0]}; leave one of the two out")
         del here[name]
         here.update(found)

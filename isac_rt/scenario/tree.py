@@ -21,7 +21,7 @@ from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dott
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
 from isac_rt.scenario.sensors import Sensor, with_sensor
-from isac_rt.scenario.swarm import Access, RoleChange, Uav
+from isac_rt.scenario.swarm import Access, RoleChange, Uav, unfolded
 
 OWN = "own"
 """Name of the scenario's own receivers beside those compared with them."""
@@ -100,6 +100,8 @@ class Scenario(Node):
         if not isinstance(data, dict):
             return data
         out = with_preset(with_sensor(data), data.get("receiver_preset"), {})
+        if isinstance(out.get("swarm"), dict):
+            out["swarm"] = unfolded(out["swarm"])
         own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
         if isinstance(sets := out.get("compare"), dict):
             out["compare"] = {

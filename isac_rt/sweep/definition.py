@@ -26,6 +26,7 @@ from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import load, plain_tree
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
+from isac_rt.scenario.tables import with_tables
 from isac_rt.scenario.tree import Scenario
 from isac_rt.storage import program_fingerprint, versions
 from isac_rt.world.area import city_digest, file_digest
@@ -224,6 +225,7 @@ class Plan:
             for axis, i in zip(self.sweep.axes.values(), index[:-1], strict=True):
                 for key, value in axis.entry(i).items():
                     put(here, key, value)
+            here = with_tables(here, self.base.folder, replace=True)
             here["seed"] = self.seed(index[-1])
             ground = _ground(here, files)
             yield Point(index, here, ground, point_key(here, ground), paths_key(here, ground))
@@ -374,6 +376,7 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
         for i in range(axis.size):
             _try(
                 tree,
+                file.parent,
                 axis.entry(i),
                 lambda text, n=name, j=i: refuse(("axes", n), f"entry {j} of {n} {text}"),
             )
@@ -384,7 +387,7 @@ def _options(values: dict[str, Any]) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in values.items()]
 
 
-def _try(tree: dict[str, Any], entry: dict[str, Any], refuse: Any) -> None:
+def _try(tree: dict[str, Any], folder: Path, entry: dict[str, Any], refuse: Any) -> None:
     """Check one entry of an axis alone on the base scenario.
 
     What depends on the other axes too is left to the points: a combination that cannot be is
@@ -395,7 +398,7 @@ def _try(tree: dict[str, Any], entry: dict[str, Any], refuse: Any) -> None:
     try:
         for key, value in entry.items():
             put(here, key, value)
-        Scenario.model_validate(here)
+        Scenario.model_validate(with_tables(here, folder, replace=True))
     except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
         if not isinstance(error, ValidationError):
             raise refuse(f"({shown}): the scenario has no such place; check the key") from None

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from isac_rt.scenario.swarm import Uav
 
@@ -73,14 +75,27 @@ def attitude(boresight: Sequence[float] | np.ndarray) -> np.ndarray:
     return np.array([[x0, east, x1 * up], [x1, north, -x0 * up], [0.0, up, x0 * north - x1 * east]])
 
 
+def turned(yaw_pitch_roll: npt.ArrayLike) -> Rotation:
+    """Rotation from body to world of (..., 3) yaw (clockwise from north, which is +y), pitch (nose
+    up) and roll (right side down) [degrees]."""
+    angles = np.asarray(yaw_pitch_roll, float) * [-1.0, 1.0, 1.0]
+    return Rotation.from_euler("ZXY", angles, degrees=True)
+
+
 class Trajectory:
-    """Position, velocity and acceleration of one UAV at any time: a straight line, or the smooth
-    (C2) spline through its waypoints, prolonged in a straight line beyond them."""
+    """Position, velocity, acceleration and attitude of one UAV at any time.
+
+    A straight line, or the smooth (C2) spline through its waypoints, prolonged in a straight line
+    beyond them. Attitudes of waypoints are met by a spline whose angular velocity and acceleration
+    are smooth; beyond them it stays as it is.
+    """
 
     def __init__(self, uav: Uav) -> None:
         self._fixed_boresight = (
             None if uav.boresight == "velocity" else np.array(uav.boresight, float)
         )
+        self._mount = None if not any(uav.mount_deg) else turned(uav.mount_deg).as_matrix()
+        self._attitude: RotationSpline | None = None
         if uav.waypoints is None:
             assert uav.position_m is not None  # the scenario's own check
             self._start, self._velocity, self._spline = (
@@ -94,6 +109,9 @@ class Trajectory:
             self._spline = CubicSpline(
                 times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural"
             )
+            angles = [w.attitude_deg for w in uav.waypoints if w.attitude_deg is not None]
+            if angles:
+                self._attitude = RotationSpline(times, turned(angles))
 
     def positions(self, times: np.ndarray) -> np.ndarray:
         """(K, 3) positions at times (K,) [s]."""
@@ -118,7 +136,12 @@ class Trajectory:
         boresight = self._fixed_boresight if self._fixed_boresight is not None else velocity
         if not np.any(boresight):
             boresight = np.array([0.0, 1.0, 0.0])  # a hovering UAV looks north
-        return Pose(position, velocity, acceleration, attitude(boresight))
+        rotation = attitude(boresight)
+        if self._attitude is not None:
+            rotation = self._attitude(float(np.clip(time, *self._span))).as_matrix()
+        if self._mount is not None:
+            rotation = rotation @ self._mount
+        return Pose(position, velocity, acceleration, rotation)
 
     def way(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (T,) [s] and places (T, 3) [m] of the flight between two times, whose straight
