@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from isac_rt.receive.clutter.angle_doppler import AngleDoppler
+from isac_rt.receive.clutter.bistatic import BeamSearch
 from isac_rt.receive.clutter.detectors import ClutterDetector
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.clutter.sample_matrix import SampleMatrix
@@ -59,8 +60,15 @@ def filter_of(settings: Receivers) -> ClutterFilter | None:
 
 
 def cfar_of(settings: Receivers) -> Cfar:
-    """The CFAR that the settings name, which decides at passive terminals."""
+    """The CFAR that the settings name."""
     return CFARS[settings.velocity_method](settings, ESTIMATORS[settings.refinement])
+
+
+def passive_detector_of(settings: Receivers) -> Cfar:
+    """The passive terminal's detector."""
+    if settings.passive_detector == "beams":
+        return BeamSearch(settings, ESTIMATORS[settings.refinement])
+    return cfar_of(settings)
 
 
 def detector_of(settings: Receivers) -> Detector:

@@ -10,7 +10,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.chain import Refiner, cfar_of, reader_of, refiner_of
+from isac_rt.receive.chain import Refiner, passive_detector_of, reader_of, refiner_of
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.fit import JointPath
 from isac_rt.receive.joint.neighbours import separate
@@ -27,7 +27,13 @@ from isac_rt.receive.symbols.powers import (
     transition_error_rate,
     velocity_spread,
 )
-from isac_rt.receive.types import Detections, Prediction, Reception, no_detections
+from isac_rt.receive.types import (
+    Detections,
+    ExpectedClutter,
+    Prediction,
+    Reception,
+    no_detections,
+)
 from isac_rt.scenario.receivers import Receivers
 
 REFERENCE_SPAN_DB = 20.0
@@ -67,8 +73,8 @@ class PassiveReceiver:
         groups: Sequence[int] | None = None,
     ) -> PassiveReceiver:
         """The chain that the settings name."""
-        chain = reader_of(settings, dpsk_order), cfar_of(settings), refiner_of(settings)
-        return cls(antennas, settings, *chain, groups)
+        reader, refiner = reader_of(settings, dpsk_order), refiner_of(settings)
+        return cls(antennas, settings, reader, passive_detector_of(settings), refiner, groups)
 
     def receive(
         self,
@@ -76,18 +82,20 @@ class PassiveReceiver:
         prediction: Prediction | None,
         modulated: bool,
         profile: np.ndarray | None = None,
+        clutter: ExpectedClutter | None = None,
         *,
         maps: bool = False,
     ) -> Reception:
-        """See `receive_passive`; `profile` is what the reader learned last."""
+        """See `receive_passive`; `profile` is what the reader learned last, `clutter` what the
+        terminal expects of its mesh."""
         if self.groups is not None and modulated:
             part, every = cube.of_groups(self.groups), replace(self, groups=None)
-            mine = every.receive(part, prediction, True, profile, maps=maps)
+            mine = every.receive(part, prediction, True, profile, clutter, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
         if not modulated:
             known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
-            found = self.detector.sense(clean_spectrum(cube, known), known)
+            found = self.detector.sense(clean_spectrum(cube, known), known, clutter)
             detections, reference = self._earliest(found, known)
             detections, reference = self._alone(cube, known, detections, reference)
             return self._reception(cube, known, found, detections, reference, maps=maps)
@@ -99,13 +107,13 @@ class PassiveReceiver:
             picture = make_maps(power, cube, self.settings, 1) if maps else None
             return Reception.undecoded(w, no_detections(), picture)
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
-        found, detections, reference = self._sense_data(cube, known, prediction)
+        found, detections, reference = self._sense_data(cube, known, prediction, clutter)
         phases = None
         if self.refiner is not None and reference is not None:
             phases = self._phases(cube, known, detections)
         if phases is not None:
             known = replace(known, phases=phases)
-            found, detections, reference = self._sense_data(cube, known, prediction)
+            found, detections, reference = self._sense_data(cube, known, prediction, clutter)
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -132,11 +140,15 @@ class PassiveReceiver:
         return bool(confident) and moves_as_predicted(symbols, self.reader.order)
 
     def _sense_data(
-        self, cube: IFCube, known: Known, prediction: Prediction
+        self,
+        cube: IFCube,
+        known: Known,
+        prediction: Prediction,
+        clutter: ExpectedClutter | None,
     ) -> tuple[Sensed, Detections, Estimate | None]:
         """What a frame shows once its symbols are taken out, with the reference put first."""
         spectra = clean_spectrum(cube, known)
-        found = self.detector.sense(spectra, known)
+        found = self.detector.sense(spectra, known, clutter)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
         return found, *self._alone(cube, known, detections, reference)
 

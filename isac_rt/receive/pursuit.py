@@ -44,6 +44,9 @@ LEFT_OVER_DB = 35.0
 """What is this far under a path found before, within `NEAR` rows and bins of it, is what its
 removal left."""
 NEAR = (3, 4)
+STRONG_DB, STRONG_ROUNDS = 25.0, 3
+"""Paths so far over the noise of a cell hide others far about them and are taken out first, in at
+most so many rounds."""
 CLOSE = STENCILS[1:]
 """Of the estimates after the first."""
 
@@ -123,19 +126,56 @@ def pursue(
         rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
         if not rows.size:
             break
-        new = []
-        for row, column in zip(rows.tolist(), bins.tolist(), strict=True):
-            peak = float(power[row, column])
-            local = LocalSpectra(left, known, row)
-            estimate = refine(local, *start_point(power, row, column, known.waveform))
-            new.append(_Path(estimate, peak, peak / float(level[row, column])))
-            _take_out(left, new[-1], known, noise)
-            _mark(taken, row, column, peak)
-        found += new
-        _fit_again(left, found, len(new), known, noise)
+        _find(left, power, level, (rows, bins), found, taken, known, noise)
         if len(found) < settings.max_detections:
             power = power_map(left, known)
     return [f.estimate for f in found], np.array([f.snr for f in found]), whole
+
+
+def take_strong(
+    spectra: np.ndarray, known: Known, settings: Receivers
+) -> tuple[list[Estimate], np.ndarray, np.ndarray, np.ndarray]:
+    """Paths `STRONG_DB` over the noise and more, their SNR, the spectra without them, and the map
+    (rows, P) with them; parameters as for `pursue`."""
+    left, floor = spectra.copy(), sidelobe_floor(known)
+    power = whole = power_map(left, known)
+    noise = max(float(np.median(power)), 1e-30)
+    taken, level = np.zeros(power.shape), np.full(power.shape, noise)
+    found: list[_Path] = []
+    for _ in range(STRONG_ROUNDS):
+        above = power > np.maximum(noise * 10 ** (STRONG_DB / 10), taken)
+        rows, bins = peaks(power, above, (1, 1))
+        keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
+        rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
+        if not rows.size:
+            break
+        _find(left, power, level, (rows, bins), found, taken, known, noise)
+        power = power_map(left, known)
+    return [f.estimate for f in found], np.array([f.snr for f in found]), left, whole
+
+
+def _find(
+    left: np.ndarray,
+    power: np.ndarray,
+    level: np.ndarray,
+    cells: tuple[np.ndarray, np.ndarray],
+    found: list[_Path],
+    taken: np.ndarray,
+    known: Known,
+    noise: float,
+) -> None:
+    """Estimate the paths at some peaks of the map of what is `left`, take them out, and estimate
+    again what they touch; in place."""
+    new = []
+    for row, column in zip(cells[0].tolist(), cells[1].tolist(), strict=True):
+        peak = float(power[row, column])
+        local = LocalSpectra(left, known, row)
+        estimate = refine(local, *start_point(power, row, column, known.waveform))
+        new.append(_Path(estimate, peak, peak / float(level[row, column])))
+        _take_out(left, new[-1], known, noise)
+        _mark(taken, row, column, peak)
+    found += new
+    _fit_again(left, found, len(new), known, noise)
 
 
 def sidelobe_floor(known: Known) -> float:

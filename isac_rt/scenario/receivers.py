@@ -84,6 +84,12 @@ class Receivers(Node):
     velocity predict clutter. `sample_matrix`: the antennas are filtered with the covariance of the
     cells around. `map` and `angle_doppler` first correct the own velocity and the clutter's level
     by the frame."""
+    passive_detector: Literal["cfar", "beams"] = "cfar"
+    """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out of
+    those around. `beams`: strong paths are taken out, then the antennas are added in phase towards
+    every direction, and filtered with the clutter's covariance where the city's mesh and the
+    transmitter as it is tracked predict clutter. Needs as many groups as transmit antennas, else as
+    `cfar`."""
     clutter_channels: Literal["arms", "joint"] = "arms"
     """Antennas that are filtered together, for `sample_matrix`: each arm of the virtual L by itself
     (`arms`, the default), or both at once (`joint`, several times slower)."""
@@ -139,7 +145,7 @@ class Receivers(Node):
             return True
         if own:
             return self.clutter_detector in ("angle_doppler", "sample_matrix")
-        return self.symbol_decision == "beams"
+        return "beams" in (self.symbol_decision, self.passive_detector)
 
 
 class Tracking(Node):
@@ -165,11 +171,11 @@ class Tracking(Node):
     """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s].
     null, the default: only `drop_misses` counts."""
     births: Literal["all", "unexplained"] = "all"
-    """Detections that start tracks at an active terminal. `all`, the default. `unexplained`: not
-    those where the city's mesh shows the terminal itself by one or two walls, nor those at the edge
-    of the view, nor those that stand still beside each other as a building does that the mesh
-    lacks; and no track is confirmed that is a wall's image of a nearer one or lies behind a
-    wall."""
+    """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
+    mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
+    at the edge of the view, nor, at an active one, those that stand still beside each other as a
+    building does that the mesh lacks; and no track is confirmed that is a wall's image of a nearer
+    one or lies behind a wall."""
 
     @property
     def needs_mesh(self) -> bool:
@@ -191,6 +197,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "refinement": "local",
         "symbol_decision": "powers",
         "separate_reference": False,
+        "passive_detector": "cfar",
         "clutter_filter": "none",
         "clutter_detector": "cfar",
         "false_alarm_rate": 1e-6,
@@ -214,6 +221,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             **PLAIN["receivers"],
             "symbol_decision": "beams",
             "separate_reference": True,
+            "passive_detector": "beams",
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
         },

@@ -517,9 +517,10 @@ class Scenario(Node):
     @property
     def needs_mesh(self) -> bool:
         """Whether some terminal predicts clutter from the city's mesh."""
-        return self.receivers.needs_mesh or any(
-            one.receivers.needs_mesh for one in self.compare.values()
-        )
+        sets = [self.receivers, *(one.receivers for one in self.compare.values())]
+        traced = self.propagation.model == "ray_traced" and self.city is not None
+        by_beams = traced and any(one.passive_detector == "beams" for one in sets)
+        return by_beams or any(one.needs_mesh for one in sets)
 
 
 def _plain(value: Any) -> Any:

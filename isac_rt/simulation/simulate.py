@@ -31,7 +31,12 @@ from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.terminal.terminal import (
+    ActiveTerminal,
+    PassiveTerminal,
+    Surroundings,
+    TerminalState,
+)
 
 _LOG = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
@@ -54,9 +59,12 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
     """
     s = settings or setup.scenario
+    walls = setup.walls if s.tracking.needs_mesh else None
     if link.own:
-        walls = setup.walls if s.tracking.needs_mesh else None
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
+    clutter = None
+    if s.receivers.passive_detector == "beams" and setup.expectation is not None:
+        clutter = partial(setup.expectation.between, link, setup.plan.amplitude)
     return PassiveTerminal(
         setup.waveform,
         setup.antennas,
@@ -65,6 +73,7 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
         setup.scenario.modulation.dpsk_order,
         setup.plan.amplitude,
         groups=setup.timetable.groups(link),
+        surroundings=Surroundings(walls, clutter),
     )
 
 

@@ -103,6 +103,38 @@ class MeshExpectation:
             parts.append(self._expected(s, there, back, error, amplitude, state, moved))
         return ExpectedClutter.joined(parts)
 
+    def between(
+        self, link: Link, amplitude: float, sender: np.ndarray, own: Pose
+    ) -> ExpectedClutter:
+        """What a passive terminal hears of the mesh by one bounce.
+
+        Parameters
+        ----------
+        link : of the terminal
+        amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
+        sender : (6,) position and velocity of the transmitter in world coordinates, as the terminal
+            has them. Its attitude it does not know: each element sends as on boresight
+        own : pose of the terminal in world coordinates
+
+        Returns
+        -------
+        clutter : departures in the axes of the terminal's own body
+        """
+        end = replace(own, position=own.position - self._city.origin)
+        place, velocity = sender[:3] - self._city.origin, sender[3:]
+        start = replace(end, position=place, velocity=velocity, acceleration=np.zeros(3))
+        seen = self._field.from_places(LinkState(link, 0.0, start, end))
+        heard = self._antennas.element_gain(end.to_body(seen.arrival))
+        power = (amplitude * seen.magnitude) ** 2 * self._antennas.gain * heard
+        some = power > 0
+        return ExpectedClutter(
+            seen.length[some] / SPEED_OF_LIGHT,
+            seen.rate[some] / SPEED_OF_LIGHT,
+            power[some],
+            end.to_body(seen.departure)[some],
+            end.to_body(seen.arrival)[some],
+        )
+
     def _expected(
         self,
         seen: Seen,
@@ -142,6 +174,13 @@ class ClutterExpectation(Protocol):
     ) -> ExpectedClutter:
         """Clutter of the own link of a terminal at a pose, in world coordinates; amplitude is
         sqrt(transmit power) [sqrt(W)]."""
+        ...
+
+    def between(
+        self, link: Link, amplitude: float, sender: np.ndarray, own: Pose
+    ) -> ExpectedClutter:
+        """Clutter of a link from a transmitter in a state (6,) to a passive terminal at a pose, in
+        world coordinates."""
         ...
 
 

@@ -73,9 +73,15 @@ class Walls:
         """Numbers of the mirrors of which something may lie within reach [m] and in front."""
         low, high = self._faces[2]
         p, forward = own.position, own.rotation[:, 1]
-        away = np.maximum(np.maximum(low - p, p - high), 0.0)
         ahead = np.where(forward > 0, high - p, low - p) @ forward
-        return np.flatnonzero(((away**2).sum(axis=1) < reach**2) & (ahead > 0))
+        some = self.about(p, reach)
+        return some[ahead[some] > 0]
+
+    def about(self, place: np.ndarray, reach: float) -> np.ndarray:
+        """Numbers of the mirrors of which something may lie within reach [m] of a place."""
+        low, high = self._faces[2]
+        away = np.maximum(np.maximum(low - place, place - high), 0.0)
+        return np.flatnonzero((away**2).sum(axis=1) < reach**2)
 
     def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""

@@ -1,4 +1,5 @@
-"""What a terminal hears of itself over the walls of its mesh: its own mirror images.
+"""What a terminal hears of itself over the walls of its mesh: its own mirror images, or those of its
+transmitter.
 
 A wall that is met at a right angle sends the terminal's chirps straight back, and so does a corner
 of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world
@@ -17,7 +18,7 @@ from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.ghosts import Walls, suspicion
-from isac_rt.terminal.tracker import Tracker
+from isac_rt.terminal.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
 
 EDGE = 0.3
@@ -28,50 +29,66 @@ BESIDE_CELLS = 1.5
 """Off an image by no more cells of range and of rate than these, a detection is taken for it."""
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
+ALIAS_DEVIATIONS = 3.0
+"""So many deviations further inside at a passive terminal, whose array is a third as long."""
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What an active terminal does not take for a UAV.
+    """What a terminal does not take for a UAV.
 
     Attributes
     ----------
     walls : the mesh
     antennas : Antennas
     waveform : Waveform
+    passes : 2 at an active terminal, 1 at a passive one
     """
 
     walls: Walls
     antennas: Antennas
     waveform: Waveform
+    passes: int = 2
 
-    def births(self, detections: Detections, own: Pose) -> Detections:
-        """The same detections; none starts a track that may be an image of the terminal or an alias
-        from beyond the view."""
+    def births(
+        self, detections: Detections, own: Pose, sender: np.ndarray | None = None
+    ) -> Detections:
+        """The same detections; none starts a track that may be an image of the terminal, at a
+        passive one of its `sender` (6,) in world coordinates, or an alias from beyond the view."""
         d, w = detections, self.waveform
-        inside = np.abs(d.direction) < WELL_INSIDE * self.antennas.view_limit
+        spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self.passes == 1 else 0.0
+        inside = np.abs(d.direction) + spread < WELL_INSIDE * self.antennas.view_limit
         starts = d.starts & inside.all(axis=1)
         if starts.any():
-            shown = own_images(own, self.walls, float(d.range[starts].max()) + 1)
+            reach = float(d.range[starts].max()) + 1
+            if sender is None:
+                shown = own_images(own, self.walls, reach)
+            else:
+                shown = sender_images(sender, own, self.walls, reach)
             off = np.column_stack([d.range, d.velocity])[:, None] - shown
             off[..., 1] -= self._period * np.round(off[..., 1] / self._period)
-            allowed = BESIDE_CELLS * np.array([w.range_cell(2), w.velocity_cell(2)])
+            cells = np.array([w.range_cell(self.passes), w.velocity_cell(self.passes)])
+            allowed = BESIDE_CELLS * cells
             starts &= ~(np.abs(off) < allowed).all(axis=-1).any(axis=1)
         return replace(d, starts=starts)
 
-    def remove_ghosts(self, tracker: Tracker, new: set[int], own: Pose) -> None:
-        """Take out the tracks, among those `new` to be confirmed, that a wall explains."""
+    def remove_ghosts(
+        self, tracker: Tracker, new: set[int], own: Pose, reference: Track | None = None
+    ) -> None:
+        """Take out the tracks, among those `new` to be confirmed, that a wall explains; at a
+        passive terminal with its `reference`."""
         confirmed = {t.id for t in tracker.tracks if t.confirmed} & new
         if not confirmed:
             return
-        tracks, cells = tracker.snapshot(own), resolutions(self.waveform, self.antennas, 2)
+        tracks = tracker.snapshot(own, reference)
+        cells = resolutions(self.waveform, self.antennas, self.passes)
         suspect = suspicion(tracks, own, self.walls, cells, self._period).suspect
         out = confirmed & set(tracks.ids[suspect].tolist())
         tracker.tracks = [t for t in tracker.tracks if t.id not in out]
 
     @property
     def _period(self) -> float:
-        return 2 * self.waveform.max_velocity(2)
+        return 2 * self.waveform.max_velocity(self.passes)
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
@@ -83,42 +100,85 @@ def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
     reach : farthest range that counts [m]
     """
     near = walls.near(own, reach)
-    return np.concatenate([_by_one(own, walls, near, reach), _by_two(own, walls, near, reach)])
+    here = np.concatenate([own.position, own.velocity])
+    return _images(here, here, walls, (near, near), 2 * reach) / 2
 
 
-def _by_one(own: Pose, walls: Walls, near: np.ndarray, reach: float) -> np.ndarray:
+def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
+    """Length [m] and its rate [m/s] of the ways from a transmitter to a passive terminal over one or
+    two planes: (K, 2).
+
+    Parameters
+    ----------
+    sender : (6,) position and velocity of the transmitter, world coordinates
+    own : pose of the terminal
+    reach : longest way that counts [m]
+    """
+    here = np.concatenate([own.position, own.velocity])
+    return _images(sender, here, walls, (walls.about(sender[:3], reach), walls.near(own, reach)), reach)
+
+
+def _images(
+    start: np.ndarray, end: np.ndarray, walls: Walls, near: tuple[np.ndarray, np.ndarray], reach: float
+) -> np.ndarray:
+    """Ways from `start` to `end` (6,), over mirrors that are near the one and the other."""
+    return np.concatenate(
+        [_by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)]
+    )
+
+
+def _by_one(
+    start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
+) -> np.ndarray:
     _, normals, offsets = walls.mirrors
-    n, p = normals[near], own.position
-    s = n @ p - offsets[near]
-    on = walls.holds(near, p - s[:, None] * n, EDGE)
-    on &= (np.abs(s) < reach) & (np.abs(s) > LEAST_RANGE)
-    return np.column_stack([np.abs(s), np.sign(s) * (n @ own.velocity)])[on]
+    n, p = normals[near], end[:3]
+    s, e = n @ start[:3] - offsets[near], n @ p - offsets[near]
+    some = s * e > 0
+    n, s, e, near = n[some], s[some], e[some], near[some]
+    image = start[:3] - 2 * s[:, None] * n
+    met = p + (image - p) * (e / (e + s))[:, None]
+    ways = _ways(image, start[3:] - 2 * (n @ start[3:])[:, None] * n, end)
+    on = walls.holds(near, met, EDGE) & (ways[:, 0] < reach) & (ways[:, 0] > 2 * LEAST_RANGE)
+    return ways[on]
 
 
-def _by_two(own: Pose, walls: Walls, near: np.ndarray, reach: float) -> np.ndarray:
-    """The echo over plane i, then j, comes from the image p_ij of the terminal's image in i; it
-    meets j at B, and i at A."""
+def _by_two(
+    start: np.ndarray,
+    end: np.ndarray,
+    walls: Walls,
+    near: tuple[np.ndarray, np.ndarray],
+    reach: float,
+) -> np.ndarray:
+    """The wave over plane i, then j, comes from the image p_ij of the start's image in i; it meets
+    j at B, and i at A."""
     _, normals, offsets = walls.mirrors
-    n, d, p, v = normals[near], offsets[near], own.position, own.velocity
-    s = n @ p - d
-    once = p - 2 * s[:, None] * n
-    beyond = once @ n.T - d
-    length = np.sqrt(((once[:, None] - 2 * beyond[..., None] * n - p) ** 2).sum(axis=-1))
-    both = (length / 2 < reach) & (length / 2 > LEAST_RANGE) & (beyond * s > 0)
-    i, j = np.nonzero(both & ~np.eye(near.size, dtype=bool))
-    # from the image behind j to the terminal before it
-    at_j = once[i] - 2 * beyond[i, j][:, None] * n[j]
-    B = at_j + (p - at_j) * (beyond[i, j] / (beyond[i, j] + s[j]))[:, None]
-    kept = walls.bounded(near[j], B, EDGE)
+    first, last = near
+    n, d, m, c = normals[first], offsets[first], normals[last], offsets[last]
+    p, v = end[:3], start[3:]
+    s, e = n @ start[:3] - d, m @ p - c
+    once = start[:3] - 2 * s[:, None] * n
+    beyond = once @ m.T - c
+    length = np.sqrt(((once[:, None] - 2 * beyond[..., None] * m - p) ** 2).sum(axis=-1))
+    both = (length < reach) & (length > 2 * LEAST_RANGE) & (beyond * e > 0)
+    i, j = np.nonzero(both & (first[:, None] != last))
+    # from the image behind j to the end before it
+    at_j = once[i] - 2 * beyond[i, j][:, None] * m[j]
+    B = at_j + (p - at_j) * (beyond[i, j] / (beyond[i, j] + e[j]))[:, None]
+    kept = walls.bounded(last[j], B, EDGE)
     i, j, at_j, B = i[kept], j[kept], at_j[kept], B[kept]
     height = (B * n[i]).sum(axis=1) - d[i]
     A = once[i] + (B - once[i]) * (s[i] / (s[i] + height))[:, None]
-    kept = (height * s[i] > -EDGE * np.abs(s[i])) & walls.bounded(near[i], A, EDGE)
+    kept = (height * s[i] > -EDGE * np.abs(s[i])) & walls.bounded(first[i], A, EDGE)
     i, j, at_j, A, B = i[kept], j[kept], at_j[kept], A[kept], B[kept]
-    kept = walls.holds(near[i], A, EDGE) & walls.holds(near[j], B, EDGE)
+    kept = walls.holds(first[i], A, EDGE) & walls.holds(last[j], B, EDGE)
     i, j, at_j = i[kept], j[kept], at_j[kept]
     turned = v - 2 * (n[i] @ v)[:, None] * n[i]
-    turned -= 2 * (turned * n[j]).sum(axis=1)[:, None] * n[j]
-    span = p - at_j
+    turned -= 2 * (turned * m[j]).sum(axis=1)[:, None] * m[j]
+    return _ways(at_j, turned, end)
+
+
+def _ways(places: np.ndarray, motions: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Length and rate (K, 2) of straight ways from moving places (K, 3) to `end` (6,)."""
+    span = end[:3] - places
     far = np.linalg.norm(span, axis=1)
-    return np.column_stack([far / 2, (span * (v - turned)).sum(axis=1) / (2 * far)])
+    return np.column_stack([far, (span * (end[3:] - motions)).sum(axis=1) / far])

@@ -8,8 +8,8 @@ which frames carry data, and, at the active terminal, its own payload.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -63,6 +63,8 @@ MOST_CELLS = 0.4
 paths a cell apart are found in their middle."""
 ANCHOR_CELLS = 0.75
 """A pilot off by more than this has found another cell: the track starts anew from it."""
+MOTION_BINS = 1.0
+"""Doppler bins to which the transmitter's motion must be known before the mesh explains clutter."""
 PATIENCE = 25
 """So many frames of disbelief in a row, and the next pilot is right and the track wrong."""
 REFERENCE_STD_CELLS = 0.02
@@ -180,11 +182,27 @@ class ActiveTerminal:
         self._correction = None if found is None else Correction(*found)
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What a passive terminal knows of the city.
+
+    Attributes
+    ----------
+    walls : the mesh, against which births are held; None: all are allowed
+    clutter : what the terminal expects of the mesh, from the state (6,) of its transmitter as it is
+        tracked and its own pose, both in world coordinates; None: nothing
+    """
+
+    walls: Walls | None = None
+    clutter: Callable[[np.ndarray, Pose], ExpectedClutter] | None = None
+
+
 class PassiveTerminal:
     """A PT: acquires from unmodulated frames, decodes and senses, says when it loses the line of
     sight, and comes back.
 
-    `groups` carry data for it, None for all (see `receive_passive`).
+    `groups` carry data for it, None for all (see `receive_passive`); `surroundings` are what it
+    knows of the city.
 
     Attributes
     ----------
@@ -203,6 +221,7 @@ class PassiveTerminal:
         dpsk_order: int,
         transmit_amplitude: float,
         groups: Sequence[int] | None = None,
+        surroundings: Surroundings | None = None,
     ) -> None:
         self._receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)
         self._groups, self._waveform = groups, waveform
@@ -211,12 +230,17 @@ class PassiveTerminal:
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
         self._time = -np.inf
         self._level = (transmit_amplitude * antennas.gain * waveform.wavelength / (4 * np.pi)) ** 2
+        self._surroundings = surroundings or Surroundings()
+        self._doubts = None
+        if tracking.births == "unexplained" and self._surroundings.walls is not None:
+            self._doubts = Doubts(self._surroundings.walls, antennas, waveform, passes=1)
         self.tracker = Tracker(tracking, self._period)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
         self.slips_repaired = 0
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
         self._profile: np.ndarray | None = None
+        self._clutter: ExpectedClutter | None = None
 
     def step(
         self, cube: IFCube, own_pose: Pose, time: float, modulated: bool, *, maps: bool = False
@@ -230,6 +254,7 @@ class PassiveTerminal:
             self.reference.detection = -1
         self._time = time
         self.tracker.predict(time)
+        self._clutter = self._expected_clutter(own_pose)
         reception = self.receive(
             cube, self._expect(own_pose) if modulated else None, modulated, maps
         )
@@ -241,8 +266,38 @@ class PassiveTerminal:
             self._profile = self._receiver.reader.learn(cube, reception.detections)
         self._follow(reception, own_pose, modulated)
         if self.reference is not None and reception.line_of_sight:
-            self.tracker.update(in_plane(reception.detections), own_pose, self.reference.state)
+            self._track(in_plane(reception.detections), own_pose, self.reference)
         return reception, self.tracker.snapshot(own_pose, self.reference)
+
+    def _track(self, detections: Detections, own: Pose, reference: Track) -> None:
+        """Carry on the reflectors' tracks, and start those that the city does not explain."""
+        sender = reference.state
+        if self._doubts is None:
+            self.tracker.update(detections, own, sender)
+            return
+        if self._surroundings.clutter is not None and not self._placed:
+            detections = replace(detections, starts=np.zeros(len(detections), bool))
+        new = {track.id for track in self.tracker.tracks if not track.confirmed}
+        allowed = self._doubts.births(detections, own, sender.mean[:6])
+        self.tracker.update(allowed, own, sender)
+        self._doubts.remove_ghosts(self.tracker, new, own, reference)
+
+    @property
+    def _placed(self) -> bool:
+        """Whether the transmitter's motion is known to a Doppler bin: what is expected of the city
+        before that explains nothing."""
+        if self.reference is None:
+            return False
+        spread = np.linalg.eigvalsh(self.reference.state.covariance[3:6, 3:6])[-1]
+        return bool(np.sqrt(spread) < MOTION_BINS * self._cells[1])
+
+    def _expected_clutter(self, own: Pose) -> ExpectedClutter | None:
+        """What the mesh returns of the transmitter as it is tracked; None where neither is
+        known."""
+        known = self._surroundings.clutter
+        if known is None or self.reference is None or not self._placed:
+            return None
+        return known(self.reference.state.mean[:6], own)
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
@@ -276,7 +331,8 @@ class PassiveTerminal:
         self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
     ) -> Reception:
         """What the terminal makes of one frame's samples; a custom receiver replaces this."""
-        return self._receiver.receive(cube, prediction, modulated, self._profile, maps=maps)
+        known = self._profile, self._clutter
+        return self._receiver.receive(cube, prediction, modulated, *known, maps=maps)
 
     def _expect(self, own: Pose) -> Prediction | None:
         """Prediction for a data frame; None when the range is no longer known well enough to read a

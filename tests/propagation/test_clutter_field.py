@@ -640,3 +640,27 @@ def test_points_ever_seen_are_those_seen_from_any_place():
     assert (each.any(axis=0) & ~each[0]).sum() > 100
     assert (each[2] & ~each[0] & ~each[1]).sum() > 100
     assert (~each.any(axis=0)).sum() > 100
+
+
+@pytest.mark.sionna
+def test_expected_bistatic_clutter_is_that_of_the_field_between_two_terminals():
+    """Two places before a wall: delays and rates by the points' distances to both, found from the
+    directions of arrival alone; power as the field's own integral of the bistatic Lambert law over
+    a fine grid. Planted bugs: the transmitter's motion left out; the receiver's place for the
+    transmitter's; amplitude for power."""
+    city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
+    city = replace(city, origin=np.array([310.7, -120.3, 41.9]))
+    at, speed, amplitude = np.array([1.3, 28.3, 2.1]), np.array([3.7, -8.1, 1.9]), 0.37
+    there, motion = np.array([-9.7, 21.5, 5.3]), np.array([-2.2, 4.0, 0.6])
+    copy, pose = expectation(city, speed, at + city.origin)
+    sender = np.concatenate([there + city.origin, motion])
+    found = copy.between(Link("A", "B"), amplitude, sender, pose)
+    back = pose.to_world(found.arrival)
+    points = at + ((50.0 - at[1]) / back[:, 1])[:, None] * back
+    out, home = points - there, points - at
+    far = np.linalg.norm(out, axis=1), np.linalg.norm(home, axis=1)
+    assert found.delay * C == pytest.approx(sum(far), rel=1e-12, abs=0)
+    rate = -(out @ motion) / far[0] - (home @ speed) / far[1]
+    assert found.delay_rate * C == pytest.approx(rate, rel=0, abs=1e-9)
+    truth = amplitude**2 * lambertian_wall(there, at, 0.43)
+    assert abs(10 * np.log10(found.power.sum() / truth)) < 0.05

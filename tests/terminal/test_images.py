@@ -10,7 +10,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.images import Doubts, own_images
+from isac_rt.terminal.images import Doubts, own_images, sender_images
 from isac_rt.terminal.tracker import Tracker
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, attitude
@@ -52,6 +52,30 @@ def test_wall_ground_and_their_corner_show_the_terminal():
     expected = [[d, -0.6], [h, -0.2], [far, (d * -0.6 + h * -0.2) / far]]
     found = unique(own_images(OWN, city(WALL, GROUND), 100.0))
     np.testing.assert_allclose(found, unique(np.array(expected)), rtol=0, atol=1e-8)
+
+
+def test_walls_show_a_passive_terminal_its_transmitter():
+    """The transmitter 9.6 m before the wall and 10.2 m over the ground shows there, and by both
+    planes, where its images stand: lengths of straight ways from (20.9, -3.1, 4.2), (1.7, -3.1,
+    -16.2) and (20.9, -3.1, -16.2), either order alike. Rates by the images' motion: components
+    turned in the plane or planes. A receiver behind the wall is shown nothing over it. Planted
+    bugs: the receiver's motion left out; the image turned in the last plane alone."""
+    sender = np.concatenate([ORIGIN + [1.7, -3.1, 4.2], [1.3, -0.4, 2.2]])
+    own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
+    images = [
+        ([20.9, -3.1, 4.2], [-1.3, -0.4, 2.2]),
+        ([1.7, -3.1, -16.2], [1.3, -0.4, -2.2]),
+        ([20.9, -3.1, -16.2], [-1.3, -0.4, -2.2]),
+    ]
+    expected = []
+    for place, motion in images:
+        span = np.array([3.7, 8.9, 2.2]) - place
+        far = np.linalg.norm(span)
+        expected.append([far, span @ (VELOCITY - motion) / far])
+    found = unique(sender_images(sender, own, city(WALL, GROUND), 100.0))
+    np.testing.assert_allclose(found, unique(np.array(expected)), rtol=0, atol=1e-8)
+    behind = pose([14.0, 8.9, 2.2], [-1.0, 0.0, 0.0])
+    assert not len(sender_images(sender, behind, city(WALL), 100.0))
 
 
 def test_what_is_not_there_shows_nothing():

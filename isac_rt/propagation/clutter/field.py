@@ -297,6 +297,13 @@ class ClutterField:
         parts = {id(a): a[lit] for a in vars(found).values()}
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
+    def from_places(self, state: LinkState) -> Seen:
+        """What is in sight of both ends by rays alone, wherever they are; poses in local
+        coordinates."""
+        ends = np.array([state.start.position, state.end.position])
+        share = self.sight.from_places(ends).all(axis=0).astype(np.float32)
+        return self._ways(self.cells, share, state)
+
     def _ways(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
         """What cells do of which both ends see shares (N,) that are not 0."""
         own, start, end = state.link.own, state.start, state.end

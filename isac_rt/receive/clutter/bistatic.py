@@ -1,0 +1,372 @@
+r"""A passive terminal's search for weak echoes: strong paths out, then every direction of every
+cell, whitened where clutter is.
+
+What each transmit antenna sends comes from a direction that the receiver does not know, so that
+the channels of a cell are matched receiver by receiver and added in power over the L_tx transmit
+antennas,
+
+.. math:: T(u) = \sum_t |a^H R^{-1} x_t|^2 / (a^H R^{-1} a),
+
+R the covariance of the receivers under noise and clutter, the same for all transmit antennas, in
+units of the noise. Without a target 2 T is a chi-squared field of 2 L_tx degrees of freedom. Where
+clutter remains the transmit antennas hear the same of it: with c its share of the beam's power,
+c = 1 - a^H R^-2 a / a^H R^-1 a, one of the L_tx terms grows to 1 + (L_tx - 1) c, and the threshold
+with it.
+
+The search is separable as at the active terminal (`isac_rt.receive.clutter.coherent`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage, optimize, special
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.kernels.jit import jit
+from isac_rt.receive.arms import Channels
+from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
+from isac_rt.receive.clutter.adaptive import scanned
+from isac_rt.receive.clutter.coherent import (
+    CLIMBED,
+    DIRECTIONS,
+    Bucketed,
+    Found,
+    Search,
+    denominators,
+)
+from isac_rt.receive.clutter.detectors import FINE, noise_level
+from isac_rt.receive.clutter.power import TAPER, expected_power
+from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import UNION_FLOOR, accumulate, add_power, channel_maps
+from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
+from isac_rt.receive.sense import Sensed, describe
+from isac_rt.receive.types import Detections, ExpectedClutter
+
+LEAST = 0.03
+"""Cells whose expected clutter is less than this share of the noise are taken to hold noise
+alone."""
+PRUNED = 0.9
+"""Share of the lower threshold below which a cell is not looked at further."""
+BESIDE = (3, 1)
+"""Rows and bins about a path that was taken out which may hold its remainder, `LEFT_OVER_DB` below
+it."""
+SAME_DIRECTION = 0.2
+"""Off a strong path by less than this in both direction cosines, about a resolution of the default
+array, what its lobes could hide is taken for what its removal left."""
+LOBE_MARGIN = 4.0
+BOUNDED, SCALLOPED = 2, 1.12
+"""Every so many directions of the grid is looked at for the bound, which an arm's power between two
+of them may exceed by this factor in amplitude."""
+STD_CELLS = 0.1
+"""Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
+
+
+@dataclass(frozen=True)
+class BeamSearch(BySchedule):
+    """The CFAR for paths that stand out, beams for those that do not."""
+
+    def sense(
+        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
+    ) -> Sensed:
+        if not known.full:
+            return super().sense(spectra, known, clutter)
+        strong, snr, left, power = take_strong(spectra, known, self.settings)
+        _, level = self.rule(known).detect(power)
+        maps = channel_maps(left, known)
+        rest = accumulate(maps)
+        left_over = _left_over(strong, snr, known, rest.shape)
+        noise, expected = self._noise(rest, known, clutter)
+        ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter)
+        held_up = self._unexplained(rest / (noise + expected), ratio, left_over > 0)
+        held_up *= 1 + left_over * (noise / (noise + expected))
+        ratio, sure = ratio / held_up, sure / held_up
+        ratio[: first_row(self.settings, known.range_cell)] = 0
+        rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
+        weak, found = [], []
+        for row, column in zip(rows.tolist(), bins.tolist(), strict=True):
+            beam = _Beam(left, known, row, cosines[row, column])
+            e = self.estimator.at(beam, ratio, row, column)
+            found.append(e)
+            weak.append(_near(e, known, cosines[row, column]))
+        limit = self._limits(search_of(known.antennas, known.wavenumber), known)[0]
+        detections = _described(
+            found, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
+        )
+        first = describe(strong, snr, known)
+        first = replace(first, starts=np.zeros(len(strong), bool))
+        starts = (sure[rows, bins] > 1) & ~_remainders(detections, first, known)
+        detections = replace(detections, starts=starts)
+        return Sensed([*strong, *found], Detections.joined([first, detections]), power, level)
+
+    def _noise(
+        self, power: np.ndarray, known: Known, clutter: ExpectedClutter | None
+    ) -> tuple[float, np.ndarray]:
+        """Of a cell of one channel, and the clutter's (rows, P), Doppler centred."""
+        if clutter is None:
+            return noise_level(power, None, known.channels), np.zeros_like(power)
+        expected = expected_power(clutter, known, len(power), TAPER)
+        return noise_level(power, expected, known.channels), expected
+
+    def _judge(
+        self,
+        maps: np.ndarray,
+        noise: float,
+        expected: np.ndarray,
+        known: Known,
+        clutter: ExpectedClutter | None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """T over its two thresholds, (rows, P), and its directions (rows, P, 2), Doppler
+        centred."""
+        search = search_of(known.antennas, known.wavenumber)
+        limit, least = self._limits(search, known), PRUNED * self._limits(search, known)[0]
+        shape = maps.shape[2:]
+        ratio, sure = np.zeros((2, maps[0, 0].size), np.float32)
+        cosines = np.full((ratio.size, 2), np.nan)
+        plain = search_plain(maps, search, noise, least)
+        ratio[plain.cell], sure[plain.cell] = plain.peak / limit[0], plain.peak / limit[1]
+        cosines[plain.cell] = plain.cosines
+        if clutter is not None:
+            held = np.fft.ifftshift(expected, axes=1).ravel()[plain.cell] > LEAST * noise
+            cell = plain.cell[held & (plain.peak > least)]
+            R = Bucketed.of(clutter, known, search, noise, TAPER).covariances(
+                *np.divmod(cell, shape[1])
+            )
+            x = maps.reshape(*maps.shape[:2], -1)[:, :, cell].transpose(2, 0, 1)
+            white, common = search_white(x / np.float32(np.sqrt(noise)), R, cell, search, least)
+            ratio[cell] = white.peak / (limit[0] * common)
+            sure[cell] = white.peak / (limit[1] * common)
+            cosines[cell] = white.cosines
+        ratio, sure, cosines = (
+            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1)
+            for a in (ratio, sure, cosines)
+        )
+        return ratio, sure, cosines
+
+    def _limits(self, search: Search, known: Known) -> tuple[float, float]:
+        """Thresholds of a detection and of one that may start a track."""
+        size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
+        usual, sure = self.settings.false_alarm_rates
+        looks = known.antennas.num_tx
+        return field_threshold(*size, looks, usual), field_threshold(*size, looks, sure)
+
+    def _unexplained(self, found: np.ndarray, ratio: np.ndarray, beside: np.ndarray) -> np.ndarray:
+        """How many times the power around a cell is what was expected, once at least."""
+        target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool)) | beside
+        rule = CfarRule.of(self.settings, 1)
+        return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
+
+
+@lru_cache(maxsize=8)
+def search_of(antennas: Antennas, wavenumber: float) -> Search:
+    """The search over the receivers."""
+    rx = np.arange(antennas.num_rx)
+    channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
+    return Search.of(channels, wavenumber, antennas.view_limit)
+
+
+@lru_cache(maxsize=64)
+def field_threshold(
+    lengths: tuple[float, ...], area: float, looks: int, rate: float
+) -> float:
+    """What the largest of a sum of `looks` unit exponential fields exceeds at this rate: by the
+    mean Euler characteristic of a chi-squared field (Worsley, see `adaptive`)."""
+
+    def count(t: float) -> float:
+        shape = np.exp((looks - 1) * np.log(2 * t) - t - (looks - 1) * np.log(2))
+        shape /= special.gamma(looks)
+        edges = sum(lengths) * np.sqrt(2 * t) * shape / np.sqrt(2 * np.pi)
+        inside = area * max(2 * t - (2 * looks - 1), 0.0) * shape / (2 * np.pi)
+        return float(special.gammaincc(looks, t) + edges + inside)
+
+    aim = -np.log1p(-rate)
+    return float(optimize.brentq(lambda t: np.log(count(t) / aim), looks, 400.0))
+
+
+def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
+    """Cells (flat numbers) whose T against noise alone can be `least` or more.
+
+    Of each arm the power in its best direction, summed over the transmit antennas, bounds what both
+    can hold together: T <= (sqrt(max A) + sqrt(max B))^2.
+
+    Parameters
+    ----------
+    maps : (L_tx, L_rx, rows, P) complex64 of `channel_maps`
+    noise : mean power of a cell of one channel
+    """
+    looks, size = maps.shape[0], len(search.channels)
+    flat, scale = maps.reshape(looks, size, -1), 1 / (size * noise)
+    bound = np.zeros(flat.shape[2], np.float32)
+    for lines in (search.along_x, search.along_z):
+        power = np.zeros((DIRECTIONS // BOUNDED, bound.size), np.float32)
+        for one in flat:
+            add_power(power, lines.spectra[0][::BOUNDED] @ one[lines.members[0]])
+        bound += np.sqrt(power.max(axis=0)) * np.float32(SCALLOPED)
+    cell = np.flatnonzero(bound**2 * scale >= least)
+    y = np.ascontiguousarray(flat[:, :, cell].transpose(2, 0, 1))
+    peak, cosines = _best(y, np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32), search)
+    some = np.flatnonzero(peak >= least)
+    norm = np.eye(size, dtype=np.complex64)[None] * np.float32(noise)
+    peak[some], cosines[some] = _climbed(y[some], norm, cosines[some], search)
+    return Found(cell, peak, cosines)
+
+
+def search_white(
+    x: np.ndarray, R: np.ndarray, cell: np.ndarray, search: Search, least: float
+) -> tuple[Found, np.ndarray]:
+    """The largest T of cells with covariances, and how much wider than in noise it scatters,
+    1 + (L_tx - 1) c.
+
+    Parameters
+    ----------
+    x : (S, L_tx, L_rx) channels in units of the noise's amplitude
+    R : (S, L_rx, L_rx) covariances in units of the noise
+    cell : (S,) their numbers
+    """
+    inverse = np.linalg.inv(R)
+    y = np.matmul(x, inverse.transpose(0, 2, 1))
+    peak, cosines = _best(y, 1 / denominators(inverse, search), search)
+    common = np.ones(len(x))
+    some = np.flatnonzero(peak >= least)
+    if some.size:
+        peak[some], cosines[some] = _climbed(y[some], inverse[some], cosines[some], search)
+        a = search.steering(cosines[some])
+        white = np.einsum("sij,sj->si", inverse[some], a)
+        norm = (a.conj() * white).sum(axis=1).real
+        share = 1 - (np.abs(white) ** 2).sum(axis=1) / norm
+        common[some] = 1 + (x.shape[1] - 1) * np.clip(share, 0, 1)
+    return Found(cell, peak, cosines), common
+
+
+def _climbed(
+    y: np.ndarray, inverse: np.ndarray, cosines: np.ndarray, search: Search
+) -> tuple[np.ndarray, np.ndarray]:
+    """The largest statistic near directions (S, 2), and where; as at the active terminal."""
+    peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
+    around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(9, 2)
+    for part in CLIMBED:
+        tried = cosines[:, None] + part * (search.cosines[1] - search.cosines[0]) * around
+        a = search.steering(tried)
+        norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
+        values = (np.abs(a.conj() @ y.transpose(0, 2, 1)) ** 2).sum(axis=2) / norm
+        best = values.argmax(axis=1)
+        peak, cosines = values[each, best], tried[each, best]
+    return peak, cosines
+
+
+def _best(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
+    """The largest statistic over the grid of directions, and where, of cells (S, L_tx, L_rx)."""
+    X, Z = search.along_x, search.along_z
+    along_x = (y[..., X.members[0]] @ X.spectra[0].T) * Z.turns[0].conj()
+    along_z = (y[..., Z.members[0]] @ Z.spectra[0].T).conj() * X.turns[0]
+    peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.int64)
+    _search(along_x, along_z, np.where(search.inside, scale, 0).astype(np.float32), peak, place)
+    return peak, search.cosines[place]
+
+
+@jit(fast=True)
+def _search(along_x, along_z, scale, peak, place):
+    """Largest sum over the transmit antennas of |a^H y|^2 times the scale of each cell, and its
+    place on the grid: the powers of both arms, and twice the real part of their product."""
+    looks, size = along_x.shape[1], along_x.shape[2]
+    re, im = np.empty((looks, size), np.float32), np.empty((looks, size), np.float32)
+    own, total = np.empty(size, np.float32), np.empty(size, np.float32)
+    for s in range(along_x.shape[0]):
+        norm = scale[min(s, scale.shape[0] - 1)]
+        own[:] = 0.0
+        for t in range(looks):
+            for j in range(size):
+                re[t, j], im[t, j] = along_z[s, t, j].real, along_z[s, t, j].imag
+                own[j] += re[t, j] * re[t, j] + im[t, j] * im[t, j]
+        best = np.float32(0.0)
+        for i in range(size):
+            for j in range(size):
+                total[j] = own[j]
+            for t in range(looks):
+                a, b = along_x[s, t, i].real, along_x[s, t, i].imag
+                power = a * a + b * b
+                for j in range(size):
+                    total[j] += power + np.float32(2.0) * (a * re[t, j] - b * im[t, j])
+            for j in range(size):
+                total[j] *= norm[i, j]
+            for j in range(size):
+                if total[j] > best:
+                    best = total[j]
+                    place[s, 0], place[s, 1] = i, j
+        peak[s] = best
+
+
+class _Beam(LocalSpectra):
+    """The rows around a peak, of which only the power towards one direction counts."""
+
+    def __init__(
+        self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray
+    ) -> None:
+        super().__init__(spectra, known, row)
+        search = search_of(known.antennas, known.wavenumber)
+        self._towards = search.steering(cosines).conj()
+
+    def power(self, delay: float, delay_rate: float) -> float:
+        """What the estimate maximises."""
+        return float((np.abs(self.respond(delay, delay_rate) @ self._towards) ** 2).sum())
+
+
+def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
+    """(u_x, u_z) of the most power near a direction; NaN beyond the horizon."""
+    search = search_of(known.antennas, known.wavenumber)
+    best = np.array(cosines, float)
+    around = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), axis=-1)
+    for step in FINE:
+        tried = best + step * around.reshape(25, 2)
+        power = (np.abs(search.steering(tried).conj() @ estimate.channels.T) ** 2).sum(axis=1)
+        best = tried[power.argmax()]
+    return best if (best**2).sum() <= 1 else np.full(2, np.nan)
+
+
+def _described(
+    found: list[Estimate], direction: np.ndarray, statistic: np.ndarray, known: Known
+) -> Detections:
+    """Detections with deviations by what the beam holds."""
+    w, looks = known.waveform, known.antennas.num_tx
+    snr = np.maximum(statistic - looks, 1.0) / known.channels
+    std = np.array([standard_deviations(s, 0.0, known) for s in snr]).reshape(-1, 4)
+    floor = STD_CELLS * np.array([w.range_cell(1), w.velocity_cell(1), 0.0, 0.0])
+    limit = known.antennas.view_limit
+    return Detections(
+        range=np.array([e.delay for e in found]) * known.metres,
+        velocity=np.array([e.delay_rate for e in found]) * known.metres,
+        direction=np.where((np.abs(direction) <= limit), direction, np.nan),
+        snr=1 + snr,
+        std=np.hypot(std, floor),
+        is_reference=np.zeros(len(found), bool),
+    )
+
+
+def _left_over(
+    strong: list[Estimate], snr: np.ndarray, known: Known, shape: tuple[int, ...]
+) -> np.ndarray:
+    """(rows, P) what the removal of strong paths may have left over the noise, Doppler centred."""
+    out, w = np.zeros(shape, np.float32), known.waveform
+    for e, over in zip(strong, snr, strict=True):
+        row = round(float(w.beat_cells(e.delay, e.delay_rate, 0.0)))
+        column = round(e.delay_rate * w.frame_duration * w.effective_carrier) + shape[1] // 2
+        rows = np.arange(max(row - BESIDE[0], 0), min(row + BESIDE[0] + 1, shape[0]))
+        block = np.ix_(rows, (np.arange(-BESIDE[1], BESIDE[1] + 1) + column) % shape[1])
+        out[block] = np.maximum(out[block], over * 10 ** (-LEFT_OVER_DB / 10))
+    return out
+
+
+def _remainders(weak: Detections, strong: Detections, known: Known) -> np.ndarray:
+    """(Q,) which weak detections come from the direction of a strong one whose lobes would have
+    hidden them."""
+    w = known.waveform
+    rows = np.abs(weak.range[:, None] - strong.range) / w.range_cell(1)
+    bins = np.abs(weak.velocity[:, None] - strong.velocity) / w.velocity_cell(1)
+    bins = np.minimum(bins % w.num_chirps, -bins % w.num_chirps)
+    lobes = hann_envelope(np.maximum(rows - 1, 0)) * (hann_envelope(bins) + UNION_FLOOR)
+    hidden = weak.snr[:, None] - 1 < LOBE_MARGIN * strong.snr * lobes
+    same = np.abs(weak.direction[:, None] - strong.direction).max(axis=2) < SAME_DIRECTION
+    return (hidden & same).any(axis=1)
