@@ -85,11 +85,11 @@ class Receivers(Node):
     cells around. `map` and `angle_doppler` first correct the own velocity and the clutter's level
     by the frame."""
     passive_detector: Literal["cfar", "beams"] = "cfar"
-    """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out of
-    those around. `beams`: strong paths are taken out, then the antennas are added in phase towards
-    every direction, and filtered with the clutter's covariance where the city's mesh and the
-    transmitter as it is tracked predict clutter. Needs as many groups as transmit antennas, else as
-    `cfar`."""
+    """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out
+    of those around. `beams`: strong paths are taken out, then the antennas are added in phase
+    towards every direction, and filtered with the clutter's covariance where the city's mesh and
+    the transmitter as it is tracked predict clutter. With fewer groups than transmit antennas it
+    is as `cfar`."""
     clutter_channels: Literal["arms", "joint"] = "arms"
     """Antennas that are filtered together, for `sample_matrix`: each arm of the virtual L by itself
     (`arms`, the default), or both at once (`joint`, several times slower)."""

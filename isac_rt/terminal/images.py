@@ -1,5 +1,4 @@
-"""What a terminal hears of itself over the walls of its mesh: its own mirror images, or those of its
-transmitter.
+"""What a terminal hears over the walls of its mesh: its own mirror images, or its transmitter's.
 
 A wall that is met at a right angle sends the terminal's chirps straight back, and so does a corner
 of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world
@@ -105,8 +104,8 @@ def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
 
 
 def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
-    """Length [m] and its rate [m/s] of the ways from a transmitter to a passive terminal over one or
-    two planes: (K, 2).
+    """Length [m] and its rate [m/s] of the ways from a transmitter to a passive terminal over one
+    or two planes: (K, 2).
 
     Parameters
     ----------
@@ -115,11 +114,16 @@ def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> 
     reach : longest way that counts [m]
     """
     here = np.concatenate([own.position, own.velocity])
-    return _images(sender, here, walls, (walls.about(sender[:3], reach), walls.near(own, reach)), reach)
+    near = walls.about(sender[:3], reach), walls.near(own, reach)
+    return _images(sender, here, walls, near, reach)
 
 
 def _images(
-    start: np.ndarray, end: np.ndarray, walls: Walls, near: tuple[np.ndarray, np.ndarray], reach: float
+    start: np.ndarray,
+    end: np.ndarray,
+    walls: Walls,
+    near: tuple[np.ndarray, np.ndarray],
+    reach: float,
 ) -> np.ndarray:
     """Ways from `start` to `end` (6,), over mirrors that are near the one and the other."""
     return np.concatenate(

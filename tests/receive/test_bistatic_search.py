@@ -81,7 +81,7 @@ def test_false_alarms_in_clutter_are_no_more_than_those_designed(together: bool)
 
 
 def test_a_weak_path_is_found_beside_a_strong_one():
-    """A line of sight of 10 dB a sample and an echo 45.6 dB below it, five cells and three bins off:
+    """A line of sight of 10 dB a sample and an echo 45.6 dB below, five cells and three bins off:
     the plain receiver reports the first alone, beams both, the weak one within 4 deviations.
     Planted bug: nothing taken out."""
     w, schedule, _ = frame(waveform=W)

@@ -341,7 +341,7 @@ def test_what_was_learned_last_goes_to_the_receiver():
     answers = [heard(sight()), heard(), heard(sight(0.04)), heard(sight(0.06)), heard(sight(0.08))]
     given, lessons = [], iter(["first", "second", "third"])
 
-    def receive(cube, prediction, modulated, profile, *, maps):
+    def receive(cube, prediction, modulated, profile, clutter, *, maps):
         given.append(profile)
         return answers[len(given) - 1]
 

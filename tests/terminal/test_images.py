@@ -60,7 +60,7 @@ def test_walls_show_a_passive_terminal_its_transmitter():
     -16.2) and (20.9, -3.1, -16.2), either order alike. Rates by the images' motion: components
     turned in the plane or planes. A receiver behind the wall is shown nothing over it. Planted
     bugs: the receiver's motion left out; the image turned in the last plane alone."""
-    sender = np.concatenate([ORIGIN + [1.7, -3.1, 4.2], [1.3, -0.4, 2.2]])
+    sender = np.append(OWN.position, [1.3, -0.4, 2.2])
     own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
     images = [
         ([20.9, -3.1, 4.2], [-1.3, -0.4, 2.2]),

@@ -301,8 +301,8 @@ class ClutterField:
         """What is in sight of both ends by rays alone, wherever they are; poses in local
         coordinates."""
         ends = np.array([state.start.position, state.end.position])
-        share = self.sight.from_places(ends).all(axis=0).astype(np.float32)
-        return self._ways(self.cells, share, state)
+        one, other = self.sight.from_places(ends)
+        return self._ways(self.cells, (one & other).astype(np.float32), state)
 
     def _ways(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
         """What cells do of which both ends see shares (N,) that are not 0."""

@@ -141,8 +141,7 @@ class BeamSearch(BySchedule):
             sure[cell] = white.peak / (limit[1] * common)
             cosines[cell] = white.cosines
         ratio, sure, cosines = (
-            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1)
-            for a in (ratio, sure, cosines)
+            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1) for a in (ratio, sure, cosines)
         )
         return ratio, sure, cosines
 
@@ -169,9 +168,7 @@ def search_of(antennas: Antennas, wavenumber: float) -> Search:
 
 
 @lru_cache(maxsize=64)
-def field_threshold(
-    lengths: tuple[float, ...], area: float, looks: int, rate: float
-) -> float:
+def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: float) -> float:
     """What the largest of a sum of `looks` unit exponential fields exceeds at this rate: by the
     mean Euler characteristic of a chi-squared field (Worsley, see `adaptive`)."""
 
@@ -302,9 +299,7 @@ def _search(along_x, along_z, scale, peak, place):
 class _Beam(LocalSpectra):
     """The rows around a peak, of which only the power towards one direction counts."""
 
-    def __init__(
-        self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray
-    ) -> None:
+    def __init__(self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray) -> None:
         super().__init__(spectra, known, row)
         search = search_of(known.antennas, known.wavenumber)
         self._towards = search.steering(cosines).conj()
