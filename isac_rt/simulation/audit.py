@@ -54,6 +54,7 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 if TYPE_CHECKING:
+    from isac_rt.propagation.clutter.field import ClutterField
     from isac_rt.propagation.raytrace import RayTracer
 
 _LOG = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ class Item:
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "dB of noise
         and clutter", "relative", "paths/frame", "of the power radiated" or "of a path's amplitude"
     link : "TX->RX", or "all"
-    seconds : per frame, None where it has no time of its own
+    seconds : of processor time per frame, None where it has no time of its own
     """
 
     what: str
@@ -116,8 +117,8 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
 def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     """The plan of a run: decisions, one item per line, and the seconds of each stage per frame.
 
-    Traces a few frames of the run, and those that follow, and makes the samples of one; with
-    `receive` its receivers work on them too.
+    Traces a few frames of the run, and those that follow, and makes their samples; with `receive`
+    receivers work on them too, the passive ones on the run's first frames.
     """
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
@@ -136,8 +137,8 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
             light = max(light, flight_of_light(paths, setup.waveform, fastest))
             late = max(late, _late(setup, paths, last.noise_power(link)))
             short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
-    _LOG.info("making the samples of frame %d", frames[-1])
-    stages = stage_seconds(last, setup, receive)
+    _LOG.info("making the samples of %d frames", len(frames))
+    stages = stage_seconds(setup, frames, receive)
     tracing = float(np.mean(trace))
     items = [_tracing_item(setup, frames, tracing)]
     items += _scene_items(setup)
@@ -150,7 +151,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         "synthesis": sum(s["synthesis"] for s in stages.values()),
     }
     if receive:
-        seconds["receive"] = sum(s["receive"] for s in stages.values())
+        seconds["receive"] = sum(s.get("receive", 0.0) for s in stages.values())
     return {
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
@@ -216,12 +217,13 @@ def _synthesis_seconds(frame: Frame, link: Link, ends: Ends) -> float:
 
 
 def _seconds_after(setup: Setup, frame: int) -> list[float]:
-    """Seconds that tracing the frames after a traced one takes; of the last, itself again."""
+    """Processor seconds that tracing the frames after a traced one takes; of the last, itself
+    again."""
     out = []
     for number in range(frame + 1, frame + 1 + FOLLOWED):
-        begin = time.perf_counter()
+        begin = time.process_time()
         setup.find(min(number, setup.timetable.frames - 1))
-        out.append(time.perf_counter() - begin)
+        out.append(time.process_time() - begin)
     return out
 
 
@@ -455,28 +457,41 @@ def _clutter_error(setup: Setup, frame: Frame, link: Link) -> float:
     tracer = tracer_of(setup)
     if tracer is None or tracer.field is None or link not in tracer.field.merged:
         return 0.0
+    both = (tracer.field.whole(), tracer.field)
+    return cells_apart(*(clutter_by_cell(setup, frame, link, field) for field in both))
+
+
+def clutter_by_cell(
+    setup: Setup, frame: Frame, link: Link, field: ClutterField
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the scatterers of a field the range-Doppler cells in which a link hears them, and their
+    mean powers over the noise of a cell."""
     level = setup.plan.cell_noise_gain() / frame.noise_power(link)
     origin, epoch = setup.city.origin, setup.timetable.epoch(frame.number)
     start, end = (
         replace(frame.poses[name], position=frame.poses[name].position - origin) for name in link
     )
-    state, cells, powers = LinkState(link, epoch, start, end), [], []
-    for field in (tracer.field.whole(), tracer.field):
-        seen = field.seen(state)
-        heard = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
-        motion = seen.length[heard] / SPEED_OF_LIGHT, seen.rate[heard] / SPEED_OF_LIGHT
-        cells.append(resolution_cell(setup.waveform, *motion))
-        powers.append(level * (seen.magnitude * state.elements(setup.antennas, seen))[heard] ** 2)
+    state = LinkState(link, epoch, start, end)
+    seen = field.seen(state)
+    heard = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
+    motion = seen.length[heard] / SPEED_OF_LIGHT, seen.rate[heard] / SPEED_OF_LIGHT
+    power = level * (seen.magnitude * state.elements(setup.antennas, seen))[heard] ** 2
+    return resolution_cell(setup.waveform, *motion), power
+
+
+def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np.ndarray]) -> float:
+    """Error of mean noise plus clutter that nine of ten cells keep to, of those that hold any [dB];
+    two results of `clutter_by_cell`."""
+    cells, powers = zip(every, some, strict=True)
     _, number = np.unique(np.concatenate(cells), return_inverse=True)
     count = number.max(initial=-1) + 1
     if not count:
         return 0.0
-    every, some = (
+    a, b = (
         np.bincount(part, power, count)
         for part, power in zip(np.split(number, [len(cells[0])]), powers, strict=True)
     )
-    error = np.abs(10 * np.log10((1 + some) / (1 + every)))
-    return float(np.quantile(error, 0.9))
+    return float(np.quantile(np.abs(10 * np.log10((1 + b) / (1 + a))), 0.9))
 
 
 def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:

@@ -7,12 +7,13 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from isac_rt.access import exchange
@@ -44,6 +45,8 @@ Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
 
 
+MOST_EARLY = 8
+"""First frames at the most that show what passive terminals take."""
 AHEAD = 2
 """Frames at work at once: a frame does not wait for the slowest link of the one before."""
 
@@ -304,24 +307,45 @@ def summarise(
     return run.summary()
 
 
-def stage_seconds(frame: Frame, setup: Setup, receive: bool) -> dict[Link, dict[str, float]]:
-    """Seconds of synthesis and, if asked for, reception of one frame on each link, by terminals
-    that hear it as their first."""
-    out = {}
-    links = setup.timetable.links(frame.number)
+def stage_seconds(
+    setup: Setup, frames: Sequence[int], receive: bool
+) -> dict[Link, dict[str, float]]:
+    """Processor seconds of synthesis and, if asked for, reception by link, for one frame of the run
+    on average, as some of its frames show them.
+
+    Passive terminals read what they have acquired: their reception is that of the first frames of
+    the run, one after the other.
+    """
+    timetable = setup.timetable
+    acquired = timetable.modulation.acquisition_frames + 2
+    early = range(min(acquired, MOST_EARLY, timetable.frames) if receive else 0)
+    observers = {link: _fresh(setup, link) for link in timetable.all_links}
+    spent: dict[tuple[Link, str], list[float]] = {}
     # the first once more: what is compiled on first use is not a frame's cost
-    for link in links[:1] + links:
-        stopwatch = Stopwatch()
-        with stopwatch.stage("synthesis"):
-            cube = frame.heard(link)
-        if receive:
-            terminal = standard_terminal(setup, link)
-            observer = _Observer(setup, link, terminal, setup.scenario.receivers)
-            with stopwatch.stage("receive"):
-                observer.hear(frame, cube, False)
-        stages = ("synthesis", "receive") if receive else ("synthesis",)
-        out[link] = {stage: stopwatch.spent[stage].processor for stage in stages}
+    for i, number in enumerate([frames[0], *dict.fromkeys([*early, *frames])]):
+        frame = setup.frame(number)
+        for link in timetable.links(number):
+            stopwatch = Stopwatch()
+            with stopwatch.stage("synthesis"):
+                cube = frame.heard(link)
+            if receive and (link.own or number in early):
+                observer = _fresh(setup, link) if link.own or not i else observers[link]
+                with stopwatch.stage("receive"):
+                    observer.hear(frame, cube, False)
+                spent.setdefault((link, "receive"), []).append(stopwatch.spent["receive"].processor)
+            spent.setdefault((link, "synthesis"), []).append(stopwatch.spent["synthesis"].processor)
+        if not i:
+            spent.clear()
+    out: dict[Link, dict[str, float]] = {}
+    for (link, stage), seconds in spent.items():
+        share = np.mean([timetable.holds(link, frame) for frame in range(timetable.frames)])
+        out.setdefault(link, {})[stage] = float(share * np.mean(seconds))
     return out
+
+
+def _fresh(setup: Setup, link: Link) -> _Observer:
+    """A link's standard receiver before its first frame."""
+    return _Observer(setup, link, standard_terminal(setup, link), setup.scenario.receivers)
 
 
 @dataclass

@@ -325,6 +325,8 @@ def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path
     more = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 600})})
     taller = s.city.model_copy(update={"building_height_m": 14.5})
     other = load_city(taller, ".", F_C, (0.0, 0.0, 9.0))
-    for change in ((more, city), (few, city, 1.5), (few, other)):
+    uav = few.swarm["A"].model_copy(update={"position_m": (-3.1, -20.3, 9.25)})
+    aside = few.model_copy(update={"swarm": {**few.swarm, "A": uav}})
+    for change in ((more, city), (aside, city), (few, other)):
         chains(*change)
         assert sent

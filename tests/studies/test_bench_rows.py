@@ -11,7 +11,7 @@ import pytest
 
 from isac_rt.cli.cli import main
 from isac_rt.signal.gridded import ACCURATE_ERROR, GRIDDED_ERROR
-from isac_rt.studies.bench import REQUIRED, hermes, nufft, reception, synthesis
+from isac_rt.studies.bench import REQUIRED, endtoend, hermes, nufft, reception, synthesis
 
 
 def test_errors_of_the_synthesis_are_as_stated():
@@ -127,3 +127,15 @@ def test_hermespy_floors_its_delays():
     found = hermes.measured(job)
     assert found["error"] == pytest.approx(0.805, rel=0.1)
     assert found["seconds"]["80"] == pytest.approx(4 * found["seconds"]["20"], rel=0.25)
+
+
+@pytest.mark.slow
+@pytest.mark.sionna
+def test_denser_clutter_is_nearer_the_densest():
+    """Errors fall with the stated one and stay within twice of it; scatterers grow. Planted bug:
+    the truth's merged scatterers of another link."""
+    rows = endtoend.densities(True, 1.0)
+    errors, sizes = ([row[key] for row in rows] for key in ("error", "size"))
+    assert errors == sorted(errors, reverse=True) and sizes == sorted(sizes)
+    stated = [*endtoend.ERRORS_DB, endtoend.TRUTH_DB]
+    assert all(error < 2 * db for error, db in zip(errors, stated, strict=True))

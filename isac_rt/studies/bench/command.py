@@ -40,7 +40,8 @@ SCENES: dict[str, tuple[str, int, int, tuple[str, ...]]] = {
 
 def tables(quick: bool) -> list[dict[str, Any]]:
     """One dict for each scene: `scene`, `frames`, `peak_memory_mib`, `paths_per_frame`, `processor`
-    and `wall` [s] by part and ``total``, and `stages`, the processor seconds of the frames."""
+    and `wall` [s] by part and ``total``, `stages`, the processor seconds of the frames, and what
+    `isac-rt plan --receivers` says of one frame's, `predicted`."""
     return [measured(name, quick) for name in SCENES]
 
 
@@ -115,12 +116,17 @@ def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
         parts.mark("figures")
         write_report(results, folder, pictures, setup.city)
     parts.mark("report")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    from isac_rt.simulation.audit import make_plan
+
+    predicted = make_plan(irt.prepare(scenario), receive=True)["seconds_per_frame"]
     stages = ("trace", "synthesis", "receive", "track", "other")
     return {
         "processor": parts.processor,
         "wall": parts.wall,
         "stages": {stage: results.summary["timing_s"][stage] for stage in stages},
-        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "predicted": predicted,
+        "peak_memory_mib": peak / 1024,
         "paths_per_frame": sum(results.summary["paths"].values()) / scenario.frames,
     }
 
@@ -141,6 +147,9 @@ def markdown(found: list[dict[str, Any]]) -> list[str]:
     for stage in found[0]["stages"]:
         cells = [f"{one['stages'][stage] / one['frames']:.3f}" for one in found]
         lines.append(f"| a frame's {stage} [s] | {' | '.join(cells)} |")
+        if stage in found[0]["predicted"]:
+            cells = [f"{one['predicted'][stage]:.3f}" for one in found]
+            lines.append(f"| a frame's {stage} by the plan [s] | {' | '.join(cells)} |")
     for key, title in (("peak_memory_mib", "peak memory [MiB]"), ("paths_per_frame", "paths")):
         cells = [f"{one[key]:,.0f}" for one in found]
         lines.append(f"| {title} | {' | '.join(cells)} |")
