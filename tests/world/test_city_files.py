@@ -91,6 +91,69 @@ def cityjson(**changes) -> dict:
     }
 
 
+def openstreetmap() -> bytes:
+    """What people map: heights, parts, roofs, a reference system, something that is no building."""
+    tags: list[dict] = [
+        {"building": "yes", "height": "12,5 m", "roof:shape": "gabled", "roof:height": "3"},
+        {"building": "house", "building:levels": "4;5", "roof:shape": "hipped"},
+        {"building:part": "yes", "height": "40'", "min_height": "2"},
+        {"tags": {"building": "roof", "height": 6, "roof:shape": "pyramidal"}},
+        {"landuse": "forest"},
+    ]
+    squares = [[[x + 30 * i, y] for x, y in SQUARE] for i in range(len(tags))]
+    features = [feature([ring], **t) for ring, t in zip(squares, tags, strict=True)]
+    named = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    document = {"type": "FeatureCollection", "crs": named, "features": features}
+    return json.dumps(document).replace("[0,", "[500000,").encode()
+
+
+def by_lines() -> bytes:
+    """CityJSONSeq of two buildings."""
+    whole = cityjson(CityObjects={})
+    rest = [
+        {
+            "type": "CityJSONFeature",
+            "id": key,
+            "CityObjects": {key: item},
+            "vertices": whole["vertices"],
+        }
+        for key, item in cityjson()["CityObjects"].items()
+    ]
+    return "\n".join(json.dumps(line) for line in [whole | {"vertices": []}, *rest]).encode()
+
+
+def town() -> dict:
+    """Relief, a tree by its template, water, a part above another, a reference system."""
+    base = cityjson()
+    solid = base["CityObjects"]["a"]["geometry"][0]
+    plan = {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2]], [[0, 2, 3]]]}
+    matrix = [2.0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
+    tree = {
+        "type": "GeometryInstance",
+        "template": 0,
+        "boundaries": [4],
+        "transformationMatrix": matrix,
+    }
+    objects = base["CityObjects"] | {
+        "ground": {"type": "TINRelief", "geometry": [plan]},
+        "tree": {"type": "SolitaryVegetationObject", "geometry": [tree]},
+        "lake": {"type": "WaterBody", "geometry": [plan]},
+        "part": {
+            "type": "BuildingPart",
+            "parents": ["a"],
+            "geometry": [solid | {"semantics": None}],
+        },
+    }
+    corners = [
+        [float(x), float(y), float(z)] for z in (0, 3) for x, y in ((0, 0), (2, 0), (2, 2), (0, 2))
+    ]
+    return base | {
+        "CityObjects": objects,
+        "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/25832"},
+        "geometry-templates": {"templates": [solid], "vertices-templates": corners},
+    }
+
+
 BOX = trimesh.creation.box(extents=(9.0, 7.0, 5.0))
 SHAPE = '<shape type="{}" id="a"><string name="filename" value="{}"/>{}</shape>'
 
@@ -120,7 +183,10 @@ def whole_cities() -> dict[str, tuple[str, str, dict[str, bytes]]]:
     )
     files = {
         "geojson": ("footprints", {"f.geojson": json.dumps(QUARTER).encode()}),
+        "openstreetmap": ("footprints", {"f.geojson": openstreetmap()}),
         "cityjson": ("footprints", {"f.city.json": json.dumps(cityjson()).encode()}),
+        "cityjson by lines": ("footprints", {"f.city.jsonl": by_lines()}),
+        "a town of cityjson": ("footprints", {"f.city.json": json.dumps(town()).encode()}),
         "obj": ("mesh", {"box.obj": obj.encode(), "box.mtl": b"newmtl itu_wood\nKd 1 1 1\n"}),
         "binary ply": ("mesh", {"box.ply": ply}),
         "text ply": ("mesh", {"box.ply": BOX.export(file_type="ply", encoding="ascii")}),
@@ -201,7 +267,7 @@ def mutant(kind: str, chance: random.Random) -> dict[str, bytes]:
     _, name, files = WHOLE[kind]
     spoilt = chance.choice(sorted(files)) if chance.random() < 0.3 else name
     data = files[spoilt]
-    if data[:1] == b"{" and chance.random() < 0.6:
+    if data[:1] == b"{" and b"\n{" not in data and chance.random() < 0.6:
         return files | {spoilt: json.dumps(swapped(json.loads(data), chance)).encode()}
     if data[:4] == b"glTF" and chance.random() < 0.6:
         size = int.from_bytes(data[12:16], "little")

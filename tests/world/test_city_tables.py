@@ -3,7 +3,10 @@ here. Without the extra one message names it."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import random
 import sys
 from pathlib import Path
 
@@ -223,3 +226,31 @@ def test_a_raster_in_other_coordinates_and_elsewhere(tmp_path):
         read(tmp_path, "d.geojson", terrain=name, origin=[x, y, 0])
     with pytest.raises(CityError, match=r"city\.terrain"):
         read(tmp_path, "d.geojson", terrain="nothing.tif", origin=[x, y, 0])
+
+
+@pytest.mark.parametrize("kind", ["gpkg", "shp", "fgb", "parquet", "osm", "tif"])
+def test_bent_tables_and_rasters_give_a_city_or_one_message(kind, tmp_path):
+    """FUZZ=500 looks further. Bytes changed and cut off, in one of the files."""
+    if kind == "osm":
+        pytest.importorskip("geopandas")
+        osm(tmp_path)
+    elif kind == "tif":
+        town(tmp_path)
+        raster(tmp_path)
+    elif kind == "parquet":
+        table().to_parquet(tmp_path / "town.parquet")
+    else:
+        table().to_file(tmp_path / f"town.{kind}")
+    whole = {file: file.read_bytes() for file in tmp_path.iterdir() if file.suffix != ".geojson"}
+    name, keys = ("t.geojson", {"terrain": "dem.tif"}) if kind == "tif" else (f"town.{kind}", {})
+    for case in range(int(os.environ.get("FUZZ", "8"))):
+        chance = random.Random(f"{kind} {case}")
+        for file, data in whole.items():
+            file.write_bytes(data)
+        file = chance.choice(sorted(whole))
+        bent = bytearray(whole[file])
+        for _ in range(chance.randint(1, 5)):
+            bent[chance.randrange(len(bent))] = chance.randrange(256)
+        file.write_bytes(bent[: chance.choice([len(bent), len(bent), chance.randrange(len(bent))])])
+        with contextlib.suppress(CityError):
+            assert np.isfinite(read(tmp_path, name, **keys).corners).all()

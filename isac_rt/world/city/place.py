@@ -191,7 +191,12 @@ def place_of(
         _check_degrees(boxes, name)
     middle = (boxes[:, :2].min(axis=0) + boxes[:, 2:].max(axis=0)) / 2
     x, y, z = _three(origin or (float(middle[0]), float(middle[1])))
-    lon, lat, metric = _on_earth(crs, x, y)
+    try:
+        lon, lat, metric = _on_earth(crs, x, y)
+    except RuntimeError as error:  # of PROJ
+        raise CityError(
+            f"{name}: {crs[:80]} leads nowhere on Earth ({str(error)[:200]}); correct city.crs"
+        ) from None
     if not (abs(lon) <= 360 and abs(lat) <= 90):
         raise CityError(
             f"{name}: {x:.10g}, {y:.10g} lies outside of {crs}; correct city.crs or city.origin"

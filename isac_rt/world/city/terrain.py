@@ -165,7 +165,9 @@ def _sampled(
             cells = _cells(raster, nodes, place, path.name, notes)
             window, shape, cells = _window(rasterio, raster, cells, path.name)
             band = raster.read(1, window=window, out_shape=shape, masked=True)
-    except (rasterio.errors.RasterioError, ValueError, MemoryError) as error:
+    except CityError:
+        raise
+    except (rasterio.errors.RasterioError, RuntimeError, ValueError, MemoryError) as error:
         raise CityError(f"{path.name}: not readable as a GeoTIFF ({error})") from None
     heights = np.ma.filled(band.astype(np.float64), np.nan)
     missing = ~np.isfinite(heights)
