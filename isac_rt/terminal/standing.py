@@ -30,10 +30,19 @@ CROWD = 3
 
 
 class Standing:
-    """Where echoes stood still that nothing explains."""
+    """Where echoes stood still that nothing explains.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    turn : by which direction cosines are ambiguous, the wavelength over the array's spacing: an
+        echo from beyond the view is seen so far beside its direction; inf: by nothing
+    """
+
+    def __init__(self, turn: float) -> None:
         self._seen = np.zeros((0, 4))
+        steps = (0, -1, 1) if np.isfinite(turn) else (0,)
+        by = [step * turn if step else 0.0 for step in steps]
+        self._aliases = np.array([(x, z) for x in by for z in by])
 
     def memory(self) -> np.ndarray:
         """(n, 4) times and places, for `restore`."""
@@ -44,7 +53,8 @@ class Standing:
         self._seen = memory
 
     def look(self, d: Detections, own: Pose, time: float, period: float) -> np.ndarray:
-        """Take down a frame's echoes that stand still, of those that may start a track.
+        """Take down a frame's echoes that stand still, of those that may start a track. What would
+        stand still in a direction that it may be an alias of stands there.
 
         Parameters
         ----------
@@ -55,13 +65,16 @@ class Standing:
         -------
         (Q,) which of all detections stand still within a crowd
         """
-        known = np.isfinite(d.direction).all(axis=1) & ((d.direction**2).sum(axis=1) < 1)
-        towards = own.to_world(unit_vector(np.where(known[:, None], d.direction, 0.0)))
-        off = d.velocity + towards @ own.velocity
-        off -= period * np.round(off / period)
+        u = d.direction[:, None] + self._aliases
+        real = (u**2).sum(axis=-1) < 1
+        towards = own.to_world(unit_vector(np.where(real[..., None], u, 0.0)))
+        off = d.velocity[:, None] + towards @ own.velocity
+        off = np.where(real, np.abs(off - period * np.round(off / period)), np.inf)
+        best = off.argmin(axis=1)  # the direction in which it would stand still
+        each = np.arange(len(d))
         across = np.linalg.norm(own.velocity) * np.linalg.norm(d.std[:, 2:], axis=1)
-        still = known & (np.abs(off) < STILL_MPS + 3 * np.hypot(d.std[:, 1], across))
-        place = own.position + d.range[:, None] * towards
+        still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
+        place = own.position + d.range[:, None] * towards[each, best]
         new = np.column_stack([np.full(len(d), time), place])[still & d.starts]
         self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
         return still & self.crowded(place)

@@ -119,7 +119,8 @@ class ActiveTerminal:
             if walls is None:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
             self._doubts = Doubts(walls, antennas, waveform)
-        self._standing = Standing()
+        step = antennas.step(2)
+        self._standing = Standing(waveform.wavelength / step if step else np.inf)
         self._correction: Correction | None = None
 
     def step(

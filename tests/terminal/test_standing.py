@@ -47,18 +47,30 @@ def test_a_wall_is_a_crowd_and_who_flies_before_it_is_not():
     d = seen(
         0.0, [*WALL, (0.0, 28.0, 6.0), (10.0, 90.0, 5.0)], [(0, 0, 0)] * 5 + [(0, -2, 0), (0, 0, 0)]
     )
-    assert Standing().look(d, own(0.0), 0.0, PERIOD).tolist() == [True] * 5 + [False] * 2
+    assert Standing(1.71).look(d, own(0.0), 0.0, PERIOD).tolist() == [True] * 5 + [False] * 2
+
+
+def test_a_wall_beyond_the_view_is_seen_elsewhere_and_still_stands():
+    """The same wall 25 m to the right and 8 m ahead, at u_x of 0.93 to 0.96: seen 1.71 to the left
+    of it, where nothing at that rate would stand still. Planted bug: the directions as they are
+    seen."""
+    places = [(25.0 + 2 * k, 8.0 + k, 2.0) for k in range(5)]
+    d = seen(0.0, places)
+    seen_at = Detections(**{**vars(d), "direction": d.direction - [1.71, 0.0]})
+    assert (d.direction[:, 0] > 0.9).all()
+    assert Standing(1.71).look(seen_at, own(0.0), 0.0, PERIOD).all()
+    assert not Standing(np.inf).look(seen_at, own(0.0), 0.0, PERIOD).any()
 
 
 def test_velocities_are_folded():
     d = seen(0.0, WALL)
     folded = Detections(**{**vars(d), "velocity": d.velocity + PERIOD})
-    assert Standing().look(folded, own(0.0), 0.0, PERIOD).all()
+    assert Standing(1.71).look(folded, own(0.0), 0.0, PERIOD).all()
 
 
 def test_a_uav_that_hovers_alone_is_no_crowd():
     """Thirty frames with errors of 0.3 m on each axis. Planted bug: echoes of one place count."""
-    rng, standing = np.random.default_rng(4), Standing()
+    rng, standing = np.random.default_rng(4), Standing(1.71)
     for frame in range(30):
         place = np.array([2.0, 25.0, 6.0]) + rng.normal(0, 0.3, 3)
         time = 0.05 * frame
@@ -68,12 +80,12 @@ def test_a_uav_that_hovers_alone_is_no_crowd():
 def test_a_wall_that_shows_itself_piece_by_piece():
     """One place a frame: the fourth has three beside it. Long after, it is forgotten; kept by its
     memory it is not. Planted bugs: no memory; no end of it."""
-    standing = Standing()
+    standing = Standing(1.71)
     found = [
         bool(standing.look(seen(t := 0.1 * k, [WALL[k]]), own(t), t, PERIOD)[0]) for k in range(4)
     ]
     assert found == [False, False, False, True]
-    again = Standing()
+    again = Standing(1.71)
     again.restore(standing.memory())
     assert again.look(seen(0.4, [WALL[4]]), own(0.4), 0.4, PERIOD).all()
     late = 0.4 + MEMORY_S + 0.01
@@ -83,7 +95,7 @@ def test_a_wall_that_shows_itself_piece_by_piece():
 def test_only_what_could_start_a_track_makes_a_crowd():
     """What the city explains is no surface that it lacks."""
     d = seen(0.0, WALL, starts=[False] * 5)
-    assert not Standing().look(d, own(0.0), 0.0, PERIOD).any()
+    assert not Standing(1.71).look(d, own(0.0), 0.0, PERIOD).any()
 
 
 @pytest.mark.parametrize(
@@ -97,7 +109,7 @@ def test_only_what_could_start_a_track_makes_a_crowd():
 )
 def test_a_track_that_stands_still_within_a_crowd(place, velocity, std, expected):
     """Planted bugs: the speed alone; the place alone."""
-    standing = Standing()
+    standing = Standing(1.71)
     standing.look(seen(0.0, WALL), own(0.0), 0.0, PERIOD)
     P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 10.0)

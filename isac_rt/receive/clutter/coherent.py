@@ -216,13 +216,15 @@ def _climbed(
     `statistic` of steering vectors (S, 9, L) is (S, 9).
     """
     peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
+    towards = search.steering(cosines)
     around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(9, 2)
     for part in CLIMBED:
         step = part * (search.cosines[1] - search.cosines[0])
-        tried = cosines[:, None] + step * around
-        values = statistic(search.steering(tried))
+        turned = search.steering(step * around)  # the phases of two directions add
+        values = statistic(towards[:, None] * turned)
         best = values.argmax(axis=1)
-        peak, cosines = values[each, best], tried[each, best]
+        peak, cosines = values[each, best], cosines + step * around[best]
+        towards = towards * turned[best]
     return peak, cosines
 
 
