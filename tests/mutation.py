@@ -124,7 +124,7 @@ TESTS_OF = {
     "storage.py": "test_storage",
     "propagation/store.py": "test_keys test_sweep",
     "simulation/resume.py": "test_resume",
-    "simulation/simulate.py": "test_resume test_simulate",
+    "simulation/simulate.py": "test_resume test_simulate test_fall_back",
     "sweep/definition.py": "test_sweep test_keys",
     "sweep/execute.py": "test_sweep test_trouble",
     "sweep/outcomes.py": "test_sweep test_trouble",
@@ -135,7 +135,7 @@ TESTS_OF = {
     "results/scoring.py": "test_scoring",
     "results/sensing.py": "test_sensing",
     "results/records.py": "test_results test_resume",
-    "results/recorder.py": "test_results test_resume",
+    "results/recorder.py": "test_results test_resume test_fall_back",
 }
 """Modules of the signal, the propagation, the receivers, the terminals, access and flights, of what
 is kept and of scores, and the tests that stand for each."""
@@ -178,6 +178,7 @@ EXCUSED = [
     ("access/ook.py", "total * (samples", "energies that are compared with each other"),
     ("propagation/clutter/penumbra.py", "LIFT / side", "a quotient by a sign"),
     ("propagation/legs/images.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
+    ("results/provenance.py", "timeout=20", "a limit"),
     ("receive/omp.py", "support] = -2", "less than any modulus, as -1 is"),
     (
         "signal/profiles.py",

@@ -17,6 +17,7 @@ from isac_rt import storage
 from isac_rt.results import provenance
 from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import ResultsError, check_folder, open_results, save
+from isac_rt.results.recorder import kept_of_paths
 from isac_rt.results.records import KINDS
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import load, to_yaml
@@ -347,3 +348,30 @@ def missing(old, new, at="summary"):
         return []
     lost = [f"{at}.{key}" for key in old if key not in new]
     return lost + [m for k in old.keys() & new.keys() for m in missing(old[k], new[k], f"{at}.{k}")]
+
+
+def test_what_was_kept_of_the_paths_is_means_and_the_worst():
+    """Three frames of one link and one of another, generic numbers. Planted bugs: the kinds left
+    out; one that a frame has none of left out of the mean; the last frame's bounds."""
+
+    def use(found, kept, bounces, left_out, error):
+        worst = dict.fromkeys(("plane_error", "straight_error", "turning_error"), error)
+        counts = dict.fromkeys(("unheard", "weak", "plane", "straight"), 2 * found)
+        return (
+            counts
+            | worst
+            | {"found": found, "kept": kept, "bounces": bounces, "left_out": left_out}
+        )
+
+    frames = [
+        {"A->A": use(3, {"target": 2, "ghost": 1}, 1, 0.02, 0.3), "A->B": use(1, {}, 0, 0, 0.1)},
+        {"A->A": use(5, {"target": 4}, 2, 0.5, 0.1)},
+        {"A->A": use(6, {"target": 5, "diffuse": 3}, 0, 0.1, 0.2)},
+    ]
+    found = kept_of_paths(frames)
+    assert {link: block["frames"] for link, block in found.items()} == {"A->A": 3, "A->B": 1}
+    one = found["A->A"]
+    assert (one["found_per_frame"], one["weak_per_frame"]) == (4.67, 9.33)
+    assert one["kept_per_frame"] == {"target": 3.67, "ghost": 0.33, "diffuse": 1.0}
+    assert (one["bounces"], one["left_out_db"], one["plane_error_rad"]) == (2, -3.01, 0.3)
+    assert found["A->B"]["left_out_db"] is None and found["A->B"]["kept_per_frame"] == {}
