@@ -147,6 +147,17 @@ def test_keys_hold_the_files_that_a_scenario_names(folder, name):
     assert same == {"frames of a study"} | (set() if name == "house.obj" else paths)
 
 
+def test_files_of_a_sweep_are_those_beside_its_base(folder):
+    """The sweep lies in a folder of its own, with another mesh of the same name beside it. Planted
+    bug: files looked for beside the sweep."""
+    (folder / "sweeps").mkdir()
+    (folder / "sweeps" / "w.yaml").write_text(SWEEP.replace("s.yaml", "../s.yaml"))
+    (folder / "sweeps" / "house.obj").write_text(HOUSE.replace("v 1 0", "v 3 0"))
+    here, there = (load_sweep(folder / f / "w.yaml") for f in (".", "sweeps"))
+    assert next(there.points()).ground == next(here.points()).ground
+    assert there.base.folder == folder.resolve()
+
+
 def leaves(tree, at=()):
     """Places of all values in a tree of mappings and lists, empty ones included."""
     inside = tree.items() if isinstance(tree, dict) else enumerate(tree)
