@@ -21,14 +21,18 @@ from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.payload import Payload, running_phases
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.hardware.front_end import Ends, front_end_of
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
 from isac_rt.scenario.environment import Clutter
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
+from isac_rt.signal.noise import WhiteNoise
+from isac_rt.signal.received import received
 from isac_rt.studies.paper.montecarlo import Counts, Curve, Precision, sample
 from isac_rt.studies.paper.outcome import Progress
 from isac_rt.studies.waves import sender, waves
@@ -41,6 +45,7 @@ VELOCITY_ERROR = 0.25
 """Errors of the prediction: standard deviation in range cells; largest, uniform [m/s]."""
 
 
+IDEAL_NODE = FrontEnd()
 PREDICTION_ERROR = f"{RANGE_ERROR_CELLS} cell rms, up to {VELOCITY_ERROR} m/s"
 
 
@@ -74,6 +79,7 @@ class Setting:
     orders : of the DPSK symbols that are decided
     literal : decide by the paper's letter as well: floor and round on the integer grid, data phases
         left in
+    front_end : hardware of both ends, drawn anew for each frame
     """
 
     name: str
@@ -85,6 +91,7 @@ class Setting:
     run_cells: int | None = None
     orders: tuple[int, ...] = ()
     literal: bool = False
+    front_end: FrontEnd = IDEAL_NODE
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,15 @@ def draw_frame(link: Setting, seed: int, index: int) -> LinkFrame:
     rx = Pose.at_rest(length * direction, (0, -1, 0))
     sent = sender(antennas, schedule, payload, tx)
     method = Auto(max_direct=1) if link.clutter else Direct()
-    cube = if_signal(w, [(sent, paths)], ReceiveArray(rx, antennas), Reference(0.0), method)
+    job = w, [(sent, paths)], ReceiveArray(rx, antennas), Reference(0.0)
+    if link.front_end.ideal:
+        cube = if_signal(*job, method)
+    else:
+        own, other = (
+            front_end_of(link.front_end, w, antennas, seed, f"{end} {link.name} {index}")
+            for end in ("PT", "AT")
+        )
+        cube = received(*job, Ends(own, (other,)), method, WhiteNoise(0.0, np.zeros(2)))
     errors = 0.0, 0.0
     if not link.exact_prediction:
         errors = RANGE_ERROR_CELLS * rng.standard_normal(), rng.uniform(-1, 1) * VELOCITY_ERROR
