@@ -59,8 +59,11 @@ if TYPE_CHECKING:
     from isac_rt.simulation.setup import trace as trace
     from isac_rt.simulation.simulate import run as run
     from isac_rt.simulation.simulate import standard_terminal as standard_terminal
+    from isac_rt.sweep import Samples as Samples
+    from isac_rt.sweep import load_dataset as load_dataset
     from isac_rt.sweep import load_sweep as load_sweep
     from isac_rt.sweep import open_sweep as open_sweep
+    from isac_rt.sweep import run_dataset as run_dataset
     from isac_rt.sweep import run_sweep as run_sweep
     from isac_rt.terminal.terminal import ActiveTerminal as ActiveTerminal
     from isac_rt.terminal.terminal import PassiveTerminal as PassiveTerminal
@@ -88,7 +91,7 @@ _NAMES = {
     "signal.methods": "Auto Direct Exact Gridded Separable",
     "simulation.setup": "Frame Setup city_of prepare trace",
     "simulation.simulate": "run standard_terminal",
-    "sweep": "load_sweep open_sweep run_sweep",
+    "sweep": "Samples load_dataset load_sweep open_sweep run_dataset run_sweep",
     "terminal.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",
     "views.interactive": "scene_3d",

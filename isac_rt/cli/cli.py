@@ -33,6 +33,7 @@ COMMANDS: dict[Callable[..., None], str] = {
     simulation.figures: "figures runs/munich --as svg --style column",
     simulation.export: "export runs/munich --as csv --out tables",
     sweeps.sweep: "sweep scenes/sweeps/canyon_power.yaml --workers 2",
+    sweeps.dataset: "dataset scenes/sweeps/canyon_dataset.yaml --workers 2",
     studies.reproduce: "reproduce table1 fig8 --quick",
     studies.validate: "validate --quick --only geometry",
     studies.bench: "bench synthesis --quick",

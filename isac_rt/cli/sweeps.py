@@ -97,3 +97,49 @@ def _say_status(folder: Path) -> None:
     say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in found.errors))
     if found.failed:
         say("  --retry-failed runs them again")
+
+
+def dataset(
+    file: Annotated[Path, typer.Argument(metavar="DATASET", help="The data set, a YAML file.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where it goes; default runs/NAME.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes; default one per core, as memory allows."),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
+    ] = None,
+) -> None:
+    """Draw many scenes and keep maps, paths, truth, tracks and bits for learning, or make what is
+    missing: the same command again goes on."""
+    from isac_rt.results.files import check_folder
+
+    with working("drawing the scenes"):
+        from isac_rt.sweep import SchedulerLost, load_dataset, run_dataset
+
+        plan = load_dataset(file)
+    folder = out if out is not None else Path("runs") / plan.data.name
+    check_folder(folder)
+    with ending_soon_after_interrupt(folder):
+        try:
+            card = with_progress(
+                lambda report: run_dataset(
+                    plan,
+                    folder,
+                    workers=workers,
+                    scheduler=scheduler,
+                    progress=lambda done, failed, total: report(
+                        done + failed, total, f"{failed} failed"
+                    ),
+                ),
+                "scenes",
+            )
+        except SchedulerLost as lost:
+            typer.echo(lost, err=True)
+            raise typer.Exit(1) from None
+    counts = {name: (len(shards), sum(shards.values())) for name, shards in card["splits"].items()}
+    said = ", ".join(f"{name}: {s} scenes, {n:,} samples" for name, (s, n) in counts.items())
+    say(f"{said}; {card['bytes'] / 1e6:,.1f} MB, {card['scenes_failed']} scenes failed")
+    say(f"data set in {folder}: SPLIT/NUMBER.tar (WebDataset), card.json")

@@ -157,7 +157,10 @@ class Timetable:
         return random_payload(self.waveform, usual, self.modulation.dpsk_order, rng)
 
     def snapshots(self, count: int) -> set[int]:
-        """At most `count` frames, spread over those in data mode that active terminals process."""
+        """At most `count` frames, spread over those in data mode that active terminals process; all
+        frames where `count` is as large."""
+        if count >= self.frames:
+            return set(range(self.frames))
         heard = [
             f
             for f in range(0, self.frames, self.active_every)

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from isac_rt.sweep.definition import MAX_POINTS, Plan, Sweep, load_sweep
+from isac_rt.sweep.drawn import DataPlan, load_dataset
 from isac_rt.sweep.execute import PointsLeft, SchedulerLost, SweepError, run_sweep
+from isac_rt.sweep.make_dataset import run_dataset
 from isac_rt.sweep.outcomes import Outcomes, Status, assemble, open_sweep, save_dataset, status
+from isac_rt.sweep.shards import Samples
 
 __all__ = [
     "MAX_POINTS",
+    "DataPlan",
     "Outcomes",
     "Plan",
     "PointsLeft",
+    "Samples",
     "SchedulerLost",
     "Status",
     "Sweep",
     "SweepError",
     "assemble",
+    "load_dataset",
     "load_sweep",
     "open_sweep",
+    "run_dataset",
     "run_sweep",
     "save_dataset",
     "status",

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
@@ -38,7 +38,7 @@ OWN_DIMENSIONS = ("link", "repetition", "kind")
 """Dimensions of the results that an axis cannot be named after."""
 
 
-class _Free(Node):
+class Free(Node):
     """A node whose values are any that a scenario may have."""
 
     @field_validator("*", mode="before")
@@ -47,7 +47,7 @@ class _Free(Node):
         return value
 
 
-class Axis(_Free):
+class Axis(Free):
     """One axis: `key` and its `values`; or `zip`, several keys that change together; or `list`,
     named sets of keys."""
 
@@ -111,7 +111,7 @@ class Axis(_Free):
         return [v if isinstance(v, str) else json.dumps(v) for v in values]
 
 
-class Figure(_Free):
+class Figure(Free):
     """A picture of one quantity against an axis, a curve for each entry of another."""
 
     quantity: str
@@ -119,7 +119,7 @@ class Figure(_Free):
     by: str | None = None
 
 
-class Sweep(_Free):
+class Sweep(Free):
     """A sweep file."""
 
     name: Name = "sweep"
@@ -208,6 +208,18 @@ class Point:
     paths_key: str | None
 
 
+class Points(Protocol):
+    """A number of points over one base scenario: a sweep, or a data set."""
+
+    @property
+    def base(self) -> Scenario: ...
+
+    @property
+    def num_points(self) -> int: ...
+
+    def points(self) -> Iterator[Point]: ...
+
+
 @dataclass(frozen=True)
 class Plan:
     """A sweep with its base scenario, ready to be run: what `load_sweep` gives."""
@@ -215,11 +227,15 @@ class Plan:
     sweep: Sweep
     base: Scenario
 
+    @property
+    def num_points(self) -> int:
+        return self.sweep.num_points
+
     def points(self) -> Iterator[Point]:
         """All points in order, made one by one: a million of them need no memory."""
         tree = plain_tree(self.base)
         tree.pop("name")
-        files = lru_cache(maxsize=64)(partial(_files_digest, self.base.folder))
+        files = lru_cache(maxsize=64)(partial(files_digest, self.base.folder))
         for index in itertools.product(*(range(n) for n in self.sweep.shape)):
             here = copy.deepcopy(tree)
             for axis, i in zip(self.sweep.axes.values(), index[:-1], strict=True):
@@ -227,7 +243,7 @@ class Plan:
                     put(here, key, value)
             here = with_tables(here, self.base.folder, replace=True)
             here["seed"] = self.seed(index[-1])
-            ground = _ground(here, files)
+            ground = ground_by(here, files)
             yield Point(index, here, ground, point_key(here, ground), paths_key(here, ground))
 
     def seed(self, repetition: int) -> int:
@@ -244,10 +260,11 @@ def ground_of(tree: dict[str, Any], folder: Path) -> dict[str, str]:
     tree : the scenario as plain values
     folder : to which its files are relative
     """
-    return _ground(tree, partial(_files_digest, folder))
+    return ground_by(tree, partial(files_digest, folder))
 
 
-def _ground(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> dict[str, str]:
+def ground_by(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> dict[str, str]:
+    """The same, with what makes the digests of files."""
     city = {k: v for k, v in (tree.get("city") or {}).items() if k in ("source", "name", "file")}
     return {
         "program": program_fingerprint(),
@@ -314,7 +331,7 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _files_digest(folder: Path, city: str, costs: str | None) -> str:
+def files_digest(folder: Path, city: str, costs: str | None) -> str:
     """Digest of the files of a city, as JSON, or of another file; "" where one is missing: the
     point's own check says so."""
     try:
@@ -364,7 +381,7 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
         raise refuse(("axes",), said)
     file = path.parent / sweep.scenario
     try:
-        base = load(file, _options(sweep.set))
+        base = load(file, options(sweep.set))
     except ScenarioError as error:
         raise refuse(
             ("set",) if sweep.set and file.is_file() else ("scenario",),
@@ -383,7 +400,8 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
     return Plan(sweep, base)
 
 
-def _options(values: dict[str, Any]) -> list[str]:
+def options(values: dict[str, Any]) -> list[str]:
+    """Values by dotted key as the options that replace them."""
     return [f"{key}={json.dumps(value)}" for key, value in values.items()]
 
 

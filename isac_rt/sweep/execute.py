@@ -22,11 +22,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from isac_rt.runtime import MachineProblem, UserError, available_memory, of_machine
-from isac_rt.sweep.definition import Plan, Point, ground_of
+from isac_rt.sweep.definition import Plan, Point, Points, ground_of
 from isac_rt.sweep.outcomes import Outcomes, pending
+
+if TYPE_CHECKING:
+    from isac_rt.propagation.store import PathStore
+    from isac_rt.scenario.tree import Scenario
+    from isac_rt.simulation.setup import Setup
 
 WINDOW = 4
 """Tasks that the scheduler is given ahead, for each thread of a worker."""
@@ -41,6 +46,9 @@ ROOM = 1_000_000
 """Free disk without which no point is begun. [bytes]"""
 CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
+
+KEPT = ("links", "terminals", "paths", "fidelity", "timing_s", "versions", "shard")
+"""What an outcome holds of a summary, and of what was written beside it."""
 
 Progress = Callable[[int, int, int], None]
 """Called with points done, failed, and in all."""
@@ -75,6 +83,29 @@ class Job:
     threads: int
     retry_failed: bool = False
 
+    @property
+    def outcomes(self) -> Outcomes:
+        """Where its outcome is kept."""
+        return Outcomes(Path(self.folder))
+
+    def prepared(self, store: PathStore | None = None) -> tuple[Scenario, Setup]:
+        """The scenario and its set-up; the ray tracer is told how many threads it may use."""
+        from isac_rt.scenario.tree import Scenario
+        from isac_rt.simulation.setup import prepare
+
+        scenario = Scenario.model_validate(self.tree).in_folder(Path(self.scenario_folder))
+        if scenario.propagation.model == "ray_traced":
+            _limit_tracer(self.threads)
+        return scenario, prepare(scenario, store)
+
+    def simulate(self) -> dict[str, Any]:
+        """Run the point, and what is kept of it: its summary."""
+        from isac_rt.propagation.store import PathStore
+        from isac_rt.simulation import simulate
+
+        scenario, setup = self.prepared(PathStore(Path(self.folder) / "paths", CACHE_BYTES))
+        return simulate.summarise(scenario, setup=setup, threads=self.threads)
+
 
 class Ended(NamedTuple):
     """What came of a point at a worker: its outcome's status, or "left" and why."""
@@ -92,7 +123,7 @@ def run_job(job: Job) -> Ended:
     to do. Dask repeats a task whose worker dies before its word reached the client; a point whose
     outcome is there is not repeated.
     """
-    outcomes = Outcomes(Path(job.folder))
+    outcomes = job.outcomes
     try:
         outcome = outcomes.read(job.key)
         if outcome is None or (job.retry_failed and outcome["status"] == "failed"):
@@ -133,9 +164,8 @@ def _outcome(job: Job) -> dict[str, Any]:
     begin = time.perf_counter()
     about: dict[str, Any] = {"scenario": job.tree}
     try:
-        summary = _simulate(job)
-        kept = ("links", "terminals", "paths", "fidelity", "timing_s", "versions")
-        about |= {"status": "done", **{name: summary[name] for name in kept}}
+        made = job.simulate()
+        about |= {"status": "done", **{name: made[name] for name in KEPT if name in made}}
         json.dumps(about, allow_nan=False)
     except Exception as problem:
         if of_machine(problem):
@@ -157,20 +187,6 @@ def _address() -> str:
         return get_worker().address
     except ValueError:
         return ""
-
-
-def _simulate(job: Job) -> dict[str, Any]:
-    from isac_rt.propagation.store import PathStore
-    from isac_rt.scenario.tree import Scenario
-    from isac_rt.simulation import simulate
-    from isac_rt.simulation.setup import prepare
-
-    scenario = Scenario.model_validate(job.tree).in_folder(Path(job.scenario_folder))
-    store = PathStore(Path(job.folder) / "paths", CACHE_BYTES)
-    if scenario.propagation.model == "ray_traced":
-        _limit_tracer(job.threads)
-    setup = prepare(scenario, store)
-    return simulate.summarise(scenario, setup=setup, threads=job.threads)
 
 
 @lru_cache(maxsize=1)
@@ -207,7 +223,7 @@ def _silent(*names: str) -> Iterator[None]:
 
 
 @contextmanager
-def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at an address, or of a cluster of our own with one thread a
     worker."""
     import dask
@@ -297,13 +313,40 @@ def run_sweep(
     outcomes = Outcomes(Path(folder).resolve())
     outcomes.save_definition(plan)
     todo = sum(1 for _ in pending(plan, outcomes, retry_failed))
-    total = plan.sweep.num_points
+    total = plan.num_points
     if progress:
         progress(total - todo, 0, total)
     if not todo:
         return
-    with _client(workers, scheduler) as client:
-        _Runner(plan, outcomes, client, total - todo, retry_failed, progress).run()
+    with connected(workers, scheduler) as client:
+        run_points(plan, outcomes, client, _job, total - todo, retry_failed, progress)
+
+
+def _job(point: Point, **fields: Any) -> Job:
+    return Job(**fields)
+
+
+def run_points(
+    plan: Points,
+    outcomes: Outcomes,
+    client: Any,
+    job: Callable[..., Job],
+    done: int,
+    retry_failed: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Run what is missing among points at a client's workers.
+
+    Parameters
+    ----------
+    job : makes what a worker gets of a point; called with the point and the fields of `Job`
+    done : points that are done already
+
+    Raises
+    ------
+    PointsLeft, SchedulerLost  As `run_sweep`.
+    """
+    _Runner(plan, outcomes, client, job, done, retry_failed, progress).run()
 
 
 class _Runner:
@@ -316,13 +359,15 @@ class _Runner:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: Points,
         outcomes: Outcomes,
         client: Any,
+        job: Callable[..., Job],
         done: int,
         retry_failed: bool,
         progress: Progress | None,
     ) -> None:
+        self._job = job
         self._retry_failed = retry_failed
         self._plan, self._outcomes, self._client, self._progress = plan, outcomes, client, progress
         self._done, self._failed = done, 0
@@ -348,7 +393,7 @@ class _Runner:
         if self._left:
             (point, why), *_ = self._left.values()
             raise PointsLeft(
-                f"the machine did not let {len(self._left)} of {self._plan.sweep.num_points} "
+                f"the machine did not let {len(self._left)} of {self._plan.num_points} "
                 f"points end, {self._done} are done and kept; at {list(point.index)}: {why}; mend "
                 "it and start the same command again"
             )
@@ -374,7 +419,7 @@ class _Runner:
     def _lost(self, problem: BaseException | None) -> SchedulerLost:
         why = f" ({problem})" if problem is not None and str(problem) else ""
         return SchedulerLost(
-            f"the scheduler was lost{why}; {self._done} of {self._plan.sweep.num_points} points "
+            f"the scheduler was lost{why}; {self._done} of {self._plan.num_points} points "
             "are done and kept: "
             "start the same command again to go on"
         )
@@ -401,14 +446,15 @@ class _Runner:
             self._submit(point, queue)
 
     def _submit(self, point: Point, queue: Any) -> None:
-        job = Job(
-            point.key,
-            point.tree,
-            point.ground,
-            str(self._plan.base.folder),
-            str(self._outcomes.folder),
-            self._threads,
-            self._retry_failed,
+        job = self._job(
+            point,
+            key=point.key,
+            tree=point.tree,
+            ground=point.ground,
+            scenario_folder=str(self._plan.base.folder),
+            folder=str(self._outcomes.folder),
+            threads=self._threads,
+            retry_failed=self._retry_failed,
         )
         self._active[point.key] = point
         good = self._troubled and [w for w in self._client.nthreads() if w not in self._troubled]
@@ -438,7 +484,7 @@ class _Runner:
             self._done += ended.status == "done"
             self._failed += ended.status == "failed"
         if self._progress:
-            self._progress(self._done, self._failed, self._plan.sweep.num_points)
+            self._progress(self._done, self._failed, self._plan.num_points)
         if point.paths_key is not None:
             self._traced.add(point.paths_key)
             for follower in self._leading.pop(point.paths_key, ()):

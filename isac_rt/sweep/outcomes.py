@@ -32,7 +32,7 @@ from isac_rt.storage import (
     versions,
     write_whole,
 )
-from isac_rt.sweep.definition import Plan, Point, Sweep, flat_numbers
+from isac_rt.sweep.definition import Plan, Point, Points, Sweep, flat_numbers
 
 FILE, DEFINITION = "sweep.nc", "sweep.json"
 CONFIDENCE = 0.95
@@ -112,7 +112,11 @@ class Outcomes:
             "base": plain_tree(plan.base),
             "folder": str(plan.base.folder),
         }
-        write_whole(self.folder / DEFINITION, json.dumps(tree, indent=1) + "\n")
+        self.begin(tree)
+
+    def begin(self, definition: dict[str, Any]) -> None:
+        """Keep what the points are points of, and make their folder."""
+        write_whole(self.folder / DEFINITION, json.dumps(definition, indent=1) + "\n")
         self.points.mkdir(exist_ok=True)
 
     def definition(self) -> Plan:
@@ -318,6 +322,6 @@ def open_sweep(folder: Path | str) -> xr.Dataset:
     return assemble(outcomes.definition(), outcomes)
 
 
-def pending(plan: Plan, outcomes: Outcomes, retry_failed: bool) -> Iterator[Point]:
+def pending(plan: Points, outcomes: Outcomes, retry_failed: bool) -> Iterator[Point]:
     """Points that need a run, in order."""
     return (point for point in plan.points() if not outcomes.done(point.key, retry_failed))

@@ -171,7 +171,7 @@ def raising(problem):
         def simulate(_):
             raise problem
 
-        monkeypatch.setattr(execute, "_simulate", simulate)
+        monkeypatch.setattr(execute.Job, "simulate", simulate)
         return str(problem) or type(problem).__name__
 
     return broken
@@ -270,7 +270,7 @@ def here(monkeypatch):
         ) as made:
             yield made
 
-    monkeypatch.setattr(execute, "_client", client)
+    monkeypatch.setattr(execute, "connected", client)
 
 
 def test_points_that_the_machine_left_are_tried_again_and_then_left(folder, here, monkeypatch):
@@ -279,7 +279,7 @@ def test_points_that_the_machine_left_are_tried_again_and_then_left(folder, here
     plan, out = plan_of(folder), folder / "out"
     never, once = (list(plan.points())[i].tree for i in (3, 7))
     calls = []
-    simulate = execute._simulate
+    simulate = execute.Job.simulate
 
     def flaky(job):
         calls.append(job.tree)
@@ -287,7 +287,7 @@ def test_points_that_the_machine_left_are_tried_again_and_then_left(folder, here
             raise MemoryError
         return simulate(job)
 
-    monkeypatch.setattr(execute, "_simulate", flaky)
+    monkeypatch.setattr(execute.Job, "simulate", flaky)
     moved = []
     with pytest.raises(PointsLeft) as caught:
         run_sweep(plan, out, progress=lambda *counts: moved.append(counts))
@@ -295,7 +295,7 @@ def test_points_that_the_machine_left_are_tried_again_and_then_left(folder, here
     assert "did not let 1 of 12 points end, 11 are done" in said and "MemoryError" in said
     assert str([0, 1, 1]) in said and "\n" not in said and moved[-1] == (11, 0, 12)
     assert len(calls) == 14 and (status(out).done, status(out).failed) == (11, 0)
-    monkeypatch.setattr(execute, "_simulate", simulate)
+    monkeypatch.setattr(execute.Job, "simulate", simulate)
     run_sweep(plan, out)
     assert status(out).done == 12
 
@@ -366,7 +366,7 @@ def test_a_sweep_on_which_nothing_ends_stops_early(folder, here, monkeypatch):
         calls.append(job)
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(execute, "_simulate", broken)
+    monkeypatch.setattr(execute.Job, "simulate", broken)
     with pytest.raises(PointsLeft, match="Input/output error"):
         run_sweep(plan, folder / "out")
     assert 16 <= len(calls) <= 16 + 8 < plan.sweep.num_points
@@ -406,20 +406,20 @@ def test_a_point_that_takes_its_workers_with_it_is_left(folder):
 import os, sys
 from isac_rt.sweep import execute, load_sweep, run_sweep
 from distributed.diagnostics.plugin import WorkerPlugin
-simulate = execute._simulate
+simulate = execute.Job.simulate
 class Deadly(WorkerPlugin):
     def setup(self, worker):
         from isac_rt.sweep import execute
-        simulate = execute._simulate
-        execute._simulate = lambda job: os._exit(9) if job.key == {deadly!r} else simulate(job)
-client = execute._client
+        simulate = execute.Job.simulate
+        execute.Job.simulate = lambda job: os._exit(9) if job.key == {deadly!r} else simulate(job)
+client = execute.connected
 from contextlib import contextmanager
 @contextmanager
 def deadly(*a):
     with client(*a) as made:
         made.register_plugin(Deadly())
         yield made
-execute._client = deadly
+execute.connected = deadly
 if __name__ == "__main__":
     try:
         run_sweep(load_sweep({str(folder / "sweep.yaml")!r}), {str(out)!r}, workers=2)

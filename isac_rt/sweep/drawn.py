@@ -1,0 +1,365 @@
+"""What a data set is: many scenes drawn from one scenario, each in one of several splits that share
+no flight and no street."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from isac_rt.frame.schedule import decoded_schedule
+from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import waveform_of
+from isac_rt.randomness import generator, seed_sequence
+from isac_rt.scenario.document import Document, ScenarioError
+from isac_rt.scenario.file import load, plain_tree
+from isac_rt.scenario.node import Finite, Key, Name, Problem, Seed, dotted
+from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.preflight import check_passage
+from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
+from isac_rt.sweep.definition import (
+    Free,
+    Point,
+    files_digest,
+    ground_by,
+    options,
+    put,
+)
+
+MOST_SCENES = 1_000_000
+MOST_TRIES = 400
+"""Draws of one scene before the places are taken for too narrow."""
+Range = tuple[Finite, Finite]
+Kept = Literal["map", "samples", "paths", "detections", "tracks", "bits"]
+
+
+class Draw(Free):
+    """A distribution of one key, a number or numbers by component: exactly one of these."""
+
+    uniform: tuple[Any, Any] | None = None
+    """Lowest and highest value."""
+    log_uniform: tuple[Any, Any] | None = None
+    """The same, uniform in the logarithm; both over 0."""
+    normal: tuple[Any, Any] | None = None
+    """Mean and standard deviation."""
+    choice: tuple[Any, ...] | None = None
+    """Values, each as likely."""
+
+    def problems(self) -> Iterator[Problem]:
+        given = [name for name, value in self if value is not None]
+        if len(given) != 1:
+            kinds = ", ".join(type(self).model_fields)
+            yield Problem(
+                ((*given, "uniform")[:1],), f"a draw is one of {kinds}; keep one of these"
+            )
+        elif self.choice is not None:
+            if not self.choice:
+                yield Problem((("choice",),), "has no value; give it one or more")
+        else:
+            yield from self._numbers(given[0])
+
+    def _numbers(self, name: str) -> Iterator[Problem]:
+        try:
+            a, b = (np.asarray(v, float) for v in getattr(self, name))
+            np.broadcast_shapes(a.shape, b.shape)
+        except (TypeError, ValueError):
+            yield Problem(((name,),), "must be two numbers, or two lists as long of numbers")
+            return
+        low = a if name != "normal" else np.zeros_like(b)
+        if not (np.isfinite(a).all() and np.isfinite(b).all() and (low <= b).all()):
+            yield Problem(((name,),), "must be finite, the second no lower than the first (or 0)")
+        elif name == "log_uniform" and not (a > 0).all():
+            yield Problem(((name,),), "must be over 0; use uniform")
+
+    def draw(self, rng: np.random.Generator) -> Any:
+        """One value."""
+        if self.choice is not None:
+            return self.choice[int(rng.integers(len(self.choice)))]
+        for name in ("uniform", "log_uniform", "normal"):
+            if (ends := getattr(self, name)) is not None:
+                a, b = (np.asarray(v, float) for v in ends)
+                if name == "log_uniform":
+                    return np.asarray(np.exp(rng.uniform(np.log(a), np.log(b)))).tolist()
+                return np.asarray(getattr(rng, name)(a, b)).tolist()
+        raise AssertionError("checked before")
+
+
+class Place(Free):
+    """Where the whole swarm is moved to: about the middle of one of the cells of a square grid."""
+
+    east_m: Range
+    """Lowest and highest x of the ground that is used [m]."""
+    north_m: Range
+    """The same of y [m]."""
+    cell_m: Annotated[float, Field(gt=0)] = 100.0
+    """Side of a cell [m]. A flight stays in its cell, and a cell belongs to one split, so that
+    splits share no street."""
+    up_m: Range = (0.0, 0.0)
+    """By how much the swarm is lifted [m]."""
+    turn: bool = True
+    """Whether the swarm is turned about its middle by a random angle, boresights with it."""
+
+    def problems(self) -> Iterator[Problem]:
+        for name in ("east_m", "north_m", "up_m"):
+            low, high = getattr(self, name)
+            if low > high:
+                yield Problem(((name,),), "the second is lower than the first; exchange them")
+        if not self.cells:
+            yield Problem((("cell_m",),), "no whole cell fits into the ground; make it smaller")
+
+    @property
+    def cells(self) -> list[tuple[float, float]]:
+        """South-west corners of the cells [m]."""
+        axes = [
+            [low + k * self.cell_m for k in range(int((high - low) / self.cell_m + 1e-9))]
+            for low, high in (self.east_m, self.north_m)
+        ]
+        return [(x, y) for x in axes[0] for y in axes[1]]
+
+
+class DataSet(Free):
+    """A data set's file."""
+
+    name: Name = "dataset"
+    scenario: str
+    """The base scenario, a path relative to this file."""
+    set: dict[str, Any] = Field({})
+    """Keys of the base scenario to replace in all scenes."""
+    scenes: Annotated[int, Field(ge=1, le=MOST_SCENES)]
+    """How many scenes are drawn; each is one run of the base scenario's frames."""
+    seed: Seed = 1
+    place: Place | None = None
+    """Where the swarm is moved to; left out: it stays where the scenario has it, and splits share
+    the street."""
+    draw: dict[str, Draw] = Field({})
+    """A distribution for each key of the scenario that is drawn."""
+    splits: dict[Name, Annotated[float, Field(gt=0)]] = Field(
+        {"train": 0.7, "val": 0.15, "test": 0.15}
+    )
+    """Shares of the scenes, by the name of the split."""
+    keep: tuple[Kept, ...] = ("map", "paths", "detections", "tracks", "bits")
+    """What is kept of every frame and link beside the truth. `samples`, the IF samples, are the
+    largest by far."""
+
+    def problems(self) -> Iterator[Problem]:
+        for key in self.draw:
+            if key == "seed" or key in self.set:
+                other = "every scene has its own" if key == "seed" else "set has it too"
+                yield Problem((("draw", key),), f"{other}; remove it here")
+        if not self.splits:
+            yield Problem((("splits",),), "has no split; give it one")
+        elif self.place and len(self.place.cells) < len(self.splits):
+            said = (
+                f"the ground has {len(self.place.cells)} cells for {len(self.splits)} splits, "
+                "which share none; make cell_m smaller or the ground larger"
+            )
+            yield Problem((("place", "cell_m"), ("splits",)), said)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene of a data set: its split and its scenario as plain values."""
+
+    split: str
+    tree: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class DataPlan:
+    """A data set with its base scenario, ready to be made: what `load_dataset` gives."""
+
+    data: DataSet
+    base: Scenario
+
+    @property
+    def num_points(self) -> int:
+        return self.data.scenes
+
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """All scenes; drawn once, for where a swarm flies through a wall it is drawn again.
+
+        Raises
+        ------
+        ScenarioError  If a scene finds no place.
+        """
+        tree = plain_tree(self.base)
+        tree.pop("name")
+        splits = _quota(self.data.splits, self.data.scenes, self.data.seed)
+        cells = _cells_of(self.data)
+        return [self._scene(tree, k, split, cells) for k, split in enumerate(splits)]
+
+    def _scene(
+        self, base: dict[str, Any], number: int, split: str, cells: dict[str, list]
+    ) -> Scene:
+        why: Exception | None = None
+        for attempt in range(MOST_TRIES):
+            rng = generator(self.data.seed, "scene", number, attempt)
+            tree = copy.deepcopy(base)
+            for key, draw in self.data.draw.items():
+                put(tree, key, draw.draw(rng))
+            tree["seed"] = int(seed_sequence(self.data.seed, "seed", number).generate_state(1)[0])
+            try:
+                if self.data.place:
+                    corner = cells[split][int(rng.integers(len(cells[split])))]
+                    _move(tree, self.data.place, corner, rng)
+                self._check(tree)
+            except (ScenarioError, ValueError) as problem:
+                why = problem
+                continue
+            return Scene(split, tree)
+        raise ScenarioError(
+            f"{self.data.name}: scene {number} found no place in {MOST_TRIES} draws; widen place "
+            f"or draw (the last: {_words(why)})"
+        )
+
+    def _check(self, tree: dict[str, Any]) -> None:
+        """Refuse scenes that cannot be, or whose swarm flies through a wall."""
+        scenario = Scenario.model_validate(tree).in_folder(self.base.folder)
+        if scenario.city is not None:
+            whole = self.base.model_copy(update={"city": scenario.city})
+            check_passage(swarm_of(scenario), _timetable(scenario), city_of(whole))
+
+    def points(self) -> Iterator[Point]:
+        """The scenes as points of a sweep; what is kept of them is part of their key."""
+        files = partial(files_digest, self.base.folder)
+        for number, scene in enumerate(self.scenes):
+            ground = ground_by(scene.tree, files)
+            content = json.dumps([scene.tree, ground, self.data.keep, scene.split], sort_keys=True)
+            key = hashlib.sha256(content.encode()).hexdigest()[:32]
+            yield Point((number,), scene.tree, ground, key, None)
+
+
+def _words(problem: Exception | None) -> str:
+    """A problem in one line, with the key where a value does not fit."""
+    if isinstance(problem, ValidationError):
+        first = problem.errors()[0]
+        unknown = first["type"] == "extra_forbidden"
+        return f"{dotted(first['loc'])}: {'unknown key' if unknown else first['msg']}"
+    return str(problem).splitlines()[0]
+
+
+def _quota(shares: dict[str, float], count: int, seed: int) -> list[str]:
+    """A split for each scene, as near to the shares as whole scenes can be, in random order."""
+    ends = np.round(np.cumsum([*shares.values()]) / math.fsum(shares.values()) * count).astype(int)
+    split = np.repeat([*shares], np.diff(ends, prepend=0)).tolist()
+    order = generator(seed, "splits").permutation(count)
+    return [split[k] for k in order]
+
+
+def _cells_of(data: DataSet) -> dict[str, list[tuple[float, float]]]:
+    """Each split's own cells of the ground, at least one, else by its share."""
+    if data.place is None:
+        return {name: [] for name in data.splits}
+    cells = data.place.cells
+    order = generator(data.seed, "cells").permutation(len(cells)).tolist()
+    out = {name: [cells[order.pop()]] for name in data.splits}
+    rest = _quota(data.splits, len(order), data.seed)
+    for k, name in zip(order, rest, strict=True):
+        out[name].append(cells[k])
+    return out
+
+
+def _move(
+    tree: dict[str, Any], place: Place, corner: tuple[float, float], rng: np.random.Generator
+) -> None:
+    """Turn the swarm about its middle and set it into a cell.
+
+    Raises
+    ------
+    ValueError  If the flights do not fit into the cell.
+    """
+    points = _flown(tree)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    angle = rng.uniform(0, 2 * np.pi) if place.turn else 0.0
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    inside = (points[:, :2] - middle[:2]) @ turn.T
+    low, high = np.array(corner) - inside.min(axis=0), np.array(corner) + place.cell_m
+    high = high - inside.max(axis=0)
+    if (low > high).any():
+        need = float(np.ptp(inside, axis=0).max())
+        raise ValueError(f"the flights need {need:.0f} m and place.cell_m is {place.cell_m:g} m")
+    to = np.append(rng.uniform(low, high), middle[2] + rng.uniform(*place.up_m))
+
+    def turned(v: Any) -> list[float]:
+        return [*(turn @ np.asarray(v[:2], float)).tolist(), float(v[2])]
+
+    def moved(v: Any) -> list[float]:
+        return (np.array(turned(np.asarray(v, float) - middle)) + to).tolist()
+
+    for uav in tree["swarm"].values():
+        for key, change in (("position_m", moved), ("velocity_mps", turned)):
+            if uav.get(key) is not None:
+                uav[key] = change(uav[key])
+        if isinstance(uav.get("boresight"), list):
+            uav["boresight"] = turned(uav["boresight"])
+        for waypoint in uav.get("waypoints") or ():
+            waypoint["position_m"] = moved(waypoint["position_m"])
+
+
+def _flown(tree: dict[str, Any]) -> np.ndarray:
+    """(N, 3) places along all flights [m].
+
+    Raises
+    ------
+    ScenarioError  If a flight is in a file, which cannot be moved.
+    """
+    for name, uav in tree["swarm"].items():
+        if uav.get("position_m") is None and not uav.get("waypoints"):
+            raise ScenarioError(f"place moves position_m and waypoints only; swarm.{name} has none")
+    scenario = Scenario.model_validate(tree)
+    timetable = _timetable(scenario)
+    span = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
+    ways = (flight.way(*span)[1] for flight in swarm_of(scenario).trajectories.values())
+    return np.vstack([*ways])
+
+
+def _timetable(scenario: Scenario) -> Timetable:
+    waveform = waveform_of(scenario.radio, scenario.array)
+    return timetable_of(scenario, waveform, decoded_schedule(waveform))
+
+
+def load_dataset(path: Path | str) -> DataPlan:
+    """Read and check a data set's file, and draw its scenes.
+
+    Raises
+    ------
+    ScenarioError  One line per problem, with the place in the file.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> plan = irt.load_dataset("scenes/sweeps/canyon_dataset.yaml")
+    >>> len(plan.scenes), sorted({scene.split for scene in plan.scenes})
+    (12, ['test', 'train', 'val'])
+    """
+    path = Path(path)
+    document = Document(path, "a data set needs a scenario and a number of scenes")
+    data = document.check(DataSet)
+
+    def refuse(key: Key, text: str) -> ScenarioError:
+        return ScenarioError(document.complaint(Problem((key,), text)))
+
+    file = path.parent / data.scenario
+    try:
+        base = load(file, options(data.set)).in_folder(file.parent.resolve())
+    except ScenarioError as error:
+        raise refuse(("scenario",), f"the base scenario cannot be used: {error}") from None
+    plan = DataPlan(data, base)
+    try:
+        _ = plan.scenes
+    except (KeyError, IndexError, TypeError) as problem:
+        said = f"the scenario has no such place ({problem}); check the keys"
+        raise refuse(("draw",), said) from None
+    except ScenarioError as problem:
+        raise refuse(("place",) if data.place else ("draw",), str(problem)) from None
+    return plan

@@ -1,0 +1,217 @@
+"""The samples of a data set on disk: a tar file for each scene, as WebDataset reads them, with a
+few files for each frame and link; and the reading of them.
+
+Files of one sample share a name up to the first dot. Arrays are ``.npy`` without objects, the truth
+is ``.json``; nothing in a shard can run code.
+"""
+
+from __future__ import annotations
+
+import bisect
+import io
+import json
+import tarfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from isac_rt.frame.link import Link
+from isac_rt.results.files import ResultsError
+from isac_rt.results.recorder import Results
+from isac_rt.runtime import shortly
+from isac_rt.simulation.setup import Setup
+from isac_rt.storage import BAD_DATA
+
+COLUMNS = {
+    "paths": (
+        "power_db", "delay", "delay_rate", "kind", "target", "bounces",
+        "departure_x", "departure_y", "departure_z", "arrival_x", "arrival_y", "arrival_z",
+    ),
+    "detections": ("range", "velocity", "u_x", "u_z", "snr", "kind", "target"),
+    "tracks": ("id", "range", "velocity", "u_x", "u_z", "confirmed", "uav"),
+}  # fmt: skip
+"""Columns of the tables, float64; names, units and meanings are those of ``results.nc``."""
+_PREFIX = {"paths": "path", "detections": "det", "tracks": "track"}
+TRUTH = ("range", "velocity", "azimuth", "elevation")
+CARD = "card.json"
+
+
+def samples_of(
+    results: Results, setup: Setup, keep: Sequence[str], name: str
+) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the files of all frames and links of a scene.
+
+    Parameters
+    ----------
+    results : of a run whose every frame is a snapshot
+    keep : what is kept beside the truth
+    name : of the scene, before the frame and the link
+    """
+    d = results.dataset
+    for f, o in np.argwhere(d.processed.values).tolist():
+        link = Link(str(d.transmitter.values[o]), str(d.receiver.values[o]))
+        sample = f"{name}_{int(d.frame.values[f]):05d}_{link.tx}_to_{link.rx}"
+        yield f"{sample}.json", json.dumps(_truth(d, f, o)).encode()
+        for key, values in _arrays(d, setup, keep, f, o, link):
+            yield f"{sample}.{key}.npy", _npy(values)
+
+
+def _truth(d: xr.Dataset, f: int, o: int) -> dict[str, Any]:
+    """What is true of every UAV in a frame on a link, and the axes of its map."""
+    seen = d.isel(frame=f, observer=o)
+    own = d.transmitter.values[o], d.receiver.values[o]
+    uavs = {
+        str(name): {
+            "position_m": d.uav_position.values[f, u].tolist(),
+            "velocity_mps": d.uav_velocity.values[f, u].tolist(),
+            "in_view": bool(seen.in_view.values[u]),
+            "shadowed": bool(seen.shadowed.values[u]),
+            **{key: _finite(seen[f"truth_{key}"].values[u]) for key in TRUTH},
+        }
+        for u, name in enumerate(d.uav.values)
+    }
+    return {
+        "time_s": float(d.time.values[f]),
+        "modulated": bool(d.modulated.values[f]),
+        "transmitter": str(own[0]),
+        "receiver": str(own[1]),
+        "uavs": uavs,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _arrays(
+    d: xr.Dataset, setup: Setup, keep: Sequence[str], f: int, o: int, link: Link
+) -> Iterator[tuple[str, np.ndarray]]:
+    number = int(d.frame.values[f])
+    shot = np.flatnonzero(d.snapshot_frame.values == f)
+    if "map" in keep and shot.size and np.isfinite(d.map_power.values[shot[0], o]).any():
+        rows, columns = np.isfinite(d.map_range.values[o]), np.isfinite(d.map_velocity.values[o])
+        yield "map", d.map_power.values[shot[0], o][np.ix_(rows, columns)]
+        yield "map_range", d.map_range.values[o][rows]
+        yield "map_velocity", d.map_velocity.values[o][columns]
+    for table in (name for name in COLUMNS if name in keep):
+        prefix = _PREFIX[table]
+        mine = (d[f"{prefix}_frame"].values == f) & (d[f"{prefix}_observer"].values == o)
+        values = [d[f"{prefix}_{name}"].values[mine] for name in COLUMNS[table]]
+        yield table, np.stack(values, axis=1).astype(np.float64)
+    if "samples" in keep or "bits" in keep:
+        frame = setup.frame(number)
+        if "bits" in keep:
+            yield "bits", frame.sent[link.tx].payload.bits
+        if "samples" in keep:
+            yield "samples", frame.samples(link).samples
+
+
+def _npy(values: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.ascontiguousarray(values), allow_pickle=False)
+    return out.getvalue()
+
+
+def tar_of(files: Iterator[tuple[str, bytes]]) -> bytes:
+    """A tar file in memory; the same bytes for the same files, whenever and by whom it is made."""
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name, content in files:
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    return out.getvalue()
+
+
+class Samples:
+    """The samples of a split, by number: what PyTorch's `DataLoader` takes as a data set.
+
+    Parameters
+    ----------
+    folder : of a data set
+    split : its name
+    keep : arrays that are read; None: all
+
+    Raises
+    ------
+    ResultsError  If it is the folder of no finished data set, has no such split, or a shard cannot
+        be read.
+
+    Examples
+    --------
+    >>> samples = Samples("runs/dataset", "train", ["map"])  # doctest: +SKIP
+    >>> samples[0]["map"].shape, samples[0]["truth"]["uavs"]["U1"]["range"]  # doctest: +SKIP
+    ((192, 64), 31.5)
+    """
+
+    def __init__(self, folder: str | Path, split: str, keep: Sequence[str] | None = None) -> None:
+        self.folder, self.keep = Path(folder), keep
+        card = read_card(self.folder)
+        if split not in card["splits"]:
+            raise ResultsError(
+                f"{folder} has no split {split}; there are {', '.join(card['splits'])}"
+            )
+        shards: Mapping[str, int] = card["splits"][split]
+        self._shards, self._ends = [*shards], np.cumsum([*shards.values()], dtype=int).tolist()
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        """Its name, its truth, and its arrays by name."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"sample {number} of {len(self)}")
+        k = bisect.bisect_right(self._ends, number)
+        within = number - (self._ends[k - 1] if k else 0)
+        return read_sample(self.folder / self._shards[k], within, self.keep)
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """What a finished data set says of itself.
+
+    Raises
+    ------
+    ResultsError  If it is the folder of none.
+    """
+    try:
+        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+        _ = [int(n) for shards in card["splits"].values() for n in shards.values()]
+    except (OSError, *BAD_DATA) as problem:
+        raise ResultsError(
+            f"{folder} holds no finished data set ({shortly(problem)}); give the folder that "
+            "`isac-rt dataset` wrote"
+        ) from problem
+    return dict(card)
+
+
+def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> dict[str, Any]:
+    """A sample of a shard: `key`, `truth`, and the arrays by name.
+
+    Raises
+    ------
+    ResultsError  If it cannot be read.
+    """
+    try:
+        with tarfile.open(shard) as tar:
+            members = tar.getmembers()
+            names = list(dict.fromkeys(m.name.split(".")[0] for m in members))
+            out: dict[str, Any] = {"key": names[number]}
+            for member in members:
+                stem, _, ending = member.name.partition(".")
+                name = ending.removesuffix(".npy")
+                opened = tar.extractfile(member) if stem == names[number] else None
+                if opened is None:
+                    continue
+                if ending == "json":
+                    out["truth"] = json.load(opened)
+                elif keep is None or name in keep:
+                    content = io.BytesIO(opened.read())
+                    out[name] = np.load(content, allow_pickle=False)
+    except (OSError, tarfile.TarError, *BAD_DATA) as problem:
+        raise ResultsError(
+            f"{shard} cannot be read ({shortly(problem)}); make the data set again"
+        ) from problem
+    return out

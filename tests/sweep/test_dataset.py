@@ -1,0 +1,271 @@
+"""Data sets: what is drawn keeps apart what it says, what is read back is what was simulated."""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_sweep import BASE
+
+import isac_rt as irt
+from isac_rt.results.files import ResultsError
+from isac_rt.scenario.file import ScenarioError
+from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import prepare
+from isac_rt.sweep import Samples, load_dataset
+from isac_rt.sweep.execute import run_job
+from isac_rt.sweep.make_dataset import SceneJob, Shards, _write_card
+from isac_rt.sweep.outcomes import pending
+
+SET = """
+name: drawn
+scenario: base.yaml
+set: {frame_interval_s: 0.5}
+scenes: 20
+seed: 5
+place: {east_m: [-40, 70], north_m: [10, 121], cell_m: 18, up_m: [-3.5, 11]}
+draw:
+  noise.snr_db: {uniform: [-7.5, 12]}
+  swarm.P1.position_m: {normal: [[-1.9, 5.3, 50.7], [0.4, 0.3, 0.2]]}
+  radio.bandwidth_hz: {log_uniform: [2.1e8, 4.3e8]}
+  modulation.dpsk_order: {choice: [2, 8]}
+splits: {train: 0.6, test: 0.4}
+"""
+STAY = """
+name: two
+scenario: base.yaml
+scenes: 2
+draw: {noise.snr_db: {uniform: [3, 12]}}
+splits: {train: 1, test: 1}
+keep: [map, samples, paths, detections, tracks, bits]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "base.yaml").write_text(BASE)
+    return tmp_path
+
+
+def plan_of(folder: Path, text: str):
+    (folder / "set.yaml").write_text(text)
+    return load_dataset(folder / "set.yaml")
+
+
+def test_splits_share_no_street_and_no_flight(folder):
+    """Where every UAV is at the first and the last frame, from the drawn numbers by hand: all of a
+    scene in one cell of the grid, and no cell in two splits; shares to the scene. Planted bugs: the
+    cell by the scene's number; a flight that begins in its cell and ends in the next."""
+    plan = plan_of(folder, SET)
+    cells: dict[str, set[tuple[int, int]]] = {"train": set(), "test": set()}
+    slot = irt.prepare(Scenario.model_validate(plan.scenes[0].tree)).timetable
+    for scene in plan.scenes:
+        for uav in scene.tree["swarm"].values():
+            for time in (slot.epoch(0), slot.epoch(2)):
+                at = np.array(uav["position_m"]) + time * np.array(uav["velocity_mps"])
+                east, north = (at[:2] - [-40, 10]) // 18
+                cells[scene.split].add((int(east), int(north)))
+                assert -40 <= at[0] <= 68 and 10 <= at[1] <= 118
+                assert 40 < at[2] < 70
+    assert not cells["train"] & cells["test"] and len(cells["train"]) > len(cells["test"]) > 2
+    assert [sum(s.split == name for s in plan.scenes) for name in ("train", "test")] == [12, 8]
+    assert len({json.dumps(scene.tree) for scene in plan.scenes}) == 20
+    seeds = {scene.tree["seed"] for scene in plan.scenes}
+    assert len(seeds) == 20
+
+
+def test_a_swarm_is_turned_as_one(folder):
+    """Directions between UAVs, along velocities and boresights keep their angles and lengths.
+    Planted bug: boresights left where they were."""
+    plan = plan_of(folder, SET.replace("  swarm.P1.position_m", "  # swarm.P1.position_m"))
+    base = plan.base.swarm
+    turns = set()
+    for scene in plan.scenes:
+        a, p = (scene.tree["swarm"][name] for name in ("A", "P1"))
+        away = np.subtract(p["position_m"], a["position_m"])
+        first = np.subtract(base["P1"].position_m, base["A"].position_m)
+        assert np.linalg.norm(away) == pytest.approx(np.linalg.norm(first), rel=1e-12)
+        for uav, own in ((a, base["A"]), (p, base["P1"])):
+            for key in ("velocity_mps", "boresight"):
+                before = np.dot(first, getattr(own, key))
+                assert np.dot(away, uav[key]) == pytest.approx(before, abs=1e-9)
+        turns.add(round(np.arctan2(away[1], away[0]), 3))
+    assert len(turns) == 20
+
+
+def test_draws_have_their_distributions(folder):
+    """Bounds, and over 400 scenes the middle of each within four standard errors. Planted bug: a
+    uniform draw in place of one uniform in the logarithm (its mean is 0.4 deviations higher)."""
+    text = SET.replace("scenes: 20", "scenes: 400").replace("place:", "# place:")
+    scenes = [scene.tree for scene in plan_of(folder, text).scenes]
+    snr = np.array([t["noise"]["snr_db"] for t in scenes])
+    assert snr.min() >= -7.5 and snr.max() <= 12
+    assert abs(snr.mean() - 2.25) < 4 * 19.5 / np.sqrt(12 * 400)
+    log = np.log([t["radio"]["bandwidth_hz"] for t in scenes])
+    low, high = np.log([2.1e8, 4.3e8])
+    assert abs(log.mean() - (low + high) / 2) < 4 * (high - low) / np.sqrt(12 * 400)
+    east = np.array([t["swarm"]["P1"]["position_m"][0] for t in scenes])
+    assert abs(east.mean() + 1.9) < 4 * 0.4 / 20 and abs(east.std() / 0.4 - 1) < 4 / np.sqrt(800)
+    order = [t["modulation"]["dpsk_order"] for t in scenes]
+    assert set(order) == {2, 8} and abs(order.count(2) - 200) < 4 * 10
+
+
+def test_what_is_drawn_does_not_depend_on_who_asks(folder):
+    keys = [point.key for point in plan_of(folder, SET).points()]
+    assert keys == [point.key for point in plan_of(folder, SET).points()]
+    other = [point.key for point in plan_of(folder, SET.replace("seed: 5", "seed: 6")).points()]
+    assert not set(keys) & set(other)
+    kept = SET + "keep: [map]\n"
+    assert not set(keys) & {point.key for point in plan_of(folder, kept).points()}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("cell_m: 18", "cell_m: 200"), "no whole cell fits"),
+        (("cell_m: 18", "cell_m: 60"), "1 cells for 2 splits, which share none"),
+        (("cell_m: 18", "cell_m: 2.5"), "the flights need"),
+        (("uniform: [-7.5, 12]", "uniform: [12, -7.5]"), "the second no lower"),
+        (("uniform: [-7.5, 12]", "uniform: [1, 2], choice: [3]"), "keep one of these"),
+        (("log_uniform: [2.1e8", "log_uniform: [-1"), "must be over 0"),
+        (("noise.snr_db:", "noise.snr_dB:"), "snr_dB"),
+        (("swarm.P1.position_m: {normal", "swarm.P9.position_m.0: {normal"), "P9"),
+        (("  noise.snr_db", "  seed: {choice: [1]}\n  noise.snr_db"), "own; remove it"),
+        (("scenes: 20", "scenes: 0"), "scenes"),
+        (("scenario: base.yaml", "scenario: none.yaml"), "cannot be used"),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_message(folder, change, said):
+    assert change[0] in SET
+    with pytest.raises(ScenarioError, match=said) as refused:
+        plan_of(folder, SET.replace(*change))
+    assert "set.yaml" in str(refused.value)
+
+
+def jobs_of(plan, out: Path) -> list[SceneJob]:
+    (out / "points").mkdir(parents=True, exist_ok=True)
+    return [
+        SceneJob(
+            key=point.key,
+            tree=point.tree,
+            ground=point.ground,
+            scenario_folder=str(plan.base.folder),
+            folder=str(out),
+            threads=1,
+            number=point.index[0],
+            split=plan.scenes[point.index[0]].split,
+            keep=plan.data.keep,
+        )
+        for point in plan.points()
+    ]
+
+
+def test_samples_are_those_of_the_run(folder):
+    """Every array of a split against a run of the drawn scenario by itself. Planted bugs: frames
+    of the next scene; bits of the other transmitter."""
+    plan, out = plan_of(folder, STAY), folder / "out"
+    for job in jobs_of(plan, out):
+        assert run_job(job).status == "done"
+    card = _write_card(plan, Shards(out))
+    assert {name: sum(s.values()) for name, s in card["splits"].items()} == {"train": 6, "test": 6}
+    number = next(k for k, scene in enumerate(plan.scenes) if scene.split == "test")
+    alone = Scenario.model_validate(plan.scenes[number].tree)
+    setup = prepare(alone)
+    d = irt.run(alone, setup=setup, snapshots=3).dataset
+    samples = Samples(out, "test")
+    assert len(samples) == 6 and len(Samples(out, "train")) == 6
+    seen, maps = set(), 0
+    for k in range(6):
+        sample = samples[k]
+        _, frame, link = sample["key"].split("_", 2)
+        f, o = int(frame), ["A_to_A", "A_to_P1"].index(link)
+        seen.add((f, o))
+        cube = setup.frame(f).samples(tuple(link.split("_to_")))
+        assert np.array_equal(sample["samples"], cube.samples)
+        assert np.array_equal(sample["bits"], setup.frame(f).sent["A"].payload.bits)
+        rows = np.isfinite(d.map_range.values[o])
+        columns = np.isfinite(d.map_velocity.values[o])
+        shot = [*d.snapshot_frame.values].index(f) if f in d.snapshot_frame.values else None
+        if shot is not None and np.isfinite(d.map_power.values[shot, o]).any():
+            power = d.map_power.values[shot, o][np.ix_(rows, columns)]
+            assert np.array_equal(sample["map"], power)
+            assert len(sample["map_range"]) == len(power)
+            maps += 1
+        else:
+            assert "map" not in sample
+        mine = (d.path_frame.values == f) & (d.path_observer.values == o)
+        assert np.array_equal(sample["paths"][:, 1], d.path_delay.values[mine])
+        found = (d.det_frame.values == f) & (d.det_observer.values == o)
+        assert np.array_equal(sample["detections"][:, 0], d.det_range.values[found])
+        a, p = (sample["truth"]["uavs"][name] for name in ("A", "P1"))
+        away = np.linalg.norm(np.subtract(a["position_m"], p["position_m"]))
+        assert p["range"] == pytest.approx(away) if o == 0 else a["range"] == pytest.approx(away)
+    assert len(seen) == 6 and maps == 6
+    assert set(Samples(out, "test", ["bits"])[0]) == {"key", "truth", "bits"}
+    with pytest.raises(IndexError):
+        samples[6]
+    with pytest.raises(ResultsError, match="there are train, test"):
+        Samples(out, "val")
+
+
+def test_a_shard_that_is_not_whole_is_made_anew(folder):
+    """Truncated, changed or gone: the scene is to do again, and its bytes are the same then; the
+    others stay as they are. Planted bug: the shard believed because it is there."""
+    plan, out = plan_of(folder, STAY.replace("samples, ", "")), folder / "out"
+    jobs = jobs_of(plan, out)
+    for job in jobs:
+        run_job(job)
+    shards = Shards(out)
+    assert not [*pending(plan, shards, False)]
+    file = next((out / "train").glob("*.tar"))
+    whole = file.read_bytes()
+    for damage in (whole[:-512], b"", whole.replace(b"npy", b"exe"), None):
+        file.unlink() if damage is None else file.write_bytes(damage)
+        (left,) = pending(plan, shards, False)
+        run_job(jobs[left.index[0]])
+        assert file.read_bytes() == whole and not [*pending(plan, shards, False)]
+    assert all(m.isreg() for m in tarfile.open(file).getmembers())
+    outcome = shards.read(jobs[0].key)
+    assert outcome is not None and outcome["status"] == "done"
+
+
+def test_a_folder_that_is_none_is_one_message(tmp_path):
+    with pytest.raises(ResultsError, match="holds no finished data set"):
+        Samples(tmp_path, "train")
+    (tmp_path / "card.json").write_text(json.dumps({"splits": {"train": {"train/0.tar": 3}}}))
+    with pytest.raises(ResultsError, match="cannot be read"):
+        Samples(tmp_path, "train")[0]
+
+
+@pytest.mark.slow
+def test_pytorch_takes_the_samples(folder):
+    """A `DataLoader` batches the maps of a split."""
+    data = pytest.importorskip("torch.utils.data")
+    plan, out = plan_of(folder, STAY), folder / "out"
+    for job in jobs_of(plan, out):
+        run_job(job)
+    _write_card(plan, Shards(out))
+    maps = Samples(out, "train", ["bits"])
+    batch = next(iter(data.DataLoader(maps, batch_size=1)))
+    assert batch["bits"].shape[0] == 1
+    assert asdict(plan.scenes[0])["split"] in ("train", "test")
+
+
+@pytest.mark.slow
+@pytest.mark.sionna
+def test_the_command_makes_what_the_file_says(tmp_path, capsys):
+    """The shipped example on Dask, once: shards of three splits; called again it says the same and
+    makes nothing."""
+    from isac_rt.cli.cli import main
+
+    example = Path(__file__).parents[2] / "scenes" / "sweeps" / "canyon_dataset.yaml"
+    command = ["dataset", str(example), "--out", str(tmp_path), "--workers", "2"]
+    assert main(command) == 0
+    first = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*/*.tar")}
+    assert len(first) == 12 and "train: 8 scenes, 64 samples" in capsys.readouterr().out
+    assert main(command) == 0
+    assert first == {file: file.stat().st_mtime_ns for file in tmp_path.glob("*/*.tar")}
