@@ -596,7 +596,7 @@ class Counted:
         return self.model.trace(*arguments)._replace(dropped=2)
 
     def census(self):
-        return Census(7, 9, {"AT": {"count": 1, "share": 0.1, "share_left_out": 0.25}})
+        return Census(7, 9, mirrors={"AT": {"count": 1, "share": 0.1, "share_left_out": 0.25}})
 
 
 def test_cached_paths_are_the_same_and_made_once(folder, tmp_path):

@@ -340,7 +340,8 @@ def test_of_points_that_share_paths_one_goes_first(folder):
     ]
     client = Scheduler({"one": 1, "two": 1})
     queue = SimpleNamespace(add=lambda _: None)
-    runner = execute._Runner(plan_of(folder), Outcomes(folder / "o"), client, 0, False, None)
+    folder_of = Outcomes(folder / "o")
+    runner = execute._Runner(plan_of(folder), folder_of, client, execute._job, 0, False, None)
     runner._fill(iter(points), queue)
     assert client.given == ["a", "c", "d"]
     left = execute.Ended("left", "no room", "one")
@@ -463,6 +464,8 @@ def test_a_scheduler_that_is_killed_is_one_message(folder):
     client = start_client(folder, folder / "out", "--scheduler", address)
     assert client.wait(timeout=300) == 1
     assert mortal.wait() == -9
-    progress, said = client.stderr.read().strip().splitlines()
-    assert progress.startswith("points") and said.startswith("the scheduler was lost")
+    *progress, said = client.stderr.read().strip().splitlines()
+    assert all(line.startswith("points") for line in progress) and said.startswith(
+        "the scheduler was lost"
+    )
     assert said.endswith("0 of 12 points are done and kept: start the same command again to go on")
