@@ -27,12 +27,22 @@ from isac_rt.storage import BAD_DATA
 
 COLUMNS = {
     "paths": (
-        "power_db", "delay", "delay_rate", "kind", "target", "bounces",
-        "departure_x", "departure_y", "departure_z", "arrival_x", "arrival_y", "arrival_z",
+        "power_db",
+        "delay",
+        "delay_rate",
+        "kind",
+        "target",
+        "bounces",
+        "departure_x",
+        "departure_y",
+        "departure_z",
+        "arrival_x",
+        "arrival_y",
+        "arrival_z",
     ),
     "detections": ("range", "velocity", "u_x", "u_z", "snr", "kind", "target"),
     "tracks": ("id", "range", "velocity", "u_x", "u_z", "confirmed", "uav"),
-}  # fmt: skip
+}
 """Columns of the tables, float64; names, units and meanings are those of ``results.nc``."""
 _PREFIX = {"paths": "path", "detections": "det", "tracks": "track"}
 TRUTH = ("range", "velocity", "azimuth", "elevation")
