@@ -9,10 +9,11 @@ keys too, but neither places that are options nor how far aliases unfold.
 from __future__ import annotations
 
 import difflib
+import numbers
 import re
 import typing
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence, Set
+from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
@@ -128,6 +129,28 @@ class _Reader:
         return values
 
 
+def _plain(value: Any, key: Key, depth: int) -> Any:
+    """A value from Python as YAML would have given it."""
+    if depth > MAX_DEPTH:
+        raise ScenarioError(f"load: {dotted(key[:3])}: nested more than {MAX_DEPTH} levels deep")
+    if isinstance(value, Node):
+        value = {k: v for k, v in value if k in value.model_fields_set}
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v, (*key, str(k)), depth + 1) for k, v in value.items()}
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, numbers.Real):  # numpy's too
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+    if isinstance(value, Iterable) and not isinstance(value, bytes | Set):
+        return [_plain(v, (*key, i), depth + 1) for i, v in enumerate(value)]
+    raise ScenarioError(
+        f"load: {dotted(key)}: {type(value).__name__} is no value of a scenario; give mappings, "
+        "lists, numbers and words"
+    )
+
+
 def _yaml_complaint(error: yaml.YAMLError, text: str) -> tuple[int | None, str]:
     """Line and wording of what PyYAML or `_Reader` did not like."""
     if isinstance(error, yaml.MarkedYAMLError):
@@ -211,6 +234,19 @@ class Document:
         self.path = path
         self.data: dict[str, Any] = data
         self.places = reader.places
+
+    @classmethod
+    def of_tree(cls, tree: Mapping[str, Any]) -> Document:
+        """The document of a mapping made in Python, from the working folder.
+
+        Raises
+        ------
+        ScenarioError  If it holds anything but mappings, lists, numbers and words.
+        """
+        document = cls.__new__(cls)
+        document.path, document.places = Path(), {(): "load"}
+        document.data = _plain(tree, (), 0)
+        return document
 
     def override(self, text: str) -> None:
         """Replace a value as --set does: `text` is "key=value", the value YAML.

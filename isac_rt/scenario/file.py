@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ class ScenarioWarning(UserWarning):
 
 
 def load(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Mapping[str, Any],
     overrides: Iterable[str] = (),
     frames: int | None = None,
     seed: int | None = None,
@@ -32,8 +32,8 @@ def load(
 
     Parameters
     ----------
-    path : path of the YAML file; `city.file` and `accuracy.cost_model` in it are relative to its
-        folder
+    path : path of the YAML file, or a mapping with the same keys; files that it names are relative
+        to its folder, or to the working folder
     overrides : of the form "radio.groups=2", as after --set; the value is YAML
     frames, seed : replace the file's, as --frames and --seed do
 
@@ -55,15 +55,21 @@ def load(
     --------
     >>> load("scenes/street_canyon.yaml", ["noise.tx_power_dbm=3"], frames=4).noise.tx_power_dbm
     3.0
+    >>> radar = {"role": "active", "position_m": (0, 0, 30)}
+    >>> load({"sensor": "awr1843", "swarm": {"radar": radar}}).radio.mode
+    'fmcw'
     """
-    document = Document(Path(path), "a scenario needs at least a swarm")
+    if isinstance(path, Mapping):
+        document = Document.of_tree(path)
+    else:
+        document = Document(Path(path), "a scenario needs at least a swarm")
     for override in overrides:
         document.override(override)
     for name, value in (("frames", frames), ("seed", seed)):
         if value is not None:
             document.data[name] = value
             document.places[(name,)] = f"--{name} {value}"
-    folder = document.path.parent
+    folder = Path() if isinstance(path, Mapping) else document.path.parent
     try:
         document.data = with_tables(document.data, folder)
     except TableError as problem:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -221,6 +221,28 @@ class Setup:
     seconds: Seconds = NONE
     """What `prepare` took."""
 
+    def __post_init__(self) -> None:
+        """With other antennas than those of its paths a set-up finds its paths anew: what
+        `dataclasses.replace` makes is whole."""
+        if self.antennas == self.reference.antennas:
+            return
+        if self.antennas.num_tx != self.waveform.num_tx:
+            raise ValueError(
+                f"the waveform is of {self.waveform.num_tx} transmit antennas, the array has "
+                f"{self.antennas.num_tx}; prepare a scenario with this array"
+            )
+        free = replace(self.reference, antennas=self.antennas)
+        plan = replace(self.plan, antennas=self.antennas)
+        floor = noise_floor(self.scenario, plan, free)
+        anew = {
+            "reference": free,
+            "plan": plan,
+            "propagation": _maker(self.scenario, plan, free, self.city, floor)(),
+            "expectation": _expectation_of(self.scenario, plan, self.city),
+        }
+        for name, value in anew.items():
+            object.__setattr__(self, name, value)
+
     @property
     def schedule(self) -> Schedule:
         return self.timetable.schedule
@@ -420,17 +442,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     )
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     floor = noise_floor(scenario, plan, free)
-    make = partial(
-        make_propagation,
-        scenario.propagation,
-        scenario.clutter,
-        swarm,
-        free,
-        city,
-        waveform,
-        plan.max_untraced,
-        floor,
-    )
+    make = _maker(scenario, plan, free, city, floor)
     if store is None or scenario.propagation.model == "free_space":
         propagation = make()
     else:
@@ -448,21 +460,37 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         timetable,
         Connections(),
         plan,
-        make_expectation(
-            scenario.clutter,
-            swarm,
-            city.without(scenario.belief.missing_m),
-            waveform,
-            antennas,
-            scenario.seed,
-        )
-        if scenario.needs_mesh
-        else None,
+        _expectation_of(scenario, plan, city),
     )
     _ = setup.calibration  # a file that is none is refused here
     setup = _connected(setup)
     warn_of_unseen(setup.coverage)
     return replace(setup, seconds=Seconds.of_process() - begin)
+
+
+def _maker(
+    scenario: Scenario, plan: Plan, free: FreeSpace, city: CityMesh, floor: NoiseFloor | None
+) -> Callable[[], Propagation]:
+    """What makes the propagation model of a run."""
+    return partial(
+        make_propagation,
+        scenario.propagation,
+        scenario.clutter,
+        plan.swarm,
+        free,
+        city,
+        plan.waveform,
+        plan.max_untraced,
+        floor,
+    )
+
+
+def _expectation_of(scenario: Scenario, plan: Plan, city: CityMesh) -> ClutterExpectation | None:
+    if not scenario.needs_mesh:
+        return None
+    believed = city.without(scenario.belief.missing_m)
+    about = scenario.clutter, plan.swarm, believed, plan.waveform
+    return make_expectation(*about, plan.antennas, scenario.seed)
 
 
 def _noise_power(

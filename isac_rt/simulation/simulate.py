@@ -35,6 +35,7 @@ from isac_rt.simulation.stopwatch import Stopwatch
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
     PassiveTerminal,
+    Receiver,
     Surroundings,
     TerminalState,
 )
@@ -78,6 +79,25 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
         groups=setup.timetable.groups(link),
         surroundings=Surroundings(walls, clutter),
     )
+
+
+def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
+    """A terminal as it is, or the scenario's own with `made` as its receiver.
+
+    Raises
+    ------
+    TypeError  If `made` has no `receive`.
+    """
+    if isinstance(made, ActiveTerminal | PassiveTerminal):
+        return made
+    if not isinstance(made, Receiver):
+        raise TypeError(
+            f"the terminal of {link} is {type(made).__name__}, which has no receive; return a "
+            "terminal or an object with receive"
+        )
+    out = standard_terminal(setup, link)
+    out.other = made
+    return out
 
 
 class _Observer:
@@ -250,7 +270,7 @@ def run(
     setup: Setup | None = None,
     threads: int | None = None,
     snapshots: int = 3,
-    terminal: Callable[[Setup, Link], Terminal] = standard_terminal,
+    terminal: Callable[[Setup, Link], Terminal | Receiver] = standard_terminal,
     resume: Resume | None = None,
 ) -> Results:
     """Simulate every frame of a scenario.
@@ -263,8 +283,9 @@ def run(
     threads : receivers at work at once; None: as many as the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path
         ledger are kept
-    terminal : makes the receiver of a link; a custom one is a subclass of `ActiveTerminal` or
-        `PassiveTerminal` with another `receive`
+    terminal : makes the receiver of a link: any object with `receive`, which is given what
+        `ActiveTerminal.receive` or `PassiveTerminal.receive` is, or a terminal, whose tracking may
+        be another too
     resume : where the frames are kept meanwhile and from where a run that was stopped goes on
 
     Returns
@@ -368,7 +389,7 @@ class _Run:
         scenario: Scenario,
         setup: Setup | None,
         snapshots: int,
-        terminal: Callable[[Setup, Link], Terminal],
+        terminal: Callable[[Setup, Link], Terminal | Receiver],
     ) -> _Run:
         """Before the first frame."""
         s, stopwatch = setup or prepare(scenario), Stopwatch()
@@ -379,7 +400,9 @@ class _Run:
         }
         return cls(
             s,
-            _Listeners.of(s, partial(terminal, s), scenario.receivers),
+            _Listeners.of(
+                s, lambda link: terminal_with(s, link, terminal(s, link)), scenario.receivers
+            ),
             compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import gammainccinv
@@ -80,6 +80,16 @@ class TerminalState(IntEnum):
     LOST = 2  # it had a reference and does not see it now
 
 
+@runtime_checkable
+class Receiver(Protocol):
+    """Anything with `receive`: what `ActiveTerminal.receive` or `PassiveTerminal.receive` is given
+    in, a `Reception` out."""
+
+    def receive(self, cube: Any, /, *known: Any) -> Reception:
+        """What is made of one frame's samples."""
+        ...
+
+
 class ActiveTerminal:
     """The AT: senses with its own echoes and tracks what it finds.
 
@@ -112,6 +122,7 @@ class ActiveTerminal:
         walls: Walls | None = None,
     ) -> None:
         self._receiver = ActiveReceiver.of(antennas, receivers)
+        self.other: Receiver | None = None
         period = 2 * waveform.max_velocity(2) * unambiguous_share(waveform)
         self.tracker = Tracker(tracking, period)
         self._doubts = None
@@ -163,7 +174,10 @@ class ActiveTerminal:
         clutter: ExpectedClutter | None,
         maps: bool,
     ) -> Reception:
-        """What the terminal makes of one frame's samples; a custom receiver replaces this."""
+        """What the terminal makes of one frame's samples; a custom receiver replaces this, or is
+        `other`, which is given the same."""
+        if self.other is not None:
+            return self.other.receive(cube, payload, clutter, maps)
         return self._receiver.receive(cube, payload, clutter, maps=maps)
 
     def memory(self) -> dict[str, Any]:
@@ -225,6 +239,7 @@ class PassiveTerminal:
         surroundings: Surroundings | None = None,
     ) -> None:
         self._receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)
+        self.other: Receiver | None = None
         self._groups, self._waveform = groups, waveform
         self._acceleration = tracking.acceleration_std_mps2
         self._period = 2 * waveform.max_velocity(1)
@@ -331,7 +346,10 @@ class PassiveTerminal:
     def receive(
         self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
     ) -> Reception:
-        """What the terminal makes of one frame's samples; a custom receiver replaces this."""
+        """What the terminal makes of one frame's samples; a custom receiver replaces this, or is
+        `other`, which is given the same."""
+        if self.other is not None:
+            return self.other.receive(cube, prediction, modulated, maps)
         known = self._profile, self._clutter
         return self._receiver.receive(cube, prediction, modulated, *known, maps=maps)
 
