@@ -288,21 +288,22 @@ class Scenario(Node):
             return
         sets: dict[Key, Receivers] = {("receivers",): self.receivers}
         sets |= {("compare", n, "receivers"): one.receivers for n, one in self.compare.items()}
-        usual = {
-            "clutter_detector": ("cfar", "looks at the two arms of an L"),
-            "refinement": ("local", "needs an L with two receive arms"),
-            "symbol_decision": ("powers", "needs an L with two receive arms"),
+        able = {
+            "clutter_detector": ("cfar",),
+            "passive_detector": ("cfar",),
+            "refinement": ("local", "grid"),
+            "symbol_decision": ("powers", "profile"),
         }
-        unlike = {"clutter_detector": ("cfar",), "refinement": ("local", "grid")}
-        unlike["symbol_decision"] = ("powers", "profile")
         for at, receivers in sets.items():
-            for key, (use, why) in usual.items():
-                if (value := getattr(receivers, key)) not in unlike[key]:
-                    yield Problem(
-                        ((*at, key), ("array",)),
-                        f"{value} {why}, and the arrays are another; set {key}: {use}, or leave "
-                        "array.tx and array.rx out",
-                    )
+            unlike = {k: v for k, v in able.items() if getattr(receivers, k) not in v}
+            if unlike:
+                named = " and ".join(f"{key}: {getattr(receivers, key)}" for key in unlike)
+                use = ", ".join(f"{key}: {values[0]}" for key, values in unlike.items())
+                yield Problem(
+                    (*((*at, key) for key in unlike), ("array",)),
+                    f"{named} needs an L with two receive arms, and the arrays are another; set "
+                    f"{use}, or leave array.tx and array.rx out",
+                )
 
     def _swarm_problems(self) -> Iterator[Problem]:
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
