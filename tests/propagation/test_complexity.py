@@ -3,8 +3,10 @@ ratios with wide margins."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Gridded
 from isac_rt.simulation.audit import tracer_of
 from isac_rt.simulation.setup import prepare
@@ -103,3 +105,60 @@ def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
         clutter.advance(setup, range(3 * per_metre))
         tests.append(len(calls))
     assert 0 < tests[1] <= tests[0] + 2
+
+
+def slope(sizes, counts) -> float:
+    """Of the line through the logarithms."""
+    return float(np.polyfit(np.log(sizes), np.log(counts), 1)[0])
+
+
+def rays_sent(setup) -> tuple[int, int]:
+    """Rays that one frame's search sends, and the legs that its images place."""
+    tracer, sent, placed = tracer_of(setup), [], []
+    hit, legs = tracer._search._hit, tracer._images.legs
+    tracer._search._hit = lambda at, along: (sent.append(len(at)), hit(at, along))[1]
+    tracer._images.legs = lambda *args: (placed.append(legs(*args)), placed[-1])[1]
+    setup.find(1)
+    return sum(sent), sum(map(len, placed))
+
+
+def with_terminals(count: int):
+    """A town of six UAVs, so many of which are terminals."""
+    tree = town(6).model_dump(mode="json", exclude_unset=True)
+    for i in range(count - 2):
+        tree["swarm"][f"U{i}"]["role"] = "passive"
+    return Scenario.model_validate(tree)
+
+
+@pytest.mark.sionna
+def test_work_of_tracing_grows_with_terminals_and_bounces_and_not_with_faces():
+    """Slopes of rays sent and legs placed over faces, bounces, terminals and UAVs, on logarithmic
+    scales. Planted bug: rays sent for every UAV."""
+    blocks = [prepare(town(3, count)) for count in (2, 4, 6)]
+    faces = [setup.city.num_faces for setup in blocks]
+    rays = [rays_sent(setup)[0] for setup in blocks]
+    assert faces[-1] > 4 * faces[0] and abs(slope(faces, rays)) < 0.15
+    walls = {"model": "ray_traced", "rays": 20_000}
+    bounces = [
+        rays_sent(prepare(town(3, propagation=walls | {"max_bounces": n})))[0] for n in (1, 2, 3)
+    ]
+    assert 0.3 < slope([1, 2, 3], bounces) < 1.05  # rays that leave the town are not sent on
+    work = [rays_sent(prepare(with_terminals(n))) for n in (2, 4, 6)]
+    assert slope([2, 4, 6], [rays for rays, _ in work]) == pytest.approx(1.0, abs=0.1)
+    assert slope([2, 4, 6], [legs for _, legs in work]) == pytest.approx(1.0, abs=1e-9)
+    legs = [rays_sent(prepare(town(count)))[1] for count in (3, 5, 7)]
+    assert slope([3, 5, 7], legs) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.sionna
+def test_work_of_clutter_and_synthesis_grows_with_the_scatterers():
+    """Paths that are advanced and synthesised, over scatterers of the field: slope one. Planted
+    bug: every scatterer advanced once for each UAV."""
+    made, kept = [], []
+    for area in (1.0, 0.25, 0.06):
+        setup = prepare(alone(clutter={"model": "field", "cell_area_per_metre_m": area}))
+        field = tracer_of(setup).field
+        kept.append(sum(len(some.cells) for some in field.merged.values()))
+        made.append(sum(len(paths) for paths in setup.find(1)[1].values()))
+    assert kept[-1] > 3 * kept[0]
+    assert slope(kept, made) == pytest.approx(1.0, abs=0.1)
