@@ -29,6 +29,9 @@ REACH = 6
 leakage."""
 PADDING = 5
 """Points of the spectrum in a range cell, as TI's calibration has them."""
+PASSED = 0.9
+"""Share of the sampling rate that the boards' IF filters pass; what is seen beyond are negative
+beats next to zero, of leakage, which can have rank one."""
 SWEEP_POINTS = 32
 ROUNDS = 25
 KEY = "calibration 1"
@@ -207,7 +210,8 @@ def _reflector(y: np.ndarray, w: Waveform, one_sided: bool) -> tuple[float, floa
     floor = float(np.median(power))
     if not floor > 0:
         raise CaptureError("the samples are zero in most range cells; capture again")
-    first, last = REACH * PADDING, (size // (2 if one_sided else 1) - REACH) * PADDING
+    first = REACH * PADDING
+    last = int(min(size * (0.5 if one_sided else 1.0) - REACH, size * PASSED) * PADDING)
     around = np.lib.stride_tricks.sliding_window_view(power, 4 * PADDING + 1).max(axis=1)
     peaks = [k for k in range(first, last) if power[k] == around[k - 2 * PADDING]]
     tried = [
