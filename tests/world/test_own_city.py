@@ -465,6 +465,20 @@ def test_what_is_no_building_is_named_with_its_material(tmp_path):
     assert said(mapped, "1 WaterBody: glass")
 
 
+def test_an_object_without_a_surface_is_left_out(tmp_path):
+    """Seen failing in case 478 of a fuzz: the box about no corner."""
+    line = {"type": "MultiSurface", "lod": "2", "boundaries": [[[0, 1]]]}
+    objects = {
+        "a": {"type": "Building", "geometry": [solid(0)]},
+        "b": {"type": "Building", "geometry": [line]},
+    }
+    (tmp_path / "c.json").write_text(json.dumps(cityjson(box(0, 0, 0, 10), objects)))
+    assert said(read(tmp_path, "c.json", **LOCAL), "1 of 2 objects left out", "no surface")
+    (tmp_path / "c.json").write_text(json.dumps(cityjson(box(0, 0, 0, 10), {"b": objects["b"]})))
+    with pytest.raises(CityError, match="no surface"):
+        read(tmp_path, "c.json", **LOCAL)
+
+
 def test_cityjson_by_lines_and_one_bad_object(tmp_path):
     head = cityjson([], {})
     lines = [head]

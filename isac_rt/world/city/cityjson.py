@@ -382,10 +382,12 @@ class _Reader:
         what, kind = f"{self.name}: object {key}", str(item.type)
         if _has_faces(geometry) or kind in _FLAT_TYPES:
             root = _root(key, objects)
-            self.model.bodies.append(self._body(what, kind, root, geometry, vertices))
+            body = self._body(what, kind, root, geometry, vertices)
+            if not len(body.vertices):
+                raise CityError(f"{what}: has no surface; correct or remove it")
+            self.model.bodies.append(body)
             if kind not in BUILDING_TYPES:
-                material = next(iter(self.model.bodies[-1].faces), "nothing")
-                self.counted[kind, material] += 1
+                self.counted[kind, next(iter(body.faces))] += 1
         elif not detailed.intersection(item.children) and not isinstance(geometry, _Instance):
             attributes = item.attributes or {}
             try:
