@@ -22,8 +22,9 @@ from isac_rt.storage import load_data, save_data
 LEAST_SHARE = 0.9
 """Rank-one share from which an echo is that of one reflector. A corner reflector in a room has
 0.986 and more; echoes of walls and furniture, and the leakage, mostly stay under 0.8."""
-LEAST_SNR_DB = 20.0
-"""How far the reflector must stand out of the median range cell [dB]."""
+LEAST_SNR_DB = 25.0
+"""How far the reflector must stand out of the median range cell [dB]. Corner reflectors in rooms
+stand 32 dB and more; second harmonics of the mixer, which have rank one too, reach 20 dB."""
 REACH = 6
 """Range cells on each side of the echo that belong to it, and about zero that belong to the
 leakage."""
