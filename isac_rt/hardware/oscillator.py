@@ -192,15 +192,12 @@ class Oscillator:
 
     def _band(self, number: int, band: _Band, first: int, count: int) -> np.ndarray:
         """One band at places first .. first + count - 1 of its own grid."""
-        out, hop, fade = np.zeros(count), band.hop, band.size - band.hop
-        angle = (np.arange(fade) + 0.5) * (np.pi / 2 / fade)
+        out, hop, weight = np.zeros(count), band.hop, _fades(band.size, band.hop)
         for index in range(first // hop - 1, (first + count - 1) // hop + 1):
             begin = index * hop
             low, high = max(begin, first), min(begin + band.size, first + count)
             if low >= high:
                 continue
-            weight = np.ones(band.size, np.float32)
-            weight[:fade], weight[hop:] = np.sin(angle), np.cos(angle)
             inside = slice(low - begin, high - begin)
             drawn = _block(self, number, index)
             out[low - first : high - first] += weight[inside] * drawn[inside]
@@ -214,6 +211,16 @@ def _sine(angle: float, first: float, count: int) -> np.ndarray:
     out = np.outer(np.sin(coarse), np.cos(fine))
     out += np.outer(np.cos(coarse), np.sin(fine))
     return out.ravel()[:count]
+
+
+@lru_cache(maxsize=4)
+def _fades(size: int, hop: int) -> np.ndarray:
+    """Weights of a block (size,) float32: sin to 1, and cos from the next block's beginning on."""
+    angle = (np.arange(size - hop) + 0.5) * (np.pi / 2 / (size - hop))
+    out = np.ones(size, np.float32)
+    out[: size - hop], out[hop:] = np.sin(angle), np.cos(angle)
+    out.setflags(write=False)
+    return out
 
 
 @lru_cache(maxsize=48)

@@ -127,7 +127,7 @@ def read_at(shift: np.ndarray) -> tuple[int, np.ndarray]:
     first : of the neighbours, relative to the sample
     weights : (T, N) float64 of the neighbours `first` .. `first` + T - 1
     """
-    most = int(np.ceil(np.abs(shift).max(initial=0.0)))
+    most = int(np.ceil(max(np.abs(shift).max(initial=0.0) - 0.5, 0.0)))
     first, count = -REACH - most, 2 * (REACH + most) + 1
     apart = shift - np.arange(first, first + count)[:, None]
     inside = np.clip(1 - (apart / (REACH + 0.5)) ** 2, 0, None)

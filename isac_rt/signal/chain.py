@@ -69,8 +69,9 @@ def _phasors(out, cycles):
 def phasors(cycles: np.ndarray) -> np.ndarray:
     """exp(j 2 pi cycles) of float64, complex64, to 1e-7."""
     size = -(-cycles.size // LANES) * LANES
-    flat = np.zeros(size)
-    flat[: cycles.size] = cycles.ravel()
+    flat = cycles.ravel()
+    if size > flat.size:
+        flat = np.concatenate([flat, np.zeros(size - flat.size)])
     out = aligned(2 * size)
     _phasors(out, flat)
     return out[: 2 * cycles.size].view(np.complex64).reshape(cycles.shape)

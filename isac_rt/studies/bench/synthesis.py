@@ -22,13 +22,16 @@ from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.hardware.front_end import Ends, front_end_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.signal.gridded import ACCURATE, COVERING, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import if_signal, range_profiles
-from isac_rt.signal.methods import Direct, Exact, Gridded, Method
-from isac_rt.signal.noise import add_white_noise
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
+from isac_rt.signal.noise import WhiteNoise, add_white_noise
+from isac_rt.signal.received import received
 from isac_rt.signal.tones import tones_of
 from isac_rt.studies.bench import nufft
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds
@@ -37,6 +40,7 @@ from isac_rt.world.swarm import Pose
 SIZES = (3, 30, 1000, 10_000, 50_000, 200_000)
 QUICK_SIZES = (3, 1000)
 MOST_DIRECT = 30
+REAL_SIZE = 1000
 PROFILE_SIZES = (3, 30, 1000, 10_000)
 BOTH = "samples (gridded wideband, 1.5 N, width 6), Hann window, transform, data out"
 JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
@@ -53,6 +57,20 @@ GRIDS = (
     ("gridded wideband, 1.5 N, width 12 over 4", Gridded(COVERING)),
     ("gridded, 1.5 N, width 4, of what noise covers", Gridded(COVERING, faint=True)),
 )
+REAL: dict[str, dict[str, Any]] = {
+    "oscillators": {"preset": "pll_good"},
+    "elements": {
+        "transmit": {"gain_std_db": 1, "delay_std_ps": 5, "tilt_std_deg": 1, "coupling_db": -25},
+        "receive": {"gain_std_db": 1, "delay_std_ps": 5, "tilt_std_deg": 1, "coupling_db": -25},
+    },
+    "responses": {
+        "transmit_response": {"table_db": [0, -1, -3]},
+        "receive_response": {"table_db": [0, -1, -3], "slope_std_db": 0.2},
+    },
+    "converters": {"converter": {"compression_dbm": 50, "iq_gain_db": 0.3, "bits": 12}},
+    "ramps": {"ramp": {"quadratic_hz": 2e4, "ripple_hz": 1e4}},
+}
+"""Parts of front ends whose cost is measured by itself, and together."""
 DIRECTLY = (
     ("profiles directly, 1.25 N, width 6", PROFILES),
     ("profiles directly, cubic, 1.5 N, width 8", ACCURATE),
@@ -129,6 +147,14 @@ class Job:
             self.sender.payload,
             setting=setting,
         ).spectra
+
+    def behind(self, links: list, stated: dict[str, Any]) -> np.ndarray:
+        """The samples with noise, from one terminal to another with such front ends."""
+        node = FrontEnd.model_validate(stated)
+        tx, rx = (front_end_of(node, self.waveform, self.antennas, 1, name) for name in "AB")
+        noise = WhiteNoise(1e3, np.array([1, 2], np.uint32))
+        job = self.waveform, links, self.receiver, Reference(0.0)
+        return received(*job, Ends(rx, (tx,)), Auto(noise_power=noise.power), noise).samples
 
     def by_finufft(self, links: list) -> np.ndarray:
         """The samples by a library's transform, narrowband."""
@@ -242,6 +268,12 @@ def rows(quick: bool) -> list[dict[str, Any]]:
         for name, method in GRIDS:
             seconds = cpu_seconds(partial(job.samples, links, method), times)
             add(name, size, "paths", seconds, error[name])
+        if size == REAL_SIZE:
+            together = {key: value for part in REAL.values() for key, value in part.items()}
+            behind: dict[str, dict[str, Any]] = {"ideal": {}, **REAL, "all": together}
+            for name, stated in behind.items():
+                seconds = cpu_seconds(partial(job.behind, links, stated), times)
+                add(f"with noise, front ends: {name}", size, "paths", seconds, None)
         if size in PROFILE_SIZES and nufft.NAME in error:
             seconds = cpu_seconds(partial(job.by_finufft, links), times)
             add(nufft.NAME, size, "paths", seconds, error[nufft.NAME])
