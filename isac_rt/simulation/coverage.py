@@ -41,7 +41,8 @@ class LinkCoverage:
     min_range_m : nearer detections are left out, the line of sight of pilots among them
     range_resolution_m, velocity_resolution_mps : one cell of the map
     max_velocity_mps : beyond it a velocity is reported a whole period off
-    azimuth_resolution_deg, elevation_resolution_deg : wavelength over aperture, at broadside
+    azimuth_resolution_deg, elevation_resolution_deg : wavelength over aperture, at broadside; None
+        where the array does not observe them
     field_of_view_deg : to each side of the boresight
     unambiguous_angle_deg : to each side; beyond it a direction is reported on the other side
     bit_rate_bps : sent for this receiver over the whole run, pilots and pauses included; None for
@@ -55,8 +56,8 @@ class LinkCoverage:
     range_resolution_m: float
     velocity_resolution_mps: float
     max_velocity_mps: float
-    azimuth_resolution_deg: float
-    elevation_resolution_deg: float
+    azimuth_resolution_deg: float | None
+    elevation_resolution_deg: float | None
     field_of_view_deg: float
     unambiguous_angle_deg: float
     bit_rate_bps: float | None
@@ -158,6 +159,7 @@ def _link_coverage(
 ) -> LinkCoverage:
     w, passes = timetable.waveform, link.passes
     cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
+    sideways, upwards = antennas.observes(passes)
     apart = SPEED_OF_LIGHT / (float(w.carrier()) * max(antennas.step(passes), 1e-9))
     return LinkCoverage(
         link=str(link),
@@ -167,8 +169,8 @@ def _link_coverage(
         range_resolution_m=cell,
         velocity_resolution_mps=velocity,
         max_velocity_mps=unambiguous_velocity(link, timetable, receivers.velocity_method, schedule),
-        azimuth_resolution_deg=_degrees(across),
-        elevation_resolution_deg=_degrees(up),
+        azimuth_resolution_deg=_degrees(across) if sideways else None,
+        elevation_resolution_deg=_degrees(up) if upwards else None,
         field_of_view_deg=float(np.degrees(antennas.half_view)),
         unambiguous_angle_deg=_degrees(apart / 2),
         bit_rate_bps=None if link.own else _bit_rate(link, timetable),

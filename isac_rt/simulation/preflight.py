@@ -192,6 +192,14 @@ def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
 def warn_of_unseen(seen: Coverage) -> None:
     """Warn of what cannot be seen: terminals whose data are lost, and UAVs that nobody sees."""
     limits, by_uav = {of.link: of for of in seen.links}, dict[str, list[Outside]]()
+    for axis in ("azimuth", "elevation"):
+        if blind := [
+            link for link in limits if vars(limits[link])[f"{axis}_resolution_deg"] is None
+        ]:
+            _warn(
+                f"{' and '.join(blind)}: the array does not observe {axis}; tracks take bodies to "
+                "be in its plane; elements beside that plane (array.tx, array.rx) would tell"
+            )
     for row in seen.outside:
         tx, _, rx = row.link.partition("->")
         if row.uav != tx:

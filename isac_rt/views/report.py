@@ -196,12 +196,17 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
         number(seen[key] * unit)
         for key, unit in (("slot_s", 1e6), ("frame_s", 1e3), ("frame_interval_s", 1e3))
     )
+    past = ""
+    if farthest["filtered_range_m"] > farthest["max_range_m"]:
+        past = (
+            ", and hold with data as without; paths of up to twice that range still disturb some "
+            "chirps"
+        )
     words = (
         f"A slot, one chirp of each group, lasts {slot} us, a frame {frame} ms; a frame begins "
         f"every {interval} ms. Ranges are one way for echoes, the whole way from transmitter to "
-        "receiver otherwise, and hold with data as without; paths of up to twice that range still "
-        "disturb some chirps. Faster UAVs are seen at a wrong velocity. A beam is the width of "
-        "the array's main lobe ahead; the view reaches so far to each side, and directions are "
+        f"receiver otherwise{past}. Faster UAVs are seen at a wrong velocity. A beam is the width "
+        "of the array's main lobe ahead; the view reaches so far to each side, and directions are "
         f"unambiguous to {number(farthest['unambiguous_angle_deg'])} deg. Walls in between are "
         "not counted here."
     )

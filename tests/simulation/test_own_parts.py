@@ -13,7 +13,7 @@ from isac_rt.receive import receive_passive
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.types import Reception, no_detections
 from isac_rt.scenario.document import ScenarioError
-from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.swarm import Uav
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import run
@@ -120,3 +120,13 @@ def test_any_object_with_receive_is_a_receiver():
     assert [deaf[name]["hit_rate"] for name in ("AT", "PT")] == [0, 0] and deaf["PT"]["bits"] == 0
     with pytest.raises(TypeError, match="is object, which has no receive"):
         run(scenario, terminal=lambda setup, link: object())
+
+
+def test_a_row_says_so_before_the_run():
+    """Its elevation beam is none, and a run warns; bug: a beam of 90 degrees."""
+    row = {"shape": "linear", "columns": 3}
+    tree = {**TREE, "array": {"tx": row, "rx": row, "element_pattern": "isotropic"}}
+    with pytest.warns(ScenarioWarning, match="does not observe elevation; tracks take bodies"):
+        setup = prepare(load({**tree, "array": {**tree["array"], "element_gain_dbi": 0}}))
+    beams = [link.elevation_resolution_deg for link in setup.coverage.links]
+    assert beams == [None, None] and setup.coverage.links[0].azimuth_resolution_deg is not None
