@@ -228,7 +228,7 @@ def test_error_of_the_full_model(setting, bound):
 @pytest.mark.parametrize("speed", [0.0, 15.0, 60.0])
 def test_error_of_paths_that_noise_covers(speed):
     """The stated bounds of both classes, which lie within three times of the truth. Planted bug:
-    `late` left out of the covered ones."""
+    `br` and `bi` of zero."""
     w, tones = scene(40, np.random.default_rng(23), speed=speed, num_chirps=3)
     truth, bound = exact(w, tones), 2e-3 + 7e-5 * speed
     covered = relative(gridded(w, tones, COVERING, np.ones(40, bool)), truth)
