@@ -60,6 +60,22 @@ def run(
     say(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/")
 
 
+def demo(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where the scenario and its results go.")
+    ] = Path("isac_rt_demo"),
+) -> None:
+    """Simulate a small scene over a street canyon; needs no file. The scenario is written beside
+    its results, to be changed and run again."""
+    from isac_rt.cli.starter import write_starter
+
+    scenario = out / "demo.yaml"
+    if not scenario.exists():
+        write_starter(scenario)
+    run(scenario, out / "results", frames=12)
+    say(f"next: change {scenario}, then isac-rt run {scenario}")
+
+
 def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, restart: bool) -> None:
     from isac_rt.results.files import check_folder, save
 

@@ -103,6 +103,20 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
     assert "Traceback" not in said.err
 
 
+def test_demo_needs_no_file(simulation, tmp_path, monkeypatch, capsys):
+    """In an empty folder: the scenario beside its results, and what to do next; called again it
+    keeps what was changed. Planted bug: the scenario written anew."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo"]) == 0
+    file = tmp_path / "isac_rt_demo" / "demo.yaml"
+    assert (file.parent / "results" / "report.html").is_file()
+    assert "next: change isac_rt_demo/demo.yaml" in capsys.readouterr().out
+    file.write_text(file.read_text().replace("seed: 1 ", "seed: 17 "))
+    assert main(["demo"]) == 0
+    summary = json.loads((file.parent / "results" / "summary.json").read_text())
+    assert (summary["seed"], summary["frames"]) == (17, 12)
+
+
 def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypatch):
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
     assert (
