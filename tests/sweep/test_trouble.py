@@ -19,6 +19,7 @@ from test_sweep import BASE, SWEEP, job_of, plan_of, run_here, same, start_clien
 
 from isac_rt import storage
 from isac_rt.cli.cli import main
+from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError
 from isac_rt.scenario.document import ScenarioError
 from isac_rt.sweep import Outcomes, PointsLeft, execute, open_sweep, run_sweep, save_dataset, status
@@ -215,6 +216,17 @@ def test_trouble_of_the_machine_is_no_failure_of_the_point(folder, what, monkeyp
     outcomes.points.mkdir(exist_ok=True)
     assert run_job(job_of(plan, outcomes.folder, point)).status == "done"
     assert outcomes.read(point.key)["status"] == "done"
+
+
+def test_points_look_for_their_paths_in_the_sweep_s_folder(folder, monkeypatch):
+    """Planted bug: a set-up without the store."""
+    plan, outcomes, seen = plan_of(folder), Outcomes(folder / "out"), []
+    outcomes.save_definition(plan)
+    monkeypatch.setattr(
+        "isac_rt.simulation.setup.prepare", lambda _, store=None: seen.append(store) or 1 / 0
+    )
+    assert run_job(job_of(plan, outcomes.folder, next(plan.points()))).status == "failed"
+    assert seen == [PathStore(outcomes.folder / "paths", execute.CACHE_BYTES)]
 
 
 @pytest.mark.parametrize(
