@@ -178,6 +178,7 @@ EXCUSED = [
     ("access/ook.py", "total * (samples", "energies that are compared with each other"),
     ("propagation/clutter/penumbra.py", "LIFT / side", "a quotient by a sign"),
     ("propagation/legs/images.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
+    ("access/feedback.py", "+ away.min() ** 2", "a factor that all weights share"),
     ("results/provenance.py", "timeout=20", "a limit"),
     ("receive/omp.py", "support] = -2", "less than any modulus, as -1 is"),
     (
