@@ -222,7 +222,7 @@ def _seconds_after(setup: Setup, frame: int) -> list[float]:
     out = []
     for number in range(frame + 1, frame + 1 + FOLLOWED):
         begin = time.process_time()
-        setup.find(min(number, setup.timetable.frames - 1))
+        setup.frame(min(number, setup.timetable.frames - 1))
         out.append(time.process_time() - begin)
     return out
 

@@ -149,4 +149,4 @@ def test_the_parts_of_a_whole_command_add_up():
     assert found["frames"] == 20 and found["peak_memory_mib"] > 100
     for stage, seconds in found["predicted"].items():
         measured = found["stages"][stage] / found["frames"]
-        assert measured / 1.5 < seconds < measured * 1.5 or measured < 1e-3, stage
+        assert measured / 1.5 < seconds < measured * 1.5 or measured < 5e-3, stage
