@@ -149,12 +149,6 @@ class Samples:
     ------
     ResultsError  If it is the folder of no finished data set, has no such split, or a shard cannot
         be read.
-
-    Examples
-    --------
-    >>> samples = Samples("runs/dataset", "train", ["map"])  # doctest: +SKIP
-    >>> samples[0]["map"].shape, samples[0]["truth"]["uavs"]["U1"]["range"]  # doctest: +SKIP
-    ((192, 64), 31.5)
     """
 
     def __init__(self, folder: str | Path, split: str, keep: Sequence[str] | None = None) -> None:
