@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from isac_rt import scenario
-from isac_rt.world.city import CityError, CityMesh, load_city
+from isac_rt.world.city import CityError, CityMesh, files, load_city
 from isac_rt.world.city.heights import parse_length
 
 F_C = 77e9
@@ -378,7 +379,7 @@ def gaps(city: CityMesh) -> np.ndarray:
 @pytest.mark.parametrize("relief", [True, False])
 def test_no_building_floats(semantics, relief, tmp_path):
     """Seen failing: on one plane at the lowest foot they hang up to 45 m above it. Planted bugs:
-    the tower's foot is a point of the ground; feet of a shared vertex move for both."""
+    the tower's foot is a point of the ground; nothing goes down."""
     city = read(hill(tmp_path, semantics, relief), "hill.city.json", **LOCAL)
     assert (gaps(city) <= 1e-6).all()
     roofs = np.sort(np.unique(np.round(city.corners[city.normals[:, 2] > 0.99][..., 2], 3)))
@@ -463,6 +464,26 @@ def test_what_is_no_building_is_named_with_its_material(tmp_path):
     assert crown.min(axis=0) == pytest.approx([50, 0, 2])
     mapped = read(tmp_path, "c.json", material_map={"WaterBody": "glass"}, **LOCAL)
     assert said(mapped, "1 WaterBody: glass")
+
+
+def test_gzip_is_unpacked_and_a_bomb_is_not(tmp_path, monkeypatch):
+    """As the tiles of 3DBAG come."""
+    document = json.dumps(
+        cityjson(box(0, 0, 0, 10), {"a": {"type": "Building", "geometry": [solid(0)]}})
+    )
+    packed = gzip.compress(document.encode())
+    (tmp_path / "c.city.json.gz").write_bytes(packed)
+    assert body(read(tmp_path, "c.city.json.gz", **LOCAL)).volume == pytest.approx(1000)
+    (tmp_path / "c.city.json.gz").write_bytes(packed[:-20])
+    with pytest.raises(CityError, match="cut off"):
+        read(tmp_path, "c.city.json.gz", **LOCAL)
+    (tmp_path / "c.city.json.gz").write_bytes(packed[:30] + b"xxxx" + packed[34:])
+    with pytest.raises(CityError, match="gzip"):
+        read(tmp_path, "c.city.json.gz", **LOCAL)
+    monkeypatch.setattr(files, "MAX_BYTES", 1_000_000)
+    (tmp_path / "c.city.json.gz").write_bytes(gzip.compress(b"[" * 2_000_000))
+    with pytest.raises(CityError, match="holds more"):
+        read(tmp_path, "c.city.json.gz", **LOCAL)
 
 
 def test_an_object_without_a_surface_is_left_out(tmp_path):

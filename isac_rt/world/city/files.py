@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import stat
+import zlib
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -85,6 +86,27 @@ def read_bytes(path: Path, factor: float = READING_FACTOR) -> bytes:
             return opened.read(size)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise CityError(f"{path.name}: cannot be read ({error}); give a file") from None
+
+
+def unpacked(data: bytes, name: str, factor: float) -> bytes:
+    """The content of a gzip file; anything else as it is.
+
+    Raises
+    ------
+    CityError  If it is broken, or grows beyond `MAX_BYTES` or the free memory over `factor`.
+    """
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    free = available_memory()
+    most = MAX_BYTES if free is None else min(MAX_BYTES, int(free / factor))
+    try:
+        stream = zlib.decompressobj(wbits=31)
+        found = stream.decompress(data, most)
+    except zlib.error as error:
+        raise CityError(f"{name}: is no whole gzip file ({error}); fetch it again") from None
+    if stream.unconsumed_tail or not stream.eof:
+        raise CityError(f"{name}: is cut off, or holds more than {most / 1e9:.3g} GB; cut it out")
+    return found
 
 
 def beside(path: Path, name: str, what: str) -> Path:

@@ -16,7 +16,7 @@ from isac_rt import scenario
 from isac_rt.world.city.buildings import Outline, buildings, moved
 from isac_rt.world.city.cityjson import CityModel, is_sequence, read_cityjson
 from isac_rt.world.city.extrude import Finish, building, polygons_of, roofed
-from isac_rt.world.city.files import JSON_FACTOR, read_bytes
+from isac_rt.world.city.files import JSON_FACTOR, read_bytes, unpacked
 from isac_rt.world.city.geojson import by_lines, read_geojson, tell_bad
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, check_coordinates
@@ -39,7 +39,8 @@ def _model(city: scenario.City, path: Path, notes: list[str]) -> CityModel:
     if path.suffix.lower() in TABLES:
         features, crs = read_table(path, city.layer, notes)
         return CityModel(crs, buildings(features, city, path.name, notes))
-    data = read_bytes(path, JSON_FACTOR).removeprefix(b"\xef\xbb\xbf")
+    data = unpacked(read_bytes(path, JSON_FACTOR), path.name, JSON_FACTOR)
+    data = data.removeprefix(b"\xef\xbb\xbf")
     if data.lstrip()[:1] == b"<":
         raise CityError(_REMEDY_XML.format(path.name))
     if is_sequence(data) or b'"CityJSON"' in data:
