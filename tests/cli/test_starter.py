@@ -86,8 +86,8 @@ def begun(make, folder: Path) -> Scenario:
 
 @pytest.mark.parametrize("make", [osm, swiss, pytest.param(quarter, marks=pytest.mark.slow)])
 def test_the_swarm_is_among_buildings_in_sight_and_before_a_wall(make, tmp_path):
-    """By trimesh's rays. Planted bug: no site is good, so that the swarm flies over the highest roof,
-    as it did."""
+    """By trimesh's rays. Planted bug: no site is good, so that the swarm flies over the highest
+    roof, as it did."""
     scenario = begun(make, tmp_path)
     city, swarm = city_of(scenario), swarm_of(scenario)
     mesh = trimesh.Trimesh(
