@@ -260,3 +260,22 @@ def test_a_driven_amplifier_sends_less():
     found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
     ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
     np.testing.assert_allclose(found, ideal * 2**-0.25, rtol=1e-5, atol=1e-5)
+
+
+def test_each_bin_of_delay_has_its_own_phase_once_a_chirp():
+    """Noise so slow that a chirp of 5 us turns as a whole: what one phase for all delays would leave
+    is taken away by the bins. Planted bugs: the bins' phase with the other sign; none."""
+    links, ear = scene(40, seed=2)
+    at = FrontEnd(
+        oscillator=Oscillator(
+            Mask(((2e4, -45.0), (2e5, -125.0), (1e7, -125.0))), (), W.sampling_rate, 3, "A"
+        )
+    )
+    ends = Ends(at, (at,))
+    noise = WhiteNoise(1e3, np.array([3, 4], np.uint32))
+    quiet = received(W, links, ear, Reference(START), Ends(IDEAL, (IDEAL,)), Direct(), noise)
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    found = received(W, links, ear, Reference(START), ends, Direct(), noise).samples
+    found = found - quiet.samples + ideal
+    truth = heard_one_by_one(links, ear, ends)
+    assert error(found, truth) < 0.45 * error(ideal, truth)
