@@ -263,8 +263,8 @@ def test_a_driven_amplifier_sends_less():
 
 
 def test_each_bin_of_delay_has_its_own_phase_once_a_chirp():
-    """Noise so slow that a chirp of 5 us turns as a whole: what one phase for all delays would leave
-    is taken away by the bins. Planted bugs: the bins' phase with the other sign; none."""
+    """Noise so slow that a chirp of 5 us turns as a whole: what one phase for all delays would
+    leave is taken away by the bins. Planted bugs: the bins' phase with the other sign; none."""
     links, ear = scene(40, seed=2)
     at = FrontEnd(
         oscillator=Oscillator(
