@@ -352,6 +352,8 @@ def test_of_two_tracks_the_one_that_followed_goes_on():
     tracks = [(3, True, 0, "U1", 0.0), (7, True, 1, "U1", 0.0)]
     record = scored(judge, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
     assert record.tracks.uav.tolist() == [-1, 0]
+    assert record.tracked.range[0] == record.tracks.range[1]
+    assert np.isnan(record.tracked.range[1:]).all()
     again = scorer("AT")
     scored(again, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
     resumed = scorer("AT")
