@@ -100,20 +100,46 @@ class Places(NamedTuple):
         return np.abs(range - self.range) / self.cells[0], np.abs(off) / self.cells[1]
 
 
+class Aim(NamedTuple):
+    """Where paths come from, for a receiver.
+
+    Attributes
+    ----------
+    direction : (K, 2) u_x, u_z of each path's arrival in body axes
+    beam : (2,) width of the array's beam in both, infinite where it sees no direction
+    """
+
+    direction: np.ndarray
+    beam: np.ndarray
+
+    def towards(self, direction: np.ndarray) -> np.ndarray:
+        """(K,) which paths come from within a beam about a direction (2,); none where it is not
+        known."""
+        return np.asarray((np.abs(self.direction - direction) <= self.beam).all(axis=1))
+
+
 def explain(
-    detections: Detections, paths: PathSet, waveform: Waveform, passes: int, cell_gain: float
+    detections: Detections,
+    paths: PathSet,
+    waveform: Waveform,
+    passes: int,
+    cell_gain: float,
+    aim: Aim | None = None,
 ) -> Explanation:
     """Which path caused each detection: the one with the most power at its place.
 
     A path counts with all its power within one cell in range and in Doppler, and beyond with what
     its Hann-windowed sidelobes hold at most. The diffuse paths within a cell count together, as the
     clutter that they are; the strongest of them gives order and face. What lies under `EXPLAINS`
-    of the noise explains nothing. The direction does not count: paths of one cell reach a detection
-    together, and the strongest decides what it says.
+    of the noise explains nothing. Paths of one cell reach a detection together, and the strongest
+    decides; but a receiver that looks by beam, or takes strong paths out first, finds a weak one
+    beside it. So a path of the cell that comes from where the detection says is the cause before
+    a stronger one from elsewhere.
 
     Parameters
     ----------
     cell_gain : power over the noise of one channel's cell, of a path of unit power
+    aim : of `paths`; None: their directions do not count
     """
     places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
     diffuse = paths.kind == PathKind.DIFFUSE
@@ -129,14 +155,30 @@ def explain(
         here[~diffuse] *= reach(rows[~diffuse]) * np.minimum(
             reach(bins[~diffuse]) + UNION_FLOOR, 1.0
         )
-        clutter = np.flatnonzero(near & diffuse)
-        if clutter.size:
-            here[clutter[np.argmax(power[clutter])]] = power[clutter].sum()
-        if not here.size or here.max() < EXPLAINS:
+        clutter = np.where(near & diffuse, power, 0.0)
+        cause = -1
+        if aim is not None:
+            towards = aim.towards(detections.direction[q])
+            cause = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
+        if cause < 0 or not near[cause]:
+            cause = _strongest(here, clutter)
+        if cause < 0:
             continue
-        cause = int(np.argmax(here))
         out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
         out.order[q], out.skirt[q] = paths.bounces[cause], not near[cause]
         met = paths.faces[cause][paths.faces[cause] >= 0]
         out.face[q] = met[0] if met.size else -1
     return out
+
+
+def _strongest(power: np.ndarray, clutter: np.ndarray) -> int:
+    """The path of most power, -1 if none explains anything; all clutter counts as its strongest.
+
+    Parameters
+    ----------
+    power, clutter : (K,) of single paths, and of those that count together
+    """
+    power = power.copy()
+    if clutter.any():
+        power[np.argmax(clutter)] = clutter.sum()
+    return int(np.argmax(power)) if power.size and power.max() >= EXPLAINS else -1

@@ -19,7 +19,7 @@ from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.receive import Reception
 from isac_rt.receive.types import Detections
-from isac_rt.results.labels import Places, explain, owners
+from isac_rt.results.labels import Aim, Places, explain, owners
 from isac_rt.results.losses import Chance, Sensitivity, cause_of
 from isac_rt.results.metrics import (
     GOSPA_CUTOFF_M,
@@ -98,7 +98,7 @@ class Scorer:
         reception, timetable, tracks = heard.reception, self._timetable, heard.tracks
         view = self._view(frame, paths)
         sees = self._sensitivity(frame, sent, noise_power)
-        labels = self._labels_of(reception.detections, paths, sees)
+        labels = self._labels_of(reception.detections, paths, sees, view.directions)
         best, hit = self._found(view, reception.detections, labels.uav)
         table = self._table(view, tracks, labels)
         followed = {int(i): int(k) for k, i in enumerate(table.uav) if i >= 0}
@@ -165,7 +165,10 @@ class Scorer:
         direct = np.isin(np.arange(len(names)), straight)
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         places = [poses[names[i]].position - own.position for i in seen]
-        return _View(truth, inside, direct, straight, seen, np.array(places).reshape(-1, 3))
+        directions = own.to_body(paths.arrival)[:, [0, 2]]
+        return _View(
+            truth, inside, direct, straight, seen, np.array(places).reshape(-1, 3), directions
+        )
 
     def _sensitivity(self, frame: int, sent: Transmission, noise_power: float) -> Sensitivity:
         timetable = self._timetable
@@ -181,8 +184,12 @@ class Scorer:
             self.link.own,
         )
 
-    def _labels_of(self, d: Detections, paths: PathSet, sees: Sensitivity) -> _Labels:
-        found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell)
+    def _labels_of(
+        self, d: Detections, paths: PathSet, sees: Sensitivity, directions: np.ndarray
+    ) -> _Labels:
+        beam = np.where(self._observed, self._resolution[2:], np.inf)
+        aim = Aim(directions, beam)
+        found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
         names = list(self._swarm.uavs)
         uav = owners(found.kind, found.target, paths, names)
         index = np.array([names.index(name) for name in paths.target_names] + [-1], np.int16)
@@ -278,6 +285,7 @@ class _View:
     straight : (K,) index of the UAV whose own straight path each path is, -1: none's
     seen : the truth of those in view and unshadowed, by index
     places : (S, 3) of these, relative to the receiver [m]
+    directions : (K, 2) u_x, u_z from which each path arrives
     """
 
     truth: list[Truth | None]
@@ -286,6 +294,7 @@ class _View:
     straight: np.ndarray
     seen: dict[int, Truth]
     places: np.ndarray
+    directions: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.types import Detections
-from isac_rt.results.labels import explain, hann_response, owners, reach
+from isac_rt.results.labels import Aim, explain, hann_response, owners, reach
 
 WAVEFORM = Waveform()
 RANGE, VELOCITY = WAVEFORM.range_cell(2), WAVEFORM.velocity_cell(2)
@@ -71,6 +71,44 @@ def test_the_strongest_path_within_a_cell_wins():
     assert order.tolist() == [1, 2, -1, 0]
     assert face.tolist() == [41, 17, -1, -1]
     assert not skirt.any()
+
+
+def test_direction_tells_a_weak_path_from_a_strong_one():
+    """In one cell a line 40 dB over a UAV's echo, 0.4 away in u_x, and clutter beside it: a
+    detection at the echo's direction is the echo's, one between both the strong one's, as is one
+    without a direction; of what comes from one direction the strongest decides, clutter together.
+    An echo beside the detection's cell is no cause for its direction. Planted bugs: the echo's
+    direction compared in u_z alone; clutter from all directions together."""
+    rows = [
+        (20.0, 1.0, 100.0, PathKind.SPECULAR, -1),
+        (20.1, 1.0, 1.0, PathKind.TARGET, 1),
+        *((20.0 + 0.02 * k, 1.0, 0.3, PathKind.DIFFUSE, -1) for k in range(13)),
+        (20.0 + 1.4 * RANGE, 1.0, 3.0, PathKind.TARGET, 2),
+    ]
+    around = [(0.3, 0.1)] * 9 + [(0.5, -0.3)] * 4  # 0.81 of the echo's power in its beam
+    towards = np.array([(-0.1, 0.1), (0.31, 0.12), *around, (0.7, 0.1)])
+    aim = Aim(towards, np.array([0.07, 0.13]))
+    found = [
+        explain(detections([[20.05, 1.0, *u]]), paths(rows), WAVEFORM, 2, LOUD, aim)
+        for u in (
+            (0.29, 0.05),
+            (0.1, 0.1),
+            (np.nan, np.nan),
+            (-0.12, 0.15),
+            (0.5, -0.3),
+            (0.7, 0.1),
+        )
+    ]
+    strong, echo = (PathKind.SPECULAR, -1), (PathKind.TARGET, 1)
+    assert [(f.kind[0], f.target[0]) for f in found] == [
+        echo,
+        strong,
+        strong,
+        strong,
+        (PathKind.DIFFUSE, -1),
+        strong,
+    ]
+    assert not any(f.skirt[0] for f in found)
 
 
 @pytest.mark.parametrize(("scatterers", "kind"), [(3, PathKind.TARGET), (5, PathKind.DIFFUSE)])
