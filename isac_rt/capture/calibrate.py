@@ -8,7 +8,7 @@ is of rank one is the board's and the reflector's, what is not is neither.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,8 @@ import numpy as np
 from isac_rt.capture.types import Capture, CaptureError
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.storage import load_data, save_data
+from isac_rt.runtime import shortly
+from isac_rt.storage import BAD_DATA, load_data, save_data
 
 LEAST_SHARE = 0.9
 """Rank-one share from which an echo is that of one reflector. A corner reflector in a room has
@@ -33,6 +34,9 @@ PADDING = 5
 PASSED = 0.9
 """Share of the sampling rate that the boards' IF filters pass; what is seen beyond are negative
 beats next to zero, of leakage, which can have rank one."""
+FAINT_DB = 20.0
+"""How far a channel may stay below the mean of all [dB]. Boards that work scatter by 1 or 2 dB; an
+antenna that is not connected has next to nothing."""
 SWEEP_POINTS = 32
 ROUNDS = 25
 KEY = "calibration 1"
@@ -126,7 +130,8 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
 
     Raises
     ------
-    CaptureError  If no reflector is clear, with its rank-one share and level.
+    CaptureError  If no reflector is clear, with its rank-one share and level; if a channel does not
+        hear it.
     """
     y, w = capture.channels(), capture.cube.waveform
     if min(y.shape[:2]) < 2:
@@ -137,6 +142,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     cell, snr_db = _reflector(y, w, capture.one_sided)
     cells = _peaks(y, cell)
     amplitude = _amplitudes(y, cells.mean())
+    _refuse_faint(amplitude)
     rx, tx, share = _rank_one(amplitude)
     left = amplitude / (rx[:, None] * tx)
     free = left.size - sum(left.shape) + 1
@@ -231,6 +237,19 @@ def _reflector(y: np.ndarray, w: Waveform, one_sided: bool) -> tuple[float, floa
         )
     _, level, k = max(clear, key=lambda one: one[1])
     return k / PADDING, level
+
+
+def _refuse_faint(amplitude: np.ndarray) -> None:
+    """Raise a `CaptureError` if the echo is missing in channels (L_rx, L_tx)."""
+    power = np.abs(amplitude) ** 2
+    faint = power < power.mean() * 10 ** (-FAINT_DB / 10)
+    if faint.any():
+        r, t = np.argwhere(faint)[0]
+        raise CaptureError(
+            f"receiver {r} hears the reflector by transmitter {t} more than {FAINT_DB:g} dB below "
+            f"the mean of all, and so do {faint.sum()} of {faint.size} channels; see whether these "
+            "antennas are connected"
+        )
 
 
 def _peaks(y: np.ndarray, cell: float) -> np.ndarray:
@@ -480,12 +499,36 @@ def load_calibration(file: str | Path) -> Calibration:
     CaptureError  If the file is none.
     """
     found = load_data(Path(file), KEY)
-    names = {f.name for f in fields(Calibration)}
-    if not isinstance(found, dict) or set(found) != names:
+    try:
+        if not isinstance(found, dict):
+            raise ValueError("it is cut off, changed or of another kind")
+        made = Calibration(**{name: _whole(value) for name, value in found.items()})
+        _check(made)
+    except BAD_DATA as problem:
         raise CaptureError(
-            f"{file}: is no calibration; give a file that isac-rt calibrate --out wrote"
-        )
-    return Calibration(**{name: _whole(value) for name, value in found.items()})
+            f"{file}: is no calibration ({shortly(problem)}); give a file that isac-rt calibrate "
+            "--out wrote"
+        ) from None
+    return made
+
+
+def _check(one: Calibration) -> None:
+    """Raise a `ValueError` unless all numbers are there, fit each other and can be divided by."""
+    rx, tx = one.rx_gain.size, one.tx_gain.size
+    shapes: dict[str, tuple[int, ...]] = {"sweep": (3, SWEEP_POINTS)}
+    shapes |= {f"pair_{what}": (rx, tx) for what in ("gain", "delay")}
+    for what in ("gain", "gain_std", "delay", "delay_std"):
+        shapes |= {f"rx_{what}": (rx,), f"tx_{what}": (tx,)}
+    mixed = ("rx_gain", "tx_gain", "pair_gain", "response_slope", "sweep")
+    for name, value in vars(one).items():
+        array = np.asarray(value)
+        kinds = "ifc" if name in mixed else "if"
+        if array.shape != shapes.get(name, ()) or array.dtype.kind not in kinds:
+            raise ValueError(f"{name} is {array.dtype} of {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+    if not (one.rx_gain.all() and one.tx_gain.all() and one.half_sweep_hz > 0):
+        raise ValueError("a gain or the sweep is zero")
 
 
 def _parted(value: Any) -> Any:

@@ -19,6 +19,9 @@ Format = Literal["ti_calibration", "dca1000", "numpy", "sigmf"]
 Axis = Literal["frame", "loop", "chirp", "receiver", "sample"]
 Place = tuple[Finite, Finite]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
+MOST_ELEMENTS = 256
+"""Antennas of an array."""
+Places = Annotated[tuple[Place, ...], Field(min_length=1, max_length=MOST_ELEMENTS)]
 
 
 class Elements(Node):
@@ -26,9 +29,9 @@ class Elements(Node):
 
     unit_hz: Positive = CASCADE_HZ
     """Places are counted in half wavelengths of this frequency [Hz]."""
-    transmitters: Annotated[tuple[Place, ...], Field(min_length=1, max_length=256)]
+    transmitters: Places
     """[x, z] of each transmit element [half wavelengths], in the order of its numbers."""
-    receivers: Annotated[tuple[Place, ...], Field(min_length=1, max_length=256)]
+    receivers: Places
     """[x, z] of each receive element [half wavelengths], in the order of the file."""
 
     def antennas(self) -> Antennas:
@@ -52,7 +55,7 @@ class Description(Node):
     """Samples per second of each receiver, complex or real [Hz]."""
     samples_per_chirp: Annotated[int, Field(ge=16, le=65536)] | None = None
     """Samples of a chirp."""
-    receivers: Annotated[int, Field(ge=1, le=256)] | None = None
+    receivers: Annotated[int, Field(ge=1, le=MOST_ELEMENTS)] | None = None
     """Receive antennas in the file."""
     chirps: Annotated[tuple[int, ...], Field(min_length=1, max_length=512)] = (0,)
     """Transmit antenna of each chirp of a loop, counted from 0; every antenna sends equally

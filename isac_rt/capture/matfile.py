@@ -99,9 +99,9 @@ class _Reader:
 
     def _unfolded(self, data: memoryview) -> bytes:
         worker = zlib.decompressobj()
-        out = worker.decompress(data, self._left)
+        out = worker.decompress(data, self._left + 1)  # zlib takes 0 for no limit
         self._left -= len(out)
-        if worker.unconsumed_tail or self._left <= 0:
+        if self._left < 0:
             raise ValueError(f"it unfolds to more than {MOST_BYTES} bytes")
         return out
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.capture.description import Description
+from isac_rt.capture.description import MOST_ELEMENTS, Description
 from isac_rt.capture.matfile import read_mat
 from isac_rt.capture.store import checked_cube
 from isac_rt.capture.types import Capture, CaptureError
@@ -87,6 +87,11 @@ def _ti_calibration(file: Path, d: Description) -> Capture:
         raise CaptureError(
             f"{file}: calibResult.Rx_fft is {seen}, a calibration has (cells, receivers, "
             "transmitters); give a file that TI's cascade calibration wrote"
+        )
+    if max(spectra.shape[1:]) > MOST_ELEMENTS:
+        raise CaptureError(
+            f"{file}: calibResult.Rx_fft is of {spectra.shape[1]} receivers and {spectra.shape[2]} "
+            f"transmitters, at most {MOST_ELEMENTS} of each can be read"
         )
     params = params if isinstance(params, dict) else {}
     slope = _stated(file, params.get("Slope_MHzperus"), d.slope_mhz_per_us, "slope", "MHz/us")

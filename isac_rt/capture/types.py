@@ -63,6 +63,12 @@ class Capture:
                 "told apart in a cube of 1 group"
             )
         senders = cube.schedule[0]
+        silent = np.setdiff1d(np.arange(cube.waveform.num_tx), senders)
+        if silent.size:
+            raise CaptureError(
+                f"transmit antenna {silent[0]} never sends in this frame; take a frame in which "
+                "every antenna does"
+            )
         return np.stack(
             [
                 cube.samples[0][:, senders == tx].mean(axis=1, dtype=np.complex128)

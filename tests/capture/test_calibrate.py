@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 from synthetic import C, channels, write_ti
 
-from isac_rt.capture.calibrate import PARTS, apply, calibrate, load_calibration, save_calibration
+from isac_rt.capture.calibrate import (
+    KEY,
+    PARTS,
+    apply,
+    calibrate,
+    load_calibration,
+    save_calibration,
+)
 from isac_rt.capture.description import Description
 from isac_rt.capture.explain import unexplained_by
 from isac_rt.capture.readers import import_file, waveform_described
@@ -19,6 +26,7 @@ from isac_rt.capture.types import Capture, CaptureError, measured_folder
 from isac_rt.cli.cli import main
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
+from isac_rt.storage import load_data, save_data
 
 TABLE = {
     "phaseMismatchCalibration": (4.7319, 0.44, 0.9946, 0.64, 1.05, 1.00, 0.68, -16.3, -21.0),
@@ -171,6 +179,54 @@ def test_a_calibration_comes_back_and_another_file_is_refused(board, tmp_path):
     fewer, _ = board(num_rx=4)
     with pytest.raises(CaptureError, match="5 receivers and 3 transmitters, the samples of 4 and"):
         apply(found, fewer)
+
+
+@pytest.mark.parametrize("receiver", [True, False])
+@pytest.mark.parametrize("level", [0.0, 0.05])
+def test_an_antenna_that_is_not_connected_is_named(board, receiver, level):
+    """Its gain was 0/0 before, or so small that `apply` made noise of it a strong channel."""
+    capture, _ = board(noise=1.0)
+    samples = capture.cube.samples.copy()
+    hurt = samples[:, 2] if receiver else samples[:, :, 2]
+    hurt *= level
+    capture = replace(capture, cube=replace(capture.cube, samples=samples))
+    told = "receiver 2 hears .* by transmitter 0" if receiver else "receiver 0 .* transmitter 2"
+    count = 3 if receiver else 5
+    with pytest.raises(CaptureError, match=f"{told} more than 20 dB .* {count} of 15 channels"):
+        calibrate(capture)
+
+
+def test_an_antenna_that_never_sends_is_named(board):
+    capture, _ = board()
+    schedule = np.array([[0, 1, 1]])
+    capture = replace(capture, cube=replace(capture.cube, schedule=schedule))
+    with pytest.raises(CaptureError, match="transmit antenna 2 never sends"):
+        capture.channels()
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern"),
+    [
+        ({"rx_gain": "five"}, "no attribute 'size'"),
+        ({"rx_gain": np.zeros(5, complex)}, "a gain or the sweep is zero"),
+        ({"tx_gain": np.full(3, np.nan + 0j)}, "tx_gain is not finite"),
+        ({"rx_delay": np.zeros(7)}, r"rx_delay is float64 of \(7,\)"),
+        ({"tx_delay": np.zeros(3, complex)}, "tx_delay is complex128"),
+        ({"response_slope": [1.0, 2.0, 3.0]}, "complex"),
+        ({"half_sweep_hz": None}, "half_sweep_hz is object"),
+        ({"half_sweep_hz": 0.0}, "a gain or the sweep is zero"),
+        ({"one_more": 1.0}, "one_more"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_sealed_file_of_other_numbers_is_refused(board, tmp_path, change, pattern):
+    """The seal says that a file is whole, not who wrote it."""
+    capture, _ = board()
+    save_calibration(calibrate(capture), tmp_path / "b.cal")
+    plain = load_data(tmp_path / "b.cal", KEY)
+    save_data(tmp_path / "b.cal", KEY, plain | change)
+    with pytest.raises(CaptureError, match=f"is no calibration .*{pattern}"):
+        load_calibration(tmp_path / "b.cal")
 
 
 @pytest.mark.parametrize("where", ["stdout", "first", "file"])

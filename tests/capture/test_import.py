@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+import tracemalloc
 import zlib
 from dataclasses import asdict
 
@@ -233,8 +234,9 @@ def test_what_is_missing_or_no_number_is_said(tmp_path):
         ({"calibResult": {"Rx_fft": np.full((640, 4, 2), np.nan)}}, "5120 of 5120 numbers"),
         ({"params": {"Slope_MHzperus": -3.0}}, "the slope is -3 MHz/us"),
         ({"params": {}}, "no slope is stated"),
+        ({"calibResult": {"Rx_fft": np.ones((80, 2, 600))}}, "600 transmitters, at most 256"),
     ],
-    ids=["no spectra", "two axes", "zero", "nan", "slope", "no slope"],
+    ids=["no spectra", "two axes", "zero", "nan", "slope", "no slope", "600 antennas"],
 )
 def test_bent_calibrations_are_refused(tmp_path, change, pattern):
     write_ti(tmp_path / "b.mat", channels()[0], 61.3, **change)
@@ -337,6 +339,23 @@ def test_what_unfolds_without_end_is_refused(tmp_path):
     (tmp_path / "x.mat").write_bytes(mat(element(15, bomb())))
     with pytest.raises(CaptureError, match="unfolds to more than"):
         read_mat(tmp_path / "x.mat")
+
+
+def test_what_unfolds_with_nothing_left_is_refused_before_it_does(tmp_path, monkeypatch):
+    """An array that takes exactly what may be unfolded, and after it what unfolds to 16 MiB: for
+    zlib no byte left was no limit."""
+    most = 2**16
+    monkeypatch.setattr("isac_rt.capture.matfile.MOST_BYTES", most)
+    count = most // 16
+    whole = matrix(6, (count, 1), [element(9, bytes(8 * count))])
+    (tmp_path / "x.mat").write_bytes(mat(whole, element(15, zlib.compress(bytes(2**24), 9))))
+    tracemalloc.start()
+    try:
+        with pytest.raises(CaptureError, match="unfolds to more than 65536 bytes"):
+            read_mat(tmp_path / "x.mat")
+        assert tracemalloc.get_traced_memory()[1] < 2**21
+    finally:
+        tracemalloc.stop()
 
 
 def test_every_cut_of_a_real_file_is_one_message(tmp_path):
