@@ -36,6 +36,7 @@ WITHOUT_A_NUMBER = {
     "jinja2",
     "matplotlib",
     "pandas",
+    "plotly",
     "pyyaml",
     "rich",
     "rtree",

@@ -646,6 +646,9 @@ CHANGES = {
     "receiver_preset": "paper",
     "compare": {"runs": {"receivers": {"clutter_filter": "runs"}}},
     "tracking": {"confirm_hits": 2},
+    "belief": {"level_db": 1.5},
+    "cooperation": "tracks",
+    "sensor": "awr1843",
 }
 """One change of each part of a scenario."""
 
