@@ -265,7 +265,8 @@ def ground_of(tree: dict[str, Any], folder: Path) -> dict[str, str]:
 
 def ground_by(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> dict[str, str]:
     """The same, with what makes the digests of files."""
-    city = {k: v for k, v in (tree.get("city") or {}).items() if k in ("source", "name", "file")}
+    of_files = ("source", "name", "file", "terrain")
+    city = {k: v for k, v in (tree.get("city") or {}).items() if k in of_files}
     return {
         "program": program_fingerprint(),
         "versions": json.dumps(versions()),

@@ -22,7 +22,7 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.file import load, plain_tree
-from isac_rt.scenario.node import Finite, Key, Name, Problem, Seed, dotted
+from isac_rt.scenario.node import Key, Name, Problem, Seed, dotted
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.preflight import check_passage
 from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
@@ -38,7 +38,10 @@ from isac_rt.sweep.definition import (
 MOST_SCENES = 1_000_000
 MOST_TRIES = 400
 """Draws of one scene before the places are taken for too narrow."""
-Range = tuple[Finite, Finite]
+MOST_CELLS = 100_000
+"""Of the ground that is used."""
+Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
+Range = tuple[Metres, Metres]
 Kept = Literal["map", "samples", "paths", "detections", "tracks", "bits"]
 
 
@@ -75,7 +78,9 @@ class Draw(Free):
             yield Problem(((name,),), "must be two numbers, or two lists as long of numbers")
             return
         low = a if name != "normal" else np.zeros_like(b)
-        if not (np.isfinite(a).all() and np.isfinite(b).all() and (low <= b).all()):
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(b - a).all()
+        if not (finite and (low <= b).all()):
             yield Problem(((name,),), "must be finite, the second no lower than the first (or 0)")
         elif name == "log_uniform" and not (a > 0).all():
             yield Problem(((name,),), "must be over 0; use uniform")
@@ -113,17 +118,35 @@ class Place(Free):
             low, high = getattr(self, name)
             if low > high:
                 yield Problem(((name,),), "the second is lower than the first; exchange them")
-        if not self.cells:
+        if not self.num_cells:
             yield Problem((("cell_m",),), "no whole cell fits into the ground; make it smaller")
+        elif self.num_cells > MOST_CELLS:
+            said = f"the ground has more than {MOST_CELLS} cells; make them larger"
+            yield Problem((("cell_m",),), said)
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Cells to the east and to the north; no more than one too many."""
+        east, north = (
+            int(min((high - low) / self.cell_m + 1e-9, MOST_CELLS + 1))
+            for low, high in (self.east_m, self.north_m)
+        )
+        return max(east, 0), max(north, 0)
+
+    @property
+    def num_cells(self) -> int:
+        """How many cells there are."""
+        return math.prod(self.sides)
 
     @property
     def cells(self) -> list[tuple[float, float]]:
         """South-west corners of the cells [m]."""
-        axes = [
-            [low + k * self.cell_m for k in range(int((high - low) / self.cell_m + 1e-9))]
-            for low, high in (self.east_m, self.north_m)
-        ]
-        return [(x, y) for x in axes[0] for y in axes[1]]
+        east, north = self.sides
+        x, y = (
+            [low + k * self.cell_m for k in range(count)]
+            for (low, _), count in ((self.east_m, east), (self.north_m, north))
+        )
+        return [(x_k, y_k) for x_k in x for y_k in y]
 
 
 class DataSet(Free):
@@ -142,7 +165,7 @@ class DataSet(Free):
     the street."""
     draw: dict[str, Draw] = Field({})
     """A distribution for each key of the scenario that is drawn."""
-    splits: dict[Name, Annotated[float, Field(gt=0)]] = Field(
+    splits: dict[Name, Annotated[float, Field(ge=1e-6, le=1e6)]] = Field(
         {"train": 0.7, "val": 0.15, "test": 0.15}
     )
     """Shares of the scenes, by the name of the split."""
@@ -157,9 +180,9 @@ class DataSet(Free):
                 yield Problem((("draw", key),), f"{other}; remove it here")
         if not self.splits:
             yield Problem((("splits",),), "has no split; give it one")
-        elif self.place and len(self.place.cells) < len(self.splits):
+        elif self.place and self.place.num_cells < len(self.splits):
             said = (
-                f"the ground has {len(self.place.cells)} cells for {len(self.splits)} splits, "
+                f"the ground has {self.place.num_cells} cells for {len(self.splits)} splits, "
                 "which share none; make cell_m smaller or the ground larger"
             )
             yield Problem((("place", "cell_m"), ("splits",)), said)
@@ -304,18 +327,13 @@ def _move(
             uav["boresight"] = turned(uav["boresight"])
         for waypoint in uav.get("waypoints") or ():
             waypoint["position_m"] = moved(waypoint["position_m"])
+            if waypoint.get("attitude_deg") is not None:  # yaw counts clockwise
+                yaw, *others = waypoint["attitude_deg"]
+                waypoint["attitude_deg"] = [yaw - math.degrees(angle), *others]
 
 
 def _flown(tree: dict[str, Any]) -> np.ndarray:
-    """(N, 3) places along all flights [m].
-
-    Raises
-    ------
-    ScenarioError  If a flight is in a file, which cannot be moved.
-    """
-    for name, uav in tree["swarm"].items():
-        if uav.get("position_m") is None and not uav.get("waypoints"):
-            raise ScenarioError(f"place moves position_m and waypoints only; swarm.{name} has none")
+    """(N, 3) places along all flights [m]."""
     scenario = Scenario.model_validate(tree)
     timetable = _timetable(scenario)
     span = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
@@ -357,7 +375,7 @@ def load_dataset(path: Path | str) -> DataPlan:
     plan = DataPlan(data, base)
     try:
         _ = plan.scenes
-    except (KeyError, IndexError, TypeError) as problem:
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError) as problem:
         said = f"the scenario has no such place ({problem}); check the keys"
         raise refuse(("draw",), said) from None
     except ScenarioError as problem:

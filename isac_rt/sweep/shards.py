@@ -13,6 +13,7 @@ import json
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import shortly
 from isac_rt.simulation.setup import Setup
-from isac_rt.storage import BAD_DATA
+from isac_rt.storage import BAD_DATA, read_whole
 
 COLUMNS = {
     "paths": (
@@ -128,7 +129,7 @@ def _npy(values: np.ndarray) -> bytes:
 def tar_of(files: Iterator[tuple[str, bytes]]) -> bytes:
     """A tar file in memory; the same bytes for the same files, whenever and by whom it is made."""
     out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar:
         for name, content in files:
             info = tarfile.TarInfo(name)
             info.size = len(content)
@@ -181,8 +182,10 @@ def read_card(folder: Path) -> dict[str, Any]:
     ResultsError  If it is the folder of none.
     """
     try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-        _ = [int(n) for shards in card["splits"].values() for n in shards.values()]
+        card = json.loads(read_whole(folder / CARD))
+        for name, count in (item for shards in card["splits"].values() for item in shards.items()):
+            if type(count) is not int or count < 0 or ".." in name or Path(name).is_absolute():
+                raise ValueError(f"the shard {name[:80]} cannot be")
     except (OSError, *BAD_DATA) as problem:
         raise ResultsError(
             f"{folder} holds no finished data set ({shortly(problem)}); give the folder that "
@@ -199,8 +202,10 @@ def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> 
     ResultsError  If it cannot be read.
     """
     try:
-        with tarfile.open(shard) as tar:
+        with tarfile.open(shard, "r:") as tar:  # not packed: what is read is as large as the file
             members = tar.getmembers()
+            if any(member.issparse() for member in members):
+                raise ValueError("a file in it has holes")
             names = list(dict.fromkeys(m.name.split(".")[0] for m in members))
             out: dict[str, Any] = {"key": names[number]}
             for member in members:
@@ -212,9 +217,12 @@ def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> 
                 if ending == "json":
                     out["truth"] = json.load(opened)
                 elif keep is None or name in keep:
-                    content = io.BytesIO(opened.read())
-                    out[name] = np.load(content, allow_pickle=False)
-    except (OSError, tarfile.TarError, *BAD_DATA) as problem:
+                    out[name] = np.load(io.BytesIO(opened.read()), allow_pickle=False)
+                    if not isinstance(out[name], np.ndarray):
+                        raise ValueError(f"{ending} is no array")
+    except (
+        OSError, EOFError, MemoryError, SyntaxError, TokenError, tarfile.TarError, *BAD_DATA
+    ) as problem:
         raise ResultsError(
             f"{shard} cannot be read ({shortly(problem)}); make the data set again"
         ) from problem

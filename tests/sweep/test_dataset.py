@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 import tarfile
 from dataclasses import asdict
@@ -20,6 +22,7 @@ from isac_rt.sweep import Samples, load_dataset
 from isac_rt.sweep.execute import run_job
 from isac_rt.sweep.make_dataset import SceneJob, Shards, _write_card
 from isac_rt.sweep.outcomes import pending
+from isac_rt.sweep.shards import tar_of
 
 SET = """
 name: drawn
@@ -97,6 +100,23 @@ def test_a_swarm_is_turned_as_one(folder):
     assert len(turns) == 20
 
 
+def test_a_flight_of_a_file_is_turned_with_its_attitude(folder):
+    """The nose keeps its angle to the way flown (37 degrees to the right of it), pitch and roll
+    stay. Planted bug: the yaw of the file kept."""
+    rows = "time_s,x,y,z,yaw_deg,pitch_deg,roll_deg\n0,1,5,50,37,-3,8\n10,1,9,51,37,-3,8\n"
+    (folder / "p1.csv").write_text(rows)
+    start = BASE.index("  P1:")
+    (folder / "base.yaml").write_text(BASE[:start] + "  P1: {role: passive, flight: p1.csv}\n")
+    text = SET.replace("  swarm.P1.position_m", "  # swarm.P1.position_m")
+    for scene in plan_of(folder, text).scenes:
+        first, last = scene.tree["swarm"]["P1"]["waypoints"]
+        east, north, _ = np.subtract(last["position_m"], first["position_m"])
+        yaw, pitch, roll = first["attitude_deg"]
+        right = yaw - np.degrees(np.arctan2(east, north))
+        assert right % 360 == pytest.approx(37, abs=1e-9)
+        assert (pitch, roll) == (-3, 8)
+
+
 def test_draws_have_their_distributions(folder):
     """Bounds, and over 400 scenes the middle of each within four standard errors. Planted bug: a
     uniform draw in place of one uniform in the logarithm (its mean is 0.4 deviations higher)."""
@@ -136,6 +156,12 @@ def test_what_is_drawn_does_not_depend_on_who_asks(folder):
         (("swarm.P1.position_m: {normal", "swarm.P9.position_m.0: {normal"), "P9"),
         (("  noise.snr_db", "  seed: {choice: [1]}\n  noise.snr_db"), "own; remove it"),
         (("scenes: 20", "scenes: 0"), "scenes"),
+        (("noise.snr_db:", "swarm:"), "no such place"),
+        (("swarm.P1.position_m: {normal", "swarm.P1.position_m.x: {normal"), "no such place"),
+        (("[-7.5, 12]", "[-1.0e+308, 1.0e+308]"), "must be finite"),
+        (("east_m: [-40, 70]", "east_m: [-1.0e+308, 1.0e+308]"), "east_m"),
+        (("cell_m: 18", "cell_m: 1.0e-7"), "make them larger"),
+        (("train: 0.6", "train: 1.0e+308"), "train"),
         (("scenario: base.yaml", "scenario: none.yaml"), "cannot be used"),
     ],
 )
@@ -239,6 +265,50 @@ def test_a_folder_that_is_none_is_one_message(tmp_path):
     (tmp_path / "card.json").write_text(json.dumps({"splits": {"train": {"train/0.tar": 3}}}))
     with pytest.raises(ResultsError, match="cannot be read"):
         Samples(tmp_path, "train")[0]
+
+
+def shard_with(kind: str) -> bytes:
+    """A tar file as only a stranger makes it."""
+    if kind == "empty array":
+        return tar_of(iter([("a.map.npy", b"")]))
+    if kind == "archive":
+        packed = io.BytesIO()
+        np.savez(packed, a=np.arange(3))
+        return tar_of(iter([("a.map.npy", packed.getvalue())]))
+    if kind == "bent header":
+        return tar_of(iter([("a.map.npy", b"\x93NUMPY\x01\x00\x06\x00{'a':\n")]))
+    if kind == "packed":
+        return gzip.compress(tar_of(iter([("a.json", b"{}")])))
+    info = tarfile.TarInfo("a.json")  # a header alone that asks for 100 GB of holes
+    info.type, info.size = tarfile.GNUTYPE_SPARSE, 0
+    head = bytearray(info.tobuf(tarfile.GNU_FORMAT))
+    head[386:410] = b"00000000000\x0000000000000\x00"
+    head[483:495] = tarfile.itn(100 * 1024**3, 12, tarfile.GNU_FORMAT)
+    head[148:156] = b"%06o\0 " % tarfile.calc_chksums(bytes(head))[0]
+    return bytes(head) + bytes(1024)
+
+
+@pytest.mark.parametrize("kind", ["empty array", "archive", "bent header", "packed", "holes"])
+def test_a_stranger_s_shard_is_one_message(kind, tmp_path):
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "0.tar").write_bytes(shard_with(kind))
+    (tmp_path / "card.json").write_text(json.dumps({"splits": {"train": {"train/0.tar": 1}}}))
+    with pytest.raises(ResultsError, match="cannot be read"):
+        Samples(tmp_path, "train")[0]
+
+
+@pytest.mark.parametrize("shards", [{"../0.tar": 1}, {"/0.tar": 1}, {"0.tar": -1}, {"0.tar": "1"}])
+def test_a_stranger_s_card_names_shards_in_its_folder(shards, tmp_path):
+    (tmp_path / "card.json").write_text(json.dumps({"splits": {"train": shards}}))
+    with pytest.raises(ResultsError, match="cannot be"):
+        Samples(tmp_path, "train")
+
+
+def test_long_names_of_terminals_fit_into_a_shard():
+    """Two names of 100 letters, as a scenario may have them."""
+    name = f"000001_00002_{'A' * 100}_to_{'B' * 100}.json"
+    with tarfile.open(fileobj=io.BytesIO(tar_of(iter([(name, b"{}")])))) as tar:
+        assert tar.getnames() == [name]
 
 
 @pytest.mark.slow

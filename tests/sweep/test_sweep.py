@@ -31,7 +31,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import summarise
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, save_dataset, status
-from isac_rt.sweep.definition import ground_of, paths_key
+from isac_rt.sweep.definition import ground_of, paths_key, point_key
 from isac_rt.sweep.execute import Job, run_job
 
 ROOT = Path(__file__).parents[2]
@@ -657,6 +657,19 @@ def merged(tree, change):
     if not isinstance(tree, dict) or not isinstance(change, dict):
         return change
     return tree | {key: merged(tree.get(key), value) for key, value in change.items()}
+
+
+def test_the_key_of_a_point_depends_on_every_file_of_its_city(tmp_path):
+    """Buildings, the other files of a Shapefile, and the heights under them, each changed once."""
+    city = {"source": "footprints", "file": "town.shp", "terrain": "dem.tif"}
+    files = [tmp_path / name for name in ("town.shp", "town.dbf", "town.prj", "dem.tif")]
+    for file in files:
+        file.write_text(file.name)
+    keys = [point_key({"city": city}, ground_of({"city": city}, tmp_path))]
+    for file in files:
+        file.write_text("another")
+        keys.append(point_key({"city": city}, ground_of({"city": city}, tmp_path)))
+    assert len(set(keys)) == 5
 
 
 def test_paths_are_shared_by_what_differs_in_nothing_that_they_depend_on(folder):

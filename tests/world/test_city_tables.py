@@ -97,6 +97,26 @@ def test_layers(tmp_path):
         read(tmp_path, "town.gpkg", layer="roofs")
 
 
+def test_columns_that_hold_lists_and_nothing(tmp_path):
+    """As Overture's GeoParquet, whose `sources` are lists and whose `names` are structs; numbers
+    that may be missing are those of pandas."""
+    rows = table()
+    rows["sources"] = [[{"dataset": "a"}, {"dataset": "b"}], [], None]
+    rows["names"] = [{"primary": "x"}, None, {"primary": "y"}]
+    rows["levels"] = rows["levels"].astype("Int64")
+    rows.to_parquet(tmp_path / "town.parquet")
+    assert volume(read(tmp_path, "town.parquet")) == pytest.approx(VOLUME, rel=1e-6)
+
+
+def test_a_layer_without_shapes_is_one_message(tmp_path):
+    pyogrio = pytest.importorskip("pyogrio")
+    table().to_file(tmp_path / "town.gpkg", layer="buildings")
+    bare = table().drop(columns="geometry")
+    pyogrio.write_dataframe(bare, tmp_path / "town.gpkg", layer="owners")
+    with pytest.raises(CityError, match="owners has no shapes"):
+        read(tmp_path, "town.gpkg", layer="owners")
+
+
 def test_openstreetmap_xml(tmp_path):
     pytest.importorskip("pyogrio")
     osm(tmp_path)
@@ -114,6 +134,8 @@ def test_openstreetmap_xml(tmp_path):
         ("town.parquet", b"PAR1" + bytes(50), "not readable"),
         ("town.gpkg", b"SQLite format 3\0" + bytes(5000), "not readable"),
         ("town.osm", b'<!DOCTYPE osm [<!ENTITY a "b">]><osm/>', "document type"),
+        ("town.osm", b"<!--" + b"x" * 6000 + b"--><!DOCTYPE osm []><osm/>", "document type"),
+        ("town.osm", "<!DOCTYPE osm []><osm/>".encode("utf-16-le"), "document type"),
         ("town.osm", b"<osm version='0.6'><node id='1'", None),
         ("town.pbf", bytes(20), None),
         ("town.gml", b"<?xml version='1.0'?><CityModel/>", "citygml-tools to-cityjson town.gml"),
@@ -194,6 +216,15 @@ def test_buildings_stand_on_a_raster_of_heights(hole, tmp_path):
     assert free[:, 2] == pytest.approx(10 + 0.2 * free[:, 0], abs=2e-3)
     node = scenario.City(source="footprints", file="t.geojson", terrain="dem.tif")
     assert [f.name for f in city_files(node, tmp_path)] == ["t.geojson", "dem.tif"]
+
+
+def test_a_raster_of_cells_without_a_size_is_one_message(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    name = raster(tmp_path)
+    with rasterio.open(tmp_path / name, "r+") as file:
+        file.transform = rasterio.Affine(0, 0, EAST, 0, 0, NORTH)
+    with pytest.raises(CityError, match="says not where it lies"):
+        read(tmp_path, town(tmp_path), crs="EPSG:2056", terrain=name)
 
 
 def test_a_raster_in_other_coordinates_and_elsewhere(tmp_path):

@@ -480,6 +480,9 @@ def test_gzip_is_unpacked_and_a_bomb_is_not(tmp_path, monkeypatch):
     (tmp_path / "c.city.json.gz").write_bytes(packed[:30] + b"xxxx" + packed[34:])
     with pytest.raises(CityError, match="gzip"):
         read(tmp_path, "c.city.json.gz", **LOCAL)
+    (tmp_path / "c.city.json.gz").write_bytes(packed + gzip.compress(b"\n"))
+    with pytest.raises(CityError, match="several gzip streams"):
+        read(tmp_path, "c.city.json.gz", **LOCAL)
     monkeypatch.setattr(files, "MAX_BYTES", 1_000_000)
     (tmp_path / "c.city.json.gz").write_bytes(gzip.compress(b"[" * 2_000_000))
     with pytest.raises(CityError, match="holds more"):

@@ -106,6 +106,8 @@ def unpacked(data: bytes, name: str, factor: float) -> bytes:
         raise CityError(f"{name}: is no whole gzip file ({error}); fetch it again") from None
     if stream.unconsumed_tail or not stream.eof:
         raise CityError(f"{name}: is cut off, or holds more than {most / 1e9:.3g} GB; cut it out")
+    if stream.unused_data.strip(b"\0"):
+        raise CityError(f"{name}: has several gzip streams; unpack it with gunzip")
     return found
 
 

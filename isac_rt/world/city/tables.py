@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import shapely
 
 from isac_rt.world.city.buildings import Feature
@@ -50,7 +51,7 @@ def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Fe
     data = read_bytes(path, PBF_FACTOR if path.suffix.lower() == ".pbf" else _FACTOR)
     if not data.lstrip(b"\xef\xbb\xbf \r\n\t" if starts == (b"<",) else b"").startswith(starts):
         raise CityError(f"{path.name}: is no {kind}; check its ending")
-    if starts == (b"<",) and b"<!" in data[:5000].replace(b"<!--", b""):
+    if starts == (b"<",) and (b"<!DOCTYPE" in data or b"\0" in data):  # \0: in two bytes a letter
         raise CityError(f"{path.name}: has a document type; remove it")
     needs_extra("pyogrio", path.name, kind)
     geopandas = needs_extra("geopandas", path.name, kind)
@@ -68,6 +69,8 @@ def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Fe
         raise CityError(
             f"{path.name}: not readable as {kind} ({type(error).__name__}: {error})"
         ) from None
+    if not hasattr(table, "crs"):
+        raise CityError(f"{path.name}: {layer or 'its layer'} has no shapes; set city.layer")
     return _features(table, path.name), "" if table.crs is None else table.crs.to_wkt()
 
 
@@ -128,4 +131,6 @@ def _plain(value: Any) -> Any:
     """A cell as JSON would hold it."""
     if isinstance(value, np.generic):
         value = value.item()
-    return None if value is None or value != value else value
+    if isinstance(value, np.ndarray | list):  # GeoParquet's, of which no tag is one
+        return None
+    return None if pd.isna(value) else value

@@ -185,12 +185,14 @@ def _cells(
     """Rows and columns (N, 2) of a raster at world points."""
     from pyproj import Transformer
 
-    if raster.transform.is_identity:
+    if raster.transform.is_identity or raster.transform.is_degenerate:
         raise CityError(f"{name}: says not where it lies; give a GeoTIFF with a geotransform")
     points = place.to_file(nodes)
     if place.crs and raster.crs is not None:
         turned = Transformer.from_crs(place.crs, raster.crs.to_wkt(), always_xy=True)
         points = np.column_stack(turned.transform(points[:, 0], points[:, 1]))
+        if not np.isfinite(points).all():
+            raise CityError(f"{name}: lies elsewhere than the buildings; check city.crs")
     elif place.crs or raster.crs is not None:
         notes.append(f"{name}: taken to lie in the coordinates of the buildings")
     turn = ~raster.transform
