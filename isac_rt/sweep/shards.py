@@ -221,7 +221,13 @@ def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> 
                     if not isinstance(out[name], np.ndarray):
                         raise ValueError(f"{ending} is no array")
     except (
-        OSError, EOFError, MemoryError, SyntaxError, TokenError, tarfile.TarError, *BAD_DATA
+        OSError,
+        EOFError,
+        MemoryError,
+        SyntaxError,
+        TokenError,
+        tarfile.TarError,
+        *BAD_DATA,
     ) as problem:
         raise ResultsError(
             f"{shard} cannot be read ({shortly(problem)}); make the data set again"
