@@ -15,7 +15,7 @@ PLAUSIBLE: dict[Key, tuple[float, float, str]] = {
     ("radio", "carrier_hz"): (1e9, 1e12, "hertz"),
     ("radio", "bandwidth_hz"): (1e6, 1e11, "hertz"),
     ("radio", "sampling_rate_hz"): (2e5, 1e10, "hertz"),
-    ("radio", "filter_transition_hz"): (5e3, 5e7, "hertz"),
+    ("radio", "filter_transition_hz"): (1e3, 5e7, "hertz"),
     ("frame_interval_s",): (1e-5, 20.0, "seconds"),
     ("array", "spacing_wavelengths"): (0.05, 50.0, "wavelengths"),
     ("array", "element_gain_dbi"): (-60.0, 60.0, "dBi"),

@@ -1,8 +1,8 @@
 """Common FMCW sensors: what a scenario's `sensor` says of `radio`, `array` and `noise`.
 
-Band, power, noise figure and converters are typical values of the data sheets named at each. Where
-no source is named the chirps are settings within these limits that suit a swarm. Arrays and antenna
-gains are like those of the makers' evaluation boards, gains to a decibel or two.
+The table "Where the numbers come from" of docs/radar.md names the source of each number, and says
+which are assumed and which chirps are our choice. Arrays and antenna gains are those of the makers'
+evaluation boards.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ _TI_BOARD = {
 wavelengths apart and a third between them half a wavelength higher."""
 
 SENSORS: dict[str, dict[str, dict[str, Any]]] = {
-    # SWRS222: 76 to 81 GHz, 3 TX of 12 dBm, 4 RX, noise figure 15 dB from 77 GHz on, up to
-    # 100 MHz/us, IF of 10 MHz, complex converters of 12.5 Msps
+    # 76 to 81 GHz, 3 TX, 4 RX on AWR1843BOOST; our chirp
     "awr1843": {
         "radio": {
             "mode": "fmcw",
@@ -36,11 +35,11 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
                 "sampling_msps": 10.0,
             },
         },
-        "array": {**_TI_BOARD, "element_gain_dbi": 9.0},
+        "array": {**_TI_BOARD, "element_gain_dbi": 8.0},
         "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 15.0},
     },
-    # SWRS273: 76 to 81 GHz, 4 TX of 12 dBm with phase shifters, 4 RX, noise figure 12 dB, real
-    # converters of 37.5 Msps; DDMA with two empty bands as in TI's demonstration
+    # 76 to 81 GHz, 4 TX with phase shifters, 4 RX on AWR2944EVM, real converters; our chirp, DDMA
+    # with two empty bands and the raised antenna last, as in TI's demonstration
     "awr2944": {
         "radio": {
             "mode": "fmcw",
@@ -65,10 +64,9 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
             "rx": {"shape": "linear", "columns": 4},
             "element_gain_dbi": 12.0,
         },
-        "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 12.0},
+        "noise": {"tx_power_dbm": 13.5, "noise_figure_db": 12.0},
     },
-    # SWRS219: 60 to 64 GHz, 3 TX of 12 dBm, 4 RX, noise figure 12 dB; the chirp of TI's
-    # profile_iwr6843_ods_3d.cfg, which reaches 12 m
+    # 60 to 64 GHz, 3 TX, 4 RX on IWR6843ISK; the chirp of TI's profile_iwr6843_ods_3d.cfg
     "iwr6843": {
         "radio": {
             "mode": "fmcw",
@@ -87,8 +85,8 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
         "array": {**_TI_BOARD, "element_gain_dbi": 7.0},
         "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 12.0},
     },
-    # BGT24MTR12: 24.00 to 24.25 GHz, 1 TX of 11 dBm, 2 RX, noise figure 12 dB; 200 MHz as on
-    # Infineon's Position2Go (AN553), which has one row of antennas
+    # 24.025 to 24.225 GHz, 1 TX, 2 RX in a row on Infineon's Position2Go, with the chirp of its
+    # firmware: 64 samples over a ramp of 300 us; 0.9 us of it are left to the echoes on their way
     "bgt24mtr12": {
         "radio": {
             "mode": "fmcw",
@@ -97,11 +95,11 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
             "chirps_per_frame": 64,
             "chirp": {
                 "slope_mhz_per_us": 0.6667,
-                "repetition_us": 400.0,
-                "adc_start_us": 10.0,
+                "repetition_us": 500.0,
+                "adc_start_us": 0.9,
                 "ramp_end_us": 300.0,
-                "samples": 256,
-                "sampling_msps": 1.0,
+                "samples": 64,
+                "sampling_msps": 0.214,
             },
         },
         "array": {

@@ -123,10 +123,11 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, overrides, said):
         scenario(tmp_path, *overrides)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", SENSORS)
 def test_sensors_are_consistent_and_can_be_overridden(tmp_path, name):
-    """Band by its data sheet; what the scenario states wins; bug: the sensor's chirp merged into
-    the stated one."""
+    """Band by its data sheet; what the scenario states wins; none of a sensor's numbers raises a
+    doubt; bug: the sensor's chirp merged into the stated one."""
     scene = SCENE.replace("radio: {mode: fmcw, carrier_hz: 60.0e+9, chirps_per_frame: 48}\n", "")
     (tmp_path / "scene.yaml").write_text(scene)
     s = load(tmp_path / "scene.yaml", [f"sensor={name}", "noise.noise_figure_db=9"])
@@ -135,3 +136,22 @@ def test_sensors_are_consistent_and_can_be_overridden(tmp_path, name):
     assert (s.noise.noise_figure_db, s.radio.mode) == (9, "fmcw")
     assert s.noise.tx_power_dbm == SENSORS[name]["noise"]["tx_power_dbm"]
     assert s.radio.filter_transition_hz == pytest.approx(0.02 * s.radio.sampling_rate_hz)
+
+
+@pytest.mark.parametrize(
+    ("name", "height", "low"),
+    [("awr1843", 0.5, 8), ("iwr6843", 0.5, 8), ("awr2944", 0.8, 12)],
+)
+def test_boards_of_ti_have_the_virtual_arrays_of_tis_configurations(tmp_path, name, height, low):
+    """`low` places half a wavelength apart, four more `height` wavelengths above the third to the
+    sixth: `antGeometry0` and `antGeometry1` of TI's ISK_6m_default.cfg, RadarML/xwr's diagrams of
+    AWR1843Boost and AWR2944EVM; bug: the raised transmitter in the column of another."""
+    scene = SCENE.replace("radio: {mode: fmcw, carrier_hz: 60.0e+9, chirps_per_frame: 48}\n", "")
+    (tmp_path / "scene.yaml").write_text(scene)
+    s = load(tmp_path / "scene.yaml", [f"sensor={name}"])
+    tx, rx = positions(s)
+    virtual = (tx[:, None] + rx[None]).reshape(-1, 2) * s.radio.carrier_hz / 299792458
+    virtual -= virtual.min(axis=0)
+    expected = [(k / 2, 0.0) for k in range(low)] + [(k / 2, height) for k in range(2, 6)]
+    found = sorted((round(x, 6), round(z, 6)) for x, z in virtual)
+    assert found == pytest.approx(np.array(sorted(expected)))
