@@ -450,6 +450,11 @@ class Array(Node):
         return self.tx_x + self.tx_z - 1 if self.tx is None else self.tx.count(sending=True)
 
     @property
+    def num_rx(self) -> int:
+        """L_rx, receive elements."""
+        return self.rx_x + self.rx_z - 1 if self.rx is None else self.rx.count(sending=False)
+
+    @property
     def is_l(self) -> bool:
         """Whether both arrays are an L."""
         return self.tx is None and self.rx is None

@@ -156,8 +156,8 @@ class Scenario(Node):
 
     @property
     def num_rx(self) -> int:
-        """L_rx, elements of the receiving L."""
-        return self.array.rx_x + self.array.rx_z - 1
+        """L_rx, receive elements."""
+        return self.array.num_rx
 
     @property
     def frame_duration_s(self) -> float:
@@ -182,7 +182,8 @@ class Scenario(Node):
 
     def _timing_problems(self) -> Iterator[Problem]:
         sizes = (("array", "tx_x"), ("array", "tx_z"))
-        antennas = f"the {self.num_tx} transmit antennas (array.tx_x + array.tx_z - 1)"
+        of = " (array.tx_x + array.tx_z - 1)" if self.array.tx is None else ""
+        antennas = f"the {self.num_tx} transmit antennas{of}"
         if self.radio.bands(self.num_tx) > 1:
             yield from self._code_problems()
         elif self.radio.chirps_per_frame % self.num_tx:

@@ -33,7 +33,10 @@ def in_table(table: AspectTable, direction: np.ndarray) -> np.ndarray:
     elevation = np.degrees(np.arcsin(np.clip(direction[..., 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(direction[..., 0], direction[..., 1]))
     low, high = found.grid[1][[0, -1]]
-    azimuth = np.where(azimuth < low, azimuth + 360, azimuth) if high > 180 else azimuth
+    if high > 180:
+        azimuth = np.where(azimuth < low, azimuth + 360, azimuth)
+    elif low < -180:
+        azimuth = np.where(azimuth > high, azimuth - 360, azimuth)
     points = [
         np.clip(a, g[0], g[-1]) for a, g in zip((elevation, azimuth), found.grid, strict=True)
     ]

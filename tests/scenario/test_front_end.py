@@ -42,6 +42,26 @@ def test_a_terminal_s_own_front_end_goes_before_that_of_all():
     assert FrontEnd().ideal
 
 
+@pytest.mark.parametrize(
+    ("rx", "count"),
+    [
+        ({"shape": "linear", "columns": 4}, 4),
+        ({"shape": "planar", "columns": 3, "rows": 2}, 6),
+        ({"shape": "ti_cascade"}, 16),
+        ({"positions": [[0, 0], [1, 0], [2, 0.5]]}, 3),
+    ],
+)
+def test_elements_are_those_of_the_array_that_is_stated(rx, count):
+    """Not the 15 of the default L."""
+    array = {"rx": rx}
+    stated = {"front_end": {"receive": {"gain_db": [0.5] * count}}}
+    front_end = Scenario(swarm=SWARM, array=array, radio=stated).front_end_of("AT")
+    assert len(front_end.receive.gain_db) == count
+    stated["front_end"]["receive"]["gain_db"] = [0.5] * 15
+    with pytest.raises(ValidationError, match=f"15 values for {count} receive elements"):
+        Scenario(swarm=SWARM, array=array, radio=stated)
+
+
 def test_targets_and_profiles_have_no_front_end():
     """Planted bug: `_front_end_problems` not called."""
     with pytest.raises(ValidationError, match="no meaning for a target"):

@@ -282,6 +282,8 @@ def test_an_origin_makes_a_national_grid_local(tmp_path):
     assert city.bounds() == pytest.approx(np.array([[11, 22, -400], [31, 42, -390]]))
     with pytest.raises(CityError, match="no coordinate reference system"):
         read(tmp_path, crs="EPSG:1")
+    with pytest.raises(CityError, match="no coordinate reference system"):
+        read(tmp_path, crs="EPSG:5773")
 
 
 # ---- CityJSON

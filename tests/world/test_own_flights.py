@@ -8,9 +8,11 @@ import pytest
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.rcs import CrossSection
+from isac_rt.scenario.aspect import AspectTable
 from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.sweep import load_sweep
+from isac_rt.world.aspect import in_table
 from isac_rt.world.swarm import Trajectory, turned
 
 SCENE = """
@@ -182,3 +184,14 @@ def test_a_sweep_takes_flights_as_values(tmp_path):
     (tmp_path / "other.csv").write_text("time_s,x,y,z\n0,0,6,9\n1,1,5,9\n")
     again = list(load_sweep(tmp_path / "sweep.yaml").points())
     assert (again[0].key, again[1].key != first[1].key) == (first[0].key, True)
+
+
+def test_a_table_of_azimuths_may_begin_at_minus_360():
+    """Right, behind, left and ahead. Planted bug: azimuths over its last are not turned back."""
+    table = AspectTable(
+        azimuth_deg=(-360, -270, -180, -90, 0),
+        elevation_deg=(0,),
+        values_db=((1, 10, 20, 30, 1),),
+    )
+    ways = np.array([[1.0, 0, 0], [0, -1.0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
+    assert in_table(table, ways) == pytest.approx([10, 20, 30, 1])

@@ -144,7 +144,7 @@ def crs_name(text: str) -> str | None:
         crs: Any = CRS.from_user_input(f"{found[1]}:{found[2]}" if found else text)
         while crs.is_compound or crs.is_bound:
             crs = crs.sub_crs_list[0] if crs.is_compound else crs.source_crs
-        if crs.is_geocentric:
+        if crs.is_geocentric or crs.is_vertical:
             return None
         crs = crs.to_2d()
         known = crs.to_authority(min_confidence=100)

@@ -128,7 +128,7 @@ def of_raster(plan: Plan, path: Path, place: Place, notes: list[str]) -> Ground:
     from scipy.ndimage import map_coordinates
 
     (x_0, y_0), (x_1, y_1) = plan.low - plan.margin, plan.high + plan.margin
-    step = max(x_1 - x_0, y_1 - y_0) / (_NODES - 1)
+    step = max(x_1 - x_0, y_1 - y_0, 1.0) / (_NODES - 1)
     x = np.linspace(x_0, x_1, max(2, round((x_1 - x_0) / step) + 1))
     y = np.linspace(y_0, y_1, max(2, round((y_1 - y_0) / step) + 1))
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
