@@ -61,7 +61,8 @@ class Ends:
     Attributes
     ----------
     receiver : its own
-    senders : of each link's transmitter, in the order of the links
+    senders : of each link's transmitter, in the order of the links; once for each antenna that sends at
+        the same time
     """
 
     receiver: FrontEnd

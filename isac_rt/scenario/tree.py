@@ -410,6 +410,9 @@ class Scenario(Node):
         if self.radio.calibration is not None and self.receivers.active_input == "profiles":
             said = "profiles are made past the samples, which a calibration corrects; take samples"
             yield Problem((("receivers", "active_input"), ("radio", "calibration")), said)
+        if self.radio.calibration is not None and self.radio.bands(self.num_tx) > 1:
+            said = "gains of antennas that send at once cannot be told in the samples; take tdm"
+            yield Problem((("radio", "scheme"), ("radio", "calibration")), said)
         if real and self.receivers.active_input == "profiles":
             said = (
                 f"profiles are made past the samples, in which the front end of {real[0]} shows; "
@@ -425,6 +428,14 @@ class Scenario(Node):
         for key, one in stated.items():
             yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
             yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
+            sent = one.transmit_response
+            if (sent.slope_std_db or sent.slope_std_deg) and self.radio.bands(self.num_tx) > 1:
+                said = (
+                    "antennas that send at once have one response over the chirp here; state it by "
+                    "a table or a polynomial and set its slope_std_db and slope_std_deg to 0, or "
+                    "take another scheme"
+                )
+                yield Problem(((*key, "transmit_response"), ("radio", "scheme")), said)
             powers: list[Key] = [("converter", name) for name in one.converter.powers()]
             powers += [("saturation_dbm",)] if one.saturation_dbm is not None else []
             if powers and self.noise.model == "snr":

@@ -126,7 +126,8 @@ class Frame:
         """The hardware that shows in the samples of a link's receiver."""
         link, all_of = Link(*link), self._setup.front_ends
         senders = dict.fromkeys([link.tx, *self.sent])
-        return Ends(all_of[link.rx], tuple(all_of[name] for name in senders))
+        each = [all_of[name] for name in senders for _ in self.sent[name].streams()]
+        return Ends(all_of[link.rx], tuple(each))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
         """Noise within a chirp that `samples` leave out, over the thermal noise."""

@@ -72,6 +72,23 @@ def test_targets_and_profiles_have_no_front_end():
 
 
 @pytest.mark.parametrize(
+    ("radio", "said"),
+    [
+        ({"front_end": {"preset": "awr1443"}}, "antennas that send at once have one response"),
+        ({"calibration": "board.cal"}, "gains of antennas that send at once cannot be told"),
+    ],
+)
+def test_what_cannot_be_told_of_antennas_that_send_at_once_is_refused(radio, said):
+    """A response of its own at each, and a board's calibration by transmitter, hold where antennas
+    take turns."""
+    alone = {"AT": SWARM["AT"]}
+    for scheme in ("ddm", "bpm"):
+        with pytest.raises(ValidationError, match=said):
+            Scenario(swarm=alone, radio={"mode": "fmcw", "scheme": scheme, **radio})
+    Scenario(swarm=alone, radio={"mode": "fmcw", **radio})
+
+
+@pytest.mark.parametrize(
     ("elements", "said"),
     [
         ({"transmit": {"gain_db": [1, 2]}}, "gain_db: 2 values for 3 transmit elements"),

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import isac_rt as irt
+from isac_rt.frame.schedule import codes_of
+from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.audit import make_plan
 
 FREE = "radio.front_end.oscillator={mask_dbc_hz: [[1e4, -45], [1e7, -105]], locked: false}"
@@ -56,3 +58,43 @@ def test_the_plan_states_each_part_by_itself(scenes):
     assert all(error is None or error < 0 for *_, error in found)
     ideal = make_plan(irt.prepare(scenes[0]))["items"]
     assert not [item for item in ideal if item["what"] == "hardware"]
+
+
+def test_antennas_that_send_at_once_have_their_own_gains():
+    """Doppler division: what 6 dB more at one antenna adds turns from chirp to chirp as its code,
+    and what it adds at all of them is the sum. Such a run ended in a traceback."""
+
+    def samples(*gain_db):
+        scenario = Scenario(
+            seed=3,
+            frames=1,
+            radio={
+                "mode": "fmcw",
+                "scheme": "ddm",
+                "samples_per_chirp": 64,
+                "chirps_per_frame": 24,
+                "front_end": {"transmit": {"gain_db": gain_db}},
+            },
+            array={"tx_x": 2, "tx_z": 2, "rx_x": 3, "rx_z": 3},
+            swarm={
+                "R": {"role": "active", "position_m": [0, 0, 30], "boresight": [0, 1, 0]},
+                "T": {
+                    "role": "target",
+                    "position_m": [1, 8, 31],
+                    "rcs": {"model": "constant", "value_dbsm": 20},
+                },
+            },
+            propagation={"model": "free_space"},
+            noise={"model": "link_budget"},
+        )
+        setup = irt.prepare(scenario)
+        return setup.frame(0).samples(("R", "R")).samples, codes_of(setup.waveform)
+
+    double = 20 * np.log10(2)
+    ideal, codes = samples(1e-9, 0, 0)
+    more = [samples(*np.eye(3)[a] * double)[0] - ideal for a in range(3)]
+    for one, code in zip(more, codes, strict=True):
+        turned = one / one[:, :, :1] * code[0]
+        np.testing.assert_allclose(turned, np.broadcast_to(code[:, None], turned.shape), atol=0.02)
+    every = samples(*np.full(3, double))[0] - ideal
+    np.testing.assert_allclose(sum(more), every, atol=1e-3 * np.abs(every).max())
