@@ -61,8 +61,8 @@ class Ends:
     Attributes
     ----------
     receiver : its own
-    senders : of each link's transmitter, in the order of the links; once for each antenna that sends at
-        the same time
+    senders : of each link's transmitter, in the order of the links; one for each of its antennas
+        that send at once
     """
 
     receiver: FrontEnd
