@@ -299,11 +299,14 @@ class Picture:
         with the track that the name is of keeps it, else the one that had it before."""
         for body in self._bodies:
             body.name = min(body.name, *(by_key[key].name for key in body.members))
-        taken: set[Name] = set()
-        for body in sorted(self._bodies, key=lambda b: Key(*b.name[1:]) not in b.members):
-            if body.name in taken:
+        holder: dict[Name, _Body] = {}
+        waiting = sorted(self._bodies, key=lambda b: Key(*b.name[1:]) not in b.members)
+        for body in waiting:
+            if body.name in holder:
                 body.name = min(by_key[key].own_name for key in body.members)
-            taken.add(body.name)
+            if body.name in holder:  # by a body that lacks the track; it takes its own in its turn
+                waiting.append(holder[body.name])
+            holder[body.name] = body
 
 
 def _recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:

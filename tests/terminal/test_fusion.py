@@ -183,6 +183,23 @@ def test_no_two_bodies_have_one_name():
     }
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (2, 1, 0)])
+def test_a_name_goes_back_to_the_body_with_its_track(order):
+    """Three bodies: the second is known by the first one's name and has to fall back to that of its
+    own track, by which the third is known meanwhile. That one had it too before."""
+    a, b, c = Key("S->A", 1), Key("S->B", 1), Key("S->C", 1)
+    known = {a: Name(0.0, *a), b: Name(0.0, *a), c: Name(1.0, *b)}
+    picture = Picture()
+    bodies = [[list(known[key]), [list(key)]] for key in (a, b, c)]
+    picture.restore([bodies[i] for i in order])
+    reports = [
+        told(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
+        for i, key in enumerate((a, b, c))
+    ]
+    names = {body.members[0]: body.name for body in picture.update(reports)}
+    assert names == {a: Name(0.0, *a), b: Name(1.0, *b), c: Name(2.0, *c)}
+
+
 def test_a_terminal_is_known_by_what_it_says_of_itself():
     """The nearer in likelihood of two bodies; the other one stays a stranger."""
     itself = Gaussian(np.array([30.0, 20, 12, 1, 2, 0]), 0.0025 * np.eye(6))
