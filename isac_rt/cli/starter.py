@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from isac_rt.cli.siting import Formation, Site, site_of
 from isac_rt.results.files import ResultsError
@@ -144,7 +145,7 @@ def _over(own: OwnCity, file: Path) -> str:
     node = City.model_validate({"source": "footprints", **keys})
     city = load_city(node, file.parent, Radio().carrier_hz, (0.0, 0.0, 0.0))
     site = site_of(city, _formation())
-    lines = ["  source: footprints", *(f"  {key}: {json.dumps(v)}" for key, v in keys.items())]
+    lines = ["  source: footprints", *(f"  {key}: {_quoted(v)}" for key, v in keys.items())]
     if city.place is not None and _is_far(city, city.place):
         place, site = _local(city.place, site, city)
         x, y, z = place.origin
@@ -152,6 +153,11 @@ def _over(own: OwnCity, file: Path) -> str:
     lines += ["  height_property: height         # of each building in the file [m]"]
     lines += ["  default_height_m: 10            # where neither it nor storeys are known"]
     return starter_text(file.stem, "\n".join(lines), site)
+
+
+def _quoted(text: str) -> str:
+    """A word of YAML, whatever a path has in it."""
+    return str(yaml.safe_dump(text, default_style='"', allow_unicode=True, width=10**9)).strip()
 
 
 def _is_far(city: CityMesh, place: Place) -> bool:

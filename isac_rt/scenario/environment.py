@@ -334,7 +334,11 @@ back."""
 
 
 def _four_numbers(value: Any) -> Any:
-    if not isinstance(value, list | tuple) or len(value) != 4:
+    if (
+        not isinstance(value, list | tuple)
+        or len(value) != 4
+        or not all(isinstance(v, int | float) for v in value)
+    ):
         raise ValueError("must be four numbers [x_min, y_min, x_max, y_max]")
     if value[0] >= value[2] or value[1] >= value[3]:
         raise ValueError("holds nothing; state [x_min, y_min, x_max, y_max] in this order")

@@ -288,7 +288,8 @@ class FrontEnd(Node):
     @classmethod
     def _with_preset(cls, data: Any) -> Any:
         """Fill in what the preset says of keys that are not stated."""
-        said = PRESETS.get(data.get("preset", ""), {}) if isinstance(data, dict) else {}
+        name = data.get("preset") if isinstance(data, dict) else None
+        said = PRESETS.get(name, {}) if isinstance(name, str) else {}
         out = dict(data) if said else data
         for part, keys in said.items():
             stated = out.get(part, {})

@@ -75,6 +75,8 @@ STATED_SHARE = 1e-2
 """A bandwidth or a duration that is stated twice may differ by this share."""
 
 
+_MOST_BLOCKS = 10**9
+"""More come of numbers that no chirp has, and are refused as these."""
 SKIRT_SHARE = 0.02
 """Width of the IF filter's skirts over the sampling rate, where a data sheet states none."""
 
@@ -228,7 +230,8 @@ class Radio(Node):
         if self.chirp is None:
             return num_resource_blocks(self.bandwidth_hz, self.sampling_rate_hz, num_tx)
         times = self.times(num_tx)
-        return max(int(times.slot / (2 * times.max_delay)), 1)
+        most = times.slot / (2 * times.max_delay) if times.max_delay > 0 else math.inf
+        return int(min(max(most, 1), _MOST_BLOCKS))
 
     def bands(self, num_tx: int) -> int:
         """Doppler bands or length of the codes by which antennas that send at once are told apart;
@@ -327,6 +330,8 @@ class Radio(Node):
 
 
 MAX_ELEMENTS = 1024
+FARTHEST = 1e6
+"""No element is farther from the origin of its array, in its unit."""
 
 
 class Elements(Node):
@@ -386,6 +391,10 @@ class Elements(Node):
         if self.shape != "positions" and self.positions is not None:
             said = f"has no meaning with shape {self.shape}; leave it out, or set shape: positions"
             yield Problem((("positions",), ("shape",)), said)
+        far = max((abs(v) for place in self.positions or () for v in place), default=0.0)
+        if far > FARTHEST:
+            said = f"{far:g} is no place in an array, {FARTHEST:g} is the farthest; correct it"
+            yield Problem((("positions",),), said)
         if self.count(True) > MAX_ELEMENTS:
             said = f"{self.count(True)} elements are more than {MAX_ELEMENTS}; take fewer"
             yield Problem((("columns",), ("rows",)), said)

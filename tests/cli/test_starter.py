@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import warnings
 from pathlib import Path
 
@@ -82,6 +83,15 @@ def begun(make, folder: Path) -> Scenario:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return load(file)
+
+
+def test_a_path_may_have_any_letters(tmp_path):
+    """Planted bug: the path written as JSON, whose pairs of surrogates YAML does not join."""
+    folder = tmp_path / 'ü\U0001f600 #: "q'
+    folder.mkdir()
+    shutil.copy(QUARTER, folder / "b.geojson")
+    scenario = begun(lambda _: folder / "b.geojson", tmp_path)
+    assert scenario.city_path().read_bytes() == QUARTER.read_bytes()
 
 
 @pytest.mark.parametrize("make", [osm, swiss, pytest.param(quarter, marks=pytest.mark.slow)])

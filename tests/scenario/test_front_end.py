@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
+from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.front_end import FrontEnd, Oscillator
 from isac_rt.scenario.tree import Scenario
@@ -156,3 +157,33 @@ def test_what_is_stated_is_written_and_read_again(tmp_path):
     one = Scenario(swarm=SWARM, radio={"front_end": mask})
     (tmp_path / "s.yaml").write_text(to_yaml(one))
     assert load(tmp_path / "s.yaml").radio.front_end == one.radio.front_end
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ({"radio": {"front_end": {"preset": ["ideal"]}}}, "preset"),
+        ({"swarm": {"AT": {**SWARM["AT"], "front_end": {"preset": {"a": 1}}}}}, "preset"),
+        ({"belief": {"missing_m": [["a", 1, 2, 3]]}}, "four numbers"),
+        ({"array": {"rx": {"positions": [[1e308, 0], [-1e308, 0]]}}}, "no place in an array"),
+        (
+            {
+                "swarm": {"AT": SWARM["AT"]},
+                "radio": {
+                    "mode": "fmcw",
+                    "chirp": {
+                        "slope_mhz_per_us": 1e308,
+                        "adc_start_us": 0,
+                        "idle_us": 1,
+                        "sampling_msps": 10,
+                    },
+                },
+            },
+            "bandwidth_hz",
+        ),
+    ],
+)
+def test_what_is_no_value_is_one_message(part, said):
+    """Seen as a TypeError and a ZeroDivisionError."""
+    with pytest.raises(ScenarioError, match=said):
+        load({"swarm": SWARM} | part)
