@@ -297,7 +297,9 @@ class Radio(Node):
             ("bandwidth_hz", c.slope_mhz_per_us * 1e12 * self.ramp_end_s, self.bandwidth_hz),
         )
         for key, follows, stated in twice:
-            if follows is not None and abs(stated - follows) > STATED_SHARE * follows:
+            if follows is None:
+                continue
+            if not abs(stated - follows) <= STATED_SHARE * follows < math.inf:
                 said = f"but {follows:g} follows from radio.chirp; leave one of the two out"
                 yield Problem(((key,), ("chirp",)), said)
         last = c.adc_start_us * 1e-6 + sampled
