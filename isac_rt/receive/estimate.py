@@ -442,7 +442,7 @@ def in_plane(u: Sequence[float], known: Known) -> list[float]:
 
 def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Known) -> float:
     """Power that one wave from `direction` leaves in the channels of an estimate, over the wave's
-    own and beyond what noise leaves; 0 where there is no direction.
+    own and beyond what noise leaves; 0 where there is no direction, and of a single channel.
 
     A wave has one amplitude at the active terminal and one for each transmit antenna at a passive
     one. What is left comes from other paths in the cell.
@@ -460,6 +460,8 @@ def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Kn
     free = waves.size
     if known.passes == 2:
         waves, free = np.atleast_1d(waves @ sent.conj() / sent.size), 1
+    if free == estimate.channels.size:
+        return 0.0
     total = float((np.abs(estimate.channels) ** 2).mean())
     wave = float((np.abs(waves) ** 2).mean())
     left = (total - wave) / (1 - free / estimate.channels.size)

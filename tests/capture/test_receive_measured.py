@@ -85,6 +85,47 @@ def test_places_are_needed_for_directions(tmp_path):
             asked()
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"clutter_detector": "map"},
+        {"clutter_detector": "angle_doppler"},
+        {"clutter_detector": "sample_matrix"},
+        {"refinement": "joint"},
+    ],
+)
+def test_what_a_measured_frame_does_not_have_is_refused(tmp_path, asked):
+    """The first three ended in tracebacks of three kinds."""
+    ((key, value),) = asked.items()
+    with pytest.raises(CaptureError, match=f"receivers.{key}: {value} needs a city's mesh"):
+        sense(moving(tmp_path), Receivers(**asked))
+
+
+def test_a_board_with_one_channel_has_ranges(tmp_path):
+    """One transmitter and one receiver: no direction, and nothing by which channels could differ;
+    a division by zero before."""
+    samples, _ = channels(num_rx=1, num_tx=1, size=64, distance=7.3, slope=40e12, rate=5e6)
+    out = np.repeat(samples.T[None], LOOPS, axis=0)
+    rng = np.random.default_rng(5)
+    out += 300 * (rng.normal(size=out.shape) + 1j * rng.normal(size=out.shape))
+    np.save(tmp_path / "one.npy", out)
+    said = Description(
+        slope_mhz_per_us=40.0,
+        sampling_rate_hz=5e6,
+        samples_per_chirp=64,
+        receivers=1,
+        loops=LOOPS,
+        chirp_interval_us=60.0,
+        elements={"transmitters": [[0, 0]], "receivers": [[0, 0]]},
+    )
+    found = sense(import_file(tmp_path / "one.npy", said), Receivers()).detections
+    assert len(found) == 1
+    assert found.range[0] == pytest.approx(
+        7.3, abs=0.15
+    )  # beat at the ramp's middle: a cell is 0.3
+    assert np.isnan(found.direction).all()
+
+
 def test_the_picture_has_its_point_where_it_is(tmp_path):
     """The point recedes by 8 mm in the frame, two wavelengths: the mean chirp fades, so it is
     looked for in a frame of one loop. Planted bug: the transmitters' ways left out."""
