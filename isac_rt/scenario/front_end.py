@@ -159,6 +159,10 @@ class Response(Node):
                 yield Problem(((name,),), said)
 
 
+FARTHEST_HZ = 1e8
+"""No ramp is so far from a straight line."""
+
+
 class Ramp(Node):
     """How far the chirp's frequency is from a straight line: the error of the beat grows with the
     delay."""
@@ -181,6 +185,12 @@ class Ramp(Node):
 
     def applies(self, name: str) -> bool:
         return name != "ripple_period_s" or self.ripple_hz != 0
+
+    def problems(self) -> Iterator[Problem]:
+        for name in ("quadratic_hz", "cubic_hz", "ripple_hz"):
+            if not abs(getattr(self, name)) <= FARTHEST_HZ:
+                said = f"is no error of a ramp but another one; at most {FARTHEST_HZ:g} Hz"
+                yield Problem(((name,),), said)
 
 
 class Converter(Node):

@@ -164,6 +164,7 @@ def test_what_is_stated_is_written_and_read_again(tmp_path):
     [
         ({"radio": {"front_end": {"preset": ["ideal"]}}}, "preset"),
         ({"swarm": {"AT": {**SWARM["AT"], "front_end": {"preset": {"a": 1}}}}}, "preset"),
+        ({"radio": {"front_end": {"ramp": {"ripple_hz": 1e300}}}}, "no error of a ramp"),
         ({"belief": {"missing_m": [["a", 1, 2, 3]]}}, "four numbers"),
         ({"array": {"rx": {"positions": [[1e308, 0], [-1e308, 0]]}}}, "no place in an array"),
         (
