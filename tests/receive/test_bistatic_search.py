@@ -8,15 +8,19 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
 from isac_rt.frame.payload import unmodulated
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_passive
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.bistatic import (
+    _Beam,
     field_threshold,
     search_of,
     search_plain,
     search_white,
 )
+from isac_rt.receive.estimate import LocalSpectra, refine
+from isac_rt.receive.known import Known
+from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.receivers import Receivers
 
 W = Waveform(num_samples=256, num_chirps=24)
@@ -101,3 +105,28 @@ def test_a_weak_path_is_found_beside_a_strong_one():
     off = np.array([d.range[1], d.velocity[1], *d.direction[1]])
     off -= [echo.length, echo.rate, *echo.arrival]
     assert (np.abs(off) < 4 * d.std[1]).all()
+
+
+def test_the_beam_alone_says_where_a_weak_path_is():
+    """Two equal paths half a cell and half a bin apart, from directions in which the array hears
+    little of the other: towards each the beam finds its own place, all channels together find
+    neither. Planted bug: `_Beam` without its own `powers`."""
+    w, schedule, _ = frame(waveform=W)
+    cell, bin_ = w.range_cell(1), w.velocity_cell(1)
+    first = Path(20.2 * cell, 2.2 * bin_, 1.0, (0.1, -0.05), (-0.4, -0.3))
+    second = Path(20.7 * cell, 2.7 * bin_, 1.0, (0.3, 0.1), (0.35, 0.4))
+    samples = cube(w, schedule, unmodulated(w), [first, second], noise=0.0, seed=4)
+    known = Known.unmodulated(w, schedule, ANTENNAS, 1)
+    spectra = clean_spectrum(samples, known)
+    start = (20.45 * cell / SPEED_OF_LIGHT, 2.45 * bin_ / SPEED_OF_LIGHT)
+    for path in (first, second):
+        own = refine(_Beam(spectra, known, 20, np.array(path.arrival)), *start)
+        both = refine(LocalSpectra(spectra, known, 20), *start)
+        off = [
+            max(
+                abs(e.delay * known.metres - path.length) / cell,
+                abs(e.delay_rate * known.metres - path.rate) / bin_,
+            )
+            for e in (own, both)
+        ]
+        assert off[0] < 0.1 < 0.2 < off[1]

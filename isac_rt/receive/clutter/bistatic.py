@@ -304,9 +304,10 @@ class _Beam(LocalSpectra):
         search = search_of(known.antennas, known.wavenumber)
         self._towards = search.steering(cosines).conj()
 
-    def power(self, delay: float, delay_rate: float) -> float:
-        """What the estimate maximises."""
-        return float((np.abs(self.respond(delay, delay_rate) @ self._towards) ** 2).sum())
+    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
+        """Powers (K,) of the beam: what the estimate maximises."""
+        heard = [self.respond(*at) @ self._towards for at in zip(delays, delay_rates, strict=True)]
+        return (np.abs(heard) ** 2).sum(axis=1)
 
 
 def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
