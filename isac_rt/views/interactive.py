@@ -58,7 +58,8 @@ def scene_3d(
     figure = go.Figure()
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
     flat = tracks[..., :2]
-    figure.add_traces(city_traces(city, flat.min((0, 1)) - reach, flat.max((0, 1)) + reach))
+    low, high = flat.min((0, 1)) - reach, flat.max((0, 1)) + reach
+    figure.add_traces(city_traces(city, low, high))
     poses = swarm.poses(time)
     for kind in PathKind:
         lines, count = _lines(paths, kind, swarm, time)
@@ -106,7 +107,7 @@ def scene_3d(
                 name=f"{name}, {uav.role}",
             )
         )
-    figure.update_layout(layout(), template="plotly_white")
+    figure.update_layout(layout(low, high), template="plotly_white")
     return figure
 
 

@@ -30,14 +30,20 @@ _SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 _AXES = "xyz"
 
 
-def layout() -> dict[str, Any]:
-    """How a scene is laid out: metres alike on all axes, seen from the south-east."""
-    axes = zip(_AXES, ("east [m]", "north [m]", "up [m]"), strict=True)
+def layout(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
+    """How a scene is laid out: metres alike on all axes, seen from the south-east; of faces that
+    reach beyond the rectangle from `low` to `high` (2,) [m] the rest is cut off."""
+    axes: dict[str, dict[str, Any]] = {
+        f"{a}axis": {"title": {"text": title}}
+        for a, title in zip(_AXES, ("east [m]", "north [m]", "up [m]"), strict=True)
+    }
+    for k in range(2):
+        axes[f"{_AXES[k]}axis"]["range"] = [float(low[k]), float(high[k])]
     return {
         "scene": {
             "aspectmode": "data",
             "camera": {"eye": {"x": 0.7, "y": -0.9, "z": 0.6}},
-            **{f"{a}axis": {"title": {"text": title}} for a, title in axes},
+            **axes,
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "legend": {"x": 0.01, "y": 0.99},
@@ -109,9 +115,8 @@ def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> d
     reach : how far beyond the swarm the city is drawn [m]
     """
     position = dataset.uav_position.values
-    fixed = city_traces(
-        city, position[..., :2].min((0, 1)) - reach, position[..., :2].max((0, 1)) + reach
-    )
+    low, high = position[..., :2].min((0, 1)) - reach, position[..., :2].max((0, 1)) + reach
+    fixed = city_traces(city, low, high)
     fixed += [
         _line(points_of(position[:, u]), colour_of(u), 4, f"{name}, flight", showlegend=False)
         for u, name in enumerate(dataset.uav.values)
@@ -125,7 +130,7 @@ def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> d
     start = frames[0] if frames else []
     return {
         "data": fixed + start,
-        "layout": layout() | (_controls(dataset, steps, names) if len(steps) > 1 else {}),
+        "layout": layout(low, high) | (_controls(dataset, steps, names) if len(steps) > 1 else {}),
         "frames": [
             {"name": name, "data": data, "traces": places}
             for name, data in zip(names, frames, strict=True)
