@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from isac_rt.cli.arguments import InputProblem
-from isac_rt.cli.console import say, with_progress, working
+from isac_rt.cli.console import Report, say, with_progress, working
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
 if TYPE_CHECKING:
@@ -48,30 +50,40 @@ def sweep(
         _say_status(Path(str(status)))
         return
     from isac_rt.results.files import check_folder
-    from isac_rt.sweep import SchedulerLost, load_sweep, run_sweep
+    from isac_rt.sweep import load_sweep, run_sweep
 
     plan = load_sweep(file, max_points)
     folder = out if out is not None else Path("runs") / plan.sweep.name
     check_folder(folder)
     with ending_soon_after_interrupt(folder):
-        try:
-            with_progress(
-                lambda report: run_sweep(
-                    plan,
-                    folder,
-                    workers=workers,
-                    scheduler=scheduler,
-                    retry_failed=retry_failed,
-                    progress=lambda done, failed, total: report(
-                        done + failed, total, f"{failed} failed"
-                    ),
-                ),
-                "points",
-            )
-        except SchedulerLost as lost:
-            typer.echo(lost, err=True)
-            raise typer.Exit(1) from None
+        _on_dask(
+            "points",
+            partial(
+                run_sweep,
+                plan,
+                folder,
+                workers=workers,
+                scheduler=scheduler,
+                retry_failed=retry_failed,
+            ),
+        )
         _finish(plan, folder)
+
+
+def _on_dask(what: str, run: Callable[..., Any]) -> Any:
+    """Run points with a bar; a scheduler that is lost on the way is one message, exit 1."""
+    from isac_rt.sweep import SchedulerLost
+
+    def counting(report: Report) -> Any:
+        return run(
+            progress=lambda done, failed, total: report(done + failed, total, f"{failed} failed")
+        )
+
+    try:
+        return with_progress(counting, what)
+    except SchedulerLost as lost:
+        typer.echo(lost, err=True)
+        raise typer.Exit(1) from None
 
 
 def _finish(plan: Plan, folder: Path) -> None:
@@ -117,28 +129,15 @@ def dataset(
     from isac_rt.results.files import check_folder
 
     with working("drawing the scenes"):
-        from isac_rt.sweep import SchedulerLost, load_dataset, run_dataset
+        from isac_rt.sweep import load_dataset, run_dataset
 
         plan = load_dataset(file)
     folder = out if out is not None else Path("runs") / plan.data.name
     check_folder(folder)
     with ending_soon_after_interrupt(folder):
-        try:
-            card = with_progress(
-                lambda report: run_dataset(
-                    plan,
-                    folder,
-                    workers=workers,
-                    scheduler=scheduler,
-                    progress=lambda done, failed, total: report(
-                        done + failed, total, f"{failed} failed"
-                    ),
-                ),
-                "scenes",
-            )
-        except SchedulerLost as lost:
-            typer.echo(lost, err=True)
-            raise typer.Exit(1) from None
+        card = _on_dask(
+            "scenes", partial(run_dataset, plan, folder, workers=workers, scheduler=scheduler)
+        )
     counts = {name: (len(shards), sum(shards.values())) for name, shards in card["splits"].items()}
     said = ", ".join(f"{name}: {s} scenes, {n:,} samples" for name, (s, n) in counts.items())
     say(f"{said}; {card['bytes'] / 1e6:,.1f} MB, {card['scenes_failed']} scenes failed")
