@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.capture.types import Capture, CaptureError, ti_window
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.runtime import shortly
@@ -185,11 +185,6 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     )
 
 
-def _window(size: int) -> np.ndarray:
-    """TI's Hann window sin^2(pi (n+1)/(N+1))."""
-    return np.asarray(np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2)
-
-
 def _places(size: int) -> np.ndarray:
     """Samples from the middle of the chirp."""
     return np.arange(size) - (size - 1) / 2
@@ -212,7 +207,7 @@ def _levelled(gain: np.ndarray) -> np.ndarray:
 def _reflector(y: np.ndarray, w: Waveform, one_sided: bool) -> tuple[float, float]:
     """Range cell and SNR [dB] of the strongest echo that is of one reflector."""
     size = y.shape[-1]
-    spectra = np.fft.fft(y * _window(size), PADDING * size, axis=-1)
+    spectra = np.fft.fft(y * ti_window(size), PADDING * size, axis=-1)
     power = (np.abs(spectra) ** 2).mean(axis=(0, 1))
     floor = float(np.median(power))
     if not floor > 0:
@@ -256,7 +251,7 @@ def _peaks(y: np.ndarray, cell: float) -> np.ndarray:
     """Maximum-likelihood beat of every channel [range cells] within two cells, under the window."""
     size = y.shape[-1]
     place = _places(size)
-    still = y * _window(size) * np.exp(-2j * np.pi * cell / size * place)
+    still = y * ti_window(size) * np.exp(-2j * np.pi * cell / size * place)
     offset = np.linspace(-2, 2, 41)
     spectra = still @ np.exp(-2j * np.pi / size * np.outer(place, offset))
     found = offset[np.abs(spectra).argmax(axis=-1)]
@@ -273,7 +268,7 @@ def _peaks(y: np.ndarray, cell: float) -> np.ndarray:
 def _amplitudes(y: np.ndarray, cells: float | np.ndarray) -> np.ndarray:
     """Complex amplitudes at the middle of the chirp, of a tone at `cells`, under the window."""
     size = y.shape[-1]
-    window = _window(size) / _window(size).sum()
+    window = ti_window(size) / ti_window(size).sum()
     turn = np.exp(-2j * np.pi / size * np.multiply.outer(np.asarray(cells), _places(size)))
     return np.asarray((y * (window * turn)).sum(axis=-1))
 
@@ -310,7 +305,7 @@ def _bound(y: np.ndarray, amplitude: np.ndarray) -> float:
     """Cramer-Rao bound of a beat [range cells], root mean square over the channels; the noise is
     that of the quietest quarter of the range cells."""
     size = y.shape[-1]
-    window = _window(size)
+    window = ti_window(size)
     power = (np.abs(np.fft.fft(y * window, axis=-1)) ** 2).mean(axis=(0, 1)) / (window**2).sum()
     noise = np.sort(power)[: size // 4].mean()
     information = 2 * (2 * np.pi / size) ** 2 * (_places(size) ** 2).sum() / noise
@@ -334,7 +329,7 @@ def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> _Fit:
     Marquardt: to first order an imaginary slope is a common shift of the beats.
     """
     size = y.shape[-1]
-    place, window = _places(size), _window(size)
+    place, window = _places(size), ti_window(size)
     x, turn = place / (size / 2), 2j * np.pi / size * place
     offset = np.arange(-REACH * PADDING, REACH * PADDING + 1) / PADDING
     atoms = np.exp(-np.multiply.outer(turn, offset))
@@ -402,7 +397,7 @@ def near_spectra(capture: Capture, cell: float) -> np.ndarray:
     size = y.shape[-1]
     offset = np.round(cell * PADDING) + np.arange(-REACH * PADDING, REACH * PADDING + 1)
     turns = np.multiply.outer(_places(size), offset / PADDING / size)
-    return np.asarray((y * _window(size)) @ np.exp(-2j * np.pi * turns))
+    return np.asarray((y * ti_window(size)) @ np.exp(-2j * np.pi * turns))
 
 
 def _projection(on: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -417,7 +412,7 @@ def _sweep(y: np.ndarray, cells: np.ndarray, w: Waveform) -> np.ndarray:
     where it is more than a tenth.
     """
     size = y.shape[-1]
-    place, window = _places(size), _window(size)
+    place, window = _places(size), ti_window(size)
     turn = np.exp(-2j * np.pi / size * np.multiply.outer(cells, place))
     spectra = np.fft.fft(y * window * turn, axis=-1)
     spectra[..., REACH + 1 : size - REACH] = 0
@@ -448,13 +443,22 @@ def apply(calibration: Calibration, capture: Capture) -> Capture:
     ------
     CaptureError  If the board has other antennas.
     """
-    cube = capture.cube
-    ideal = cube.samples / board(calibration, cube, ANTENNAS_AND_SWEEP)
     return replace(
         capture,
-        cube=replace(cube, samples=ideal.astype(np.complex64)),
+        cube=ideal(calibration, capture.cube),
         source={**capture.source, "calibrated": "yes"},
     )
+
+
+def ideal(calibration: Calibration, cube: IFCube) -> IFCube:
+    """A frame's samples, in single precision, without `ANTENNAS_AND_SWEEP`.
+
+    Raises
+    ------
+    CaptureError  If the board has other antennas.
+    """
+    samples = cube.samples / board(calibration, cube, ANTENNAS_AND_SWEEP)
+    return replace(cube, samples=samples.astype(np.complex64))
 
 
 def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from isac_rt.capture.description import MOST_ELEMENTS, Description
 from isac_rt.capture.matfile import read_mat
 from isac_rt.capture.store import checked_cube
-from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.capture.types import Capture, CaptureError, ti_window
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Sweep, Waveform
@@ -156,8 +156,7 @@ def _without_window(file: Path, spectra: np.ndarray, stated: int | None) -> np.n
     size = stated or size
     if not 16 <= size <= 65536:
         raise CaptureError(f"{file}: the chirps have {size} samples, 16 to 65536 can be read")
-    window = np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2
-    return np.asarray(padded[:size] / window[:, None, None])
+    return np.asarray(padded[:size] / ti_window(size)[:, None, None])
 
 
 # ---- DCA1000

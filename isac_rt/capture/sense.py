@@ -55,7 +55,7 @@ def _at_rest(capture: Capture, found: Detections) -> Detections:
     y, w, antennas = capture.channels(), capture.cube.waveform, _antennas(capture)
     known = Known.unmodulated(w, capture.cube.schedule, antennas, 2)
     delay = found.range / known.metres
-    window = np.sin(np.pi * (np.arange(w.num_samples) + 0.5) / w.num_samples) ** 2
+    window = _hann(w.num_samples)
     beat = np.multiply.outer(delay * w.slope / w.sampling_rate, np.arange(w.num_samples))
     channels = y @ (window / window.sum() * np.exp(-2j * np.pi * beat)).T  # (L_rx, L_tx, Q)
     estimates = [Estimate(tau, 0.0, channels[..., q].T) for q, tau in enumerate(delay.tolist())]
@@ -80,9 +80,8 @@ def range_azimuth(capture: Capture, azimuth: np.ndarray, farthest: float) -> xr.
     antennas, w = _antennas(capture), capture.cube.waveform
     y = capture.channels()
     size = y.shape[-1]
-    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
     rows = min(int(farthest / w.range_cell(2)) + 1, size)
-    spectra = np.fft.fft(y * window, axis=-1)[..., :rows]
+    spectra = np.fft.fft(y * _hann(size), axis=-1)[..., :rows]
     distance = np.maximum(np.arange(rows) * w.range_cell(2), w.range_cell(2))
     points = np.stack([np.sin(azimuth), np.cos(azimuth), 0 * azimuth], axis=-1)
     points = distance[:, None, None] * points
@@ -101,6 +100,11 @@ def range_azimuth(capture: Capture, azimuth: np.ndarray, farthest: float) -> xr.
         "power",
         {"units": "1", "long_name": "power of the sum of all channels"},
     )
+
+
+def _hann(size: int) -> np.ndarray:
+    """Hann window (size,) whose zeros lie half a sample before the chirp and behind it."""
+    return np.asarray(np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2)
 
 
 def _antennas(capture: Capture) -> Antennas:

@@ -24,6 +24,11 @@ def measured_folder() -> Path:
     return Path(named) if named else Path(__file__).parents[3] / "shared" / "measured"
 
 
+def ti_window(size: int) -> np.ndarray:
+    """Hann window (size,) under which TI's scripts take range spectra, sin^2(pi (n+1)/(N+1))."""
+    return np.asarray(np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2)
+
+
 class CaptureError(UserError):
     """A file of samples, its description or what was asked of it will not do; the text says why and
     what to do."""

@@ -16,6 +16,13 @@ from isac_rt.cli.interruption import ending_soon_after_interrupt
 if TYPE_CHECKING:
     from isac_rt.sweep.definition import Plan
 
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Processes; default one per core, as memory allows.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
+]
+
 
 def sweep(
     file: Annotated[
@@ -24,13 +31,8 @@ def sweep(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the outcomes go; default runs/NAME.")
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes; default one per core, as memory allows."),
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
-    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     max_points: Annotated[
         int, typer.Option(min=1, help="Refuse a sweep with more points.")
     ] = 100_000,
@@ -116,13 +118,8 @@ def dataset(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where it goes; default runs/NAME.")
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes; default one per core, as memory allows."),
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
-    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw many scenes and keep maps, paths, truth, tracks and bits for learning, or make what is
     missing: the same command again goes on."""

@@ -18,6 +18,13 @@ _TI_BOARD = {
 """TI's AWR1843BOOST and IWR6843ISK: four receivers half a wavelength apart, two transmitters two
 wavelengths apart and a third between them half a wavelength higher."""
 
+_OUR_RAMP = {
+    "slope_mhz_per_us": 15.0,
+    "idle_us": 7.0,
+    "adc_start_us": 6.0,
+    "ramp_end_us": 33.0,
+}
+
 SENSORS: dict[str, dict[str, dict[str, Any]]] = {
     # 76 to 81 GHz, 3 TX, 4 RX on AWR1843BOOST; our chirp
     "awr1843": {
@@ -26,14 +33,7 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
             "scheme": "tdm",
             "carrier_hz": 77e9,
             "chirps_per_frame": 192,
-            "chirp": {
-                "slope_mhz_per_us": 15.0,
-                "idle_us": 7.0,
-                "adc_start_us": 6.0,
-                "ramp_end_us": 33.0,
-                "samples": 256,
-                "sampling_msps": 10.0,
-            },
+            "chirp": {**_OUR_RAMP, "samples": 256, "sampling_msps": 10.0},
         },
         "array": {**_TI_BOARD, "element_gain_dbi": 8.0},
         "noise": {"tx_power_dbm": 12.0, "noise_figure_db": 15.0},
@@ -47,14 +47,7 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
             "sub_bands": 6,
             "carrier_hz": 76e9,
             "chirps_per_frame": 192,
-            "chirp": {
-                "slope_mhz_per_us": 15.0,
-                "idle_us": 7.0,
-                "adc_start_us": 6.0,
-                "ramp_end_us": 33.0,
-                "samples": 384,
-                "sampling_msps": 15.0,
-            },
+            "chirp": {**_OUR_RAMP, "samples": 384, "sampling_msps": 15.0},
         },
         "array": {
             "tx": {

@@ -272,9 +272,7 @@ class Scenario(Node):
             }
         elif r.scheme == "tdm":
             usual = {"velocity_method": ("auto", "conventional")}
-        sets: dict[Key, Receivers] = {("receivers",): self.receivers}
-        sets |= {("compare", n, "receivers"): one.receivers for n, one in self.compare.items()}
-        for at, receivers in sets.items():
+        for at, receivers in self._all_receivers().items():
             for key, values in usual.items():
                 if (value := getattr(receivers, key)) not in values:
                     yield Problem(
@@ -283,19 +281,22 @@ class Scenario(Node):
                         f"{' or '.join(values)}, or another scheme",
                     )
 
+    def _all_receivers(self) -> dict[Key, Receivers]:
+        """The scenario's own receivers and those compared with them, by their keys."""
+        sets: dict[Key, Receivers] = {("receivers",): self.receivers}
+        return sets | {("compare", n, "receivers"): x.receivers for n, x in self.compare.items()}
+
     def _array_problems(self) -> Iterator[Problem]:
         """Receivers that look at the arms of an L one by one, beside other arrays."""
         if self.array.is_full_l:
             return
-        sets: dict[Key, Receivers] = {("receivers",): self.receivers}
-        sets |= {("compare", n, "receivers"): one.receivers for n, one in self.compare.items()}
         able = {
             "clutter_detector": ("cfar",),
             "passive_detector": ("cfar",),
             "refinement": ("local", "grid"),
             "symbol_decision": ("powers", "profile"),
         }
-        for at, receivers in sets.items():
+        for at, receivers in self._all_receivers().items():
             unlike = {k: v for k, v in able.items() if getattr(receivers, k) not in v}
             if unlike:
                 named = " and ".join(f"{key}: {getattr(receivers, key)}" for key in unlike)
@@ -530,7 +531,7 @@ class Scenario(Node):
     @property
     def needs_mesh(self) -> bool:
         """Whether some terminal predicts clutter from the city's mesh."""
-        sets = [self.receivers, *(one.receivers for one in self.compare.values())]
+        sets = self._all_receivers().values()
         traced = self.propagation.model == "ray_traced" and self.city is not None
         by_beams = traced and any(one.passive_detector == "beams" for one in sets)
         return by_beams or any(one.needs_mesh for one in sets)

@@ -11,12 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isac_rt.access import Clock, Connections, Network, establish
-from isac_rt.capture.calibrate import (
-    ANTENNAS_AND_SWEEP,
-    Calibration,
-    board,
-    load_calibration,
-)
+from isac_rt.capture.calibrate import Calibration, ideal, load_calibration
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
@@ -277,8 +272,7 @@ class Setup:
         """Samples without what the calibration says of the board."""
         if self.calibration is None:
             return cube
-        ideal = cube.samples / board(self.calibration, cube, ANTENNAS_AND_SWEEP)
-        return replace(cube, samples=ideal.astype(np.complex64))
+        return ideal(self.calibration, cube)
 
     @cached_property
     def walls(self) -> Walls:

@@ -235,7 +235,7 @@ class Plan:
         """All points in order, made one by one: a million of them need no memory."""
         tree = plain_tree(self.base)
         tree.pop("name")
-        files = lru_cache(maxsize=64)(partial(files_digest, self.base.folder))
+        files = files_under(self.base.folder)
         for index in itertools.product(*(range(n) for n in self.sweep.shape)):
             here = copy.deepcopy(tree)
             for axis, i in zip(self.sweep.axes.values(), index[:-1], strict=True):
@@ -330,6 +330,12 @@ def put(tree: dict[str, Any], key: str, value: Any) -> None:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def files_under(folder: Path) -> Callable[[str, str | None], str]:
+    """`files_digest` of one folder for many points, which share their cities: no file is read for
+    each of them."""
+    return lru_cache(maxsize=64)(partial(files_digest, folder))
 
 
 def files_digest(folder: Path, city: str, costs: str | None) -> str:

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,7 +29,7 @@ from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
 from isac_rt.sweep.definition import (
     Free,
     Point,
-    files_digest,
+    files_under,
     ground_by,
     options,
     put,
@@ -254,7 +254,7 @@ class DataPlan:
 
     def points(self) -> Iterator[Point]:
         """The scenes as points of a sweep; what is kept of them is part of their key."""
-        files = partial(files_digest, self.base.folder)
+        files = files_under(self.base.folder)
         for number, scene in enumerate(self.scenes):
             ground = ground_by(scene.tree, files)
             content = json.dumps([scene.tree, ground, self.data.keep, scene.split], sort_keys=True)

@@ -13,7 +13,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
-from isac_rt.views.moving_scene import city_traces, layout
+from isac_rt.views.moving_scene import ROLE_SYMBOLS, city_traces, layout
 from isac_rt.views.render import polyline
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 MOST_LINES = 400
 """Paths of one kind that are drawn, the strongest; thousands of scatterers would hide the rest."""
-_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 
 
 def scene_3d(
@@ -102,7 +101,7 @@ def scene_3d(
                 mode="markers+text",
                 text=[name],
                 textposition="top center",
-                marker={"color": colour, "size": 6, "symbol": _SYMBOLS[uav.role]},
+                marker={"color": colour, "size": 6, "symbol": ROLE_SYMBOLS[uav.role]},
                 legendgroup=name,
                 name=f"{name}, {uav.role}",
             )

@@ -26,7 +26,7 @@ MOST_LINES = 15
 """Paths of a kind that are drawn at a time, the strongest."""
 CREASE = np.deg2rad(20.0)
 """Faces that meet at more than this have an edge drawn between them [rad]."""
-_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
+ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 _AXES = "xyz"
 
 
@@ -164,7 +164,7 @@ class _Moving:
             "marker": {
                 "size": 6,
                 "color": [colour_of(u) for u in range(d.sizes["uav"])],
-                "symbol": [_SYMBOLS[role] for role in d.role.values],
+                "symbol": [ROLE_SYMBOLS[role] for role in d.role.values],
             },
             **points_of(d.uav_position.values[frame]),
         }
