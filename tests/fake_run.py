@@ -170,6 +170,12 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 truth=truth,
                 detected=_values(own, poses, 0.0637, see),
                 tracked=_values(own, poses, 0.0213, see),
+                bound=UavValues(
+                    **{
+                        name: np.where(see, 0.004 * (k + 1), np.nan)
+                        for k, name in enumerate(("range", "velocity", "azimuth", "elevation"))
+                    }
+                ),
                 in_view=np.array([name == "PT1", False, True]),
                 shadowed=hidden,
                 tracks=TrackTable(

@@ -114,6 +114,8 @@ ELSEWHERE = {
     "apart.terminals.bounds",
     "targets.UAV.median",
     "targets.UAV.p90",
+    "targets.UAV.bound_median",
+    "targets.UAV.bound_p90",
     "targets.UAV.losses",
     "wall",
     "cost_model",

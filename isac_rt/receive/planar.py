@@ -4,7 +4,7 @@ of view, and Newton's steps from the strongest.
 The power of the beam towards u is |sum_l v_l exp(j k r_l.u)|^2, in phase over all virtual channels
 for an echo; for one pass in phase over the receivers and added over the transmitters, whose
 direction of departure is another. Its maximum is the maximum-likelihood estimate of one wave in
-white noise, with the Cramer-Rao bound of `direction_covariance`. An axis along which the channels
+white noise, with the Cramer-Rao bound of `direction_bound`. An axis along which the channels
 do not stand apart is not observed: its direction cosine is NaN.
 """
 
@@ -125,15 +125,20 @@ def cosines(channels: np.ndarray, known: Known, *, on_grid: bool = False) -> lis
     return out
 
 
-def direction_covariance(total: float, known: Known) -> np.ndarray:
-    r"""(2, 2) Cramer-Rao bound of u_x and u_z of one wave, infinite where an axis is not observed.
+def direction_bound(antennas: Antennas, passes: int, wavenumber: float) -> np.ndarray:
+    r"""(2, 2) Cramer-Rao bound of u_x and u_z of one wave at unit SNR of all channels together,
+    infinite where an axis is not observed.
 
-    The inverse of :math:`2 \gamma k^2 C`, with the SNR :math:`\gamma` of all channels together
-    and C the covariance of their places.
+    The inverse of :math:`2 k^2 C`, with C the covariance of the channels' places.
     """
-    places, axes = channels_of(known.antennas, known.passes)
+    places, axes = channels_of(antennas, passes)
     out = np.diag([np.inf, np.inf])
     if axes:
-        fisher = 2 * total * known.wavenumber**2 * np.cov(places.T, bias=True)
+        fisher = 2 * wavenumber**2 * np.cov(places.T, bias=True)
         out[np.ix_(axes, axes)] = np.linalg.inv(np.atleast_2d(fisher))
     return out
+
+
+def direction_covariance(total: float, known: Known) -> np.ndarray:
+    """`direction_bound` at the SNR `total` of all channels together."""
+    return direction_bound(known.antennas, known.passes, known.wavenumber) / total

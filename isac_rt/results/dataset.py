@@ -101,6 +101,17 @@ OBSERVERS: dict[str, Column] = {
         for group, word in (("truth", "true"), ("detected", "detected"), ("tracked", "tracked"))
         for name, (units, _) in MEASURES.items()
     },
+    **{
+        f"bound_{name}": Column(
+            float,
+            units,
+            f"least standard deviation of an estimate of the {name} in noise (Cramer-Rao)",
+            f"bound.{name}",
+            ("uav",),
+            np.nan,
+        )
+        for name, (units, _) in MEASURES.items()
+    },
     "in_view": _number("UAV inside the field of view", "in_view", bool, dims=("uav",)),
     "shadowed": _number("UAV hidden by the city", "shadowed", bool, dims=("uav",)),
     "hit": _number(

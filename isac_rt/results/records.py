@@ -71,6 +71,8 @@ class ObserverRecord:
     reception : what it found
     paths : what it received
     truth, detected, tracked : over all UAVs; estimates are NaN where none is associated
+    bound : least standard deviations of an estimate of each UAV (Cramer-Rao), NaN where it is not
+        in view or shadowed
     in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
@@ -106,6 +108,7 @@ class ObserverRecord:
     truth: UavValues
     detected: UavValues
     tracked: UavValues
+    bound: UavValues
     in_view: np.ndarray
     shadowed: np.ndarray
     tracks: TrackTable

@@ -19,6 +19,7 @@ from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation import PathKind, PathSet
 from isac_rt.receive import Reception
 from isac_rt.receive.types import Detections
+from isac_rt.results.bounds import CramerRao
 from isac_rt.results.labels import Aim, Places, explain, owners
 from isac_rt.results.losses import Chance, Sensitivity, cause_of
 from isac_rt.results.metrics import (
@@ -68,6 +69,7 @@ class Scorer:
         self._passes = 2 if link[0] == link[1] else 1
         self._resolution = resolutions(timetable.waveform, antennas, self._passes)
         self._observed = antennas.observes(self._passes)
+        self._least = CramerRao.of(timetable.waveform, antennas, self._passes)
         self._receivers = receivers
         self._labels: dict[int, list[int]] = {}
         self._followed: dict[int, int] = {}
@@ -127,6 +129,7 @@ class Scorer:
             state=heard.state,
             hit=hit,
             loss=loss,
+            bound=self._bound(view, chances),
             target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
             target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, len(hit)),
             cooperative=friends,
@@ -265,6 +268,14 @@ class Scorer:
             own = int(mine[np.argmax(paths.power[mine])])
             out[i] = Chance.of(own, paths, places, w, sees)
         return out
+
+    def _bound(self, view: _View, chances: dict[int, Chance]) -> UavValues:
+        """Least standard deviations of an estimate of each UAV seen."""
+        rows: list[np.ndarray | None] = [None] * len(view.truth)
+        for i, chance in chances.items():
+            if chance.matched > 0:
+                rows[i] = self._least.of_path(chance.matched, view.seen[i])
+        return _values(rows)
 
     def _beside(self, truth: Truth, d: Detections) -> np.ndarray:
         """(Q,) which detections lie within a cell of a UAV."""

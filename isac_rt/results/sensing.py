@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.bounds import error_quantile
 from isac_rt.results.dataset import MEASURES, Row, errors_of
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.metrics import GOSPA_CUTOFF_M, SymbolCount
@@ -32,6 +33,7 @@ class Sensing:
     hidden : (F, U) bool, in view but shadowed
     hit : (F, U) bool
     detected, tracked : (F, U, 4) errors [m, m/s, deg, deg], NaN where there is no estimate
+    bound : (F, U, 4) their least standard deviations, NaN where it is not seen
     loss : (F, U) `Loss`, -1 where it is not seen
     switched : (F, U) bool, another track follows it than the last that did
     resumed : (F, U) bool, followed again after frames in view in which no track did
@@ -49,6 +51,7 @@ class Sensing:
     hit: np.ndarray
     detected: np.ndarray
     tracked: np.ndarray
+    bound: np.ndarray
     loss: np.ndarray
     switched: np.ndarray
     resumed: np.ndarray
@@ -74,7 +77,7 @@ class Sensing:
             out = np.full((count, num_uavs, len(MEASURES)), np.nan)
             for f, row in enumerate(rows):
                 for k, (name, (unit, _)) in enumerate(MEASURES.items()):
-                    e = errors_of(row, group, name)
+                    e = row[f"bound_{name}"] if group == "bound" else errors_of(row, group, name)
                     out[f, :, k] = np.rad2deg(e) if unit == "rad" else e
             return out
 
@@ -89,6 +92,7 @@ class Sensing:
             column("hit", bool),
             errors("detected"),
             errors("tracked"),
+            errors("bound"),
             column("loss", int),
             *_breaks(rows, in_view & ~shadowed),
             column("cooperative", bool),
@@ -143,7 +147,8 @@ class Sensing:
         return {name: self._target(i) for i, name in enumerate(names)}
 
     def _target(self, i: int) -> dict[str, Any]:
-        errors = self.detected[self.seen[:, i], i]
+        errors, least = self.detected[self.seen[:, i], i], self.bound[self.seen[:, i], i]
+        least = np.where(np.isfinite(errors), least, np.nan)
         followed = np.isfinite(self.tracked[self.seen[:, i], i, 0])
         return {
             "in_view": int(self.seen[:, i].sum()),
@@ -155,6 +160,8 @@ class Sensing:
             "ghost_tracks": int(self.ghosts[:, i].sum()),
             "median": _by_axis(np.abs(errors), np.median),
             "p90": _by_axis(np.abs(errors), lambda e: np.percentile(e, 90)),
+            "bound_median": _by_axis(least, lambda s: error_quantile(s, 0.5)),
+            "bound_p90": _by_axis(least, lambda s: error_quantile(s, 0.9)),
             "losses": _counts(self.loss[:, i]),
         }
 

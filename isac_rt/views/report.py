@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import xarray as xr
 
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.recorder import TIMINGS, Results
@@ -18,6 +19,7 @@ from isac_rt.results.sensing import FALSE_CAUSES
 from isac_rt.scenario.tree import OWN
 from isac_rt.storage import write_whole
 from isac_rt.views.moving_scene import MOST_LINES, moving_scene, page_part
+from isac_rt.views.walls import MOST_WALLS, walls
 from isac_rt.world.city.mesh import CityMesh
 
 DASH = "\u2013"
@@ -151,7 +153,7 @@ def _link(name: str) -> str:
 
 def rmse_table(summary: Mapping[str, Any]) -> Table:
     """RMSE of detections and of tracks."""
-    columns = ("RMSE", "Range [m]", "Velocity [m/s]", "Azimuth [deg]", "Elevation [deg]")
+    columns = ("RMSE", *_AXES)
     rows = [
         (f"{_link(name)}, {word}", *(number(v) for v in s[key].values()))
         for name, s in summary["links"].items()
@@ -328,32 +330,34 @@ def _targets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str
 
 
 def target_table(summary: Mapping[str, Any]) -> Table:
-    """Who saw whom, how often and how well."""
-    columns = (
-        "Link",
-        "UAV",
-        "In view",
-        "Found",
-        "Tracked",
-        "Switches",
-        "Range [m]",
-        "Velocity [m/s]",
-        "Azimuth [deg]",
-        "Elevation [deg]",
-    )
-    rows = [
-        (
-            link,
-            uav,
-            *(number(t[key]) for key in ("in_view", "found", "tracked", "switches")),
-            *(
-                DASH if middle is None else f"{number(middle, 2)} / {number(t['p90'][key], 2)}"
-                for key, middle in t["median"].items()
-            ),
-        )
-        for link, uav, t in _targets(summary)
-    ]
+    """Who saw whom, and how often."""
+    keys = ("in_view", "found", "tracked", "switches")
+    rows = [(link, uav, *(number(t[key]) for key in keys)) for link, uav, t in _targets(summary)]
+    return Table(("Link", "UAV", "In view", "Found", "Tracked", "Switches"), rows)
+
+
+def error_table(summary: Mapping[str, Any]) -> Table:
+    """Median and 90 % of the errors of each UAV, and beside them what no unbiased estimator goes
+    below; UAVs that were never found are left out."""
+    columns = ("Link", "UAV", "", *_AXES)
+    rows = []
+    for link, uav, t in _targets(summary):
+        if any(middle is not None for middle in t["median"].values()):
+            rows.append((link, uav, "error", *_pairs(t["median"], t["p90"])))
+            if "bound_median" in t:
+                rows.append((link, uav, "bound", *_pairs(t["bound_median"], t["bound_p90"])))
     return Table(columns, rows)
+
+
+_AXES = ("Range [m]", "Velocity [m/s]", "Azimuth [deg]", "Elevation [deg]")
+
+
+def _pairs(middle: Mapping[str, float | None], most: Mapping[str, float | None]) -> list[str]:
+    """Median / 90 % on each axis."""
+    return [
+        DASH if value is None else f"{number(value, 2)} / {number(most[key], 2)}"
+        for key, value in middle.items()
+    ]
 
 
 def loss_table(summary: Mapping[str, Any]) -> Table:
@@ -364,6 +368,12 @@ def loss_table(summary: Mapping[str, Any]) -> Table:
         ("Link", "UAV", *(cause.replace("_", " ").capitalize() for cause in causes)),
         [(link, uav, *(number(t["losses"][c]) for c in causes)) for link, uav, t in rows],
     )
+
+
+def wall_table(dataset: xr.Dataset, city: CityMesh) -> Table:
+    """The surfaces of the city that most detections came from, as `walls` finds them."""
+    found = walls(dataset, city).head(MOST_WALLS)
+    return Table([*found.columns], [[number(v) for v in row] for row in found.values.tolist()])
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -456,6 +466,8 @@ def write_report(
         apart=apart_table(s),
         swarm=swarm_table(s),
         targets=target_table(s),
+        errors=error_table(s),
+        walls=wall_table(d, city) if city is not None and "det_face" in d else Table((), ()),
         losses=loss_table(s),
         budget=row_table(
             [row | {"link": _link(row["link"])} for row in json.loads(d.attrs["link_budget"])]

@@ -36,6 +36,7 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
         off = np.array([np.nan if e is None else e[k] for e in errors])
         out[f"detected_{name}"] = truth + off
         follows = np.isin([0, 1], table[:, 4])
+        out[f"bound_{name}"] = np.where(seen, 0.001 * (k + 1), np.nan)
         out[f"tracked_{name}"] = np.where(follows, truth + 0.01 * (k + 1), np.nan)
     return out | more
 
@@ -60,6 +61,24 @@ def test_errors_of_each_uav_and_of_all():
     squares = [1e-4, 9e-4, 4e-4, 1e-2, 4e-4, 0.0]
     assert block["rmse"]["range_m"] == pytest.approx(np.sqrt(np.mean(squares)))
     assert block["matched"] == pytest.approx(6 / 10)
+
+
+def test_the_bound_is_of_the_frames_with_an_estimate():
+    """Five frames with a detection whose errors are normal with 1 mm and five with 4 mm: a
+    simulated mixture has the same median and 90 %. Frames without a detection, in which the bound
+    is 9 m, count nowhere; angles in degrees. Planted bugs: the mean of the deviations for the
+    mixture's; all frames in view."""
+    e = (0.0, 0.0, 0.0, 0.0)
+    rows = [
+        row(errors=(e, None), bound_range=np.array([s, 9.0])) for s in [0.001] * 5 + [0.004] * 5
+    ]
+    rows += [row(errors=(None, None), bound_range=np.array([9.0, 9.0]))]
+    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    drawn = np.abs(np.random.default_rng(3).normal(size=(2, 200_000)) * [[0.001], [0.004]])
+    assert one["bound_median"]["range_m"] == pytest.approx(np.median(drawn), rel=0.01)
+    assert one["bound_p90"]["range_m"] == pytest.approx(np.percentile(drawn, 90), rel=0.01)
+    assert one["bound_median"]["azimuth_deg"] == pytest.approx(0.6745 * np.degrees(0.003), rel=1e-3)
+    assert set(two["bound_p90"].values()) == {None}
 
 
 def test_counts_add_up():

@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
 import pytest
+import xarray as xr
 from fake_run import fake_run
 
-from isac_rt.views.report import false_table, gospa_table, loss_table, target_table
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.scenario.environment import City
+from isac_rt.views.report import (
+    error_table,
+    false_table,
+    gospa_table,
+    loss_table,
+    target_table,
+    wall_table,
+)
+from isac_rt.world.city import load_city
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +38,41 @@ def test_who_saw_what(summary):
     table = target_table(summary)
     at_pt = row(table, "AT to PT1", "U1")
     assert (at_pt["In view"], at_pt["Found"], at_pt["Tracked"]) == ("6", "5", "6")
-    assert at_pt["Range [m]"] == "0.064 / 0.064"
-    assert at_pt["Velocity [m/s]"] == "0.13 / 0.13"
+    errors = row(error_table(summary), "AT to PT1", "U1", "error")
+    assert errors["Range [m]"] == "0.064 / 0.064"
+    assert errors["Velocity [m/s]"] == "0.13 / 0.13"
+    # a normal error of 4 mm: 0.674 and 1.645 of it
+    bound = row(error_table(summary), "AT to PT1", "U1", "bound")
+    assert bound["Range [m]"] == "0.0027 / 0.0066"
     assert row(table, "AT to AT", "U1")["In view"] == "3"
     assert {r[1] for r in table.rows} == {"AT", "U1"}
+
+
+def test_walls_behind_what_was_seen():
+    """Three detections off the facade of a canyon that faces east, at x = -11, one of them a ghost
+    of the second UAV, one off the ground, one that nothing explains. Planted bugs: east and west;
+    the middle without the city's origin; detections without a face counted."""
+    node = City.model_validate({"source": "canyon", "street_width_m": 22, "block_size_m": 30})
+    city = load_city(node, ".", 77e9, (3.0, 40.0, 10.0))
+    middle = city.corners.mean(axis=1) + city.origin
+    facade = np.flatnonzero((np.abs(middle[:, 0] + 11) < 0.1) & (city.normals[:, 0] > 0.9))
+    level = np.flatnonzero((np.abs(middle[:, 2]) < 0.1) & (np.abs(city.normals[:, 2]) > 0.9))
+    kinds = [PathKind.DIFFUSE, PathKind.GHOST, PathKind.DIFFUSE, PathKind.DIFFUSE, -1]
+    d = xr.Dataset(
+        {
+            "det_face": ("detection", [facade[0], facade[0], facade[0], level[0], -1]),
+            "det_kind": ("detection", np.array(kinds)),
+            "det_target": ("detection", [-1, 1, -1, -1, -1]),
+        },
+        coords={"uav": ["A", "U7"]},
+    )
+    table = wall_table(d, city)
+    first, second = (dict(zip(table.columns, r, strict=True)) for r in table.rows)
+    assert first["Surface"].endswith("facing east") and second["Surface"].endswith("level")
+    assert (first["Diffuse"], first["Ghosts"], first["Mirror images"]) == ("2", "1", "0")
+    assert first["Ghosts of"] == "U7" and second["Ghosts of"] == ""
+    x, y, z = (float(v) for v in first["Middle [m]"].split(","))
+    np.testing.assert_allclose([x, y, z], middle[facade[0]], atol=0.5)
 
 
 def test_why_not(summary):
@@ -61,7 +104,7 @@ def test_summaries_of_earlier_versions_have_none(summary):
     for block in old["links"].values():
         for key in ("gospa", "false_tracks", "targets"):
             del block[key]
-    for table in (gospa_table, false_table, target_table, loss_table):
+    for table in (gospa_table, false_table, target_table, error_table, loss_table):
         assert not table(old).rows
 
 
@@ -74,8 +117,9 @@ def test_tables_fit_the_page(summary):
         block["false_tracks"] = dict.fromkeys(block["false_tracks"], 12.3456)
         for target in block["targets"].values():
             target["losses"] = dict.fromkeys(target["losses"], 1234)
-            target["median"] = target["p90"] = dict.fromkeys(target["median"], 0.00012345)
-    for table in (gospa_table, false_table, target_table, loss_table):
+            for key in ("median", "p90", "bound_median", "bound_p90"):
+                target[key] = dict.fromkeys(target[key], 0.00012345)
+    for table in (gospa_table, false_table, target_table, error_table, loss_table):
         found = table(full)
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
