@@ -29,10 +29,11 @@ from __future__ import annotations
 import copy
 import logging
 from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
-import sionna.rt as rt
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.field import ClutterField
@@ -61,8 +62,11 @@ from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter, Propagation
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.city.scene import shared_scene
+from isac_rt.world.city.scene import shared_scenes
 from isac_rt.world.swarm import Pose, Swarm
+
+if TYPE_CHECKING:
+    import sionna.rt as rt
 
 MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
@@ -89,10 +93,9 @@ class RayTracer:
         self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
         self._free, self._city, self._terminals = free, city, swarm.terminals
         _LOG.info("handing %s faces to the ray tracer", f"{city.num_faces:,}")
-        self._handle = shared_scene(city, carrier)
-        self._solver = rt.PathSolver(deterministic=True)
+        self._scenes = shared_scenes(city, carrier)
         self._normals, self._offsets = plane_of_each_face(city)
-        scene, wavelength = self._handle.scene.mi_scene, free.wavelength
+        scene, wavelength = self._scenes.faces, free.wavelength
         shadows = Shadows(scene)
         _LOG.info("finding the edges that cast shadows")
         self._edges = ShadowEdges(city, shadows, wavelength)
@@ -114,13 +117,16 @@ class RayTracer:
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin, knot_spacing)
             for name in (self._terminals if knot_spacing and depth else [])
         }
-        self._search = Search(self._handle, city, propagation.rays, depth, flights)
+        self._search = Search(self._scenes, city, propagation.rays, depth, flights)
         self._images = Images(city, shadows, wavelength, depth)
         self._solved_with: int | None = None
         self._clearance = Clearance(city)
-        self._handle.scene.tx_array = self._handle.scene.rx_array = rt.PlanarArray(
-            num_rows=1, num_cols=1, pattern="iso", polarization="V"
-        )
+
+    @cached_property
+    def _solver(self) -> rt.PathSolver:
+        import sionna.rt as rt
+
+        return rt.PathSolver(deterministic=True)
 
     def census(self) -> Census:
         """Scatterers and mirrors, as they were planned for the whole run."""
@@ -201,7 +207,12 @@ class RayTracer:
         ------
         ValueError  If there are so many paths that some may be missing.
         """
-        scene = self._handle.scene
+        import sionna.rt as rt
+
+        scene = self._scenes.solved.scene
+        scene.tx_array = scene.rx_array = rt.PlanarArray(
+            num_rows=1, num_cols=1, pattern="iso", polarization="V"
+        )
         for name in [*scene.transmitters, *scene.receivers]:
             scene.remove(name)
         for name, place in sources.items():
@@ -280,7 +291,7 @@ class RayTracer:
         if not shape[2]:
             empty = np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
             return amplitude, valid, *empty
-        faces = self._handle.face_index(np.asarray(found.objects), np.asarray(found.primitives))
+        faces = self._scenes.solved.face_index(np.asarray(found.objects), np.asarray(found.primitives))
         hit = np.asarray(found.interactions) != 0
         faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)
         points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)

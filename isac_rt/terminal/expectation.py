@@ -196,7 +196,7 @@ def make_expectation(
     from isac_rt import runtime
 
     runtime.activate()
-    from isac_rt.world.city.scene import shared_scene
+    from isac_rt.world.city.scene import shared_scenes
 
-    scene = shared_scene(city, waveform.carrier_frequency).scene.mi_scene
+    scene = shared_scenes(city, waveform.carrier_frequency).faces
     return MeshExpectation(clutter, swarm, city, scene, antennas, waveform.wavelength, seed)

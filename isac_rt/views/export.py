@@ -197,16 +197,16 @@ def path_lines(
 ) -> Iterator[np.ndarray]:
     """(N, 3) transmitter, points and receiver [m] of the strongest paths among rows of the
     ledger; leakage has no line."""
-    names = list(dataset.uav.values)
-    leaks = list(dataset.kind.values).index("leakage")
-    rows = rows[dataset.path_kind.values[rows] != leaks]
+    names, kind = list(dataset.uav.values), dataset.path_kind.values
+    frames, observers = dataset.path_frame.values, dataset.path_observer.values
+    places, along = dataset.uav_position.values, dataset.path_points.values
+    ends = [
+        [names.index(end) for end in dataset[side].values] for side in ("transmitter", "receiver")
+    ]
+    rows = rows[kind[rows] != list(dataset.kind.values).index("leakage")]
     for k in rows[np.argsort(-dataset.path_power_db.values[rows], kind="stable")][:most]:
-        frame, observer = int(dataset.path_frame[k]), int(dataset.path_observer[k])
-        tx, rx = (
-            dataset.uav_position.values[frame, names.index(dataset[end].values[observer])]
-            for end in ("transmitter", "receiver")
-        )
-        points = dataset.path_points.values[k]
+        tx, rx = (places[frames[k], end[observers[k]]] for end in ends)
+        points = along[k]
         yield np.vstack([tx, points[np.isfinite(points).all(axis=1)], rx])
 
 

@@ -297,10 +297,12 @@ def test_a_wall_in_the_way_hides_a_path_until_it_is_passed():
 
 
 def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path, monkeypatch):
-    """A second tracer of the same flight and city sends no ray and has the same chains; other rays,
-    another flight and another mesh are searched anew. Planted bug: a key without the places."""
+    """A second tracer of the same flight and city sends no ray, has no need of Sionna's scene and
+    has the same chains; other rays, another flight and another mesh are searched anew. Planted bug:
+    a key without the places."""
     from isac_rt.propagation.legs.chains import Search
     from isac_rt.storage import KEPT
+    from isac_rt.world.city import scene as scenes
 
     frames, s, city = streets
     few = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 500})})
@@ -319,9 +321,11 @@ def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path
     monkeypatch.setattr(Search, "_sent", lambda *at: sent.append(at) or search(*at))
     monkeypatch.setenv(KEPT, str(tmp_path))
     for again in (False, True):
+        monkeypatch.setattr(scenes, "_latest", None)
         found = chains(few, city)
         assert all(map(np.array_equal, found, plain))
         assert bool(sent) is not again
+        assert ("solved" in vars(scenes._latest)) is not again
     more = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 600})})
     taller = s.city.model_copy(update={"building_height_m": 14.5})
     other = load_city(taller, ".", F_C, (0.0, 0.0, 9.0))

@@ -182,3 +182,22 @@ def test_free_space_has_the_line_of_sight_alone():
     assert abs(gain).tolist() == pytest.approx(
         [299792458 / F_C / (4 * np.pi * distance)], rel=1e-5
     )  # float32
+
+
+def test_shadow_rays_meet_the_faces_that_sionnas_do():
+    """Of random rays in a street, those of the scene without materials are stopped as Sionna's are,
+    and the latter is made only when it is asked for. Seen failing with the roofs left out."""
+    from isac_rt.propagation.legs.rays import Shadows
+    from isac_rt.world.city import scene as scenes
+
+    city = load_city(
+        scenario.City(source="builtin", name="simple_street_canyon"), ".", F_C, (0, 0, 5.0)
+    )
+    made = scenes.CityScenes(city, F_C)
+    draw = np.random.default_rng(31)
+    low, high = city.corners.min(axis=(0, 1)), city.corners.max(axis=(0, 1))
+    starts, ends = draw.uniform(low, high + 3, (2, 4000, 3))
+    clear = Shadows(made.faces).clear(starts, ends)
+    assert "solved" not in vars(made)
+    assert 400 < clear.sum() < 3600
+    assert (clear == Shadows(made.solved.scene.mi_scene).clear(starts, ends)).all()

@@ -26,7 +26,7 @@ from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.rays import LIFT, rays
 from isac_rt.storage import kept
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.city.scene import SceneHandle
+from isac_rt.world.city.scene import CityScenes
 from isac_rt.world.swarm import Pose
 
 AROUND = 2
@@ -60,7 +60,7 @@ class Search:
 
     Parameters
     ----------
-    handle : the scene in which rays are sent
+    scenes : of the city; rays are sent in Sionna's
     city : CityMesh
     num_rays : per knot
     depth : most planes of a chain
@@ -70,13 +70,13 @@ class Search:
 
     def __init__(
         self,
-        handle: SceneHandle,
+        scenes: CityScenes,
         city: CityMesh,
         num_rays: int,
         depth: int,
         flights: Mapping[str, Flight],
     ) -> None:
-        self._handle, self._city = handle, city
+        self._scenes, self._city = scenes, city
         self._num_rays, self._depth, self._flights = num_rays, depth, flights
         self._normals = city.normals
         self._kept: dict[tuple[str, int], Chains] = {}
@@ -162,10 +162,11 @@ class Search:
         if not len(at):
             return np.zeros(0), np.zeros(0, np.int64)
         ray = rays(at, along, np.full(len(at), FAR))
-        hit = self._handle.scene.mi_scene.ray_intersect_preliminary(ray)
+        handle = self._scenes.solved
+        hit = handle.scene.mi_scene.ray_intersect_preliminary(ray)
         dr.eval(hit)  # once, not for each of its parts
         shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
-        face = self._handle.face_index(shape, np.asarray(hit.prim_index, np.int64))
+        face = handle.face_index(shape, np.asarray(hit.prim_index, np.int64))
         return np.asarray(hit.t, np.float64), face
 
 

@@ -1,21 +1,28 @@
-"""The city as a Sionna RT scene of our own making: one shape per material, so that every hit maps
-back to a face of the float64 mesh.
+"""The city as scenes of our own making, one shape per material: of faces alone for rays that ask
+what stands in their way, and with materials for Sionna RT, where every hit maps back to a face of
+the float64 mesh.
+
+Sionna RT takes longer to import than a frame to make, and runs that find their chains of walls in
+the store solve nothing: it is loaded by whoever asks for its scene.
 
 Import only after `isac_rt.runtime.activate()`: Sionna and Mitsuba start the JIT.
 """
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
-import sionna.rt as rt
 from numpy.typing import NDArray
 
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
+
+if TYPE_CHECKING:
+    import sionna.rt as rt
 
 NO_FACE = -1
 
@@ -48,17 +55,38 @@ class SceneHandle:
         return out
 
 
-_latest: tuple[weakref.ref[CityMesh], float, SceneHandle] | None = None
+@dataclass(frozen=True)
+class CityScenes:
+    """The scenes of a city, each made when it is first asked for."""
+
+    city: CityMesh
+    carrier_frequency: float
+
+    @cached_property
+    def faces(self) -> mi.Scene:
+        """The faces without materials, for shadow rays."""
+        chosen = _by_material(self.city)
+        shapes = {f"surface-{i}": _shape(self.city, f, f"surface-{i}") for i, f in chosen.items()}
+        return mi.load_dict({"type": "scene", **shapes})
+
+    @cached_property
+    def solved(self) -> SceneHandle:
+        """Sionna's, in which rays find chains of walls."""
+        return build_scene(self.city, self.carrier_frequency)
 
 
-def shared_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
-    """As `build_scene`, but the one built last is handed out again for the same city object, to
+_latest: CityScenes | None = None
+
+
+def shared_scenes(city: CityMesh, carrier_frequency: float) -> CityScenes:
+    """The scenes of a city; those made last are handed out again for the same city object, to
     tracers that place and clear away their own terminals: compilation is paid once in a worker that
     runs many points of a sweep."""
     global _latest
-    if _latest is None or _latest[0]() is not city or _latest[1] != carrier_frequency:
-        _latest = weakref.ref(city), carrier_frequency, build_scene(city, carrier_frequency)
-    return _latest[2]
+    found = _latest
+    if found is None or found.city is not city or found.carrier_frequency != carrier_frequency:
+        found = _latest = CityScenes(city, carrier_frequency)
+    return found
 
 
 def build_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
@@ -67,25 +95,31 @@ def build_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
     Materials carry their constants at the carrier, so that none can be undefined there; they are
     set before the frequency.
     """
+    import sionna.rt as rt
+
     scene = rt.load_scene()
     shapes, faces = [], []
-    for index, material in enumerate(city.materials):
-        chosen = np.flatnonzero(city.face_material == index)
-        if chosen.size:
-            name = f"surface-{index}"
-            shapes.append(
-                rt.SceneObject(
-                    mi_mesh=_shape(city, chosen, name),
-                    name=name,
-                    radio_material=_radio(material, name),
-                )
+    for index, chosen in _by_material(city).items():
+        name = f"surface-{index}"
+        shapes.append(
+            rt.SceneObject(
+                mi_mesh=_shape(city, chosen, name),
+                name=name,
+                radio_material=_radio(city.materials[index], name),
             )
-            faces.append(chosen)
+        )
+        faces.append(chosen)
     if shapes:
         scene.edit(add=shapes)
     scene.frequency = carrier_frequency
     numbers = [int(np.asarray(shape.object_id).ravel()[0]) for shape in shapes]
     return SceneHandle(scene, dict(zip(numbers, faces, strict=True)))
+
+
+def _by_material(city: CityMesh) -> dict[int, NDArray[np.int64]]:
+    """The faces of every material that has any."""
+    found = {i: np.flatnonzero(city.face_material == i) for i in range(len(city.materials))}
+    return {index: chosen for index, chosen in found.items() if chosen.size}
 
 
 def _shape(city: CityMesh, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
@@ -99,6 +133,8 @@ def _shape(city: CityMesh, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
 
 
 def _radio(material: Material, name: str) -> rt.RadioMaterial:
+    import sionna.rt as rt
+
     pattern: dict[str, float] = {}
     if material.scattering_pattern != "lambertian":
         pattern["alpha_r"] = material.pattern_exponent
