@@ -291,7 +291,9 @@ class RayTracer:
         if not shape[2]:
             empty = np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
             return amplitude, valid, *empty
-        faces = self._scenes.solved.face_index(np.asarray(found.objects), np.asarray(found.primitives))
+        faces = self._scenes.solved.face_index(
+            np.asarray(found.objects), np.asarray(found.primitives)
+        )
         hit = np.asarray(found.interactions) != 0
         faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)
         points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
