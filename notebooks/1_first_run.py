@@ -45,12 +45,19 @@ frame = setup.frame(4)
 frame.paths["AT", "PT1"]
 
 # %% [markdown]
-# What the active terminal sends, what it receives of its own chirps, and what it makes of them:
+# What the active terminal sends, what it receives of its own chirps, and what it makes of them, with
+# the clutter that it expects of the city:
 
 # %%
 cube = frame.samples(("AT", "AT"))
 cube
 
 # %%
-reception = irt.receive_active(cube, frame.sent["AT"].payload, setup.antennas, scenario.receivers)
+reception = irt.receive_active(
+    cube,
+    frame.sent["AT"].payload,
+    setup.antennas,
+    scenario.receivers,
+    clutter=frame.expected["AT"],
+)
 reception.detections

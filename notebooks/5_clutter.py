@@ -24,7 +24,7 @@ frames = {}
 for model in ("rayleigh", "field"):
     scenario = irt.load(
         "../scenes/street_canyon.yaml",
-        [f"clutter.model={model}", "modulation.acquisition_frames=1"],
+        [f"clutter.model={model}", "modulation.acquisition_frames=1", "receiver_preset=plain"],
         frames=2,
     )
     setup = irt.prepare(scenario)
@@ -78,7 +78,7 @@ def profile(paths, waveform):
 for model in ("diffuse", "field"):
     scenario = irt.load(
         "../scenes/street_canyon.yaml",
-        [f"clutter.model={model}", "frame_interval_s=0.008"],
+        [f"clutter.model={model}", "frame_interval_s=0.008", "receiver_preset=plain"],
         frames=4,
     )
     setup = irt.prepare(scenario)

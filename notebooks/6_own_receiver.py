@@ -41,7 +41,7 @@ def terminal(setup, link):
 
 scenario = irt.load(
     "../scenes/street_canyon.yaml",
-    ["clutter.model=none", "modulation.acquisition_frames=1"],
+    ["clutter.model=none", "modulation.acquisition_frames=1", "receiver_preset=plain"],
     frames=4,
 )
 for name, receiver in (("standard", irt.standard_terminal), ("cautious", terminal)):

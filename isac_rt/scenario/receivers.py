@@ -252,7 +252,23 @@ def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict
     said = PRESETS.get(named, {}) if isinstance(named, str) else {}
     out = dict(stated)
     for key in ("receivers", "tracking"):
-        parts = [own.get(key), said.get(key), stated.get(key, {})]
-        if isinstance(parts[-1], dict):
-            out[key] = {k: v for p in parts if isinstance(p, dict) for k, v in p.items()}
+        mine = stated.get(key, {})
+        if isinstance(mine, dict):
+            parts = [p for p in (own.get(key), said.get(key)) if isinstance(p, dict)]
+            filled = {k: v for part in parts for k, v in part.items()} | mine
+            out[key] = filled if key == "tracking" else _without_idle(filled, mine)
     return out
+
+
+def _without_idle(filled: dict[str, Any], stated: dict[str, Any]) -> dict[str, Any]:
+    """Settings of receivers without those that nobody stated and that have no meaning beside what
+    was."""
+    idle = {
+        key
+        for key, (other, values) in COUNTS_WITH.items()
+        if other in stated and stated[other] not in values
+    }
+    start, usual = filled.get("false_alarm_rate"), filled.get("update_false_alarm_rate")
+    if isinstance(start, int | float) and isinstance(usual, int | float) and usual < start:
+        idle.add("update_false_alarm_rate")
+    return {k: v for k, v in filled.items() if k in stated or k not in idle}

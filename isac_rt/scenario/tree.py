@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from isac_rt.scenario.environment import Accuracy, Belief, City, Clutter, Propagation
 from isac_rt.scenario.front_end import Elements, FrontEnd
@@ -76,7 +76,8 @@ class Scenario(Node):
     receiver_preset: Preset | None = None
     """Settings of `receivers` and `tracking` by name, which the keys stated there override.
     `paper`: the paper's to the letter. `plain`: better estimates, no knowledge of the city. `city`:
-    the mesh and the own motion tell clutter from targets. null, the default: `plain`."""
+    the mesh and the own motion tell clutter from targets. null, the default: `city` where paths are
+    traced in a city and the arrays are the paper's L, else `plain`."""
     receivers: Receivers = Receivers()
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
@@ -99,7 +100,8 @@ class Scenario(Node):
         """Fill in what a sensor and presets say, and what the sets to compare take over."""
         if not isinstance(data, dict):
             return data
-        out = with_preset(with_sensor(data), data.get("receiver_preset"), {})
+        out = with_sensor(data)
+        out = with_preset(out, out.get("receiver_preset") or _usual_preset(out), {})
         if isinstance(out.get("swarm"), dict):
             out["swarm"] = unfolded(out["swarm"])
         own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
@@ -535,6 +537,22 @@ class Scenario(Node):
         traced = self.propagation.model == "ray_traced" and self.city is not None
         by_beams = traced and any(one.passive_detector == "beams" for one in sets)
         return by_beams or any(one.needs_mesh for one in sets)
+
+
+def _usual_preset(data: dict[str, Any]) -> Preset:
+    """The preset of a file that states none. What is malformed is `plain`, for whoever checks
+    it."""
+    city, model, mode, array = (
+        _plain(data.get(k)) for k in ("city", "propagation", "radio", "array")
+    )
+    traced = isinstance(model, dict) and model.get("model") == "ray_traced"
+    isac = not isinstance(mode, dict) or mode.get("mode", "isac") == "isac"
+    if city is None or not traced or not isac:
+        return "plain"
+    try:
+        return "city" if Array.model_validate(array or {}).is_full_l else "plain"
+    except ValidationError:
+        return "plain"
 
 
 def _plain(value: Any) -> Any:

@@ -38,6 +38,7 @@ def swarm_over(a, p, u, **changes) -> scenario.Scenario:
     }
     tree = {
         "swarm": uavs,
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {

@@ -62,6 +62,7 @@ def flown(name: str, per_metre: float):
                 "A": {"role": "active", "position_m": list(a), "velocity_mps": list(v)},
                 "P": {"role": "passive", "position_m": list(p), "velocity_mps": list(w)},
             },
+            "receiver_preset": "plain",
             "city": {"street": STREET, "quarter": QUARTER}.get(
                 name, {"source": "builtin", "name": name}
             ),

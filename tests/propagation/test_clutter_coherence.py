@@ -49,6 +49,7 @@ def flown(waypoints, model="field", **clutter):
     tree = {
         "frames": round(waypoints[-1][0] / 7.7824e-3),
         "swarm": {"A": {"role": "active", "waypoints": w0}},
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},

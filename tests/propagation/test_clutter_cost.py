@@ -35,6 +35,7 @@ def tracer(city, **clutter):
                     "boresight": [1, -0.1, 0],
                 }
             },
+            "receiver_preset": "plain",
             "city": {"source": "builtin", "name": "munich"},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
             "clutter": clutter,

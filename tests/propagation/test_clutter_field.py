@@ -271,6 +271,7 @@ def flown(
                 "boresight": [0, 1, 0],
             },
         },
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
@@ -461,6 +462,7 @@ def expectation(
                 "boresight": [0.6, 0.8, 0],
             }
         },
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": pattern, "element_gain_dbi": gain_dbi},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},

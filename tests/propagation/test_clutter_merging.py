@@ -169,6 +169,7 @@ def swarm_tree(**changes) -> dict:
             name: {"role": role, "position_m": places[name][0], "velocity_mps": places[name][1]}
             for name, role in (("A", "active"), ("P", "passive"))
         },
+        "receiver_preset": "plain",
         "city": {"source": "canyon", **STREET},
         "propagation": {"model": "ray_traced", "max_bounces": 0},
         "clutter": {"model": "field"},

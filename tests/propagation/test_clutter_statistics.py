@@ -29,6 +29,7 @@ def flown(flight: dict, seed: int = 3):
             "seed": seed,
             "frames": 26,
             "swarm": {"A": {"role": "active", **flight}},
+            "receiver_preset": "plain",
             "city": {"source": "canyon"},
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},

@@ -360,6 +360,7 @@ def crossing() -> Scenario:
         {
             "frames": 60,
             "frame_interval_s": 0.02,
+            "receiver_preset": "plain",
             "city": {
                 "source": "canyon",
                 "street_width_m": 22,

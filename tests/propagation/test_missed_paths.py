@@ -18,7 +18,9 @@ SCENES = Path(__file__).parents[2] / "scenes"
 
 
 def ready(scene: str, *overrides: str) -> Setup:
-    return prepare(load(SCENES / f"{scene}.yaml", ["clutter.model=none", *overrides]))
+    return prepare(
+        load(SCENES / f"{scene}.yaml", ["clutter.model=none", "receiver_preset=plain", *overrides])
+    )
 
 
 def strongest_missed(setup: Setup, frames: list[int], rays: int) -> float:

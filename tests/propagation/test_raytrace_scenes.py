@@ -57,6 +57,7 @@ def tracer(mesh: CityMesh, bounces: int = 2, **changes):
             "P": {"role": "passive", "position_m": [1, 0, 0], "rcs": rcs},
             "U": {"role": "target", "position_m": [2, 0, 0], "rcs": rcs},
         },
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {

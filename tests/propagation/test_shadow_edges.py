@@ -45,6 +45,7 @@ def tracer(city: CityMesh, **radii):
     s = scenario.Scenario.model_validate(
         {
             "swarm": uavs,
+            "receiver_preset": "plain",
             "city": {"source": "canyon"},
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},

@@ -325,6 +325,7 @@ def street(material: str):
                     "velocity_mps": [0.7, -4.1, 0.3],
                 },
             },
+            "receiver_preset": "plain",
             "city": STREET
             | {f"{part}_material": material for part in ("wall", "roof", "ground")}
             | {"materials": {material: {"scattering_coefficient": 0.41}}},
@@ -464,6 +465,7 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
         {
             "frames": round(STREETS[name][-1][0] / 7.7824e-3),
             "swarm": {"A": {"role": "active", "waypoints": w0}},
+            "receiver_preset": "plain",
             "city": {"source": "canyon"},
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
@@ -540,6 +542,7 @@ def test_what_a_terminal_expects_of_mirrors():
     tree = {
         "frames": 40,
         "swarm": {"A": {"role": "active", "position_m": [0.3, -1.1, 0.9]}},
+        "receiver_preset": "plain",
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},

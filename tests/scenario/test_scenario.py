@@ -575,3 +575,39 @@ def test_presets_fill_in_what_is_not_stated(tmp_path):
     assert b.tracking.confirm_window == 9
     file.write_text(to_yaml(s))
     assert load(file) == s
+
+
+def test_the_city_preset_is_the_default_where_paths_are_traced_in_a_city(tmp_path):
+    """And nowhere else: open space, free space, plain radars and other arrays keep `plain`; what a
+    file states of a detector takes the preset's keys along that mean nothing beside it. Planted
+    bugs: the preset by the city alone; the rates of the preset left beside a stated detector."""
+    traced = BASE + "city: {source: canyon}\npropagation: {model: ray_traced}\n"
+
+    def read(text: str) -> Scenario:
+        (tmp_path / "s.yaml").write_text(text)
+        return load(tmp_path / "s.yaml")
+
+    found = read(traced)
+    assert found.receivers.passive_detector == "beams"
+    assert found.receivers.false_alarm_rates == (1e-4, 1e-6)
+    assert found.tracking.births == "unexplained"
+    others = (
+        BASE,
+        BASE + "city: {source: canyon}\n",
+        traced + "receiver_preset: plain\n",
+        traced + "array: {rx_z: 1}\n",
+    )
+    for text in others:
+        kept = read(text)
+        assert kept.receivers.clutter_detector == "cfar", text
+        assert kept.tracking.births == "all", text
+    stated = read(traced + "receivers: {clutter_detector: cfar}\n").receivers
+    assert stated.update_false_alarm_rate is None
+    assert stated.passive_detector == "beams"
+    assert read(traced + "receivers: {false_alarm_rate: 1.0e-3}\n").receivers.false_alarm_rates == (
+        1e-3,
+        1e-3,
+    )
+    again = tmp_path / "again.yaml"
+    again.write_text(to_yaml(read(traced + "receiver_preset: plain\n")))
+    assert load(again).receivers == read(traced + "receiver_preset: plain\n").receivers

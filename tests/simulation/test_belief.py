@@ -86,7 +86,6 @@ def test_a_terminal_does_not_believe_its_mesh_against_the_samples(monkeypatch):
     frame. 0.4 false tracks a frame were measured, 30 with the memory of still echoes switched
     off."""
     said = [
-        "receiver_preset=city",
         "clutter={model: field}",
         "modulation={acquisition_frames: 1, pilot_every_frames: null}",
         "belief.missing_m=[[10, -100, 60, 100]]",

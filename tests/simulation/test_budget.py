@@ -90,6 +90,7 @@ def town(seed: int) -> Scenario:
         "seed": seed,
         "frames": 24,
         "frame_interval_s": 0.031,
+        "receiver_preset": "plain",
         "city": {
             "source": "blocks",
             "street_width_m": width,

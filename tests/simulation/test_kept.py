@@ -30,6 +30,7 @@ TREE = {
         "AT": {"role": "active", "position_m": [-58.3, -8.4, 27.2], "velocity_mps": [5.3, -0.6, 0]},
         "PT1": {"role": "passive", "position_m": [4.6, -13.1, 30.4], "boresight": [-1, 0, 0]},
     },
+    "receiver_preset": "plain",
     "city": {"source": "footprints", "file": "quarter.geojson", "wall_material": "brick"},
     "propagation": {"model": "ray_traced", "max_bounces": 0},
     "clutter": {"model": "field", "max_error_db": 1.0},

@@ -40,6 +40,7 @@ def district(seed: int, **changes: Any) -> Scenario:
         "frame_interval_s": 0.4,
         "radio": SHORT,
         "modulation": {"acquisition_frames": 1},
+        "receiver_preset": "plain",
         "city": {
             "source": "blocks",
             "street_width_m": float(rng.uniform(14, 24)),

@@ -66,7 +66,7 @@ def scenarios():
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
         "canyon": lambda: load(
             SCENES / "street_canyon.yaml",
-            ["modulation.acquisition_frames=1", "receiver_preset=city"],
+            ["modulation.acquisition_frames=1"],
             frames=3,
         ),
     }

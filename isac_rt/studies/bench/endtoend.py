@@ -36,6 +36,8 @@ PRESETS = ("fastest", "budget", "everything")
 FRAMES = (4, 8, 16)
 ERRORS_DB = (1.0, 0.5, 0.2, 0.1)
 TRUTH_DB = 0.05
+QUICK = "clutter.rays=300", "receiver_preset=plain"
+"""What is measured is synthesis; receivers that hold echoes against the mesh would cover it."""
 ROWS = 16
 """Range rows to a cell of 4 m at the active terminal."""
 JOB = "street_canyon.yaml, clutter.rays 300, run without set-up"
@@ -101,7 +103,11 @@ def densities(quick: bool, floor: float) -> list[dict[str, object]]:
 def _of_density(max_error_db: float, quick: bool) -> tuple[dict[Link, Any], float, int]:
     """By link what all scatterers and what merged ones give in each cell; seconds per frame of a
     run; the links' scatterers."""
-    changes = ["clutter.model=field", f"clutter.max_error_db={max_error_db:g}"]
+    changes = [
+        "receiver_preset=plain",
+        "clutter.model=field",
+        f"clutter.max_error_db={max_error_db:g}",
+    ]
     s = load(scene_file("street_canyon.yaml"), [f"frames={FRAMES[0]}", *changes])
     setup = prepare(s)
     tracer, frame = tracer_of(setup), setup.frame(FRAMES[0] // 2)
@@ -125,7 +131,7 @@ def scenario(preset: str, frames: int) -> Scenario:
     """The scene under a preset."""
     return load(
         scene_file("street_canyon.yaml"),
-        [f"accuracy.preset={preset}", f"frames={frames}", "clutter.rays=300"],
+        [f"accuracy.preset={preset}", f"frames={frames}", *QUICK],
     )
 
 

@@ -47,6 +47,7 @@ def town(uavs: int = 3, blocks: int = 2, frames: int = 9, **changes: Any) -> Sce
         "seed": 3,
         "frames": frames,
         "frame_interval_s": 0.03,
+        "receiver_preset": "plain",
         "city": {
             "source": "blocks",
             "street_width_m": 19.0,

@@ -108,6 +108,7 @@ def scenario(
             "frames": 4,
             "swarm": uavs,
             "array": {"element_gain_dbi": 10.0},
+            "receiver_preset": "plain",
             "city": {"source": "builtin", "name": "munich", "keep_radius_m": 110.0},
             "propagation": {"model": "ray_traced", "max_bounces": 1, "leakage": {"enabled": False}},
             "clutter": {

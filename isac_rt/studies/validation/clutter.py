@@ -66,6 +66,7 @@ FAINT: dict[str, Any] = {
             "velocity_mps": (0.7, -4.1, 0.3),
         },
     },
+    "receiver_preset": "plain",
     "city": {
         "source": "canyon",
         "street_width_m": 21.3,
@@ -92,6 +93,7 @@ class Flight:
             "seed": seed,
             "frames": max(round(waypoints[-1][0] / FRAME), 4),
             "swarm": {"A": {"role": "active", "waypoints": way}},
+            "receiver_preset": "plain",
             "city": CROSSING,
             "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
             "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
@@ -126,6 +128,7 @@ def _crossing() -> CityMesh:
     s = Scenario.model_validate(
         {
             "swarm": {"A": {"role": "active", "position_m": [0, 0, 5]}},
+            "receiver_preset": "plain",
             "city": CROSSING,
             "propagation": {"model": "ray_traced"},
         }
@@ -384,6 +387,7 @@ def mean_power_of_a_street() -> float:
                 n: {"role": r, "position_m": way[n][0], "velocity_mps": way[n][1]}
                 for n, r in (("A", "active"), ("P", "passive"))
             },
+            "receiver_preset": "plain",
             "city": {
                 "source": "canyon",
                 "street_width_m": 29.3,

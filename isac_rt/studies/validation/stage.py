@@ -63,6 +63,7 @@ def scenario(traced: bool = True, **changes: Any) -> Scenario:
     }
     if traced:
         tree |= {
+            "receiver_preset": "plain",
             "city": {"source": "canyon"},
             "propagation": {"model": "ray_traced", "leakage": {"enabled": False}},
         }
