@@ -45,7 +45,7 @@ frame = setup.frame(4)
 frame.paths["AT", "PT1"]
 
 # %% [markdown]
-# What the active terminal sends, what it receives of its own chirps, and what it makes of them, with
+# What the active terminal sends, what it receives of its own chirps, what it makes of them, with
 # the clutter that it expects of the city:
 
 # %%
