@@ -408,23 +408,29 @@ def export(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the files go; default DIR/export.")
     ] = None,
-    frame: FrameNumber = 0,
+    frame: Annotated[
+        int | None, typer.Option(min=0, help="Of which frame, for sigmf; default the first.")
+    ] = None,
     link: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Whose samples; default the first.")
+        str | None,
+        typer.Option(metavar="NAME", help="Whose samples, for sigmf; default the first."),
     ] = None,
 ) -> None:
     """Write a run for other programs; IF samples are made anew from the run's scenario."""
     from isac_rt.results.files import open_results
+    from isac_rt.views import export as exports
+
+    check_names([form], [*exports.FORMATS, "sigmf"], "format")
+    if form != "sigmf" and (frame is not None or link is not None):
+        raise InputProblem("--frame and --link are of --as sigmf; leave them out")
 
     results = open_results(folder)
     target = out if out is not None else folder / "export"
     with ending_soon_after_interrupt(target), working("exporting"):
         from isac_rt.simulation.setup import city_of
-        from isac_rt.views import export as exports
 
-        check_names([form], [*exports.FORMATS, "sigmf"], "format")
         if form == "sigmf":
-            files = _sigmf(results, frame, link, target)
+            files = _sigmf(results, frame or 0, link, target)
         else:
             files = exports.write(results, form, target, lambda: city_of(results.scenario))
     for file in files:

@@ -92,8 +92,8 @@ def starter_text(name: str, city: str = _CANYON, site: Site | None = None) -> st
 
 
 def write_starter(file: str | Path, own: OwnCity | None = None) -> list[Path]:
-    """Write the scenario, and beside it the schema that it names; neither replaces a scenario that
-    is there.
+    """Write the scenario, and beside it the schema that it names. No scenario that is there is
+    replaced, and no picture where `write_picture` will draw one.
 
     Returns
     -------
@@ -101,13 +101,14 @@ def write_starter(file: str | Path, own: OwnCity | None = None) -> list[Path]:
 
     Raises
     ------
-    ResultsError  If the scenario is there already.
+    ResultsError  If the scenario or the picture is there already.
     isac_rt.storage.StorageError  If it cannot be written.
     isac_rt.world.city.CityError  If the footprints are not what they should be.
     """
     file = Path(file)
-    if file.exists():
-        raise ResultsError(f"{file} is there already; choose another name or remove it")
+    for made in (file, *([] if own is None else [file.with_suffix(".png")])):
+        if made.exists():
+            raise ResultsError(f"{made} is there already; choose another name or remove it")
     write_whole(file, starter_text(file.stem) if own is None else _over(own, file))
     write_whole(file.with_name(SCHEMA), schema_text())
     return [file, file.with_name(SCHEMA)]

@@ -253,11 +253,14 @@ class DataPlan:
             check_passage(swarm_of(scenario), _timetable(scenario), city_of(whole))
 
     def points(self) -> Iterator[Point]:
-        """The scenes as points of a sweep; what is kept of them is part of their key."""
+        """The scenes as points of a sweep; their number, by which their shard and its samples are
+        named, and what is kept of them are part of their key."""
         files = files_under(self.base.folder)
         for number, scene in enumerate(self.scenes):
             ground = ground_by(scene.tree, files)
-            content = json.dumps([scene.tree, ground, self.data.keep, scene.split], sort_keys=True)
+            content = json.dumps(
+                [number, scene.tree, ground, self.data.keep, scene.split], sort_keys=True
+            )
             key = hashlib.sha256(content.encode()).hexdigest()[:32]
             yield Point((number,), scene.tree, ground, key, None)
 

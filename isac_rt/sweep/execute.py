@@ -319,7 +319,8 @@ def run_sweep(
     if not todo:
         return
     with connected(workers, scheduler) as client:
-        run_points(plan, outcomes, client, _job, total - todo, retry_failed, progress)
+        missing = pending(plan, outcomes, retry_failed)
+        run_points(plan, outcomes, client, _job, missing, total - todo, retry_failed, progress)
 
 
 def _job(point: Point, **fields: Any) -> Job:
@@ -331,6 +332,7 @@ def run_points(
     outcomes: Outcomes,
     client: Any,
     job: Callable[..., Job],
+    missing: Iterator[Point],
     done: int,
     retry_failed: bool = False,
     progress: Progress | None = None,
@@ -340,13 +342,14 @@ def run_points(
     Parameters
     ----------
     job : makes what a worker gets of a point; called with the point and the fields of `Job`
+    missing : points that are to be run
     done : points that are done already
 
     Raises
     ------
     PointsLeft, SchedulerLost  As `run_sweep`.
     """
-    _Runner(plan, outcomes, client, job, done, retry_failed, progress).run()
+    _Runner(plan, outcomes, client, job, done, retry_failed, progress).run(missing)
 
 
 class _Runner:
@@ -384,9 +387,9 @@ class _Runner:
         self._troubled: set[str] = set()
         self._numbers = count()
 
-    def run(self) -> None:
-        """Until every point is done, failed or left."""
-        self._pass(pending(self._plan, self._outcomes, self._retry_failed))
+    def run(self, missing: Iterator[Point]) -> None:
+        """Until every missing point is done, failed or left."""
+        self._pass(missing)
         if self._left and not self._stuck:
             again, self._left, self._in_a_row = self._left, {}, 0
             self._pass(iter([point for point, _ in again.values()]))

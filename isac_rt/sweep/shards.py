@@ -14,7 +14,7 @@ import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -161,6 +161,7 @@ class Samples:
             )
         shards: Mapping[str, int] = card["splits"][split]
         self._shards, self._ends = [*shards], np.cumsum([*shards.values()], dtype=int).tolist()
+        self._indices: dict[str, Index] = {}
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -171,7 +172,10 @@ class Samples:
             raise IndexError(f"sample {number} of {len(self)}")
         k = bisect.bisect_right(self._ends, number)
         within = number - (self._ends[k - 1] if k else 0)
-        return read_sample(self.folder / self._shards[k], within, self.keep)
+        name = self._shards[k]
+        if name not in self._indices:
+            self._indices[name] = index_of(self.folder / name)
+        return read_sample(self.folder / name, self._indices[name], within, self.keep)
 
 
 def read_card(folder: Path) -> dict[str, Any]:
@@ -194,7 +198,52 @@ def read_card(folder: Path) -> dict[str, Any]:
     return dict(card)
 
 
-def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> dict[str, Any]:
+class _File(NamedTuple):
+    """A file of a shard: its name after the first dot, and where its bytes are."""
+
+    ending: str
+    start: int
+    size: int
+
+
+Index = dict[str, list[_File]]
+"""The files of each sample of a shard, by its name."""
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    MemoryError,
+    SyntaxError,
+    TokenError,
+    tarfile.TarError,
+    *BAD_DATA,
+)
+
+
+def index_of(shard: Path) -> Index:
+    """What a shard holds, from the headers of its files.
+
+    Raises
+    ------
+    ResultsError  If it cannot be read.
+    """
+    found: Index = {}
+    try:
+        with tarfile.open(shard, "r:") as tar:  # not packed: what is read is as large as the file
+            for member in tar:
+                if member.issparse():
+                    raise ValueError("a file in it has holes")
+                stem, _, ending = member.name.partition(".")
+                files = found.setdefault(stem, [])
+                if member.isreg():
+                    files.append(_File(ending, member.offset_data, member.size))
+    except _UNREADABLE as problem:
+        raise _unreadable(shard, problem) from problem
+    return found
+
+
+def read_sample(
+    shard: Path, index: Index, number: int, keep: Sequence[str] | None = None
+) -> dict[str, Any]:
     """A sample of a shard: `key`, `truth`, and the arrays by name.
 
     Raises
@@ -202,34 +251,27 @@ def read_sample(shard: Path, number: int, keep: Sequence[str] | None = None) -> 
     ResultsError  If it cannot be read.
     """
     try:
-        with tarfile.open(shard, "r:") as tar:  # not packed: what is read is as large as the file
-            members = tar.getmembers()
-            if any(member.issparse() for member in members):
-                raise ValueError("a file in it has holes")
-            names = list(dict.fromkeys(m.name.split(".")[0] for m in members))
-            out: dict[str, Any] = {"key": names[number]}
-            for member in members:
-                stem, _, ending = member.name.partition(".")
+        key = [*index][number]
+        out: dict[str, Any] = {"key": key}
+        with shard.open("rb") as opened:
+            for ending, start, size in index[key]:
                 name = ending.removesuffix(".npy")
-                opened = tar.extractfile(member) if stem == names[number] else None
-                if opened is None:
+                if ending != "json" and keep is not None and name not in keep:
                     continue
+                opened.seek(start)
+                content = opened.read(size)
+                if len(content) < size:
+                    raise EOFError(f"{ending} ends early")
                 if ending == "json":
-                    out["truth"] = json.load(opened)
-                elif keep is None or name in keep:
-                    out[name] = np.load(io.BytesIO(opened.read()), allow_pickle=False)
-                    if not isinstance(out[name], np.ndarray):
-                        raise ValueError(f"{ending} is no array")
-    except (
-        OSError,
-        EOFError,
-        MemoryError,
-        SyntaxError,
-        TokenError,
-        tarfile.TarError,
-        *BAD_DATA,
-    ) as problem:
-        raise ResultsError(
-            f"{shard} cannot be read ({shortly(problem)}); make the data set again"
-        ) from problem
+                    out["truth"] = json.loads(content)
+                    continue
+                out[name] = np.load(io.BytesIO(content), allow_pickle=False)
+                if not isinstance(out[name], np.ndarray):
+                    raise ValueError(f"{ending} is no array")
+    except _UNREADABLE as problem:
+        raise _unreadable(shard, problem) from problem
     return out
+
+
+def _unreadable(shard: Path, problem: BaseException) -> ResultsError:
+    return ResultsError(f"{shard} cannot be read ({shortly(problem)}); make the data set again")

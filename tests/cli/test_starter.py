@@ -85,6 +85,17 @@ def begun(make, folder: Path) -> Scenario:
         return load(file)
 
 
+def test_no_picture_is_written_over(tmp_path, capsys):
+    """A picture of the scenario's name: nothing is written, and the message names it. Planted bug:
+    the picture looked for after the scenario is there."""
+    (tmp_path / "holiday.png").write_bytes(b"mine")
+    file = tmp_path / "holiday.yaml"
+    assert main(["new", str(file), "--footprints", str(QUARTER)]) == 2
+    assert "holiday.png is there already" in capsys.readouterr().err
+    assert [f.name for f in tmp_path.iterdir()] == ["holiday.png"]
+    assert (tmp_path / "holiday.png").read_bytes() == b"mine"
+
+
 def test_a_path_may_have_any_letters(tmp_path):
     """Planted bug: the path written as JSON, whose pairs of surrogates YAML does not join."""
     folder = tmp_path / 'ü\U0001f600 #: "q'

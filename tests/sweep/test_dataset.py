@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
 import io
 import json
 import tarfile
@@ -20,7 +21,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.sweep import Samples, load_dataset
 from isac_rt.sweep.execute import run_job
-from isac_rt.sweep.make_dataset import SceneJob, Shards, _write_card
+from isac_rt.sweep.make_dataset import SceneJob, Shards, _write_card, run_dataset
 from isac_rt.sweep.outcomes import pending
 from isac_rt.sweep.shards import tar_of
 
@@ -257,6 +258,30 @@ def test_a_shard_that_is_not_whole_is_made_anew(folder):
     assert all(m.isreg() for m in tarfile.open(file).getmembers())
     outcome = shards.read(jobs[0].key)
     assert outcome is not None and outcome["status"] == "done"
+
+
+def test_shards_are_looked_at_once(folder, monkeypatch):
+    """Headers of a shard once for all samples of it, its bytes once for a call that has nothing to
+    make. Planted bugs: the index made for every sample; the card with a look at every shard."""
+    plan, out = plan_of(folder, STAY.replace("samples, ", "")), folder / "out"
+    for job in jobs_of(plan, out):
+        run_job(job)
+    hashed, opened, digest, open_tar = [], [], hashlib.file_digest, tarfile.open
+    monkeypatch.setattr(hashlib, "file_digest", lambda *a: hashed.append(a) or digest(*a))
+    run_dataset(plan, out)
+    assert len(hashed) == 2
+    monkeypatch.setattr(tarfile, "open", lambda *a: opened.append(a) or open_tar(*a))
+    samples = Samples(out, "train")
+    assert len({samples[k]["key"] for k in [5, *range(6)]}) == 6
+    assert len(opened) == 1
+
+
+def test_two_scenes_never_have_one_key(folder):
+    """Also where they are the same: each has a shard of its own."""
+    plan = plan_of(folder, STAY)
+    vars(plan)["scenes"] = [plan.scenes[0]] * 2
+    first, second = plan.points()
+    assert first.tree == second.tree and first.key != second.key
 
 
 def test_a_folder_that_is_none_is_one_message(tmp_path):

@@ -129,5 +129,8 @@ def test_the_command_says_what_it_wrote(run, tmp_path, capsys, monkeypatch):
     assert "xls: no such format; choose from csv" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "run"), "--as", "sigmf", "--link", "PT9"]) == 2
     monkeypatch.setitem(sys.modules, "stonesoup", None)
+    for option in (["--frame", "1"], ["--link", "AT->PT1"]):
+        assert main(["export", str(tmp_path / "run"), "--as", "csv", *option]) == 2
+        assert "are of --as sigmf" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "run"), "--as", "stonesoup"]) == 2
     assert "pip install 'isac_rt[interchange]'" in capsys.readouterr().err
