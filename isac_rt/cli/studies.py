@@ -25,6 +25,9 @@ def reproduce(
         typer.Option(metavar="DIR", help="Where the files go; default runs/reproduction/NAME."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 20260,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="Flights of each place, for city.")
+    ] = None,
 ) -> None:
     """Run the paper's tables, figures and claims again and judge them."""
     from isac_rt.studies.paper import TITLES
@@ -35,21 +38,24 @@ def reproduce(
         say_table(("name", "what it shows"), rows, numbers=False)
         return
     check_names(names, experiments(), "table or figure")
+    if seeds is not None and set(names) != {"city"}:
+        raise InputProblem("--seeds goes with city alone; leave it out for other experiments")
     for name in dict.fromkeys(names):
         folder = out if out is not None else Path("runs") / "reproduction" / name
         with ending_soon_after_interrupt(folder):
-            _reproduce(name, folder, quick, seed)
+            _reproduce(name, folder, quick, seed, seeds)
 
 
-def _reproduce(name: str, folder: Path, quick: bool, seed: int) -> None:
+def _reproduce(name: str, folder: Path, quick: bool, seed: int, seeds: int | None) -> None:
     from isac_rt.results.files import check_folder
 
     check_folder(folder)
     from isac_rt.studies.paper import experiment
+    from isac_rt.studies.paper.city_flights import repeated
     from isac_rt.studies.paper.montecarlo import kept_in
     from isac_rt.studies.paper.outcome import write
 
-    with kept_in(folder / "frames"):
+    with kept_in(folder / "frames"), repeated(seeds):
         outcome = with_progress(lambda report: experiment(name)(quick, seed, report), name)
     files = write(outcome, folder)
     colours = {"holds": "green", "holds under a condition": "yellow", "does not hold": "red"}

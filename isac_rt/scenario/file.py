@@ -14,6 +14,7 @@ import yaml
 from isac_rt.scenario.document import TAG, Document, Loader, ScenarioError
 from isac_rt.scenario.doubts import doubts
 from isac_rt.scenario.node import Node, Problem
+from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.scenario.tables import TableError, with_tables
 from isac_rt.scenario.tree import Scenario
 
@@ -93,13 +94,15 @@ def load(
 
 def plain_tree(value: Any) -> Any:
     """A tree as lists, mappings and numbers, without the keys that have no meaning beside the
-    others."""
+    others. A null that is no more than its default is left out, but where a preset would fill it
+    in."""
     if isinstance(value, Node):
-        fields = type(value).model_fields
+        fields, by_preset = type(value).model_fields, isinstance(value, Receivers | Tracking)
         return {
             name: plain_tree(item)
             for name, item in value
-            if value.applies(name) and not (item is None and fields[name].default is None)
+            if value.applies(name)
+            and (by_preset or item is not None or fields[name].default is not None)
         }
     if isinstance(value, dict):
         return {name: plain_tree(item) for name, item in value.items()}

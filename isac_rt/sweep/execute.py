@@ -47,8 +47,10 @@ ROOM = 1_000_000
 CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
 
-KEPT = ("links", "terminals", "paths", "fidelity", "timing_s", "versions", "shard")
-"""What an outcome holds of a summary, and of what was written beside it."""
+KEPT = ("links", "terminals", "swarm", "compared", "paths", "fidelity", "timing_s", "versions")
+"""What an outcome holds of a summary."""
+BESIDE = ("shard", "by_frame")
+"""What some jobs make beside it."""
 
 Progress = Callable[[int, int, int], None]
 """Called with points done, failed, and in all."""
@@ -165,7 +167,7 @@ def _outcome(job: Job) -> dict[str, Any]:
     about: dict[str, Any] = {"scenario": job.tree}
     try:
         made = job.simulate()
-        about |= {"status": "done", **{name: made[name] for name in KEPT if name in made}}
+        about |= {"status": "done", **{name: made[name] for name in KEPT + BESIDE if name in made}}
         json.dumps(about, allow_nan=False)
     except Exception as problem:
         if of_machine(problem):

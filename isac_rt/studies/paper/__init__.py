@@ -26,6 +26,7 @@ TITLES = {
     "clutter": "Gaussian, Rayleigh and geometric clutter side by side",
     "detectors": "Detectors in the clutter of a city's mesh",
     "ghosts": "Ghost tracks in a street and a geometric test of them",
+    "city": "Receivers that know the city in several cities, with several seeds",
     "hardware": "What real front ends do to data, floors, ranges and flights",
     "claims": "Claims of the text that have no figure",
 }

@@ -62,6 +62,11 @@ def kept_in(folder: str | Path) -> Iterator[None]:
         _folder.reset(token)
 
 
+def kept_folder() -> Path | None:
+    """Where results in between are kept; None: nowhere."""
+    return _folder.get()
+
+
 @dataclass(frozen=True)
 class Precision:
     """When to stop: every interval's half-width at most max(relative p, absolute), or `limit`
@@ -87,7 +92,7 @@ class Precision:
         return True
 
 
-def interval(events: np.ndarray, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+def interval(events: np.ndarray, trials: float, confidence: float = 0.95) -> tuple[float, float]:
     """Clopper-Pearson with the sample size that frames of unequal rates amount to.
 
     Parameters
