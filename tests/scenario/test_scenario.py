@@ -611,6 +611,8 @@ def test_the_city_preset_is_the_default_where_paths_are_traced_in_a_city(tmp_pat
     again = tmp_path / "again.yaml"
     again.write_text(to_yaml(read(traced + "receiver_preset: plain\n")))
     assert load(again).receivers == read(traced + "receiver_preset: plain\n").receivers
+
+
 def test_a_null_that_overrides_a_preset_is_written_down(tmp_path):
     """Of the preset city one rate and the time of deletion are taken back. The bug that was there:
     nulls that equal their default were left out, and the preset came back with the file."""
