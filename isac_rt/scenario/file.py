@@ -109,6 +109,32 @@ def plain_tree(value: Any) -> Any:
     return [plain_tree(item) for item in value] if isinstance(value, tuple) else value
 
 
+def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:
+    """A scenario as plain values, in which the formations that `keys` name stand as they were
+    stated, so that these keys can be replaced; `isac_rt.scenario.swarm.unfolded` undoes it.
+
+    Parameters
+    ----------
+    keys : dotted, such as swarm.U.formation.spacing_m
+    """
+    tree: dict[str, Any] = plain_tree(scenario)
+    named = {key.split(".")[1] for key in keys if key.startswith("swarm.")}
+    swarm: dict[str, Any] = {}
+    members = {
+        f"{name}_{i}": name
+        for name, formation in scenario.formations.items()
+        if name in named
+        for i in range(1, formation.count + 1)
+    }
+    for key, uav in tree["swarm"].items():
+        name = members.get(key, key)
+        if name not in swarm:
+            swarm[name] = uav
+            if name != key:
+                swarm[name] = {**uav, "formation": plain_tree(scenario.formations[name])}
+    return {**tree, "swarm": swarm}
+
+
 class _Dumper(yaml.SafeDumper):
     """Short lists on one line, and no word that a YAML 1.1 or 1.2 reader takes for a number."""
 

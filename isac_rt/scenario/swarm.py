@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
@@ -252,6 +253,19 @@ def unfolded(swarm: dict[Any, Any]) -> dict[Any, Any]:
             if key in out or (key != name and key in swarm):
                 raise ValueError(f"swarm.{name}.formation: there is a {key} already; rename one")
             out[key] = one
+    return out
+
+
+def formations(swarm: Any) -> dict[str, Formation]:
+    """The formations that a swarm states, by name; what is malformed is none."""
+    out: dict[str, Formation] = {}
+    for name, uav in swarm.items() if isinstance(swarm, dict) else ():
+        stated = uav.get("formation") if isinstance(uav, dict) else None
+        if isinstance(stated, Formation):
+            out[str(name)] = stated
+        elif stated:
+            with suppress(ValueError):
+                out[str(name)] = Formation.model_validate(stated)
     return out
 
 

@@ -13,7 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from isac_rt.scenario.environment import Accuracy, Belief, City, Clutter, Propagation
 from isac_rt.scenario.front_end import Elements, FrontEnd
@@ -21,7 +27,7 @@ from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dott
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
 from isac_rt.scenario.sensors import Sensor, with_sensor
-from isac_rt.scenario.swarm import Access, RoleChange, Uav, unfolded
+from isac_rt.scenario.swarm import Access, Formation, RoleChange, Uav, formations, unfolded
 
 OWN = "own"
 """Name of the scenario's own receivers beside those compared with them."""
@@ -93,6 +99,16 @@ class Scenario(Node):
     """Further sets of receivers by name, which hear the same samples. By default none."""
 
     _folder: Path = PrivateAttr(default=Path())
+    _formations: dict[str, Formation] = PrivateAttr(default={})
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _remember(cls, data: Any, check: ModelWrapValidatorHandler[Scenario]) -> Scenario:
+        """Keep which UAVs were stated as formations."""
+        scenario = check(data)
+        if isinstance(data, dict):
+            scenario._formations = formations(data.get("swarm"))
+        return scenario
 
     @model_validator(mode="before")
     @classmethod
@@ -123,6 +139,12 @@ class Scenario(Node):
         scenario = self.model_copy()
         scenario._folder = folder
         return scenario
+
+    @property
+    def formations(self) -> dict[str, Formation]:
+        """The formations of the swarm by the name that they were stated under; its members stand in
+        `swarm` as NAME_1, NAME_2 and so on."""
+        return dict(self._formations)
 
     def city_path(self) -> Path:
         """The city's file, found from the scenario's folder.

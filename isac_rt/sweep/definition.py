@@ -24,8 +24,9 @@ from isac_rt.results.provenance import path_content
 from isac_rt.results.sensing import RATES, Sensing, summary_block
 from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.environment import City
-from isac_rt.scenario.file import load, plain_tree
+from isac_rt.scenario.file import folded_tree, load
 from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
+from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tables import with_tables
 from isac_rt.scenario.tree import Scenario
 from isac_rt.storage import program_fingerprint, versions
@@ -178,6 +179,11 @@ class Sweep(Free):
                     )
 
     @property
+    def keys(self) -> frozenset[str]:
+        """Keys of the scenario that the axes set."""
+        return frozenset(key for axis in self.axes.values() for key in axis.keys)
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Entries of every axis, repetitions last."""
         return (*(axis.size for axis in self.axes.values()), self.repetitions)
@@ -231,9 +237,13 @@ class Plan:
     def num_points(self) -> int:
         return self.sweep.num_points
 
+    def tree(self) -> dict[str, Any]:
+        """The base scenario as plain values, with the formations that the axes change."""
+        return folded_tree(self.base, self.sweep.keys)
+
     def points(self) -> Iterator[Point]:
         """All points in order, made one by one: a million of them need no memory."""
-        tree = plain_tree(self.base)
+        tree = self.tree()
         tree.pop("name")
         files = files_under(self.base.folder)
         for index in itertools.product(*(range(n) for n in self.sweep.shape)):
@@ -242,6 +252,7 @@ class Plan:
                 for key, value in axis.entry(i).items():
                     put(here, key, value)
             here = with_tables(here, self.base.folder, replace=True)
+            here["swarm"] = unfolded(here["swarm"])
             here["seed"] = self.seed(index[-1])
             ground = ground_by(here, files)
             yield Point(index, here, ground, point_key(here, ground), paths_key(here, ground))
@@ -394,8 +405,8 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
             ("set",) if sweep.set and file.is_file() else ("scenario",),
             f"the base scenario cannot be used: {error}",
         ) from None
-    base = base.in_folder(file.parent.resolve())
-    tree = plain_tree(base)
+    plan = Plan(sweep, base.in_folder(file.parent.resolve()))
+    tree = plan.tree()
     for name, axis in sweep.axes.items():
         for i in range(axis.size):
             _try(
@@ -404,7 +415,7 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
                 axis.entry(i),
                 lambda text, n=name, j=i: refuse(("axes", n), f"entry {j} of {n} {text}"),
             )
-    return Plan(sweep, base)
+    return plan
 
 
 def options(values: dict[str, Any]) -> list[str]:

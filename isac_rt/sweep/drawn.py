@@ -21,8 +21,9 @@ from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.document import Document, ScenarioError
-from isac_rt.scenario.file import load, plain_tree
+from isac_rt.scenario.file import folded_tree, load
 from isac_rt.scenario.node import Key, Name, Problem, Seed, dotted
+from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.preflight import check_passage
 from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
@@ -215,7 +216,7 @@ class DataPlan:
         ------
         ScenarioError  If a scene finds no place.
         """
-        tree = plain_tree(self.base)
+        tree = folded_tree(self.base, self.data.draw)
         tree.pop("name")
         splits = _quota(self.data.splits, self.data.scenes, self.data.seed)
         cells = _cells_of(self.data)
@@ -232,6 +233,7 @@ class DataPlan:
                 put(tree, key, draw.draw(rng))
             tree["seed"] = int(seed_sequence(self.data.seed, "seed", number).generate_state(1)[0])
             try:
+                tree["swarm"] = unfolded(tree["swarm"])
                 if self.data.place:
                     corner = cells[split][int(rng.integers(len(cells[split])))]
                     _move(tree, self.data.place, corner, rng)

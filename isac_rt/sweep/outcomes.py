@@ -109,7 +109,7 @@ class Outcomes:
         alone."""
         tree = {
             "sweep": plan.sweep.model_dump(mode="json"),
-            "base": plain_tree(plan.base),
+            "base": plan.tree(),
             "folder": str(plan.base.folder),
         }
         self.begin(tree)

@@ -118,6 +118,26 @@ def test_a_flight_of_a_file_is_turned_with_its_attitude(folder):
         assert (pitch, roll) == (-3, 8)
 
 
+def test_a_formation_is_drawn_and_turned_as_one(folder):
+    """Its members stand as far apart as the drawn spacing says, in the heading of the turned
+    flight. Planted bug: the members of the base scenario kept."""
+    text = SET.replace(
+        "swarm.P1.position_m: {normal: [[-1.9, 5.3, 50.7], [0.4, 0.3, 0.2]]}",
+        "swarm.P1.formation.spacing_m: {uniform: [1.5, 2.5]}",
+    ).replace("set: {", "set: {swarm.P1.formation: {shape: column, spacing_m: 9, count: 3}, ")
+    drawn = set()
+    for scene in plan_of(folder, text).scenes:
+        swarm = scene.tree["swarm"]
+        assert list(swarm) == ["A", "P1_1", "P1_2", "P1_3"]
+        first, second, third = (np.array(swarm[f"P1_{k}"]["position_m"]) for k in (1, 2, 3))
+        apart = np.linalg.norm(second - first)
+        assert 1.5 <= apart <= 2.5
+        way = np.array(swarm["P1_1"]["velocity_mps"])
+        np.testing.assert_allclose(third - first, -2 * apart * way / np.linalg.norm(way), atol=1e-9)
+        drawn.add(round(float(apart), 6))
+    assert len(drawn) == 20
+
+
 def test_draws_have_their_distributions(folder):
     """Bounds, and over 400 scenes the middle of each within four standard errors. Planted bug: a
     uniform draw in place of one uniform in the logarithm (its mean is 0.4 deviations higher)."""
