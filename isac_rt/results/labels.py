@@ -92,6 +92,10 @@ class Places(NamedTuple):
         cells = waveform.range_cell(passes), waveform.velocity_cell(passes)
         return cls(range, velocity, cells, 2 * waveform.max_velocity(passes))
 
+    def select(self, rows: np.ndarray) -> Places:
+        """Those of some rows."""
+        return self._replace(range=self.range[rows], velocity=self.velocity[rows])
+
     def apart(self, range: float, velocity: float) -> tuple[np.ndarray, np.ndarray]:
         """Distances from a place in range and Doppler cells, velocities modulo the unambiguous
         span."""
@@ -111,6 +115,10 @@ class Aim(NamedTuple):
 
     direction: np.ndarray
     beam: np.ndarray
+
+    def select(self, rows: np.ndarray) -> Aim:
+        """That of some paths."""
+        return self._replace(direction=self.direction[rows])
 
     def towards(self, direction: np.ndarray) -> np.ndarray:
         """(K,) which paths come from within a beam about a direction (2,); none where it is not
@@ -143,29 +151,36 @@ def explain(
     """
     places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
     diffuse = paths.kind == PathKind.DIFFUSE
+    others, field_rows = np.flatnonzero(~diffuse), np.flatnonzero(diffuse)
+    field_rows = field_rows[np.argsort(places.range[field_rows], kind="stable")]
+    ranges = places.range[field_rows]
+    beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
     count = len(detections)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
     )
     out = Explanation(kinds, targets, orders, faces, np.zeros(count, bool))
     for q in range(count):
-        rows, bins = places.apart(detections.range[q], detections.velocity[q])
+        at = detections.range[q]
+        first, last = np.searchsorted(ranges, [at - beside, at + beside])
+        some = np.sort(np.concatenate([others, field_rows[first:last]]))
+        field, own = diffuse[some], power[some]
+        rows, bins = places.select(some).apart(at, detections.velocity[q])
         near = (rows <= 1) & (bins <= 1)
-        here = np.where(diffuse, 0.0, power)
-        here[~diffuse] *= reach(rows[~diffuse]) * np.minimum(
-            reach(bins[~diffuse]) + UNION_FLOOR, 1.0
-        )
-        clutter = np.where(near & diffuse, power, 0.0)
-        cause = -1
+        here = np.where(field, 0.0, own)
+        here[~field] *= reach(rows[~field]) * np.minimum(reach(bins[~field]) + UNION_FLOOR, 1.0)
+        clutter = np.where(near & field, own, 0.0)
+        best = -1
         if aim is not None:
-            towards = aim.towards(detections.direction[q])
-            cause = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
-        if cause < 0 or not near[cause]:
-            cause = _strongest(here, clutter)
-        if cause < 0:
+            towards = aim.select(some).towards(detections.direction[q])
+            best = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
+        if best < 0 or not near[best]:
+            best = _strongest(here, clutter)
+        if best < 0:
             continue
+        cause = some[best]
         out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
-        out.order[q], out.skirt[q] = paths.bounces[cause], not near[cause]
+        out.order[q], out.skirt[q] = paths.bounces[cause], not near[best]
         met = paths.faces[cause][paths.faces[cause] >= 0]
         out.face[q] = met[0] if met.size else -1
     return out

@@ -3,6 +3,7 @@ and birth."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from isac_rt.frame.antennas import unit_vector
+from isac_rt.kernels.jit import jit
 from isac_rt.world.swarm import Pose
 
 STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
@@ -72,30 +74,70 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
     return np.stack([distance, rate, u[..., 0], u[..., 2]], axis=-1)
 
 
+@jit
 def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivative of (length, rate) of one leg with respect to relative position and velocity (2,
     6), and of its direction with respect to the position, (I - e e^T)/r (3, 3)."""
-    r, e = _unit(offset)
+    r = np.sqrt(np.sum(offset * offset))
+    e = offset / r
     turn = (np.eye(3) - np.outer(e, e)) / r
-    return np.stack([np.concatenate([e, np.zeros(3)]), np.concatenate([turn @ velocity, e])]), turn
+    leg = np.zeros((2, 6))
+    leg[0, :3], leg[1, 3:] = e, e
+    for i in range(3):
+        leg[1, i] = np.sum(turn[i] * velocity)
+    return leg, turn
+
+
+@jit
+def _linearised(
+    state: np.ndarray, own: np.ndarray, transmitter: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`measure` of one state (4,) and its derivative (4, S); `own`: position, velocity and the
+    columns of the attitude (5, 3), `transmitter`: (0,) or (6 or 9,)."""
+    offset, speed = state[:3] - own[0], state[3:6] - own[1]
+    leg, turn = _leg_jacobian(offset, speed)
+    e = leg[0, :3]
+    z, out = np.empty(4), np.zeros((4, state.size))
+    z[0], z[1] = np.sum(e * offset), np.sum(e * speed)
+    for k in range(2):  # u_x, u_z
+        axis = own[2 + 2 * k]
+        z[2 + k] = np.sum(axis * e)
+        for i in range(3):
+            out[2 + k, i] = np.sum(axis * turn[i])
+    out[:2, :6] = leg
+    if transmitter.size:
+        offset, speed = state[:3] - transmitter[:3], state[3:6] - transmitter[3:6]
+        leg, turn = _leg_jacobian(offset, speed)
+        z[0] += np.sum(leg[0, :3] * offset)
+        z[1] += np.sum(leg[0, :3] * speed)
+        out[:2, :6] += leg
+    return z, out
+
+
+def _terms(own: Pose, transmitter: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """A receiver and what it hears as the compiled functions take them."""
+    mine = np.concatenate([own.position[None], own.velocity[None], own.rotation.T])
+    return mine, np.zeros(0) if transmitter is None else np.ascontiguousarray(transmitter)
 
 
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
     """Derivative of `measure` with respect to the body's state (S,): (4, S)."""
-    leg, turn = _leg_jacobian(state[:3] - own.position, state[3:6] - own.velocity)
-    out = np.zeros((4, len(state)))
-    out[:2, :6] = leg
-    out[2:, :3] = (own.rotation.T @ turn)[[0, 2]]
-    if transmitter is not None:
-        out[:2, :6] += _leg_jacobian(state[:3] - transmitter[:3], state[3:6] - transmitter[3:6])[0]
+    return np.asarray(_linearised(np.ascontiguousarray(state), *_terms(own, transmitter))[1])
+
+
+@jit
+def _transmitter_jacobians(states: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+    """`transmitter_jacobian` of each state (K, S): (K, 4, S)."""
+    out = np.zeros((len(states), 4, transmitter.size))
+    for k in range(len(states)):
+        offset, speed = states[k, :3] - transmitter[:3], states[k, 3:6] - transmitter[3:6]
+        out[k, :2, :6] = -_leg_jacobian(offset, speed)[0]
     return out
 
 
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
     """Derivative of the bistatic `measure` with respect to the transmitter's state (S,): (4, S)."""
-    out = np.zeros((4, len(transmitter)))
-    out[:2, :6] = -_leg_jacobian(state[:3] - transmitter[:3], state[3:6] - transmitter[3:6])[0]
-    return out
+    return np.asarray(_transmitter_jacobians(state[None], transmitter)[0])
 
 
 def measurement_covariance(
@@ -153,6 +195,36 @@ def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     return Gaussian(F @ g.mean, _symmetric(F @ g.covariance @ F.T + Q))
 
 
+@jit
+def _settled(
+    mean: np.ndarray,
+    P: np.ndarray,
+    measurement: np.ndarray,
+    R: np.ndarray,
+    rows: np.ndarray,
+    own: np.ndarray,
+    transmitter: np.ndarray,
+    velocity_period: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, gain K and derivative H at which the iterated update of `rows` of a measurement
+    stands."""
+    x, deviation = mean, np.sqrt(np.diag(P))
+    for _ in range(_ITERATIONS):
+        z, full = _linearised(x, own, transmitter)
+        y, H = (measurement - z)[rows], full[rows]
+        if np.isfinite(velocity_period):
+            for i in range(rows.size):
+                if rows[i] == 1:
+                    y[i] -= velocity_period * np.round(y[i] / velocity_period)
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T.copy()
+        new = mean + K @ (y - H @ (mean - x))
+        settled = np.all(np.abs(new - x) <= 1e-3 * deviation)
+        x = new
+        if settled:
+            break
+    return x, K, H
+
+
 def update(
     g: Gaussian,
     measurement: np.ndarray,
@@ -172,16 +244,8 @@ def update(
     """
     rows = np.flatnonzero(np.isfinite(measurement))
     R = R[np.ix_(rows, rows)]
-    x, P = g.mean, g.covariance
-    for _ in range(_ITERATIONS):
-        H = jacobian(x, own, transmitter)[rows]
-        y = wrapped(measurement - measure(x, own, transmitter), velocity_period)[rows]
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        new = g.mean + K @ (y - H @ (g.mean - x))
-        settled = np.all(np.abs(new - x) <= 1e-3 * np.sqrt(np.diag(P)))
-        x = new
-        if settled:
-            break
+    P = g.covariance
+    x, K, H = _settled(g.mean, P, measurement, R, rows, *_terms(own, transmitter), velocity_period)
     A = np.eye(len(x)) - K @ H
     return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))
 
@@ -203,11 +267,27 @@ def expected(
     dz = z - z_mean[..., None, :]
     S = np.swapaxes(dz, -1, -2) @ dz / z.shape[-2]
     if transmitter is not None:
-        J = np.stack(
-            [transmitter_jacobian(x, transmitter.mean) for x in mean.reshape(-1, mean.shape[-1])]
-        ).reshape(*mean.shape[:-1], 4, -1)
+        J = _transmitter_jacobians(mean.reshape(-1, mean.shape[-1]), transmitter.mean)
+        J = J.reshape(*mean.shape[:-1], *J.shape[1:])
         S = S + J @ transmitter.covariance @ np.swapaxes(J, -1, -2)
     return z_mean, S
+
+
+def reported(
+    states: Sequence[Gaussian], own: Pose, transmitter: Gaussian | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `measure` says of bodies (K, 4), and its standard deviations (K, 4) by their covariances
+    and, bistatic, the transmitter's."""
+    z, std = np.zeros((len(states), 4)), np.zeros((len(states), 4))
+    terms = _terms(own, None if transmitter is None else transmitter.mean)
+    for k, (mean, covariance) in enumerate(states):
+        z[k], H = _linearised(mean, *terms)
+        variance = np.sum(H @ covariance * H, axis=1)
+        if transmitter is not None:
+            J = transmitter_jacobian(mean, transmitter.mean)
+            variance += np.sum(J @ transmitter.covariance * J, axis=1)
+        std[k] = np.sqrt(variance)
+    return z, std
 
 
 def wrapped(difference: np.ndarray, velocity_period: float) -> np.ndarray:
@@ -280,10 +360,44 @@ def mahalanobis(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     found = np.isfinite(residual)
     both = found[..., :, None] & found[..., None, :]
-    S = np.where(both, S, np.eye(4))
-    y = np.where(found, residual, 0.0)
-    d2 = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)
-    return d2, np.linalg.slogdet(S)[1]
+    return normalised(np.where(found, residual, 0.0), np.where(both, S, np.eye(4)))
+
+
+def normalised(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """y^T S^-1 y and ln det S of residuals (..., n) with covariances S (..., n, n); infinity both
+    where S is no covariance."""
+    shape, n = residual.shape[:-1], residual.shape[-1]
+    y, every = residual.reshape(-1, n), S.reshape(-1, n, n)
+    d2, log_det = _normalised(np.ascontiguousarray(y), np.ascontiguousarray(every))
+    return d2.reshape(shape), log_det.reshape(shape)
+
+
+@jit
+def _normalised(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By Cholesky's factors L of each S: the square of L^-1 y, and twice the logarithms of L's
+    diagonal."""
+    count, n = y.shape
+    d2, log_det = np.zeros(count), np.zeros(count)
+    L, w = np.empty((n, n)), np.empty(n)
+    for k in range(count):
+        for i in range(n):
+            for j in range(i + 1):
+                left = S[k, i, j]
+                for m in range(j):
+                    left -= L[i, m] * L[j, m]
+                if j < i:
+                    L[i, j] = left / L[j, j]
+                else:
+                    L[i, i] = np.sqrt(left) if left > 0 else np.nan
+            left = y[k, i]
+            for m in range(i):
+                left -= L[i, m] * w[m]
+            w[i] = left / L[i, i]
+            d2[k] += w[i] ** 2
+            log_det[k] += 2 * np.log(L[i, i])
+        if np.isnan(log_det[k]):
+            d2[k], log_det[k] = np.inf, np.inf
+    return d2, log_det
 
 
 def _symmetric(P: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 from scipy.special import gammaincinv
 
-from isac_rt.terminal.filter import Gaussian, singer
+from isac_rt.terminal.filter import Gaussian, normalised, singer
 from isac_rt.terminal.tracker import TrackSet, assign
 from isac_rt.world.swarm import Pose
 
@@ -206,8 +206,7 @@ def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray,
     covariances = [np.stack([g.covariance for g in of]) for of in (a, b)]
     residual = means[0][:, None] - means[1][None]
     S = covariances[0][:, None] + covariances[1][None]
-    d2 = np.sum(residual * np.linalg.solve(S, residual[..., None])[..., 0], axis=-1)
-    return d2, np.linalg.slogdet(S)[1]
+    return normalised(residual, S)
 
 
 def gate(probability: float) -> float:

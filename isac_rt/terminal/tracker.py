@@ -22,12 +22,10 @@ from isac_rt.terminal.filter import (
     Gaussian,
     birth,
     expected,
-    jacobian,
     mahalanobis,
-    measure,
     measurement_covariance,
     predict,
-    transmitter_jacobian,
+    reported,
     update,
     wrapped,
 )
@@ -147,17 +145,12 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
     mean = np.array([t.state.mean[:6] for t in everyone]).reshape(count, 6)
     covariance = np.array([t.state.covariance[:6, :6] for t in everyone]).reshape(count, 6, 6)
     is_reference = np.arange(count) < (reference is not None)
-    z, std = np.zeros((count, 4)), np.zeros((count, 4))
-    for k, track in enumerate(everyone):
-        transmitter = None if reference is None or track is reference else reference.state
-        t = None if transmitter is None else transmitter.mean
-        z[k] = measure(track.state.mean, own, t)
-        H = jacobian(track.state.mean, own, t)
-        S = H @ track.state.covariance @ H.T
-        if transmitter is not None:
-            J = transmitter_jacobian(track.state.mean, transmitter.mean)
-            S = S + J @ transmitter.covariance @ J.T
-        std[k] = np.sqrt(np.diag(S))
+    states = [t.state for t in everyone]
+    if reference is None:
+        z, std = reported(states, own)
+    else:
+        parts = reported(states[:1], own), reported(states[1:], own, reference.state)
+        z, std = (np.concatenate(both) for both in zip(*parts, strict=True))
     return TrackSet(
         ids=np.array([t.id for t in everyone], np.int64),
         mean=mean - np.concatenate([own.position, own.velocity]),
