@@ -120,10 +120,9 @@ class Aim(NamedTuple):
         """That of some paths."""
         return self._replace(direction=self.direction[rows])
 
-    def towards(self, direction: np.ndarray) -> np.ndarray:
-        """(K,) which paths come from within a beam about a direction (2,); none where it is not
-        known."""
-        return np.asarray((np.abs(self.direction - direction) <= self.beam).all(axis=1))
+    def off(self, direction: np.ndarray) -> np.ndarray:
+        """(K,) how many beams each path lies off a direction (2,); NaN where it is not known."""
+        return np.asarray((np.abs(self.direction - direction) / self.beam).max(axis=1))
 
 
 def explain(
@@ -142,7 +141,7 @@ def explain(
     of the noise explains nothing. Paths of one cell reach a detection together, and the strongest
     decides; but a receiver that looks by beam, or takes strong paths out first, finds a weak one
     beside it. So a path of the cell that comes from where the detection says is the cause before
-    a stronger one from elsewhere.
+    a stronger one from elsewhere, and before the skirt of one whose direction fits worse.
 
     Parameters
     ----------
@@ -172,8 +171,12 @@ def explain(
         clutter = np.where(near & field, own, 0.0)
         best = -1
         if aim is not None:
-            towards = aim.select(some).towards(detections.direction[q])
+            off = aim.select(some).off(detections.direction[q])
+            towards = off <= 1
             best = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
+            if best >= 0 and not near[best]:
+                towards &= near & (off < off[best])
+                best = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
         if best < 0 or not near[best]:
             best = _strongest(here, clutter)
         if best < 0:

@@ -147,6 +147,23 @@ def test_skirts_of_strong_paths_are_theirs():
     assert found.skirt.tolist() == [True, True, False, False]
 
 
+def test_an_echo_in_its_place_is_not_the_skirt_of_a_line_from_elsewhere():
+    """A line 60 dB over the noise 3.4 cells away, within a beam of a detection that lies in the
+    cell of an echo: the cause is whose direction fits better. Planted bugs: the skirt first, as
+    before; the echo whatever the direction."""
+    rows = [
+        (20.0, 1.0, 1.0, PathKind.LEAKAGE, -1),
+        (20.0 + 3.4 * RANGE, 1.0, 1e-3, PathKind.TARGET, 1),
+    ]
+    aim = Aim(np.array([(0.23, 0.05), (0.06, 0.26)]), np.array([0.25, 0.25]))
+    found = [
+        explain(detections([[20.0 + 3.5 * RANGE, 1.0, *u]]), paths(rows), WAVEFORM, 2, 1e6, aim)
+        for u in ((0.08, 0.24), (0.22, 0.08))
+    ]
+    assert [f.kind[0] for f in found] == [PathKind.TARGET, PathKind.LEAKAGE]
+    assert [f.skirt[0] for f in found] == [False, True]
+
+
 def test_the_resampling_of_the_groups_leaves_a_floor():
     """1e-5 of a path's power in every Doppler bin of its row: 80 dB over the noise it explains what
     lies 30 bins away, 40 dB over it does not. Planted bug: no floor."""

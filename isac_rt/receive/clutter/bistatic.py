@@ -78,11 +78,10 @@ class BeamSearch(BySchedule):
         _, level = self.rule(known).detect(power)
         maps = channel_maps(left, known)
         rest = accumulate(maps)
-        left_over = _left_over(strong, snr, known, rest.shape)
+        left_over = Remainder.of(strong, snr, known, rest.shape)
         noise, expected = self._noise(rest, known, clutter)
-        ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter)
-        held_up = self._unexplained(rest / (noise + expected), ratio, left_over > 0)
-        held_up *= 1 + left_over * (noise / (noise + expected))
+        ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter, left_over)
+        held_up = self._unexplained(rest / (noise + expected), ratio, left_over.power > 0)
         ratio, sure = ratio / held_up, sure / held_up
         ratio[: first_row(self.settings, known.range_cell)] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
@@ -118,6 +117,7 @@ class BeamSearch(BySchedule):
         expected: np.ndarray,
         known: Known,
         clutter: ExpectedClutter | None,
+        left_over: Remainder,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """T over its two thresholds, (rows, P), and its directions (rows, P, 2), Doppler
         centred."""
@@ -129,12 +129,15 @@ class BeamSearch(BySchedule):
         plain = search_plain(maps, search, noise, least)
         ratio[plain.cell], sure[plain.cell] = plain.peak / limit[0], plain.peak / limit[1]
         cosines[plain.cell] = plain.cosines
-        if clutter is not None:
-            held = np.fft.ifftshift(expected, axes=1).ravel()[plain.cell] > LEAST * noise
-            cell = plain.cell[held & (plain.peak > least)]
-            R = Bucketed.of(clutter, known, search, noise, TAPER).covariances(
-                *np.divmod(cell, shape[1])
-            )
+        held = np.fft.ifftshift(expected / noise + left_over.power, axes=1).ravel()
+        cell = plain.cell[(held[plain.cell] > LEAST) & (plain.peak > least)]
+        if cell.size:
+            rows, bins = np.divmod(cell, shape[1])
+            R = left_over.covariances(rows, bins, search)
+            if clutter is not None:
+                R += Bucketed.of(clutter, known, search, noise, TAPER).covariances(rows, bins)
+            else:
+                R += np.eye(R.shape[1], dtype=np.float32)
             x = maps.reshape(*maps.shape[:2], -1)[:, :, cell].transpose(2, 0, 1)
             white, common = search_white(x / np.float32(np.sqrt(noise)), R, cell, search, least)
             ratio[cell] = white.peak / (limit[0] * common)
@@ -157,6 +160,51 @@ class BeamSearch(BySchedule):
         target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool)) | beside
         rule = CfarRule.of(self.settings, 1)
         return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What the removal of strong paths may have left about them, which comes from where they came.
+
+    Attributes
+    ----------
+    power : (rows, P) over the noise of a cell of one channel, Doppler centred
+    owner : (rows, P) number of the strong path that leaves most there
+    channels : (S, L_tx, L_rx) the strong paths' own
+    """
+
+    power: np.ndarray
+    owner: np.ndarray
+    channels: np.ndarray
+
+    @classmethod
+    def of(
+        cls, strong: list[Estimate], snr: np.ndarray, known: Known, shape: tuple[int, ...]
+    ) -> Remainder:
+        """`LEFT_OVER_DB` below each strong path, in the cells `BESIDE` it."""
+        w, power, owner = known.waveform, np.zeros(shape, np.float32), np.zeros(shape, np.int64)
+        for k, (e, over) in enumerate(zip(strong, snr, strict=True)):
+            row = round(float(w.beat_cells(e.delay, e.delay_rate, 0.0)))
+            column = round(e.delay_rate * w.frame_duration * w.effective_carrier) + shape[1] // 2
+            rows = np.arange(max(row - BESIDE[0], 0), min(row + BESIDE[0] + 1, shape[0]))
+            block = np.ix_(rows, (np.arange(-BESIDE[1], BESIDE[1] + 1) + column) % shape[1])
+            more = over * 10 ** (-LEFT_OVER_DB / 10) > power[block]
+            power[block] = np.where(more, over * 10 ** (-LEFT_OVER_DB / 10), power[block])
+            owner[block] = np.where(more, k, owner[block])
+        size = known.antennas.num_tx, known.antennas.num_rx
+        return cls(power, owner, np.array([e.channels for e in strong]).reshape(-1, *size))
+
+    def covariances(self, rows: np.ndarray, bins: np.ndarray, search: Search) -> np.ndarray:
+        """(S, L, L) complex64 in cells, Doppler in FFT order, in units of the noise."""
+        c = self.channels
+        if not len(c):
+            return np.zeros((rows.size, c.shape[2], c.shape[2]), np.complex64)
+        power, owner = (np.fft.ifftshift(x, axes=1)[rows, bins] for x in (self.power, self.owner))
+        each = np.einsum("sti,stj->sij", c, c.conj())
+        each *= (
+            search.spread(TAPER.cosine) / (np.abs(c) ** 2).mean(axis=2).sum(axis=1)[:, None, None]
+        )
+        return power[:, None, None] * each.astype(np.complex64)[owner]
 
 
 @lru_cache(maxsize=8)
@@ -339,20 +387,6 @@ def _described(
         std=np.hypot(std, floor),
         is_reference=np.zeros(len(found), bool),
     )
-
-
-def _left_over(
-    strong: list[Estimate], snr: np.ndarray, known: Known, shape: tuple[int, ...]
-) -> np.ndarray:
-    """(rows, P) what the removal of strong paths may have left over the noise, Doppler centred."""
-    out, w = np.zeros(shape, np.float32), known.waveform
-    for e, over in zip(strong, snr, strict=True):
-        row = round(float(w.beat_cells(e.delay, e.delay_rate, 0.0)))
-        column = round(e.delay_rate * w.frame_duration * w.effective_carrier) + shape[1] // 2
-        rows = np.arange(max(row - BESIDE[0], 0), min(row + BESIDE[0] + 1, shape[0]))
-        block = np.ix_(rows, (np.arange(-BESIDE[1], BESIDE[1] + 1) + column) % shape[1])
-        out[block] = np.maximum(out[block], over * 10 ** (-LEFT_OVER_DB / 10))
-    return out
 
 
 def _remainders(weak: Detections, strong: Detections, known: Known) -> np.ndarray:

@@ -109,6 +109,12 @@ class Search:
         turns = self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T)
         return np.exp(-1j * turns.astype(np.float32))
 
+    def spread(self, cosine: float) -> np.ndarray:
+        """(L, L) by which a box of directions, so wide, tapers a covariance."""
+        places = self.channels.places
+        apart = (places[:, None] - places) * self.wavenumber / (2 * np.pi) * cosine
+        return (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32)
+
     def lines(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X and Z (lines, G, S) of channels (L, S)."""
         out = []
@@ -394,7 +400,6 @@ class Bucketed:
         bucket = row * w.num_chirps + column % w.num_chirps
         order = np.argsort(bucket, kind="stable")
         places = search.channels.places
-        apart = (places[:, None] - places) * known.wavenumber / (2 * np.pi) * taper.cosine
         return cls(
             np.searchsorted(bucket[order], np.arange(rows * w.num_chirps + 1)),
             (beat - row + REACH)[order].astype(np.float32),
@@ -402,7 +407,7 @@ class Bucketed:
             (clutter.power / noise)[order].astype(np.float32),
             np.exp(-1j * (known.wavenumber * clutter.arrival[order] @ places.T).astype(np.float32)),
             tables,
-            (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32),
+            search.spread(taper.cosine),
             w.num_chirps,
         )
 
