@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
@@ -11,7 +11,7 @@ from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.known import Known
-from isac_rt.receive.sense import Detector, make_maps
+from isac_rt.receive.sense import Detector, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter, Reception
 from isac_rt.scenario.receivers import Receivers
@@ -55,9 +55,13 @@ class ActiveReceiver:
         if self.refiner is not None and isinstance(cube, IFCube):
             detections = self.refiner(cube.samples, known, detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
-        return Reception.undecoded(
+        out = Reception.undecoded(
             cube.waveform, detections, picture, found.sparse, found.correction
         )
+        if self.settings.self_calibration == "none":
+            return out
+        looks = look_at(spectra, known, found.estimates, found.detections.snr)
+        return replace(out, looks=looks)
 
 
 def receive_active(

@@ -28,6 +28,7 @@ from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
+from isac_rt.receive.modes import MODES, mode_shapes
 
 # range cells on each side of the peak that a template covers: Hann's main lobe and the migration
 HALF_WIDTH = 3
@@ -129,6 +130,32 @@ class LocalSpectra:
         values = (parts[:, :, 0] + 1j * parts[:, :, 1]).reshape(self._antennas, -1)
         values = values[:, : self._num_rx] / np.maximum(energy, 1e-30)[:, None]
         return values.reshape(self._sets, self.waveform.num_tx, -1)
+
+    def modes(self, delay: float, delay_rate: float) -> np.ndarray:
+        """(MODES, L_tx, L_rx) amplitudes of a path by polynomials over the chirp: the least squares
+        of all rows and chirps (`isac_rt.receive.modes`)."""
+        c, a = self._chirps, self._axis
+        size, rows = c.tx.size, c.rows
+        data = c.data.reshape(size, rows, c.blocks, 2, LANES)
+        heard = (data[:, :, :, 0] + 1j * data[:, :, :, 1]).reshape(size, rows, -1)
+        tau = delay + delay_rate * c.time.ravel()[:size]
+        beat = a.slope * tau + delay_rate * (a.carrier + a.slope * (a.middle - tau))
+        near = (beat * a.duration - a.first)[:, None] - np.arange(rows)
+        cycles = (a.carrier * tau) % 1.0 + a.slope * tau * (a.middle - tau / 2)
+        shapes = a.length / 2 * mode_shapes(near * a.share)
+        shapes = shapes * np.exp(2j * np.pi * cycles)[:, None]
+        weight = c.weight.ravel()[:size]
+        out = np.empty((MODES, self._antennas, self._num_rx), complex)
+        for antenna in range(self._antennas):
+            sent = c.tx == antenna
+            template = shapes[:, sent].reshape(MODES, -1)
+            weighted = (template * np.repeat(weight[sent], rows)).conj()
+            energy, found = (
+                weighted @ template.T,
+                weighted @ heard[sent].reshape(-1, heard.shape[2]),
+            )
+            out[:, antenna] = np.linalg.solve(energy, found[:, : self._num_rx])
+        return out
 
     @property
     def _antennas(self) -> int:

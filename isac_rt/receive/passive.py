@@ -15,7 +15,7 @@ from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.fit import JointPath
 from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.known import Known
-from isac_rt.receive.sense import Cfar, Sensed, describe, make_maps
+from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.symbols.powers import (
@@ -30,6 +30,7 @@ from isac_rt.receive.symbols.powers import (
 from isac_rt.receive.types import (
     Detections,
     ExpectedClutter,
+    Look,
     Prediction,
     Reception,
     no_detections,
@@ -95,8 +96,10 @@ class PassiveReceiver:
         w = cube.waveform
         if not modulated:
             known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
-            found = self.detector.sense(clean_spectrum(cube, known), known, clutter)
+            spectra = clean_spectrum(cube, known)
+            found = self.detector.sense(spectra, known, clutter)
             detections, reference = self._earliest(found, known)
+            found = replace(found, looks=self._look(spectra, known, detections, reference))
             detections, reference = self._alone(cube, known, detections, reference)
             return self._reception(cube, known, found, detections, reference, maps=maps)
         symbols = None
@@ -150,7 +153,20 @@ class PassiveReceiver:
         spectra = clean_spectrum(cube, known)
         found = self.detector.sense(spectra, known, clutter)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
+        found = replace(found, looks=self._look(spectra, known, detections, reference))
         return found, *self._alone(cube, known, detections, reference)
+
+    def _look(
+        self,
+        spectra: np.ndarray,
+        known: Known,
+        detections: Detections,
+        reference: Estimate | None,
+    ) -> tuple[Look, ...]:
+        """What the reference shows of the channels, where that is asked for."""
+        if reference is None or self.settings.self_calibration == "none":
+            return ()
+        return look_at(spectra, known, [reference], detections.snr[detections.is_reference])
 
     def _alone(
         self, cube: IFCube, known: Known, detections: Detections, reference: Estimate | None
@@ -220,7 +236,8 @@ class PassiveReceiver:
         picture = make_maps(found.power, cube, self.settings, 1) if maps else None
         out = Reception.undecoded(cube.waveform, detections, picture, found.sparse)
         if reference is not None:
-            out = replace(out, line_of_sight=True, reference_power=_power(reference))
+            level = _power(reference)
+            out = replace(out, line_of_sight=True, reference_power=level, looks=found.looks)
         if self.refiner is None:
             return out
         detections, power = self.refiner(cube.samples, known, detections)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,18 +31,21 @@ from isac_rt.receive.maps import (
     slow_window,
 )
 from isac_rt.receive.omp import Omp, sparse_enough
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Maps
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps
 from isac_rt.scenario.receivers import Receivers
 
 MIXED = 0.1
 """Power of other paths over its own from which a detection starts no track, beside what noise
 adds: the range of a mixed cell wanders from frame to frame."""
 
+MOST_LOOKS = 24
+"""Strongest paths of a frame that are looked at for self-calibration."""
+
 
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`, `correction`: see `Reception`."""
+    its background (`CfarRule.detect`). `sparse`, `correction`, `looks`: see `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
@@ -49,6 +53,7 @@ class Sensed:
     level: np.ndarray
     sparse: bool | None = None
     correction: Correction | None = None
+    looks: tuple[Look, ...] = ()
 
 
 class Detector(Protocol):
@@ -132,6 +137,20 @@ def window_gain(known: Known) -> float:
     antenna's chirps."""
     w = known.waveform
     return float((slow_window(w) ** 2).sum()) * len(known.schedule) / w.num_tx
+
+
+def look_at(
+    spectra: np.ndarray, known: Known, estimates: Sequence[Estimate], snr: np.ndarray
+) -> tuple[Look, ...]:
+    """What the `MOST_LOOKS` strongest of some paths show of the channels, strongest first."""
+    out = []
+    for i in np.argsort(snr)[::-1][:MOST_LOOKS]:
+        delay, rate = estimates[i].delay, estimates[i].delay_rate
+        row = round(float(known.waveform.beat_cells(delay, rate, 0.0)))
+        if 0 <= row < spectra.shape[2] and (known.full or known.passes == 1):
+            modes = LocalSpectra(spectra, known, row).modes(delay, rate)
+            out.append(Look(delay, rate, modes, float(snr[i])))
+    return tuple(out)
 
 
 def describe(

@@ -146,6 +146,24 @@ class Maps:
     equivalent_detections: np.ndarray
 
 
+@dataclass(frozen=True)
+class Look:
+    """What one strong path shows of the channels that heard it.
+
+    Attributes
+    ----------
+    delay, delay_rate : of the path at mid-frame [s, 1]
+    modes : (`isac_rt.receive.modes.MODES`, L_tx, L_rx) complex, amplitude of every virtual channel
+        by polynomials over the chirp [sqrt(W)]; the first is the mean
+    snr : of the cell after accumulation over antennas
+    """
+
+    delay: float
+    delay_rate: float
+    modes: np.ndarray
+    snr: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reception:
     """What one terminal made of one frame.
@@ -177,6 +195,8 @@ class Reception:
         one (`isac_rt.access.fall_back`). None elsewhere
     correction : what the frame's clutter says of the own velocity and of the level that the
         terminal expects; None where a detector does not ask
+    looks : what strong paths show of the channels, at a PT its reference alone; empty where
+        `receivers.self_calibration` is none
     """
 
     detections: Detections
@@ -194,6 +214,7 @@ class Reception:
     confidence_looks: int = 0
     sparse: bool | None = None
     correction: Correction | None = None
+    looks: tuple[Look, ...] = ()
 
     @classmethod
     def undecoded(

@@ -96,6 +96,12 @@ class Receivers(Node):
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """An active terminal processes one frame in so many; the others only carry data. By default it
     processes all."""
+    self_calibration: Literal["none", "tracks", "positions"] = "none"
+    """Whether terminals find gains, phases and delays of their antennas and the response over the
+    chirp from strong paths, frame by frame, and take them out of their samples. `none`, the
+    default. `tracks`: from tracked paths, whose directions are as they were measured: what turns
+    all directions alike stays. `positions`: also from the terminals' positions, which they send
+    each other, so that directions and clocks are found too."""
     active_input: Literal["samples", "profiles"] = "samples"
     """What an active terminal starts from: `samples`, the default, simulates IF samples and
     transforms them; `profiles` makes range profiles directly, which is faster and has another draw
@@ -106,6 +112,12 @@ class Receivers(Node):
             yield Problem(
                 (("active_input",), ("refinement",)),
                 "joint refinement needs samples; set active_input: samples or another one",
+            )
+        if self.active_input == "profiles" and self.self_calibration != "none":
+            yield Problem(
+                (("active_input",), ("self_calibration",)),
+                "self-calibration corrects samples; set active_input: samples, or "
+                "self_calibration: none",
             )
         if self.refinement == "grid" and self.velocity_method == "pursuit":
             yield Problem(

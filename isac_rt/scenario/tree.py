@@ -202,6 +202,7 @@ class Scenario(Node):
         yield from self._block_problems()
         yield from self._model_problems()
         yield from self._front_end_problems()
+        yield from self._self_calibration_problems()
         yield from self._set_problems()
 
     def _timing_problems(self) -> Iterator[Problem]:
@@ -425,6 +426,19 @@ class Scenario(Node):
     def front_end_of(self, name: str) -> FrontEnd:
         """The hardware of a terminal: its own, or that of all."""
         return self.swarm[name].front_end or self.radio.front_end
+
+    def _self_calibration_problems(self) -> Iterator[Problem]:
+        """Schedules by which the channels of an echo cannot be told in one frame."""
+        if self.radio.groups == self.num_tx and self.radio.bands(self.num_tx) == 1:
+            return
+        for at, receivers in self._all_receivers().items():
+            if receivers.self_calibration != "none":
+                yield Problem(
+                    ((*at, "self_calibration"), ("radio", "groups")),
+                    f"needs as many groups as the {self.num_tx} transmit antennas, one of which "
+                    f"sends at a time, and there are {self.radio.groups}; set it to none, or "
+                    "change radio.groups",
+                )
 
     def _front_end_problems(self) -> Iterator[Problem]:
         real = [

@@ -50,6 +50,7 @@ from isac_rt.simulation.plan import (
 )
 from isac_rt.simulation.setup import Frame, Setup
 from isac_rt.simulation.simulate import stage_seconds
+from isac_rt.terminal.self_calibration import SelfCalibration
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -146,6 +147,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         items += _link_items(setup, link, of_link, stages.get(link))
     items += _standing_items(setup, light, late, short_lived / len(frames))
     items += [] if all(e.ideal for e in setup.front_ends.values()) else _hardware_items(last)
+    items += _self_calibration_items(setup, last)
     seconds = {
         "trace": tracing,
         "synthesis": sum(s["synthesis"] for s in stages.values()),
@@ -204,6 +206,24 @@ def _hardware_items(frame: Frame) -> list[Item]:
                 error = decibels(frame.oscillator_noise_left_out(link))
             words, unit = part.replace("_", " "), "dB" if part == "oscillator" else ""
             out.append(Item("hardware", words, left, error, unit, str(link), seconds))
+    return out
+
+
+def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
+    """A line for each link whose receiver calibrates itself: the seconds of a pass over the
+    samples, whatever it has learnt."""
+    if s.scenario.receivers.self_calibration == "none":
+        return []
+    out = []
+    for link in frame.paths:
+        cube = frame.samples(link)
+        one = SelfCalibration(s.waveform, s.antennas, link.passes)
+        begin = time.thread_time()
+        one.correct(cube, 0.0)
+        spent = time.thread_time() - begin
+        said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
+        left = "coupling, patterns, oscillators"
+        out.append(Item("self-calibration", said, left, link=str(link), seconds=spent))
     return out
 
 

@@ -39,6 +39,7 @@ from isac_rt.terminal.terminal import (
     Surroundings,
     TerminalState,
 )
+from isac_rt.world.swarm import Pose
 
 _LOG = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
@@ -106,6 +107,7 @@ class _Observer:
     def __init__(self, setup: Setup, link: Link, terminal: Terminal, receivers: Receivers) -> None:
         self.link, self.setup, self.terminal = link, setup, terminal
         self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable, receivers)
+        self.receivers = receivers
         self.feedback = {"answers": 0, "corrections": 0}
         self.seconds = 0.0
         """Processor time of reception and tracking so far."""
@@ -117,19 +119,32 @@ class _Observer:
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
         own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
+        mates = self._mates(frame.number, when)
         state = int(TerminalState.TRACKING)
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
             reception, tracks = self.terminal.step(
-                cube, payload, own, when, clutter=clutter, maps=maps
+                cube, payload, own, when, clutter=clutter, mates=mates, maps=maps
             )
         else:
             assert isinstance(cube, IFCube)  # profiles are for active terminals only
             modulated = timetable.modulated(frame.number)
-            reception, tracks = self.terminal.step(cube, own, when, modulated, maps=maps)
+            reception, tracks = self.terminal.step(
+                cube, own, when, modulated, mates=mates, maps=maps
+            )
             state = int(self.terminal.state)
         self.seconds += time.thread_time() - begun
         return Heard(reception, tracks, state)
+
+    def _mates(self, frame: int, when: float) -> list[Pose]:
+        """Where the other end of the link, or at an active terminal those of all links, say that
+        they are, as far as the receiver asks."""
+        s = self.setup
+        if self.receivers.self_calibration != "positions":
+            return []
+        tx, rx = self.link
+        names = s.timetable.with_role("passive", frame) if self.link.own else [tx]
+        return [s.believed(s.swarm.trajectories[name].pose(when)) for name in names if name != rx]
 
     def feed_back(self, frame: int, heard: Heard, at_active: Heard) -> None:
         """The passive terminal's feedback after a frame, and the active one's answer to it."""

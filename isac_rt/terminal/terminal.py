@@ -20,7 +20,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import unambiguous_share
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
@@ -38,6 +38,8 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import Doubts
+from isac_rt.terminal.self_calibration import calibration_of
+from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
 from isac_rt.terminal.standing import Standing
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane
 from isac_rt.world.swarm import Pose
@@ -130,6 +132,7 @@ class ActiveTerminal:
             if walls is None:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
             self._doubts = Doubts(walls, antennas, waveform)
+        self.calibration = calibration_of(receivers, waveform, antennas, 2)
         step = antennas.step(2)
         self._standing = Standing(waveform.wavelength / step if step else np.inf)
         self._correction: Correction | None = None
@@ -142,10 +145,13 @@ class ActiveTerminal:
         time: float,
         *,
         clutter: ExpectedClutter | None = None,
+        mates: Sequence[Pose] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal
-        expects of its mesh there."""
+        expects of its mesh there, `mates` where other terminals say that they are."""
+        if self.calibration is not None and isinstance(cube, IFCube):
+            cube = self.calibration.correct(cube, time)
         if clutter is not None and self._correction is not None:
             clutter = self._correction.apply(clutter)
         reception = self.receive(cube, payload, clutter, maps)
@@ -165,7 +171,13 @@ class ActiveTerminal:
             self._doubts.remove_ghosts(self.tracker, new, own_pose)
             kept = [t for t in self.tracker.tracks if not self._standing.holds(t)]
             self.tracker.tracks = kept
-        return reception, self.tracker.snapshot(own_pose)
+        tracks = self.tracker.snapshot(own_pose)
+        if self.calibration is not None:
+            seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
+            change = self.calibration.learn_all(seen)
+            for track in self.tracker.tracks:
+                track.state = seen_after(track.state, own_pose, change, 2)
+        return reception, tracks
 
     def receive(
         self,
@@ -187,12 +199,15 @@ class ActiveTerminal:
             "tracker": self.tracker.memory(),
             "correction": None if found is None else [found.level, found.velocity],
             "standing": self._standing.memory(),
+            "calibration": None if self.calibration is None else self.calibration.memory(),
         }
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
         self.tracker.restore(memory["tracker"])
         self._standing.restore(memory["standing"])
+        if self.calibration is not None:
+            self.calibration.restore(memory["calibration"])
         found = memory["correction"]
         self._correction = None if found is None else Correction(*found)
 
@@ -254,14 +269,25 @@ class PassiveTerminal:
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
         self.slips_repaired = 0
+        self.calibration = calibration_of(receivers, waveform, antennas, 1)
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
         self._profile: np.ndarray | None = None
         self._clutter: ExpectedClutter | None = None
 
     def step(
-        self, cube: IFCube, own_pose: Pose, time: float, modulated: bool, *, maps: bool = False
+        self,
+        cube: IFCube,
+        own_pose: Pose,
+        time: float,
+        modulated: bool,
+        *,
+        mates: Sequence[Pose] = (),
+        maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
-        """Receive and track one frame; `time` is its middle [s], `modulated` is public."""
+        """Receive and track one frame; `time` is its middle [s], `modulated` is public, `mates` is
+        where the transmitter says that it is."""
+        if self.calibration is not None:
+            cube = self.calibration.correct(cube, time)
         if self.reference is not None:
             self.reference.state = predict(
                 self.reference.state, time - self._time, self._acceleration
@@ -271,19 +297,30 @@ class PassiveTerminal:
         self._time = time
         self.tracker.predict(time)
         self._clutter = self._expected_clutter(own_pose)
-        reception = self.receive(
-            cube, self._expect(own_pose) if modulated else None, modulated, maps
-        )
+        reception = self._hear(cube, self._expect(own_pose) if modulated else None, modulated, maps)
         if reception.decoded:
             reception = self._repair_slip(cube, reception, own_pose, maps)
         if reception.line_of_sight and not self._plausible(reception):
             reception = reception.without_reference()
         if not modulated and reception.line_of_sight:
-            self._profile = self._receiver.reader.learn(cube, reception.detections)
+            heard = self._late(reception.detections, 1)
+            self._profile = self._receiver.reader.learn(cube, heard)
         self._follow(reception, own_pose, modulated)
         if self.reference is not None and reception.line_of_sight:
             self._track(in_plane(reception.detections), own_pose, self.reference)
-        return reception, self.tracker.snapshot(own_pose, self.reference)
+        tracks = self.tracker.snapshot(own_pose, self.reference)
+        self._calibrate(reception, own_pose, mates)
+        return reception, tracks
+
+    def _calibrate(self, reception: Reception, own: Pose, mates: Sequence[Pose]) -> None:
+        """Learn of the own hardware from the line of sight, if it was one."""
+        if self.calibration is None or self.reference is None or self.reference.missed:
+            return
+        seen = lines_of_sight(reception.looks, own, mates, self.reference.state)
+        change = self.calibration.learn_all(seen)
+        self.reference.state = seen_after(self.reference.state, own, change, 1)
+        for track in self.tracker.tracks:
+            track.state = seen_after(track.state, own, change, 2)
 
     def _track(self, detections: Detections, own: Pose, reference: Track) -> None:
         """Carry on the reflectors' tracks, and start those that the city does not explain."""
@@ -313,7 +350,9 @@ class PassiveTerminal:
         known = self._surroundings.clutter
         if known is None or self.reference is None or not self._placed:
             return None
-        return known(self.reference.state.mean[:6], own)
+        clutter = known(self.reference.state.mean[:6], own)
+        delay, rate = self._clock
+        return replace(clutter, delay=clutter.delay + delay, delay_rate=clutter.delay_rate + rate)
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
@@ -325,6 +364,7 @@ class PassiveTerminal:
             "slips_repaired": self.slips_repaired,
             "ends": list(self._ends),
             "profile": self._profile,
+            "calibration": None if self.calibration is None else self.calibration.memory(),
         }
 
     def restore(self, memory: dict[str, Any]) -> None:
@@ -335,6 +375,8 @@ class PassiveTerminal:
         self._time, self.state = memory["time"], TerminalState(memory["state"])
         self.slips_repaired, self._profile = memory["slips_repaired"], memory["profile"]
         self._ends = deque(memory["ends"], maxlen=EVIDENCE_FRAMES)
+        if self.calibration is not None:
+            self.calibration.restore(memory["calibration"])
 
     def shorten(self, cells: int, own_pose: Pose) -> None:
         """Take whole cells off the reference's range, as the active terminal's answer to feedback
@@ -352,6 +394,26 @@ class PassiveTerminal:
             return self.other.receive(cube, prediction, modulated, maps)
         known = self._profile, self._clutter
         return self._receiver.receive(cube, prediction, modulated, *known, maps=maps)
+
+    @property
+    def _clock(self) -> np.ndarray:
+        """Delay [s] and rate by which all paths are heard late, as far as that is known."""
+        return np.zeros(2) if self.calibration is None else self.calibration.clock
+
+    def _late(self, what: Detections | Prediction, sign: int) -> Any:
+        """What has been found or is expected, by so much later (1) or sooner (-1)."""
+        metres, speed = sign * SPEED_OF_LIGHT * self._clock
+        return replace(what, range=what.range + metres, velocity=what.velocity + speed)
+
+    def _hear(
+        self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
+    ) -> Reception:
+        """`receive` between clocks that are set alike."""
+        if self.calibration is None:
+            return self.receive(cube, prediction, modulated, maps)
+        heard = None if prediction is None else self._late(prediction, 1)
+        reception = self.receive(cube, heard, modulated, maps)
+        return replace(reception, detections=self._late(reception.detections, -1))
 
     def _expect(self, own: Pose) -> Prediction | None:
         """Prediction for a data frame; None when the range is no longer known well enough to read a
@@ -435,7 +497,7 @@ class PassiveTerminal:
         before = self.reference.state
         self.reference.state = _moved(before, own, cells * self._cells[0])
         prediction = self._expect(own)
-        again = self.receive(cube, prediction, True, maps) if prediction else reception
+        again = self._hear(cube, prediction, True, maps) if prediction else reception
         self._ends.clear()
         if not again.decoded:
             self.reference.state = before

@@ -1,0 +1,366 @@
+r"""A terminal's estimate of its own hardware, from frame to frame.
+
+An echo at the active terminal has in the channel of transmit element t and receive element r
+
+.. math:: A\, s_{tr}(u)\, e^{\rho_r + \tau_t}\,\bigl(1 + (\rho'_r + \tau'_t) P_1(x) + c_2 P_2(x) +
+    c_3 P_3(x)\bigr)
+
+with the array's response s towards u, complex logarithms of the elements' gains, their slopes over
+the chirp (a delay is an imaginary one), and a response that is common to all. At a passive terminal
+every transmit element has an amplitude A of its own, for it is another terminal's. Samples are
+corrected by what is known so far; what a look still shows is the correction of that.
+
+Amplitudes and phases are two Gaussians of independent elements, carried in information form, so
+that what no look tells stays as the prior has it: the common gain and phase and, where the
+direction of a look is not known from elsewhere, what turns all directions alike. The amplitude of a
+look, its delay and its direction are nuisances of each look anew, of which the direction has the
+deviation that it is known by. The noise of a look is what its channels hold beside one wave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.arms import element_delays
+from isac_rt.receive.modes import MODES, polynomials
+from isac_rt.receive.types import Look
+from isac_rt.scenario.receivers import Receivers
+
+GAIN_STD = 0.2, 0.6
+"""Before the first look: logarithm of an element's amplitude (1.7 dB) and phase [rad] (34
+degrees)."""
+SLOPE_STD = 0.1
+"""Of both, over the chirp."""
+COMMON_STD = 0.5
+"""Of what all elements have in common over the chirp."""
+CLOCK_STD = (1e-8, 0.0), (1e-3, 1e-4)
+"""Delay [s] and its rate beside what the geometry says: of a terminal's own boards, and between the
+clocks of two."""
+DRIFT = 0.01
+"""How far gains [neper, rad] wander in a second."""
+CLOCK_DRIFT = 1e-12, 1e-10
+"""The same of delay [s] and rate."""
+FREE = 0.2
+"""Deviation of a direction cosine that the look itself is to find."""
+CELLS = 0.02
+"""Share of a cell to which a path's delay and rate are measured at best."""
+ROUNDS = 5
+LEAST_SNR = 1.0
+"""Of a channel, under which a look says nothing."""
+FLOOR = 1e-4
+"""Least noise of a channel over its power: what plane waves and seven range rows leave out."""
+MISFIT = 1.5
+"""Misfit beyond what chance makes, from which on a look counts for less."""
+
+
+class Sight(NamedTuple):
+    """From where a path is known to come.
+
+    Attributes
+    ----------
+    direction : (2,) u_x, u_z
+    radius : of its wavefront [m]
+    direction_std : of both cosines; `FREE`: the look is to find them
+    path : delay, delay rate and the deviations of both [s, 1, s, 1]; None where not known
+    """
+
+    direction: np.ndarray
+    radius: float
+    direction_std: float
+    path: tuple[float, float, float, float] | None = None
+
+
+class Change(NamedTuple):
+    """How much less paths are seen late [s], with their delay's rate, and off (2,) in u_x and u_z
+    than before a frame."""
+
+    delay: float
+    rate: float
+    direction: np.ndarray
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Independent Gaussians of elements, of amplitudes (row 0) and phases (row 1).
+
+    Attributes
+    ----------
+    value : (2, K)
+    information : (2, K, K), the inverse covariances
+    """
+
+    value: np.ndarray
+    information: np.ndarray
+
+    @classmethod
+    def prior(cls, size: int, std: tuple[float, float]) -> Belief:
+        """Zero means of these deviations."""
+        return cls(np.zeros((2, size)), np.stack([np.eye(size) / s**2 for s in std]))
+
+    def later(self, variance: float) -> Belief:
+        """After a random walk of this variance."""
+        if variance == 0:
+            return self
+        covariance = np.linalg.inv(self.information) + variance * np.eye(self.value.shape[1])
+        return replace(self, information=np.linalg.inv(covariance))
+
+
+class SelfCalibration:
+    """What a terminal knows of its hardware, and the correction of its samples by it.
+
+    Parameters
+    ----------
+    passes : 2 at the active terminal, whose transmit elements are its own; 1 at a passive one
+
+    Attributes
+    ----------
+    gains, slopes : Belief of the elements, at the active terminal the transmit elements first
+    common : (2, MODES) response over the chirp that all elements have, amplitude and phase by mode,
+        of which the first and the phase of the second belong to each path
+    clock : (2,) delay [s] and rate of paths beyond what the geometry says. An active terminal's
+        boards are so late, and its samples are corrected; at a passive one it is mostly the clocks,
+        and `PassiveTerminal` takes it out of ranges: to turn a tone by a microsecond would turn
+        each data symbol by another phase
+    """
+
+    def __init__(self, waveform: Waveform, antennas: Antennas, passes: int) -> None:
+        self.waveform, self._antennas, self._passes = waveform, antennas, passes
+        receives = np.tile(np.eye(antennas.num_rx), (antennas.num_tx, 1))
+        sends = np.repeat(np.eye(antennas.num_tx), antennas.num_rx, axis=0)
+        self._elements = np.hstack([sends, receives]) if passes == 2 else receives
+        self._amplitudes = np.ones((len(sends), 1)) if passes == 2 else sends
+        size = self._elements.shape[1]
+        self.gains = Belief.prior(size, GAIN_STD)
+        self.slopes = Belief.prior(size, (SLOPE_STD, SLOPE_STD))
+        self.common = np.zeros((2, MODES))
+        self._common_information = np.full((2, MODES), COMMON_STD**-2)
+        self.clock = np.zeros(2)
+        self._clock_covariance = np.diag(np.square(CLOCK_STD[2 - passes]))
+        self._time = np.nan
+        self._taken_out = (*self._known()[:-1], np.zeros(2))
+
+    def _known(self) -> tuple[np.ndarray, ...]:
+        return self.gains.value, self.slopes.value, self.common, self.clock
+
+    # ---- samples
+
+    def correct(self, cube: IFCube, time: float) -> IFCube:
+        """The samples of a frame at `time` [s] without what is known of the hardware."""
+        elapsed = 0.0 if np.isnan(self._time) else time - self._time
+        self._time = time
+        self.gains = self.gains.later(DRIFT**2 * elapsed)
+        F = np.array([[1.0, elapsed], [0.0, 1.0]])
+        self.clock = F @ self.clock
+        walk = np.diag(np.square(CLOCK_DRIFT)) * (elapsed * (self._clock_covariance[1, 1] > 0))
+        self._clock_covariance = F @ self._clock_covariance @ F.T + walk
+        clock = self.clock if self._passes == 2 else np.zeros(2)
+        self._taken_out = (*self._known()[:-1], clock)
+        table = self._table(cube.waveform)
+        out = np.empty_like(cube.samples)
+        for m, senders in enumerate(cube.schedule):
+            own = senders if self._passes == 2 else np.zeros_like(senders)
+            for r in range(out.shape[1]):
+                np.multiply(cube.samples[m, r], table[own, r], out=out[m, r])
+        return replace(cube, samples=out)
+
+    def _table(self, w: Waveform) -> np.ndarray:
+        """(L_tx or 1, L_rx, N) complex64 by which samples of the antennas are multiplied."""
+        n = np.arange(w.num_samples) - (w.num_samples - 1) / 2
+        modes = polynomials(n / (w.window_length / 2))
+        gain, slope, common = (
+            v[0] + 1j * v[1] for v in (self.gains.value, self.slopes.value, self.common)
+        )
+        tone = 2 * np.pi * w.slope * self._taken_out[-1][0] * w.sample_interval * n
+        shared = common @ modes + 1j * tone
+        own = self._elements if self._passes == 2 else self._elements[: self._antennas.num_rx]
+        each = (own @ gain)[:, None] + np.multiply.outer(own @ slope, modes[1])
+        table = np.exp(-(each + shared)).astype(np.complex64)
+        return table.reshape(-1, self._antennas.num_rx, w.num_samples)
+
+    # ---- looks
+
+    def learn_all(self, seen: Sequence[tuple[Look, Sight]]) -> Change:
+        """Take in the looks of a frame, and say how paths are seen otherwise from now on."""
+        before, clock = self.gains.value[1], self.clock
+        for look, sight in seen:
+            self.learn(look, sight)
+        phases = self._elements @ (self.gains.value[1] - before)
+        _, across = self._steering(Sight(np.zeros(2), np.inf, FREE))
+        lines = np.hstack([self._amplitudes, across])
+        turn = np.linalg.lstsq(lines, phases, rcond=None)[0][-2:]
+        delay, rate = self.clock - clock
+        return Change(delay, rate, turn)
+
+    def learn(self, look: Look, sight: Sight) -> None:
+        """Take in a look at corrected samples."""
+        towards, across = self._steering(sight)
+        gains, slopes, common, clock = (
+            now - then for now, then in zip(self._known(), self._taken_out, strict=True)
+        )
+        left_out = self._elements @ (gains[0] + 1j * gains[1])
+        modes = look.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
+        power = float(np.mean(np.abs(modes[0]) ** 2))
+        noise = max(self._noise(modes[0], look.snr), FLOOR * power)
+        if noise * LEAST_SNR >= power:
+            return
+        fitted = self._fit(modes[0], noise, across, sight.direction_std)
+        if fitted.misfit > MISFIT:
+            noise *= fitted.misfit
+            fitted = self._fit(modes[0], noise, across, sight.direction_std)
+        self.gains = fitted.gains
+        weight = 2 * np.abs(fitted.wave) ** 2 / noise
+        left = modes[1:] / fitted.wave - (common[0] + 1j * common[1])[1:, None]
+        left[0] -= self._elements @ (slopes[0] + 1j * slopes[1])
+        self._learn_response(left, weight)
+        self._learn_clock(look, sight, clock)
+
+    def _steering(self, sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+        """Response (C,) of the channels to a wave, and its phase's derivative (C, 2) with respect
+        to u_x and u_z."""
+        turn = 2 * np.pi * self.waveform.effective_carrier
+        a = self._antennas
+        rx, d_rx = element_delays(a.rx_positions, sight.direction, sight.radius)
+        tx, d_tx = np.zeros(a.num_tx), np.zeros((2, a.num_tx))
+        if self._passes == 2:
+            tx, d_tx = element_delays(a.tx_positions, sight.direction, sight.radius)
+        phase = turn * (tx[:, None] + rx).ravel()
+        across = turn * (d_tx[:, :, None] + d_rx[:, None]).reshape(2, -1)
+        return np.exp(1j * phase), across.T
+
+    def _noise(self, heard: np.ndarray, snr: float) -> float:
+        """Power of a channel that is not of one wave: whatever the elements do to a wave, it stays
+        a matrix of rank one."""
+        by_antenna = heard.reshape(self._antennas.num_tx, -1)
+        free = (by_antenna.shape[0] - 1) * (by_antenna.shape[1] - 1)
+        if free == 0:
+            return float(np.mean(np.abs(heard) ** 2)) / max(snr, 1.0)
+        others = np.linalg.svd(by_antenna, compute_uv=False)[1:]
+        return float((others**2).sum()) / free
+
+    def _fit(
+        self, heard: np.ndarray, noise: float, across: np.ndarray, direction_std: float
+    ) -> _Fitted:
+        """The most likely gains with a look (C,) whose direction has been taken out, by Gauss and
+        Newton."""
+        E, B, K = self._elements, self._amplitudes, self._elements.shape[1]
+        X = np.hstack([E, B]), np.hstack([E, B, across])
+        priors = [_padded(self.gains.information[i], X[i].shape[1]) for i in (0, 1)]
+        priors[1][-2:, -2:] = np.eye(2) / direction_std**2
+        at = [np.zeros(x.shape[1]) for x in X]
+        wave = heard
+        for _ in range(ROUNDS):
+            model = np.exp(E @ at[0][:K] + 1j * (E @ at[1][:K] + across @ at[1][-2:]))
+            power = B.T @ np.abs(model) ** 2
+            wave = model * (B @ (B.T @ (heard * model.conj()) / power))
+            weight = 2 * np.abs(wave) ** 2 / noise
+            left = heard / wave - 1
+            for i, part in enumerate((left.real, left.imag)):
+                at[i][K : K + B.shape[1]] = 0  # the amplitude has just been fitted
+                total = part + X[i] @ at[i]
+                full = priors[i] + (X[i].T * weight) @ X[i]
+                at[i] = np.linalg.solve(full, X[i].T @ (weight * total))
+        cost, after = 0.0, []
+        for i, part in enumerate((left.real, left.imag)):
+            cost += float(weight @ part**2 + at[i] @ priors[i] @ at[i])
+            after.append(_marginal(priors[i] + (X[i].T * weight) @ X[i], K))
+        value = self.gains.value + np.stack([a[:K] for a in at])
+        misfit = cost / (2 * max(len(heard) - B.shape[1], 1))
+        return _Fitted(Belief(value, np.stack(after)), wave, misfit)
+
+    def _learn_response(self, left: np.ndarray, weight: np.ndarray) -> None:
+        """Slopes of the elements, and what all have in common, from the modes (3, C) of degree 1 to
+        3 over a look's wave."""
+        K = self._elements.shape[1]
+        X = np.hstack([self._elements, self._amplitudes])
+        steps, after = [], []
+        for i, part in enumerate((left[0].real, left[0].imag)):
+            full = _padded(self.slopes.information[i], X.shape[1]) + (X.T * weight) @ X
+            steps.append(np.linalg.solve(full, X.T @ (weight * part))[:K])
+            after.append(_marginal(full, K))
+        self.slopes = Belief(self.slopes.value + np.stack(steps), np.stack(after))
+        own = np.stack([left[0] - self._elements @ (steps[0] + 1j * steps[1]), *left[1:]])
+        mean = own @ weight / weight.sum()
+        seen = np.array(
+            [[0, 1, 1, 1], [0, 0, 1, 1]]
+        )  # a common imaginary slope is the path's delay
+        new = np.stack([np.append(0, mean.real), np.append(0, mean.imag)]) * seen
+        information = self._common_information + seen * weight.sum()
+        self.common = self.common + new * (seen * weight.sum() / information)
+        self._common_information = information
+
+    def _learn_clock(self, look: Look, sight: Sight, learnt: np.ndarray) -> None:
+        """By how much the path comes late, of which the frame's samples still hold what it has
+        `learnt`."""
+        if sight.path is None:
+            return
+        delay, rate, *std = sight.path
+        left = np.array([look.delay - delay, look.delay_rate - rate]) - learnt
+        best = CELLS * np.array([self.waveform.delay_step, self._rate_cell])
+        P = self._clock_covariance
+        gain = P @ np.linalg.inv(P + np.diag(np.square(std) + best**2))
+        self.clock = self.clock + gain @ left
+        self._clock_covariance = P - gain @ P
+
+    @property
+    def _rate_cell(self) -> float:
+        return self.waveform.velocity_cell(1) / SPEED_OF_LIGHT
+
+    # ---- state
+
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        return {
+            "gains": [self.gains.value, self.gains.information],
+            "slopes": [self.slopes.value, self.slopes.information],
+            "common": [self.common, self._common_information],
+            "clock": [self.clock, self._clock_covariance],
+            "time": self._time,
+        }
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.gains, self.slopes = Belief(*memory["gains"]), Belief(*memory["slopes"])
+        self.common, self._common_information = memory["common"]
+        self.clock, self._clock_covariance = memory["clock"]
+        self._time = memory["time"]
+
+
+def calibration_of(
+    receivers: Receivers, waveform: Waveform, antennas: Antennas, passes: int
+) -> SelfCalibration | None:
+    """What the settings ask for, before the first frame."""
+    wanted = receivers.self_calibration != "none"
+    return SelfCalibration(waveform, antennas, passes) if wanted else None
+
+
+class _Fitted(NamedTuple):
+    """Gains after a look, its wave (C,), and how much worse than its noise it fits."""
+
+    gains: Belief
+    wave: np.ndarray
+    misfit: float
+
+
+def _padded(information: np.ndarray, size: int) -> np.ndarray:
+    """With further values of which nothing is known."""
+    out = np.zeros((size, size))
+    out[: len(information), : len(information)] = information
+    return out
+
+
+def _marginal(information: np.ndarray, size: int) -> np.ndarray:
+    """Information of the first values, whatever the others are."""
+    own, mixed, other = (
+        information[:size, :size],
+        information[:size, size:],
+        information[size:, size:],
+    )
+    out = own - mixed @ np.linalg.solve(other, mixed.T)
+    return (out + out.T) / 2

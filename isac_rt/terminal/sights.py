@@ -1,0 +1,93 @@
+"""Which strong paths of a frame come from where a terminal knows that somebody is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from isac_rt.frame.antennas import unit_vector
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.types import Look
+from isac_rt.terminal.filter import Gaussian, measure, wrapped
+from isac_rt.terminal.self_calibration import FREE, Change, Sight
+from isac_rt.terminal.tracker import TrackSet
+from isac_rt.world.swarm import Pose
+
+POSITION_STD, VELOCITY_STD = 0.02, 0.05
+"""Of what terminals say of themselves, per axis: satellites by carrier phase, and their velocities
+[m, m/s]."""
+NEAR_CELLS = 1.5
+"""Cells of range and of velocity within which a path is the one that is expected."""
+
+
+def echoes(
+    looks: Sequence[Look],
+    waveform: Waveform,
+    own: Pose,
+    mates: Sequence[Pose],
+    tracks: TrackSet,
+) -> list[tuple[Look, Sight]]:
+    """Looks at an active terminal that show another terminal or a confirmed track, each once, the
+    terminals first."""
+    out, left = [], list(looks)
+    for pose in mates:
+        expected, sight = _known(pose, own, 2)
+        nearest = _nearest(left, expected[:2], waveform)
+        if own.to_body(pose.position - own.position)[1] > 0 and nearest is not None:
+            out.append((left.pop(nearest), sight))
+    for k in np.flatnonzero(tracks.confirmed & (tracks.detection >= 0)):
+        expected = np.array([tracks.range[k], tracks.velocity[k]])
+        nearest = _nearest(left, expected, waveform)
+        if nearest is not None and np.isfinite(tracks.direction[k]).all():
+            sight = Sight(tracks.direction[k], float(tracks.range[k]), FREE)
+            out.append((left.pop(nearest), sight))
+    return out
+
+
+def lines_of_sight(
+    looks: Sequence[Look], own: Pose, mates: Sequence[Pose], reference: Gaussian
+) -> list[tuple[Look, Sight]]:
+    """The look of a passive terminal at its transmitter, which says where it is or is tracked."""
+    if mates:
+        return [(look, _known(mates[0], own, 1)[1]) for look in looks]
+    z = measure(reference.mean, own)
+    return [(look, Sight(z[2:], float(z[0]), FREE)) for look in looks]
+
+
+def _known(pose: Pose, own: Pose, passes: int) -> tuple[np.ndarray, Sight]:
+    """Range, its rate and direction cosines of another terminal, and the path to it and maybe
+    back."""
+    z = measure(np.concatenate([pose.position, pose.velocity]), own)
+    of_path = np.array([z[0], z[1], POSITION_STD, VELOCITY_STD]) * passes / SPEED_OF_LIGHT
+    delay, rate, delay_std, rate_std = map(float, of_path)
+    path = delay, rate, delay_std, rate_std
+    return z, Sight(z[2:], float(z[0]), POSITION_STD / float(z[0]), path)
+
+
+def _nearest(looks: Sequence[Look], expected: np.ndarray, waveform: Waveform) -> int | None:
+    """The strongest echo within `NEAR_CELLS` of a range and a velocity."""
+    w, best, most = waveform, None, 0.0
+    cells = np.array([w.range_cell(2), w.velocity_cell(2)])
+    for i, look in enumerate(looks):
+        found = np.array([look.delay, look.delay_rate]) * SPEED_OF_LIGHT / 2
+        apart = wrapped(found - expected, 2 * w.max_velocity(2))
+        power = float(np.sum(np.abs(look.modes[0]) ** 2))
+        if (np.abs(apart) < NEAR_CELLS * cells).all() and power > most:
+            best, most = i, power
+    return best
+
+
+def seen_after(state: Gaussian, own: Pose, change: Change, passes: int) -> Gaussian:
+    """A body as it is seen once the hardware is known better, by paths that pass the way to it so
+    often."""
+    body = own.to_body(state.mean[:3] - own.position)
+    distance = np.linalg.norm(body)
+    if body[1] <= 0:  # out of view
+        return state
+    u = body[[0, 2]] / distance - change.direction
+    towards = own.to_world(unit_vector(u * min(1.0, 1 / np.linalg.norm(u))))
+    mean, metres = state.mean.copy(), SPEED_OF_LIGHT / passes
+    mean[:3] = own.position + towards * (distance - change.delay * metres)
+    mean[3:6] -= towards * (change.rate * metres)
+    return Gaussian(mean, state.covariance)
