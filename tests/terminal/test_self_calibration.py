@@ -173,8 +173,8 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
 
 def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
     """A clock 31 ns late that gains 2e-9 (0.6 m/s): the reference's range and speed become those
-    between the terminals, so do its directions. Planted bugs: the track not moved with the samples,
-    the clock's rate not taken out."""
+    between the terminals, so do its directions. Planted bugs: the track not moved with the clock,
+    turned the wrong way, the clock's rate not taken out."""
     u, rng, w = np.array([-0.17, 0.08]), np.random.default_rng(21), replace(W, num_samples=256)
     settings = Receivers(self_calibration="positions")
     pt = PassiveTerminal(w, ANTENNAS, settings, Tracking(), 8, 1.0)
@@ -189,6 +189,8 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
         mate = replace(OWN, position=place(20.0, u))
         reception, tracks = pt.step(heard, OWN, 0.05 * frame, modulated, mates=[mate])
         assert reception.line_of_sight
+        assert tracks.ids[0] == 0  # the reference has not begun anew
+        assert np.linalg.norm(tracks.mean[0, 3:]) < 2
         if modulated:
             assert (reception.delay_symbols == data.delay_symbols).mean() > 0.99
     assert pt.calibration is not None
