@@ -183,6 +183,7 @@ def bench(
         for row in found["rows"]
     ]
     say_table(("method", "size", "cost [floors]", "error"), rows)
+    say(*(f"{row['method']}: {row['also']}" for row in found["rows"] if row["kind"] == "datasets"))
     say("one floor: to fill one cube of samples and transform it once, measured in this run")
     if found["commands"]:
         lines = [line.strip("| ").split(" | ") for line in command.markdown(found["commands"])]

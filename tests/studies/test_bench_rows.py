@@ -11,7 +11,7 @@ import pytest
 
 from isac_rt.cli.cli import main
 from isac_rt.signal.gridded import ACCURATE_ERROR, GRIDDED_ERROR
-from isac_rt.studies.bench import REQUIRED, endtoend, hermes, nufft, reception, synthesis
+from isac_rt.studies.bench import REQUIRED, datasets, endtoend, hermes, nufft, reception, synthesis
 
 
 def test_errors_of_the_synthesis_are_as_stated():
@@ -41,6 +41,22 @@ def test_rows_of_the_reception():
         assert row["kind"] == "reception"
         assert row["error"] < 0.01
         assert row["memory_cubes"] < 3
+
+
+@pytest.mark.slow
+@pytest.mark.sionna
+def test_rows_of_data_sets():
+    """The bytes of a sample by the sizes of what is kept: a map of 512 ranges and velocities of an
+    echo, IF samples of 3 groups, 15 receivers, 120 chirps and 1024 samples. Planted bug: bytes of
+    the whole shard."""
+    rows = {row["method"]: row for row in datasets.rows(quick=True)}
+    assert len(rows) == 7
+    for row in rows.values():
+        assert set(REQUIRED) <= set(row) and row["size"] == 8 and row["seconds"] > 0
+    for end in ("read", "written"):
+        said = str(rows[f"{end}: all with the IF samples"]["also"])
+        size = float(said.split(", ")[-1].split()[0].replace(",", ""))
+        assert 3 * 15 * 120 * 1024 * 8 / 1e3 < size < 3 * 15 * 120 * 1024 * 8 / 1e3 + 600
 
 
 def test_hermespy_is_left_out_where_it_is_not_installed(tmp_path, monkeypatch, capsys):

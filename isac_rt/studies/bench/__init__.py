@@ -1,9 +1,9 @@
 """Speed against error, method by method, in units of one floor that is measured in the same run.
 
 Every stage has a module with ``rows(quick: bool) -> list[dict[str, object]]``: `synthesis`,
-`reception`, `tracing`, `clutter`, `endtoend` and `hermes`. One that needs what may not be installed
-also has ``missing() -> str | None``, which says why it is left out; one that leaves out some of its
-methods has ``left_out() -> dict[str, str]``, reasons by method; `endtoend` also has
+`reception`, `tracing`, `clutter`, `endtoend`, `datasets` and `hermes`. One that needs what may not
+be installed also has ``missing() -> str | None``, which says why it is left out; one that leaves
+out some of its methods has ``left_out() -> dict[str, str]``, reasons by method; `endtoend` also has
 ``commands(quick)``, the parts of whole commands (`command.tables`). A row is one method at one
 size, with these keys:
 
@@ -13,7 +13,7 @@ method : str
     One curve of a figure: a method with its setting, such as "gridded, width 6".
 size : int
     What grows along the curve, K: paths (synthesis, reception), scatterers (clutter), traced UAVs,
-    triangles or frames (tracing, end to end). `unit` says which.
+    triangles or frames (tracing, end to end), samples (data sets). `unit` says which.
 error : float or None
     Relative RMS error against the oracle, or what `error_of` names; 0 for the oracle, None where
     the row has no error to speak of.
@@ -40,6 +40,7 @@ STAGES = {
     "trace": "tracing",
     "clutter": "clutter",
     "end-to-end": "endtoend",
+    "dataset": "datasets",
     "hermespy": "hermes",
 }
 """The stages by their name on the command line, with the module (and kind) of each."""
