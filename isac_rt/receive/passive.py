@@ -17,6 +17,7 @@ from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.symbols.blind import Peaks, find_peaks, read_peaks
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.symbols.powers import (
     ByPowers,
@@ -126,6 +127,46 @@ class PassiveReceiver:
             chain = replace(self, refiner=None)
         reception = chain._reception(cube, known, found, detections, reference, maps=maps)
         return reception if reference is None else _decoded(reception, symbols)
+
+    def receive_over(
+        self,
+        cube: IFCube,
+        path: Prediction,
+        profile: np.ndarray | None = None,
+        clutter: ExpectedClutter | None = None,
+        *,
+        maps: bool = False,
+    ) -> Reception:
+        """A data frame read over any `path`, row 0: once its data are out it is as one without, and
+        its reference the earliest detection. Otherwise as `receive`."""
+        if self.groups is not None:
+            part, every = cube.of_groups(self.groups), replace(self, groups=None)
+            mine = every.receive_over(part, path, profile, clutter, maps=maps)
+            return _among_all(mine, self.groups, cube.waveform)
+        w = cube.waveform
+        symbols = self.reader.read(cube, path, self.antennas, profile)
+        if not self._believed(symbols, w):
+            return Reception.undecoded(w, no_detections())
+        known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        found = self.detector.sense(clean_spectrum(cube, known), known, clutter)
+        detections, reference = self._alone(cube, known, *self._earliest(found, known))
+        spread = velocity_spread(symbols, self.reader.order, path, w)
+        detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
+        reception = self._reception(cube, known, found, detections, reference, maps=maps)
+        return _decoded(reception, symbols)
+
+    def peaks(self, cube: IFCube, time: float, modulated: bool) -> Peaks:
+        """What is kept of a frame that could not be read, `time` its middle [s]."""
+        mine = cube if self.groups is None else cube.of_groups(self.groups)
+        return find_peaks(mine, time, modulated)
+
+    def read_kept(self, peaks: Peaks, path: Prediction, waveform: Waveform) -> Reception | None:
+        """A frame read in retrospect; None where it does not show the path."""
+        symbols = read_peaks(peaks, path, self.antennas, self.reader.order)
+        if symbols is None or not self._believed(symbols, peaks.waveform):
+            return None
+        out = _decoded(Reception.undecoded(peaks.waveform, no_detections()), symbols)
+        return out if self.groups is None else _among_all(out, self.groups, waveform)
 
     def _phases(self, cube: IFCube, known: Known, detections: Detections) -> np.ndarray | None:
         """The phases as the reference, row 0 of the detections, shows them over the whole frame."""

@@ -267,6 +267,10 @@ class Reception:
             line_of_sight=False,
         )
 
+    def data_only(self) -> Reception:
+        """The same frame read over a path that is not known: what it shows has no place yet."""
+        return replace(self, detections=no_detections(), line_of_sight=False)
+
     def __repr__(self) -> str:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"
         sight = "line of sight, " if self.line_of_sight else ""

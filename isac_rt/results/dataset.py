@@ -17,7 +17,13 @@ import xarray as xr
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.results.losses import LOSSES
-from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord
+from isac_rt.results.records import (
+    KINDS,
+    FrameRecord,
+    LateRecord,
+    ObserverRecord,
+    PictureRecord,
+)
 
 Row = dict[str, Any]
 """A frame, or an observer in it, as numbers, arrays and further rows by name."""
@@ -174,6 +180,12 @@ OBSERVERS: dict[str, Column] = {
     "processed": _number("the observer processed the frame", lambda o: True, bool),
     "state": _number("state of the terminal, -1: not processed", "state", np.int8, missing=-1),
     "decoded": _number("data symbols were decided", "reception.decoded", bool),
+    "latency_frames": _number(
+        "frames after which the data were read, 0: at once, -1: not, or no data",
+        "latency",
+        np.int16,
+        missing=-1,
+    ),
     "line_of_sight": _number(
         "the receiver says that it sees its reference path", "reception.line_of_sight", bool
     ),
@@ -440,6 +452,16 @@ RAGGED = (
 def read(columns: Mapping[str, Column], record: object) -> Row:
     """The values of a record by name."""
     return {name: column.read(record) for name, column in columns.items()}
+
+
+READ_LATE = ("decoded", "latency_frames", "symbol_errors", "symbol_erased")
+"""Of `OBSERVERS` what changes when a frame is read after others have come."""
+
+
+def amended(row: Row, late: LateRecord) -> Row:
+    """An observer's row once its frame's data were read."""
+    values: Row = {name: OBSERVERS[name].read(late) for name in READ_LATE}
+    return {**row, **values, "symbols": list(astuple(late.symbols))}
 
 
 def stacked(parts: Sequence[np.ndarray], column: Column) -> np.ndarray:

@@ -11,11 +11,11 @@ import xarray as xr
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
-from isac_rt.results.dataset import Row, dataset_of, row_of
+from isac_rt.results.dataset import Row, amended, dataset_of, row_of
 from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
-from isac_rt.results.records import KINDS, FrameRecord
-from isac_rt.results.sensing import Sensing, summary_block
+from isac_rt.results.records import KINDS, FrameRecord, LateRecord
+from isac_rt.results.sensing import Sensing, latencies, summary_block
 from isac_rt.results.swarm import summary_of
 from isac_rt.scenario.tree import Scenario
 
@@ -88,18 +88,38 @@ class Recorder:
     timetable: Timetable
     states: Sequence[str]
     rows: list[Row] = field(default_factory=list)
+    amended: set[int] = field(default_factory=set)
+    """Rows that have changed since they were last kept for a later call."""
 
     def add(self, record: FrameRecord) -> None:
         """Append the next frame."""
         self.rows.append(row_of(record))
 
-    def restore(self, rows: Sequence[Row]) -> None:
-        """Append rows of an earlier call.
+    def amend(self, link: Link, late: LateRecord) -> None:
+        """Say of an earlier frame what became of its data."""
+        observers = self.rows[late.frame]["observers"]
+        label = self.timetable.labels[link]
+        observers[label] = amended(observers[label], late)
+        self.amended.add(late.frame)
+
+    def restore(self, rows: Sequence[Row], again: Sequence[tuple[int, Row]] = ()) -> None:
+        """Append rows of an earlier call, and take rows `again` that have changed since, by their
+        places.
 
         Raises
         ------
-        KeyError, ValueError, TypeError  If they are no rows of this run.
+        IndexError, KeyError, ValueError, TypeError  If they are no rows of this run.
         """
+        for place, row in again:
+            if place < 0 or self.rows[place]["frame"] != row["frame"]:
+                raise ValueError(f"row {place} is not of frame {row['frame']}")
+        self._check([*rows, *(row for _, row in again)])
+        for place, row in again:
+            self.rows[place] = row
+        self.rows += rows
+
+    def _check(self, rows: Sequence[Row]) -> None:
+        """Refuse what is no row of this run."""
         dataset_of(rows, self.timetable, self.states)
         kept_of_paths([row["uses"] for row in rows])
         _ = [SymbolCount(*o["symbols"]) for row in rows for o in row["observers"].values()]
@@ -108,7 +128,6 @@ class Recorder:
             for row in rows
             for o in row["observers"].values()
         ]
-        self.rows += rows
 
     def dataset(self) -> xr.Dataset:
         """The labelled arrays of the frames so far."""
@@ -161,7 +180,9 @@ class Recorder:
         ) -> dict[str, Any]:
             sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
             others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
-            return summary_block(role, sensing, symbols, duration) | {"targets": others}
+            found = summary_block(role, sensing, symbols, duration)
+            waits = [o["latency_frames"] for link in links for o in self._of(link)]
+            return found | {"latency_frames": latencies(symbols, waits), "targets": others}
 
         terminals = {}
         for name in dict.fromkeys(link.rx for link in timetable.all_links):

@@ -93,6 +93,7 @@ class ObserverRecord:
         explains each detection, as `isac_rt.results.labels.Explanation` says, targets as indices
         of UAVs
     symbols : what was sent to it and became of it
+    latency : frames after which its data were read, -1: they were not
     fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
         (`isac_rt.access.fall_back`)
     num_false, num_clutter : detections that no path explains, and those that something other than a
@@ -128,11 +129,30 @@ class ObserverRecord:
     detection_face: np.ndarray
     detection_skirt: np.ndarray
     symbols: SymbolCount = field(default_factory=SymbolCount)
+    latency: int = -1
     fell_back: bool = False
     num_false: int = 0
     num_clutter: int = 0
     slips: int = 0
     reference_snr: float = np.nan
+
+
+@dataclass(frozen=True)
+class LateRecord:
+    """What became of a link's earlier frame once its data were read; names as in `ObserverRecord`.
+
+    Attributes
+    ----------
+    frame : its number
+    reception : its symbols
+    symbols : what was sent and became of it
+    latency : frames after which it was read
+    """
+
+    frame: int
+    reception: Reception
+    symbols: SymbolCount
+    latency: int
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,8 +31,9 @@ from isac_rt.results.metrics import (
     truth_of,
     within_view,
 )
-from isac_rt.results.records import ObserverRecord, TrackTable, UavValues
+from isac_rt.results.records import LateRecord, ObserverRecord, TrackTable, UavValues
 from isac_rt.scenario.receivers import Receivers
+from isac_rt.terminal.retrospect import Late
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.swarm import Swarm
 
@@ -46,11 +47,12 @@ MISREAD = 0.5
 @dataclass(frozen=True)
 class Heard:
     """What a terminal made of one frame: reception, tracks and the state it is in then
-    (`TerminalState`)."""
+    (`TerminalState`), and the earlier frames that it made readable."""
 
     reception: Reception
     tracks: TrackSet
     state: int
+    late: tuple[Late, ...] = ()
 
 
 class Scorer:
@@ -108,6 +110,7 @@ class Scorer:
         if self._passes == 1:
             symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
         read = symbols.delay_errors <= MISREAD * symbols.delay_total
+        read &= symbols.frames == 0 or reception.line_of_sight
         chances = self._chances(view, paths, sees)
         loss = np.full(len(hit), -1, np.int8)
         for i, chance in chances.items():
@@ -145,12 +148,25 @@ class Scorer:
             ),
             **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
             symbols=symbols,
+            latency=0 if reception.decoded else -1,
             fell_back=sent.schedule is not timetable.schedule,
             num_false=int((labels.kind < 0).sum()),
             num_clutter=int(((labels.kind >= 0) & (labels.uav < 0)).sum()),
             slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
             reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
         )
+
+    def late(self, frame: int, heard: Heard) -> list[LateRecord]:
+        """What became of earlier frames that frame number `frame` made readable."""
+        timetable, tx = self._timetable, self.link.tx
+        records = []
+        for one in heard.late:
+            since = one.time - timetable.epoch(0, tx)
+            number = round(since / timetable.interval)
+            payload, groups = timetable.payload(tx, number), timetable.groups(self.link)
+            symbols = count_symbols(payload, one.reception, groups)
+            records.append(LateRecord(number, one.reception, symbols, frame - number))
+        return records
 
     def _view(self, frame: int, paths: PathSet) -> _View:
         tx, rx = self.link

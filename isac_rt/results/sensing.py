@@ -259,6 +259,26 @@ def share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
+def latencies(symbols: SymbolCount | None, waits: Sequence[int]) -> dict[str, Any] | None:
+    """Data frames sent to a receiver and read by it, at once or late; null where it receives none.
+
+    Parameters
+    ----------
+    symbols : what was sent to it
+    waits : frames after which each of its frames was read, -1 where it was not
+    """
+    if symbols is None:
+        return None
+    read = np.array([wait for wait in waits if wait >= 0], int)
+    return {
+        "sent": symbols.frames,
+        "read": read.size,
+        "late": int((read > 0).sum()),
+        "mean": float(read.mean()) if read.size else None,
+        "most": int(read.max()) if read.size else None,
+    }
+
+
 def summary_block(
     role: str | list[str], sensing: Sensing, symbols: SymbolCount | None, duration: float
 ) -> dict[str, Any]:

@@ -45,6 +45,11 @@ class Receivers(Node):
     """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
     reflection in the same cell, by direction, before it believes its range. Costs time only in
     frames where one wave does not explain the cell."""
+    link_acquisition: Literal["pilots", "blind"] = "pilots"
+    """From which frames a passive terminal learns over which path it reads data. `pilots`, the default
+    and the paper's: its line of sight in frames without data. `blind`: any path, from data frames
+    too; those that wait for it are read some frames late. The terminal senses only with its line of
+    sight."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""
@@ -209,6 +214,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "refinement": "local",
         "symbol_decision": "powers",
         "separate_reference": False,
+        "link_acquisition": "pilots",
         "passive_detector": "cfar",
         "clutter_filter": "none",
         "clutter_detector": "cfar",
@@ -233,6 +239,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             **PLAIN["receivers"],
             "symbol_decision": "beams",
             "separate_reference": True,
+            "link_acquisition": "blind",
             "passive_detector": "beams",
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,

@@ -320,6 +320,7 @@ class Scenario(Node):
             "passive_detector": ("cfar",),
             "refinement": ("local", "grid"),
             "symbol_decision": ("powers", "profile"),
+            "link_acquisition": ("pilots",),
         }
         for at, receivers in self._all_receivers().items():
             unlike = {k: v for k, v in able.items() if getattr(receivers, k) not in v}

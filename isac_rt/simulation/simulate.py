@@ -32,6 +32,7 @@ from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
+from isac_rt.terminal.retrospect import Late
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
     PassiveTerminal,
@@ -121,6 +122,7 @@ class _Observer:
         own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
         mates = self._mates(frame.number, when)
         state = int(TerminalState.TRACKING)
+        late: tuple[Late, ...] = ()
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
             reception, tracks = self.terminal.step(
@@ -132,9 +134,9 @@ class _Observer:
             reception, tracks = self.terminal.step(
                 cube, own, when, modulated, mates=mates, maps=maps
             )
-            state = int(self.terminal.state)
+            state, late = int(self.terminal.state), self.terminal.late
         self.seconds += time.thread_time() - begun
-        return Heard(reception, tracks, state)
+        return Heard(reception, tracks, state, late)
 
     def _mates(self, frame: int, when: float) -> list[Pose]:
         """Where the other end of the link, or at an active terminal those of all links, say that
@@ -255,6 +257,9 @@ class _Listeners:
                 pictures=pictures,
             )
         )
+        for link, h in heard.items():
+            for late in self.observers[link].scorer.late(frame.number, h):
+                self.recorder.amend(link, late)
 
     def blocks(self) -> dict[str, Any]:
         """`terminals`, `links` and `swarm` of the summary."""
@@ -265,10 +270,15 @@ class _Listeners:
         return {str(link): o.seconds for link, o in self.observers.items()}
 
     def memory(self, first: int) -> dict[str, Any]:
-        """The rows from a frame on, and what every terminal carries over."""
-        observers = {str(link): o.memory() for link, o in self.observers.items()}
-        swarm = None if self.swarm is None else self.swarm.memory()
-        return {"rows": self.recorder.rows[first:], "observers": observers, "swarm": swarm}
+        """The rows from a frame on, earlier ones that have changed, and what every terminal carries
+        over."""
+        rows = self.recorder.rows
+        return {
+            "rows": rows[first:],
+            "amended": [[i, rows[i]] for i in sorted(self.recorder.amended) if i < first],
+            "observers": {str(link): o.memory() for link, o in self.observers.items()},
+            "swarm": None if self.swarm is None else self.swarm.memory(),
+        }
 
     def restore(self, memory: Mapping[str, Any]) -> None:
         """Take up what the terminals carried over."""
@@ -448,6 +458,8 @@ class _Run:
                 self.collect(*at_work.popleft())
             if keep is not None and keep.append(self.memory()):
                 self.kept = len(self.recorder.rows)
+                for one in (self.own, *self.compared.values()):
+                    one.recorder.amended.clear()
             if progress:
                 progress(len(self.recorder.rows), frames)
 
@@ -524,9 +536,10 @@ class _Run:
         for entry in resume.entries():
             with resume.reading():
                 if entry["first"] == len(self.recorder.rows):  # not another call's at the same time
-                    self.recorder.restore(entry["rows"])
+                    self.recorder.restore(entry["rows"], entry["amended"])
                     for name, one in self.compared.items():
-                        one.recorder.restore(entry["compared"][name]["rows"])
+                        part = entry["compared"][name]
+                        one.recorder.restore(part["rows"], part["amended"])
                     last = entry
         if last is not None:
             with resume.reading():

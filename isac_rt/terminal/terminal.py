@@ -37,7 +37,8 @@ from isac_rt.terminal.filter import (
     wrapped,
 )
 from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.images import Doubts
+from isac_rt.terminal.images import WELL_INSIDE, Doubts
+from isac_rt.terminal.retrospect import Late, Retrospect
 from isac_rt.terminal.self_calibration import calibration_of
 from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
 from isac_rt.terminal.standing import Standing
@@ -273,6 +274,14 @@ class PassiveTerminal:
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
         self._profile: np.ndarray | None = None
         self._clutter: ExpectedClutter | None = None
+        self._retrospect: Retrospect | None = None
+        if receivers.link_acquisition == "blind":
+            self._retrospect = Retrospect(self._receiver, waveform)
+
+    @property
+    def late(self) -> tuple[Late, ...]:
+        """Earlier frames that the last step made readable."""
+        return () if self._retrospect is None else self._retrospect.late
 
     def step(
         self,
@@ -300,12 +309,18 @@ class PassiveTerminal:
         reception = self._hear(cube, self._expect(own_pose) if modulated else None, modulated, maps)
         if reception.decoded:
             reception = self._repair_slip(cube, reception, own_pose, maps)
-        if reception.line_of_sight and not self._plausible(reception):
+        refused = reception.line_of_sight and not self._plausible(reception)
+        if refused:
             reception = reception.without_reference()
         if not modulated and reception.line_of_sight:
             heard = self._late(reception.detections, 1)
             self._profile = self._receiver.reader.learn(cube, heard)
-        self._follow(reception, own_pose, modulated)
+        anchored = not modulated
+        if self._retrospect is not None:
+            reception, anchored = self._look_back(
+                self._retrospect, cube, reception, time, refused=refused, anchored=anchored, maps=maps
+            )
+        self._follow(reception, own_pose, anchored)
         if self.reference is not None and reception.line_of_sight:
             self._track(in_plane(reception.detections), own_pose, self.reference)
         tracks = self.tracker.snapshot(own_pose, self.reference)
@@ -321,6 +336,44 @@ class PassiveTerminal:
         self.reference.state = seen_after(self.reference.state, own, change, 1)
         for track in self.tracker.tracks:
             track.state = seen_after(track.state, own, change, 2)
+
+    def _look_back(
+        self,
+        kept: Retrospect,
+        cube: IFCube,
+        reception: Reception,
+        time: float,
+        *,
+        refused: bool,
+        anchored: bool,
+        maps: bool,
+    ) -> tuple[Reception, bool]:
+        """A data frame that the reference does not read, read over any path where one is known, and
+        whether it shows the line of sight as a frame without data does (`anchored`)."""
+        kept.late = ()
+        if anchored:
+            kept.look(cube, time)
+            if refused:
+                kept.start(self._late(reception.detections, 1), time)
+        if reception.line_of_sight:
+            kept.forget()
+        if anchored or reception.decoded:
+            return reception, anchored
+        out = kept.read(cube, time, self._profile, self._clutter, maps=maps)
+        if out is None:
+            return reception, False
+        out = replace(out, detections=self._late(out.detections, -1))
+        if out.line_of_sight and self._plausible(out) and self._well_inside(out):
+            kept.forget()
+            return out, True
+        return out.data_only(), False
+
+    def _well_inside(self, reception: Reception) -> bool:
+        """Whether the reference is not so near the edge of the view that it may have come from the
+        opposite one: a track of it would fly elsewhere."""
+        d = reception.detections
+        edge = WELL_INSIDE * self._receiver.antennas.view_limit
+        return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
     def _track(self, detections: Detections, own: Pose, reference: Track) -> None:
         """Carry on the reflectors' tracks, and start those that the city does not explain."""
@@ -365,6 +418,7 @@ class PassiveTerminal:
             "ends": list(self._ends),
             "profile": self._profile,
             "calibration": None if self.calibration is None else self.calibration.memory(),
+            "retrospect": None if self._retrospect is None else self._retrospect.memory(),
         }
 
     def restore(self, memory: dict[str, Any]) -> None:
@@ -377,6 +431,8 @@ class PassiveTerminal:
         self._ends = deque(memory["ends"], maxlen=EVIDENCE_FRAMES)
         if self.calibration is not None:
             self.calibration.restore(memory["calibration"])
+        if self._retrospect is not None:
+            self._retrospect.restore(memory["retrospect"])
 
     def shorten(self, cells: int, own_pose: Pose) -> None:
         """Take whole cells off the reference's range, as the active terminal's answer to feedback
@@ -430,8 +486,9 @@ class PassiveTerminal:
         scaled = reception.reference_power * d.range[d.is_reference][0] ** 2
         return bool(scaled >= self._level / LEVEL_DROP)
 
-    def _follow(self, reception: Reception, own: Pose, modulated: bool) -> None:
-        """Update or restart the reference track, and say where the terminal stands."""
+    def _follow(self, reception: Reception, own: Pose, anchored: bool) -> None:
+        """Update or restart the reference track, and say where the terminal stands. A frame that is
+        `anchored` found its reference without the track."""
         if not reception.line_of_sight:
             if self.reference is not None:
                 self.reference.missed += 1
@@ -443,7 +500,7 @@ class PassiveTerminal:
         std = np.maximum(d.std[q], REFERENCE_STD_CELLS * np.array([*self._cells, 0.0, 0.0]))
         off = self._disbelief(z, own)
         if self.reference is None or (
-            not modulated and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)
+            anchored and (off > ANCHOR_CELLS or self.reference.missed > PATIENCE)
         ):
             self._restart(d, q, std, own)
         elif off > 0:

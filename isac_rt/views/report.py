@@ -116,10 +116,16 @@ def _rates(link: Mapping[str, Any], keys: Iterable[str]) -> list[str]:
 def per_terminal(summary: Mapping[str, Any]) -> Table:
     """Decoding and detection, one row for each link (and so for each terminal)."""
     rows = [
-        (_link(name), s["role"], *_rates(s, _RATES.values()))
+        (_link(name), s["role"], *_rates(s, _RATES.values()), *_waits(s.get("latency_frames")))
         for name, s in summary["links"].items()
     ]
-    return Table(("Link", "Role", *_RATES), rows)
+    titles = ("Link", "Role", *_RATES, "Data frames read", "Of these late", "Frames late, at most")
+    return Table(titles, rows)
+
+
+def _waits(latency: Mapping[str, Any] | None) -> list[str]:
+    """Data frames of a link that were read, late ones among them, and by how much."""
+    return [number(None if latency is None else latency[key]) for key in ("read", "late", "most")]
 
 
 def side_by_side(summary: Mapping[str, Any]) -> Table:

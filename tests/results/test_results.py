@@ -39,6 +39,7 @@ TERMINAL_KEYS = {
     "rmse",
     "rmse_tracked",
     "erased",
+    "latency_frames",
     "matched",
     "matched_tracked",
     "false_per_frame",

@@ -17,6 +17,7 @@ from scipy import special
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, running_phases
+from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter.filter import chirp_runs
@@ -103,11 +104,11 @@ def demodulate_beams(
     for k in range(len(rows)):
         picked[k] *= np.exp(-2j * np.pi * known_cycles(w, delays[k], rates[k], raw))
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
-    product, length = _transitions(picked, cube, raw)
+    product, length = transitions_of(picked, cube.schedule, w, raw)
     far = (FARTHEST_STDS * p.velocity_std + FARTHEST_BINS * w.velocity_cell(1)) / SPEED_OF_LIGHT
     summed = np.zeros(product.shape[1:], np.complex128)
     for k in range(len(rows)):
-        rate = _rate_error(product[k], length, far[k], dpsk_order, w)
+        rate = rate_error(product[k], length, far[k], dpsk_order, w)
         product[k] *= np.exp(-2j * np.pi * rate * w.effective_carrier * length)
         summed += product[k] * (2 * snr[k] / (noise[k] * (1 + 2 * snr[k])))
     transitions, spread = nearest_symbols(summed, dpsk_order)
@@ -187,21 +188,21 @@ def _likelihood(spectra: np.ndarray) -> tuple[float, float, np.ndarray]:
     return noise, snr, np.log(special.i0e(x)) + x
 
 
-def _transitions(
-    picked: np.ndarray, cube: IFCube, raw: np.ndarray
+def transitions_of(
+    picked: np.ndarray, schedule: Schedule, waveform: Waveform, raw: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Products of each antenna's consecutive chirps with the conjugate of the earlier one, (K, M,
     L_tx, P/L_tx - 1), and the time between them [s] (M, L_tx, P/L_tx - 1)."""
-    w = cube.waveform
+    w = waveform
     products = []
     for one in picked:
-        chains = by_antenna(one, cube.schedule, w.num_tx)
+        chains = by_antenna(one, schedule, w.num_tx)
         products.append(chains[..., 1:] * chains[..., :-1].conj())
-    times = by_antenna(w.middle_time + raw * w.delay_step, cube.schedule, w.num_tx)
+    times = by_antenna(w.middle_time + raw * w.delay_step, schedule, w.num_tx)
     return np.array(products), np.diff(times, axis=-1)
 
 
-def _rate_error(
+def rate_error(
     product: np.ndarray, length: np.ndarray, far: float, order: int, waveform: Waveform
 ) -> float:
     """Error of a predicted delay rate from the DPSK phases of all groups and antennas: the maximum

@@ -1,0 +1,166 @@
+"""Data without a line of sight: paths found in data frames alone, and frames read late by them.
+
+A passive terminal that cannot read a data frame keeps what is strongest in every chirp. Once a batch of
+such frames, or a pilot among them, shows a path (`isac_rt.receive.symbols.blind`), all of the batch are
+read, and the frames that follow are read over that path as they come, as long as it lasts. Any path
+carries the data. Whether it is the line of sight shows the frame itself, once its data are out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive import Reception
+from isac_rt.receive.passive import PassiveReceiver
+from isac_rt.receive.symbols.blind import DataPath, Peaks, acquire
+from isac_rt.receive.types import Detections, ExpectedClutter
+
+BATCH = 8
+"""Frames kept at most."""
+SPAN = 0.5
+"""Age at which a frame is let go [s]: longer flights bend more than the comb tries."""
+COAST_CELLS = 0.2
+"""A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
+GATE_CELLS = 0.4
+"""Cells within which the path is found again in a frame that was read over it."""
+STD_CELLS = 0.02
+"""Floor of its range and velocity deviations in cells."""
+
+
+@dataclass(frozen=True)
+class Late:
+    """A frame that was read after others had come.
+
+    Attributes
+    ----------
+    time : of its middle [s]
+    reception : its symbols
+    """
+
+    time: float
+    reception: Reception
+
+
+class Retrospect:
+    """What a passive terminal keeps of frames that it could not read, and the path over which it
+    reads now.
+
+    Attributes
+    ----------
+    path : None where none is known
+    late : earlier frames that the last one made readable
+    """
+
+    def __init__(self, receiver: PassiveReceiver, waveform: Waveform) -> None:
+        self._receiver, self._waveform = receiver, waveform
+        self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
+        self._batch: list[Peaks] = []
+        self.path: DataPath | None = None
+        self.late: tuple[Late, ...] = ()
+
+    def read(
+        self,
+        cube: IFCube,
+        time: float,
+        profile: np.ndarray | None,
+        clutter: ExpectedClutter | None,
+        *,
+        maps: bool,
+    ) -> Reception | None:
+        """A data frame that the line of sight does not read, over the path that is known or that it
+        makes known; None where there is none yet."""
+        if self.path is not None:
+            out = self._over(cube, time, profile, clutter, maps=maps)
+            if out is not None:
+                return out
+        self.path = self._learn(cube, time, True)
+        if self.path is None:
+            return None
+        return self._over(cube, time, profile, clutter, maps=maps)
+
+    def look(self, cube: IFCube, time: float) -> None:
+        """A frame without data, which tells the whole cells of those that wait."""
+        if self._batch:
+            self.path = self._learn(cube, time, False) or self.path
+
+    def start(self, detections: Detections, time: float) -> None:
+        """Go on over the strongest path of a frame without data whose reference is none."""
+        d = detections.select(np.isfinite(detections.direction).all(axis=1))
+        if len(d):
+            i = int(d.snr.argmax())
+            mean = np.array([d.range[i], d.velocity[i], 0.0])
+            spread = np.append(self._deviations(d, i), 3.0) ** 2
+            self.path = DataPath(time, mean, np.diag(spread), d.direction[i])
+
+    def forget(self) -> None:
+        """The line of sight reads again."""
+        self.path, self._batch = None, []
+
+    def memory(self) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        kept = ("time", "modulated", "schedule", "cells", "places", "values", "noise")
+        return {
+            "batch": [{name: getattr(one, name) for name in kept} for one in self._batch],
+            "path": None if self.path is None else dict(vars(self.path)),
+        }
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        groups, w = self._receiver.groups, self._waveform
+        mine = w if groups is None else w.of_groups(groups)
+        self._batch = [Peaks(waveform=mine, **one) for one in memory["batch"]]
+        path = memory["path"]
+        self.path = None if path is None else DataPath(**path)
+
+    def _learn(self, cube: IFCube, time: float, modulated: bool) -> DataPath | None:
+        """Keep a frame, and read those that wait where it makes a path known."""
+        young = [one for one in self._batch if time - one.time <= SPAN]
+        self._batch = [*young[1 - BATCH :], self._receiver.peaks(cube, time, modulated)]
+        order = self._receiver.reader.order
+        path = acquire(self._batch, self._receiver.antennas, order)
+        if path is None:
+            return None
+        waiting, self._batch = self._batch, []
+        for one in waiting:
+            if one.modulated and one.time < time:
+                there = path.at(one.time).prediction
+                reception = self._receiver.read_kept(one, there, self._waveform)
+                if reception is not None:
+                    self.late += (Late(one.time, reception),)
+        return path
+
+    def _over(
+        self,
+        cube: IFCube,
+        time: float,
+        profile: np.ndarray | None,
+        clutter: ExpectedClutter | None,
+        *,
+        maps: bool,
+    ) -> Reception | None:
+        """A frame read over the path, which it makes known better; None where it cannot be."""
+        assert self.path is not None
+        self.path = self.path.at(time)
+        expected = self.path.prediction
+        if expected.range_std[0] > COAST_CELLS * self._cells[0]:
+            return None
+        out = self._receiver.receive_over(cube, expected, profile, clutter, maps=maps)
+        if not out.decoded:
+            return None
+        d = out.detections
+        off = np.abs(np.stack([d.range, d.velocity]).T - self.path.mean[:2])
+        near = (off < GATE_CELLS * self._cells).all(axis=1) & np.isfinite(d.direction).all(axis=1)
+        if near.any():
+            i = int(np.where(near, d.snr, -1.0).argmax())
+            measured = np.array([d.range[i], d.velocity[i]])
+            self.path = self.path.seen(measured, self._deviations(d, i), d.direction[i])
+        return out
+
+    def _deviations(self, detections: Detections, i: int) -> np.ndarray:
+        """Of range and velocity of a detection (2,)."""
+        return np.maximum(detections.std[i, :2], STD_CELLS * self._cells)

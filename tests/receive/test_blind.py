@@ -1,0 +1,215 @@
+"""Links acquired from data frames alone, on cubes from the equation of the IF signal
+(`receiver_cubes`): path, symbols, what must not lock, and what a terminal does with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from receiver_cubes import ANTENNAS, C, Path, cube, frame
+
+from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.symbols.blind import acquire, find_peaks, read_peaks
+from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.terminal.terminal import PassiveTerminal, TerminalState
+from isac_rt.world.swarm import Pose
+
+W = Waveform(num_samples=256, num_chirps=48)
+INTERVAL = 0.0041
+"""Of the frames [s], which last 0.8 ms."""
+ORDER = 8
+START, RATE, BEND, ARRIVAL = 23.71, -17.3, 4.1, (0.31, -0.22)
+
+
+def payloads(count, seed=5):
+    """A schedule and so many frames' data."""
+    _, schedule, _ = frame(waveform=W)
+    rng = np.random.default_rng(seed)
+    return schedule, [random_payload(W, schedule, ORDER, rng) for _ in range(count)]
+
+
+def path_at(n, amplitude=1.0, start=START):
+    t = n * INTERVAL
+    length, rate = start + RATE * t + BEND * t * t / 2, RATE + BEND * t
+    return Path(length, rate, amplitude, arrival=ARRIVAL)
+
+
+def flight(sent, schedule, amplitude, noise=1.0, seed=7, start=START):
+    """Frames with one path, each kept as its peaks."""
+    out = []
+    for n, payload in enumerate(sent):
+        paths = [path_at(n, amplitude, start)]
+        made = cube(W, schedule, payload, paths, noise=noise, seed=seed + n)
+        out.append(find_peaks(made, n * INTERVAL, bool(payload.delay_symbols.any())))
+    return out
+
+
+def narrow(payload, low, high):
+    """The same frame with all of its delay symbols from `low` to `high`."""
+    return replace(payload, delay_symbols=low + payload.delay_symbols % (high - low + 1))
+
+
+def test_a_path_is_found_and_read_without_a_pilot():
+    """Three frames at -13 dB a sample (11 dB in a cell, 23 in the beam): length, rate and direction
+    within what 432 chirps show, every symbol right. Planted bugs: the comb's rate with the other
+    sign, the path's Doppler left in its length, the phases not brought back from the middle of the
+    samples."""
+    schedule, sent = payloads(3)
+    kept = flight(sent, schedule, 10 ** (-13 / 20))
+    found = acquire(kept, ANTENNAS, ORDER)
+    assert found is not None
+    truth = path_at(2)
+    deviations = np.sqrt(np.diag(found.covariance))
+    assert deviations[0] < 0.05 * W.range_cell(1) and deviations[1] < 0.5
+    assert abs(found.mean[0] - truth.length) < max(4 * deviations[0], 0.02 * W.range_cell(1))
+    assert abs(found.mean[1] - truth.rate) < 4 * deviations[1]
+    # 432 chirps in a beam of 0.2: a thousandth; the search ends at steps of 0.001
+    assert np.abs(found.direction - ARRIVAL).max() < 0.01
+    for n, (one, payload) in enumerate(zip(kept, sent, strict=True)):
+        there = found.at(n * INTERVAL).prediction
+        symbols = read_peaks(one, there, ANTENNAS, ORDER)
+        assert np.array_equal(symbols.delay, payload.delay_symbols)
+        assert np.array_equal(symbols.transitions, payload.transitions)
+        assert np.array_equal(symbols.bits, payload.bits)
+
+
+def test_peaks_lie_where_the_tones_do():
+    """Without noise, over all fractions of a cell: within 0.02 cells, what the path's rate moves a
+    chirp's tone while it is sampled and what other symbols delay it. Planted bug: the parabola's top
+    as it is (0.05 cells off)."""
+    schedule, sent = payloads(1)
+    for start in np.linspace(20, 20.5, 7):
+        path = Path(start, 11.0, 1.0, arrival=ARRIVAL)
+        kept = find_peaks(cube(W, schedule, sent[0], [path]), 0.0, True)
+        beats = W.beat_cells(start / C, 11.0 / C) + sent[0].delay_symbols
+        assert np.abs(kept.cells[..., 0] - beats).max() < 0.02
+
+
+def test_symbols_that_leave_whole_cells_open_are_not_read():
+    """Data that use 100 of the 128 symbols fit at 29 shifts; a pilot, whose symbols are 0, tells
+    which. Planted bug: the lowest symbol taken for 0."""
+    schedule, sent = payloads(4)
+    some = [narrow(p, 9, 108) for p in sent]
+    kept = flight(some, schedule, 0.4)
+    assert acquire(kept, ANTENNAS, ORDER) is None
+    with_pilot = flight([*some, unmodulated(W)], schedule, 0.4)
+    assert not with_pilot[-1].modulated
+    found = acquire(with_pilot, ANTENNAS, ORDER)
+    assert abs(found.mean[0] - path_at(4).length) < 0.05 * W.range_cell(1)
+    symbols = read_peaks(with_pilot[0], found.at(0.0).prediction, ANTENNAS, ORDER)
+    assert np.array_equal(symbols.delay, some[0].delay_symbols)
+
+
+def test_one_frame_whose_rate_is_not_known_well_enough_is_not_read():
+    """At -19 dB a sample one frame's rate is known to some 2 m/s, and 1.25 m/s turn every DPSK symbol
+    by half a step; the third frame settles it. Planted bug: any deviation accepted."""
+    _, schedule, payload = frame(order=ORDER, seed=1, waveform=W)
+    full = payload.delay_symbols.copy()
+    full.flat[:2] = 0, W.num_delay_symbols - 1  # one shift is left
+    sent = [replace(payload, delay_symbols=full)] * 3
+    kept = flight(sent, schedule, 10 ** (-16 / 20))
+    assert acquire(kept[:1], ANTENNAS, ORDER) is None
+    assert acquire(kept, ANTENNAS, ORDER) is not None
+
+
+@pytest.mark.parametrize("kind", ["noise", "others", "standing"])
+def test_what_holds_no_data_of_a_path_does_not_lock(kind):
+    """Noise; five paths of as many strangers' data, none of which moves with another's; a tone that
+    stands still. Planted bug for the last: as many shifts as there are taken for one."""
+    rng = np.random.default_rng(17)
+    schedule, sent = payloads(6)
+    for trial in range(1 if kind == "others" else 2):
+        kept = []
+        for n in range(3):
+            paths = []
+            if kind == "others":
+                paths = [
+                    Path(
+                        10 + 50 * rng.random(),
+                        rng.uniform(-20, 20),
+                        np.exp(2j * np.pi * rng.random()),
+                        arrival=tuple(rng.uniform(-0.6, 0.6, 2)),
+                    )
+                    for _ in range(5)
+                ]
+            made = cube(W, schedule, sent[n], paths[:1], noise=0.5, seed=100 * trial + n)
+            samples = made.samples
+            for path, payload in zip(paths[1:], sent[1:], strict=False):
+                samples = samples + cube(W, schedule, payload, [path]).samples
+            if kind == "standing":
+                samples = samples + np.exp(2j * np.pi * 0.123 * np.arange(W.num_samples))
+            made = replace(made, samples=samples.astype(np.complex64))
+            kept.append(find_peaks(made, n * INTERVAL, True))
+        assert acquire(kept, ANTENNAS, ORDER) is None, trial
+
+
+def terminal(amplitude, groups=None):
+    """A passive terminal for which a path of 25 m has a `amplitude` of free space."""
+    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
+    free = ANTENNAS.gain * W.wavelength / (4 * np.pi * 25)
+    sent = amplitude / free
+    return PassiveTerminal(W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups)
+
+
+OWN = Pose.at_rest()
+
+
+def play(receiver, cubes, first=0):
+    """Receptions at once and late of frames with data, by their numbers."""
+    out = {}
+    for n, made in enumerate(cubes, first):
+        out[n, n], _ = receiver.step(made, OWN, n * INTERVAL, True)
+        for late in receiver.late:
+            out[round(late.time / INTERVAL), n] = late.reception
+    return out
+
+
+def cubes_of(sent, schedule, amplitude, noise=1.0):
+    return [
+        cube(W, schedule, payload, [path_at(n, amplitude)], noise=noise, seed=50 + n)
+        for n, payload in enumerate(sent)
+    ]
+
+
+def test_a_terminal_reads_in_retrospect_and_goes_on():
+    """No pilot at all. What is read late and at once is what was sent; as strong as free space, the
+    path is the line of sight once it is read, and sensing goes on from it; 20 dB weaker it carries
+    data only. Stopped and resumed with a batch that waits, all is as in one go. Planted bugs: late
+    frames not handed out, the batch not restored, a mirror path taken for the line of sight."""
+    schedule, sent = payloads(6)
+    cubes = cubes_of(sent, schedule, 0.5)
+    for weaker, sees in ((1.0, True), (0.1, False)):
+        whole, first, second = (terminal(0.5 / weaker) for _ in range(3))
+        heard = play(whole, cubes)
+        read = {n: (now, r) for (n, now), r in heard.items() if r.decoded}
+        assert sorted(read) == list(range(6)) and any(now > n for n, (now, _) in read.items())
+        for n, (_, reception) in read.items():
+            assert np.array_equal(reception.bits, sent[n].bits), n
+            assert np.array_equal(reception.delay_symbols, sent[n].delay_symbols)
+        last = read[5][1]
+        assert last.line_of_sight == sees and bool(len(last.detections)) == sees
+        assert (whole.state == TerminalState.TRACKING) == sees
+        parts = play(first, cubes[:1])
+        assert not parts[0, 0].decoded
+        second.restore(first.memory())
+        parts |= play(second, cubes[1:], 1)
+        assert parts.keys() == heard.keys()
+        for key, reception in heard.items():
+            assert np.array_equal(parts[key].bits, reception.bits), key
+
+
+def test_a_terminal_reads_its_own_groups_late():
+    """Two of three groups are meant for it: their symbols, and nothing in the third. Planted bug: the
+    late frame in the shapes of its own groups."""
+    schedule, sent = payloads(6)
+    receiver = terminal(0.5, groups=(0, 2))
+    heard = play(receiver, cubes_of(sent, schedule, 0.5))
+    late = {n: r for (n, now), r in heard.items() if now > n}
+    assert late
+    for n, reception in late.items():
+        assert (reception.delay_symbols[1] == -1).all() and (reception.transitions[1] == -1).all()
+        mine = sent[n].delay_symbols[[0, 2]]
+        assert np.array_equal(reception.delay_symbols[[0, 2]], mine)
+        assert np.array_equal(reception.bits, sent[n].bits_of((0, 2)))
