@@ -186,7 +186,7 @@ class Reception:
         there is none
     maps : Maps or None
     soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or
-        decided from powers
+        decided from powers or in retrospect
     confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many
         exponentials; 0 when not decoded
     sparse : where the velocities came from sparse sampling with OMP or from a conventional

@@ -11,7 +11,7 @@ from receiver_cubes import ANTENNAS, C, Path, cube, frame
 
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.symbols.blind import acquire, find_peaks, read_peaks
+from isac_rt.receive.symbols.blind import Peaks, acquire, find_peaks, read_peaks
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.terminal import PassiveTerminal, TerminalState
 from isac_rt.world.swarm import Pose
@@ -53,8 +53,7 @@ def narrow(payload, low, high):
 
 def test_a_path_is_found_and_read_without_a_pilot():
     """Three frames at -13 dB a sample (11 dB in a cell, 23 in the beam): length, rate and direction
-    within what 432 chirps show, every symbol right. Planted bugs: the comb's rate with the other
-    sign, the path's Doppler left in its length, the phases not brought back from the middle of the
+    within what 432 chirps show, every symbol right. Planted bugs: the path's Doppler left in its length, the phases not brought back from the middle of the
     samples."""
     schedule, sent = payloads(3)
     kept = flight(sent, schedule, 10 ** (-13 / 20))
@@ -73,6 +72,41 @@ def test_a_path_is_found_and_read_without_a_pilot():
         assert np.array_equal(symbols.delay, payload.delay_symbols)
         assert np.array_equal(symbols.transitions, payload.transitions)
         assert np.array_equal(symbols.bits, payload.bits)
+
+
+def test_the_path_over_frames_far_apart():
+    """Frames of full size, 45 ms apart, in which 31 m/s are half a cell within a frame and 2.8 cells to
+    the next: cells straight from the beat's equation, 0.08 cells off, one in fifteen anywhere, one in
+    ten from another direction. Planted bugs: the rate within frames with the other sign, chirps off
+    the comb counted among the symbols."""
+    w, rng = Waveform(), np.random.default_rng(23)
+    length, rate, bend, arrival = 141.27, -31.3, 5.0, np.array([-0.42, 0.17])
+    slope = w.bandwidth / w.chirp_duration
+    kept = []
+    for n in range(4):
+        t = 0.045 * n + w.chirp_time + w.chirp_duration / 2 - w.frame_duration / 2
+        tau = (length + rate * t + bend * t * t / 2) / C
+        doppler = (rate + bend * t) / C * (w.carrier_frequency + slope * w.chirp_duration / 2)
+        cells = (slope * tau + doppler) * w.sampled_duration + rng.integers(0, 512, t.shape)
+        cells += 0.08 * rng.standard_normal(t.shape)
+        lost = rng.random(t.shape) < 1 / 15
+        cells[lost] = rng.uniform(0, 1024, lost.sum())
+        from_there = np.where(lost[..., None], rng.uniform(-0.6, 0.6, (*t.shape, 2)), arrival)
+        x, z = ANTENNAS.rx_positions[:, [0, 2]].T
+        ahead = from_there[..., :1] * x + from_there[..., 1:] * z
+        values = 4 * np.exp(-2j * np.pi * w.effective_carrier * ahead / C)
+        values += rng.standard_normal((*values.shape, 2)).view(complex)[..., 0] / np.sqrt(2)
+        places = np.round(2 * cells).astype(int)
+        parts = (a[:, :, None] for a in (cells, places, values))
+        kept.append(Peaks(0.045 * n, True, w, None, *parts, 1.0))
+    found = acquire(kept, ANTENNAS, ORDER)
+    t = 0.135
+    truth = length + rate * t + bend * t * t / 2, rate + bend * t
+    deviations = np.sqrt(np.diag(found.covariance))
+    assert deviations[0] < 0.01 and deviations[1] < 0.2
+    # the window's middle lies 6 us beside the chirp's: 0.2 mm
+    assert np.all(np.abs(found.mean[:2] - truth) < 4 * deviations[:2] + 0.0005)
+    assert np.abs(found.direction - arrival).max() < 0.01
 
 
 def test_peaks_lie_where_the_tones_do():
@@ -198,6 +232,18 @@ def test_a_terminal_reads_in_retrospect_and_goes_on():
         assert parts.keys() == heard.keys()
         for key, reception in heard.items():
             assert np.array_equal(parts[key].bits, reception.bits), key
+
+
+def test_a_line_of_sight_at_the_edge_of_the_view_carries_data_only():
+    """From a cosine of 0.84 a wave has the phases of one from -0.89, beyond the view: read, and no
+    track begins. Planted bug: any direction taken."""
+    schedule, sent = payloads(3)
+    receiver = terminal(0.5)
+    paths = [replace(path_at(n, 0.5), arrival=(0.84, 0.0)) for n in range(3)]
+    cubes = [cube(W, schedule, p, [q], noise=0.1) for p, q in zip(sent, paths, strict=True)]
+    heard = play(receiver, cubes)
+    assert heard[2, 2].decoded and np.array_equal(heard[2, 2].bits, sent[2].bits)
+    assert not heard[2, 2].line_of_sight and receiver.reference is None
 
 
 def test_a_terminal_reads_its_own_groups_late():

@@ -51,6 +51,10 @@ FRACTION = 0.25
 """Distance from the comb beyond which a chirp shows another path [cells]."""
 READ_SHARE = 0.5
 """Share of a frame's chirps that must lie on the comb for its symbols to be read."""
+MOST_OUTSIDE = 0.05
+"""Share of chirps that may lie outside the alphabet."""
+LEAST_ODDS = 300.0
+"""Of the whole cells that are taken against any other."""
 AGREED = 0.8
 """Share of a pilot's chirps that must agree on the whole cells."""
 ALIAS_STDS, STEP_STDS = 4.0, 3.0
@@ -378,21 +382,29 @@ def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.nda
 
 
 def _whole_cells(seen: Sequence[_Seen], state: np.ndarray, symbols: int) -> int | None:
-    """The whole cells that a path's beat has besides; None if more than one number can be."""
-    low, high, pilots = -np.inf, np.inf, []
+    """The whole cells that a path's beat has besides; None if more than one number can be.
+
+    A chirp that shows another path lies anywhere, half of the time outside the alphabet. So a shift
+    with d more symbols outside than the best one, which leaves o of n, is as likely as ((o+1)/n)^d.
+    """
+    wholes: dict[bool, list[np.ndarray]] = {True: [np.zeros(0)], False: [np.zeros(0)]}
     for one in seen:
         t = one.middle + one.time
         off = one.cell - (state[0] + state[1] * t + state[2] * t * t / 2)
         whole = np.round(off)
-        whole = whole[np.abs(off - whole) < FRACTION]
-        if not one.modulated:
-            pilots.append(whole)
-        elif whole.size:
-            low, high = max(low, whole.max() - (symbols - 1)), min(high, whole.min())
-    sent = np.concatenate([np.zeros(0), *pilots])
-    if sent.size >= LEAST_CHIRPS:
-        middle = np.median(sent)
-        if (sent == middle).mean() < AGREED:
+        wholes[one.modulated].append(whole[np.abs(off - whole) < FRACTION])
+    data, pilot = (np.sort(np.concatenate(wholes[kind])) for kind in (True, False))
+    shifts = np.arange(data[0] - symbols + 1, data[-1] + 1)
+    inside = np.searchsorted(data, shifts + symbols) - np.searchsorted(data, shifts)
+    if pilot.size >= LEAST_CHIRPS:
+        sent = np.median(pilot)
+        inside = np.where(shifts == sent, inside, 0)
+        if (pilot == sent).mean() < AGREED:
             return None
-        low, high = max(low, middle), min(high, middle)
-    return int(low) if low == high else None
+    best = int(inside.argmax())
+    outside = data.size - int(inside[best])
+    if outside > MOST_OUTSIDE * data.size:
+        return None
+    further = int(inside[best] - np.delete(inside, best).max())
+    clear = further * np.log(data.size / (outside + 1)) >= np.log(LEAST_ODDS)
+    return int(shifts[best]) if clear else None
