@@ -46,10 +46,10 @@ class Receivers(Node):
     reflection in the same cell, by direction, before it believes its range. Costs time only in
     frames where one wave does not explain the cell."""
     link_acquisition: Literal["pilots", "blind"] = "pilots"
-    """From which frames a passive terminal learns over which path it reads data. `pilots`, the default
-    and the paper's: its line of sight in frames without data. `blind`: any path, from data frames
-    too; those that wait for it are read some frames late. The terminal senses only with its line of
-    sight."""
+    """From which frames a passive terminal learns over which path it reads data. `pilots`, the
+    default and the paper's: its line of sight in frames without data. `blind`: any path, from data
+    frames too; those that wait for it are read some frames late. The terminal senses only with its
+    line of sight."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""

@@ -1,9 +1,10 @@
 """Data without a line of sight: paths found in data frames alone, and frames read late by them.
 
-A passive terminal that cannot read a data frame keeps what is strongest in every chirp. Once a batch of
-such frames, or a pilot among them, shows a path (`isac_rt.receive.symbols.blind`), all of the batch are
-read, and the frames that follow are read over that path as they come, as long as it lasts. Any path
-carries the data. Whether it is the line of sight shows the frame itself, once its data are out.
+A passive terminal that cannot read a data frame keeps what is strongest in every chirp. Once a
+batch of such frames, or a pilot among them, shows a path (`isac_rt.receive.symbols.blind`), all of
+the batch are read, and the frames that follow are read over that path as they come, as long as it
+lasts. Any path carries the data. Whether it is the line of sight shows the frame itself, once its
+data are out.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ BATCH = 8
 SPAN = 0.5
 """Age at which a frame is let go [s]: longer flights bend more than the comb tries."""
 COAST_CELLS = 0.2
-"""A prediction whose range is known worse than this many cells cannot read the fraction of a cell."""
+"""A prediction whose range is known worse than this many cells cannot read the fraction of a
+cell."""
 GATE_CELLS = 0.4
 """Cells within which the path is found again in a frame that was read over it."""
 STD_CELLS = 0.02

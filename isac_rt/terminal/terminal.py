@@ -318,7 +318,13 @@ class PassiveTerminal:
         anchored = not modulated
         if self._retrospect is not None:
             reception, anchored = self._look_back(
-                self._retrospect, cube, reception, time, refused=refused, anchored=anchored, maps=maps
+                self._retrospect,
+                cube,
+                reception,
+                time,
+                refused=refused,
+                anchored=anchored,
+                maps=maps,
             )
         self._follow(reception, own_pose, anchored)
         if self.reference is not None and reception.line_of_sight:

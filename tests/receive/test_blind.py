@@ -53,8 +53,8 @@ def narrow(payload, low, high):
 
 def test_a_path_is_found_and_read_without_a_pilot():
     """Three frames at -13 dB a sample (11 dB in a cell, 23 in the beam): length, rate and direction
-    within what 432 chirps show, every symbol right. Planted bugs: the path's Doppler left in its length, the phases not brought back from the middle of the
-    samples."""
+    within what 432 chirps show, every symbol right. Planted bugs: the path's Doppler left in its
+    length, the phases not brought back from the middle of the samples."""
     schedule, sent = payloads(3)
     kept = flight(sent, schedule, 10 ** (-13 / 20))
     found = acquire(kept, ANTENNAS, ORDER)
@@ -75,10 +75,10 @@ def test_a_path_is_found_and_read_without_a_pilot():
 
 
 def test_the_path_over_frames_far_apart():
-    """Frames of full size, 45 ms apart, in which 31 m/s are half a cell within a frame and 2.8 cells to
-    the next: cells straight from the beat's equation, 0.08 cells off, one in fifteen anywhere, one in
-    ten from another direction. Planted bugs: the rate within frames with the other sign, chirps off
-    the comb counted among the symbols."""
+    """Frames of full size, 45 ms apart, in which 31 m/s are half a cell within a frame and 2.8
+    cells to the next: cells straight from the beat's equation, 0.08 cells off, one in fifteen
+    anywhere, one in ten from another direction. Planted bugs: the rate within frames with the
+    other sign, chirps off the comb counted among the symbols."""
     w, rng = Waveform(), np.random.default_rng(23)
     length, rate, bend, arrival = 141.27, -31.3, 5.0, np.array([-0.42, 0.17])
     slope = w.bandwidth / w.chirp_duration
@@ -111,8 +111,8 @@ def test_the_path_over_frames_far_apart():
 
 def test_peaks_lie_where_the_tones_do():
     """Without noise, over all fractions of a cell: within 0.02 cells, what the path's rate moves a
-    chirp's tone while it is sampled and what other symbols delay it. Planted bug: the parabola's top
-    as it is (0.05 cells off)."""
+    chirp's tone while it is sampled and what other symbols delay it. Planted bug: the parabola's
+    top as it is (0.05 cells off)."""
     schedule, sent = payloads(1)
     for start in np.linspace(20, 20.5, 7):
         path = Path(start, 11.0, 1.0, arrival=ARRIVAL)
@@ -137,8 +137,8 @@ def test_symbols_that_leave_whole_cells_open_are_not_read():
 
 
 def test_one_frame_whose_rate_is_not_known_well_enough_is_not_read():
-    """At -19 dB a sample one frame's rate is known to some 2 m/s, and 1.25 m/s turn every DPSK symbol
-    by half a step; the third frame settles it. Planted bug: any deviation accepted."""
+    """At -19 dB a sample one frame's rate is known to some 2 m/s, and 1.25 m/s turn every DPSK
+    symbol by half a step; the third frame settles it. Planted bug: any deviation accepted."""
     _, schedule, payload = frame(order=ORDER, seed=1, waveform=W)
     full = payload.delay_symbols.copy()
     full.flat[:2] = 0, W.num_delay_symbols - 1  # one shift is left
@@ -247,8 +247,8 @@ def test_a_line_of_sight_at_the_edge_of_the_view_carries_data_only():
 
 
 def test_a_terminal_reads_its_own_groups_late():
-    """Two of three groups are meant for it: their symbols, and nothing in the third. Planted bug: the
-    late frame in the shapes of its own groups."""
+    """Two of three groups are meant for it: their symbols, and nothing in the third. Planted bug:
+    the late frame in the shapes of its own groups."""
     schedule, sent = payloads(6)
     receiver = terminal(0.5, groups=(0, 2))
     heard = play(receiver, cubes_of(sent, schedule, 0.5))

@@ -1,5 +1,5 @@
-"""Frames that are read after others have come: their records, what a run says of them, and that a run
-that was stopped in between goes on to the same bits."""
+"""Frames that are read after others have come: their records, what a run says of them, and that a
+run that was stopped in between goes on to the same bits."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def whole():
 
 
 def test_late_frames_are_amended(whole):
-    """PT2 sees the AT from frame 4 or 5 on. Every data frame from then on is read, some of them late,
-    each symbol right; with pilots alone none is, and PT1 reads all of its frames at once with either.
-    Planted bugs: the record of another frame amended, the symbols of the frame that read it counted,
-    the late frame left as erased in the dataset or in the summary."""
+    """PT2 sees the AT from frame 4 or 5 on. Every data frame from then on is read, some of them
+    late, each symbol right; with pilots alone none is, and PT1 reads all of its frames at once
+    with either. Planted bugs: the record of another frame amended, the symbols of the frame that
+    read it counted, the late frame left as erased in the dataset or in the summary."""
     d = whole.dataset.sel(observer="PT2")
     seen = d.in_view.sel(uav="AT").values & d.modulated.values
     first = int(np.flatnonzero(seen)[0])

@@ -1,17 +1,18 @@
 r"""A link acquired from data frames alone: no pilot, and any path.
 
-A chirp of a data frame says where its cell lies, D + b(t) with an unknown symbol D and the beat b of
-the path. Symbols are whole: chirp by chirp the fractions of the cells follow the beat's. Over a batch
-of frames one path is left by its direction, the principal one of the chirps' strongest cells, and its
-rate and fraction are where the comb
+A chirp of a data frame says where its cell lies, D + b(t) with an unknown symbol D and the beat b
+of the path. Symbols are whole: chirp by chirp the fractions of the cells follow the beat's. Over a
+batch of frames one path is left by its direction, the principal one of the chirps' strongest
+cells, and its rate and fraction are where the comb
 
 .. math:: \Big|\sum_i e^{j 2 \pi (c_i - r t_i - a t_i^2 / 2)}\Big|
 
-is largest. What whole number of cells is still missing the alphabet says: data fill it, so that only
-one shift leaves no symbol outside. A pilot in the batch says so too, as all its symbols are 0.
+is largest. What whole number of cells is still missing the alphabet says: data fill it, so that
+only one shift leaves no symbol outside. A pilot in the batch says so too, as all its symbols are 0.
 
-What is kept of a frame is small: the strongest cells of every chirp as each receive antenna sees them
-(`Peaks`, 0.2 MB where the samples are 44). Symbols are decided from these once the path is known.
+What is kept of a frame is small: the strongest cells of every chirp as each receive antenna sees
+them (`Peaks`, 0.2 MB where the samples are 44). Symbols are decided from these once the path is
+known.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ LEAST_ODDS = 300.0
 AGREED = 0.8
 """Share of a pilot's chirps that must agree on the whole cells."""
 ALIAS_STDS, STEP_STDS = 4.0, 3.0
-"""Deviations that a frame's own rate must keep from those that turn the comb by whole cells from frame
-to frame, and the rate of all from those that turn every DPSK symbol by a whole step."""
+"""Deviations that a frame's own rate must keep from those that turn the comb by whole cells from
+frame to frame, and the rate of all from those that turn every DPSK symbol by a whole step."""
 JERK = 13.0
 """Variance that a path's acceleration gains [m^2/s^4/s]: its spread is new in 0.7 s."""
 
@@ -135,7 +136,8 @@ class DataPath:
 
 
 def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
-    """The strongest cells of every chirp, on a grid of half cells; `time` is the frame's middle [s]."""
+    """The strongest cells of every chirp, on a grid of half cells; `time` is the frame's middle
+    [s]."""
     w = cube.waveform
     groups, num_rx, chirps, size = cube.samples.shape
     fast = np.arange(size)
@@ -185,7 +187,8 @@ def acquire(batch: Sequence[Peaks], antennas: Antennas, order: int) -> DataPath 
 
     Returns
     -------
-    path : None unless the comb shows one, its rate tells the DPSK symbols apart, and one whole number
+    path : None unless the comb shows one, its rate tells the DPSK symbols apart, and one whole
+    number
         of cells is left
     """
     w = batch[0].waveform
@@ -287,9 +290,7 @@ class _Seen:
         best = power.argmax(axis=-1)[..., None]
         cell = np.take_along_axis(peaks.cells, best, axis=-1)[..., 0].astype(float)
         on = power.max(axis=-1) > _threshold(peaks.waveform) * peaks.noise
-        return cls(
-            peaks.modulated, peaks.time - last, peaks.waveform.middle_time[on], cell[on]
-        )
+        return cls(peaks.modulated, peaks.time - last, peaks.waveform.middle_time[on], cell[on])
 
 
 def _threshold(waveform: Waveform) -> float:
