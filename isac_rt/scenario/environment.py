@@ -109,12 +109,14 @@ class City(Node):
     street's."""
     ground_margin_m: Annotated[float, Field(ge=0)] = 50.0
     """How far the ground reaches beyond the outermost buildings [m], for `footprints`, `canyon` and
-    `blocks`."""
+    `blocks`; what lies beyond sends nothing back. The default is as wide as a street and the
+    yard behind it."""
     street_width_m: Positive = 20.0
     """Width of a street from facade to facade [m], for `canyon` and `blocks`. The default is a city
     street."""
     street_length_m: Positive = 120.0
-    """Length of the street, along y [m], for `canyon`."""
+    """Length of the street, along y [m], for `canyon`; a longer one has more walls to compute. The
+    default has room for flights of some seconds."""
     building_height_m: Positive = 20.0
     """Mean height of the buildings [m], for `canyon` and `blocks`. The default is six storeys."""
     height_spread_m: Annotated[float, Field(ge=0)] = 0.0
@@ -122,11 +124,13 @@ class City(Node):
     building in every run. By default all are alike."""
     block_size_m: Positive = 40.0
     """Side of a square block, for `blocks`; depth of the rows and length of a building along the
-    street, for `canyon` [m]."""
+    street, for `canyon` [m]. The default is a block of two rows of houses."""
     blocks_x: Annotated[int, Field(ge=1, le=100)] = 3
-    """Blocks from west to east, for `blocks`."""
+    """Number of blocks from west to east, for `blocks`; more of them make the city larger and runs
+    slower. The default has a street on each side of the middle block."""
     blocks_y: Annotated[int, Field(ge=1, le=100)] = 3
-    """Blocks from south to north, for `blocks`."""
+    """Number of blocks from south to north, for `blocks`, as `blocks_x` from west to east. By
+    default as many."""
     keep_radius_m: Positive | None = None
     """Horizontal distance from the middle of the flight within which the city is kept [m]. A
     smaller city is traced faster, but what is left out neither reflects nor shadows. By default all
@@ -227,14 +231,15 @@ class Propagation(Node):
     metres."""
     ghosts: bool = True
     """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
-    for targets."""
+    for targets. On by default, as in any street."""
     specular: bool = True
     """Whether mirror reflections off the city are simulated. On by default, as in any street."""
     weakest_path_db: Loss = 40.0
     """How far below the noise of one range-Doppler-antenna cell paths must be to be left out [dB].
     The default leaves out a ten-thousandth of the noise; a smaller value is faster."""
     leakage: Leakage = Leakage()
-    """What a terminal's receiver hears of its own transmitter."""
+    """What a terminal's receiver hears of its own transmitter; it covers what is very near. The
+    default is that of a board with separate antennas."""
 
 
 class Clutter(Node):
@@ -280,7 +285,7 @@ class Clutter(Node):
     run."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
     """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
-    paths, the same power in all, and take longer."""
+    paths, the same power in all, and take longer. The default gives some thousand paths a link."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
     """Error that nine of ten cells keep to [dB], for `field`: of the mean clutter power in a range
     cell of 4 m, and of noise plus mean clutter in a range-Doppler cell, under whose noise
@@ -389,14 +394,16 @@ class Accuracy(Node):
     """Farthest that a terminal flies between two knots, places from which rays search for chains of
     walls [m], for `budget`; 0: they search from where it is in each frame. A longer way is faster
     and may miss paths over walls that are seen for a shorter way only. Where the chains run, and
-    which of them are free, is found out in every frame."""
+    which of them are free, is found out in every frame. The default is shorter than walls are
+    wide."""
     synthesis_error: Annotated[float, Field(ge=1e-6, le=0.1)] = 1e-4
     """Relative RMS error that fast synthesis of IF samples may have, for `budget` and `everything`;
     the cheapest method that keeps it is taken. The default is 80 dB below the signal."""
     covered_error_db: Annotated[float, Field(ge=0, le=400)] | None = 20.0
     """How far under the noise of a range-Doppler cell of all channels the error stays that
     noise covers in the synthesis [dB], for `budget`: most scatterers of a `field` take half of
-    the time then, at a larger error than `synthesis_error`. null: none is covered."""
+    the time then, at a larger error than `synthesis_error`. The default is a hundredth of the
+    noise's power. null: none is covered."""
     cost_model: str | None = None
     """File of what the methods of synthesis cost on a machine, made by `isac-rt bench --fit` and
     relative to the scenario's folder, for `budget` and `everything`. It decides between methods

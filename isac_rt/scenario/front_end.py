@@ -132,17 +132,18 @@ class Response(Node):
     """Gain at places evenly spread over the samples of a chirp, the first and the last among them
     [dB]; straight lines between them. Empty, the default: 0."""
     table_deg: tuple[Degrees, ...] = ()
-    """The same for the phase of the IF samples [degrees]."""
+    """The same for the phase of the IF samples [degrees]. Empty, the default: none."""
     polynomial_db: tuple[Finite, ...] = ()
     """Coefficients of a polynomial that adds to it [dB], the constant first, in a variable that
     goes from -1 to 1 over the samples of a chirp. Empty, the default: 0."""
     polynomial_deg: tuple[Finite, ...] = ()
-    """The same for the phase [degrees]."""
+    """The same for the phase of the IF samples [degrees]. Empty, the default: none."""
     slope_std_db: Spread = 0.0
     """Standard deviation of slopes that are drawn for each element [dB from the middle of the
     chirp to its end]. By default all elements are alike."""
     slope_std_deg: Spread = 0.0
-    """The same for phases [degrees]."""
+    """The same for the slopes of phases [degrees from the middle of the chirp to its end]. 0, the
+    default: none."""
 
     @property
     def ideal(self) -> bool:
@@ -275,7 +276,8 @@ class FrontEnd(Node):
     phases, with an oscillator as of data sheets. The default says nothing."""
     oscillator: Oscillator = Oscillator()
     """Phase noise and spurs. At an active terminal one oscillator serves both ways, so that near
-    echoes hardly show its noise; at a passive one its own and the transmitter's add up."""
+    echoes hardly show its noise; at a passive one its own and the transmitter's add up. None by
+    default."""
 
     transmit: Elements = Elements()
     """Errors of the transmit elements. None by default."""

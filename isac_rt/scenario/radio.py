@@ -85,7 +85,8 @@ class Chirp(Node):
     """Timing of a plain FMCW chirp as a data sheet states it."""
 
     slope_mhz_per_us: Positive
-    """Slope of the ramp [MHz/us]."""
+    """Slope of the ramp [MHz/us]. A steeper one sweeps more bandwidth while samples are taken:
+    range cells get finer and the range shorter."""
     ramp_end_us: Positive | None = None
     """End of the ramp after its start [us]. null, the default: when the last sample is taken."""
     adc_start_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]

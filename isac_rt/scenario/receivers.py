@@ -44,7 +44,7 @@ class Receivers(Node):
     separate_reference: bool = False
     """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
     reflection in the same cell, by direction, before it believes its range. Costs time only in
-    frames where one wave does not explain the cell."""
+    frames where one wave does not explain the cell. Off by default, as in the paper."""
     link_acquisition: Literal["pilots", "blind"] = "pilots"
     """From which frames a passive terminal learns over which path it reads data. `pilots`, the
     default and the paper's: its line of sight in frames without data. `blind`: any path, from data
@@ -180,7 +180,8 @@ class Tracking(Node):
     """Detections within `confirm_window` frames that confirm a track. Three of five, the default,
     let hardly any false alarm become a track."""
     confirm_window: Annotated[int, Field(ge=1)] = 5
-    """Frames within which `confirm_hits` detections must fall to confirm a track."""
+    """Frames within which `confirm_hits` detections must fall to confirm a track; more of them
+    confirm weak targets too, and more false ones. The default is the usual three of five."""
     drop_misses: Annotated[int, Field(ge=1)] = 8
     """Frames without a detection in a row after which a confirmed track ends. The default bridges
     short shadows."""
@@ -260,9 +261,11 @@ class ReceiverSet(Node):
     """Settings by name, which the keys stated beside it override. null, the default: none; what is
     not stated is as in the scenario's own `receivers` and `tracking`."""
     receivers: Receivers = Receivers()
-    """How its terminals detect targets and decode data."""
+    """How its terminals detect targets and decode data. What is left out is as the preset says, or
+    as by default."""
     tracking: Tracking = Tracking()
-    """Its Kalman filters, and when a track begins and ends."""
+    """Its Kalman filters, and when a track begins and ends. What is left out is as the preset says,
+    or as by default."""
 
 
 def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict[str, Any]:

@@ -462,7 +462,8 @@ def test_every_city_key_belongs_to_a_source():
 
 
 def test_every_key_of_the_schema_explains_itself():
-    """A sentence or more, on one line. Planted bug: the docstring of one field taken away."""
+    """A sentence or more, on one line, that also speaks of the default where there is one. Planted
+    bugs: the docstring of one field taken away; the sentence on its default."""
     schema = json_schema()
     for title, node in {"Scenario": schema, **schema["$defs"]}.items():
         for key, entry in {"": node, **node["properties"]}.items():
@@ -470,6 +471,7 @@ def test_every_key_of_the_schema_explains_itself():
             where = f"{title}.{key}: {said!r}"
             assert len(said.split()) >= 5 and said[0].isupper() and said.endswith("."), where
             assert not said.startswith(("Of ", "The key")) and "\n" not in said, where
+            assert entry.get("default") is None or "default" in said.lower(), where
 
 
 def test_schema_describes_every_mapping():
