@@ -34,6 +34,8 @@ from isac_rt.receive.modes import MODES, mode_shapes
 HALF_WIDTH = 3
 STENCILS = 0.2, 0.08, 0.03
 """Half widths of the stencils on which a peak of the likelihood is fitted [cells, bins]."""
+_STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
+"""Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
 TIE = 1e-9
@@ -92,7 +94,9 @@ class LocalSpectra:
         )
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         chirps, self._num_rx = known.schedule.size, rows.shape[1]
-        data = np.zeros((chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES))
+        data = np.zeros(
+            (chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES), np.float32
+        )
         _gather(rows, turn, data)
         weight, time = np.zeros((2, chirps + -chirps % LANES))
         weight.reshape(-1)[:chirps].reshape(w.num_groups, -1)[:] = slow_window(w)
@@ -170,7 +174,7 @@ class LocalSpectra:
 
 
 class _Chirps(NamedTuple):
-    """Samples of `rows` range rows, float64: of each chirp and row the real and imaginary parts of
+    """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
     `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
     two filled up to a multiple of sixteen."""
 
@@ -250,18 +254,18 @@ def _match(chirps, axis, delay, delay_rate, antennas):
     cosine, sine, shape = _template(chirps, axis, delay, delay_rate)
     rows, blocks, flat = chirps.rows, chirps.blocks, chirps.data
     line = 2 * LANES * blocks
-    out, energy = np.zeros(antennas * line), np.zeros(antennas)
+    out, energy = np.zeros(antennas * line, np.float32), np.zeros(antennas)
     for i in range(chirps.tx.size):
         square = 0.0
         for k in range(rows):
             square += shape[k, i] * shape[k, i]
         energy[chirps.tx[i]] += chirps.weight[i] * square
-        c, s = splat(cosine[i]), splat(sine[i])
+        c, s = splat(np.float32(cosine[i])), splat(np.float32(sine[i]))
         for b in range(blocks):
             at = i * rows * line + 2 * LANES * b
-            re, im = splat(0.0), splat(0.0)
+            re, im = splat(np.float32(0)), splat(np.float32(0))
             for k in range(rows):
-                factor = splat(shape[k, i])
+                factor = splat(np.float32(shape[k, i]))
                 re = re + factor * load(flat, at)
                 im = im + factor * load(flat, at + LANES)
                 at += line
@@ -281,7 +285,7 @@ def _powers(chirps, axis, delays, delay_rates, antennas):
         for t in range(antennas):
             square = 0.0
             for c in range(t * line, (t + 1) * line):
-                square += out[c] * out[c]
+                square += np.float64(out[c]) ** 2
             total[j] += square / max(energy[t], 1e-30)
     return total
 
@@ -332,14 +336,16 @@ def refine(
     def split(b: T, d: T) -> tuple[T, T]:
         return (b - d * (w.sampled_duration / w.frame_duration)) * delay_unit, d * rate_unit
 
-    down, across = np.arange(9) // 3 - 1, np.arange(9) % 3 - 1
-    for step in steps:
-        powers = local.powers(*split(beat + step * down, doppler + step * across))
-        grid = np.log(np.maximum(powers, 1e-300)).reshape(3, 3)
-        gx, gy = (grid[2, 1] - grid[0, 1]) / (2 * step), (grid[1, 2] - grid[1, 0]) / (2 * step)
-        hxx = (grid[2, 1] - 2 * grid[1, 1] + grid[0, 1]) / step**2
-        hyy = (grid[1, 2] - 2 * grid[1, 1] + grid[1, 0]) / step**2
-        hxy = (grid[2, 2] - grid[2, 0] - grid[0, 2] + grid[0, 0]) / (4 * step**2)
+    hxy = 0.0
+    for number, step in enumerate(steps):
+        count = 5 if number else len(_STENCIL)
+        down, across = step * _STENCIL[:count].T
+        g = np.log(np.maximum(local.powers(*split(beat + down, doppler + across)), 1e-300))
+        gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
+        hxx = (g[2] - 2 * g[0] + g[1]) / step**2
+        hyy = (g[4] - 2 * g[0] + g[3]) / step**2
+        if not number:  # small in these coordinates: what the first stencil says is good enough
+            hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2)
         det = hxx * hyy - hxy**2
         if hxx < 0 and det > 0:
             move = np.array([hyy * gx - hxy * gy, hxx * gy - hxy * gx]) / -det

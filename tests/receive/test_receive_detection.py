@@ -353,7 +353,8 @@ def test_compiled_match_is_the_template():
             np.einsum("mxkp,mpk,mp->x", spectra[:, :, rows], template.conj(), weight)
             / (shape**2 * weight[..., None]).sum()
         )
-        assert np.abs(got[tx] - expected).max() < 1e-9 * np.abs(expected).max()  # rounding
+        single = 3e-6  # sums of 840 terms in single precision that nearly cancel
+        assert np.abs(got[tx] - expected).max() < single * np.abs(expected).max()
 
 
 def test_window_transform_is_closed_form():
