@@ -94,9 +94,7 @@ class LocalSpectra:
         )
         own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
         chirps, self._num_rx = known.schedule.size, rows.shape[1]
-        data = np.zeros(
-            (chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES), np.float32
-        )
+        data = np.zeros((chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES), np.float32)
         _gather(rows, turn, data)
         weight, time = np.zeros((2, chirps + -chirps % LANES))
         weight.reshape(-1)[:chirps].reshape(w.num_groups, -1)[:] = slow_window(w)
