@@ -13,8 +13,11 @@ from dataclasses import dataclass, field, replace
 from math import ceil
 from typing import Any
 
+import numpy as np
+
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, advance
+from isac_rt.terminal.pool import Look, PooledTracker
 
 HEADER_BITS = 64
 """Sender, time, length and checksum of a message."""
@@ -26,6 +29,12 @@ NUMBER_BITS = 16
 REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8
 """A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
 deviations and correlations. What these bits round off is not modelled: a centimetre and less."""
+LOOK_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
+"""Of one frame of a link: which, when, the receiver's position, velocity and attitude, how well its
+clock is known."""
+DETECTION_BITS = 24 + 16 + 2 * 14 + 4 * 8 + 8 + 16 + 1 + 40
+"""Range, rate, two cosines, their deviations, level, number of its track and whether that is
+confirmed, name of the body."""
 CODE_RATE = 0.5
 """Share of an active terminal's bits that messages get; the rest protects them."""
 CORRECTED = 0.05
@@ -64,12 +73,16 @@ class Message:
     terminals : what it knows that terminals said of themselves, itself included
     kept : by link
     reports : of tracks, its own and others'
+    looks : detections, its own and others'
+    left_out : tracks or detections that were new and that it had no room for
     """
 
     sender: str
     terminals: Mapping[str, Said]
     kept: Mapping[str, Kept]
     reports: Sequence[Report]
+    looks: Sequence[Look] = ()
+    left_out: int = 0
 
     @property
     def bits(self) -> int:
@@ -80,6 +93,8 @@ class Message:
             + TERMINAL_BITS * len(self.terminals)
             + NUMBER_BITS * numbers
             + REPORT_BITS * len(self.reports)
+            + LOOK_BITS * len(self.looks)
+            + DETECTION_BITS * sum(map(len, self.looks))
         )
 
     def memory(self) -> list[Any]:
@@ -89,17 +104,21 @@ class Message:
             {k: [s.time, list(s.state), s.via] for k, s in self.terminals.items()},
             {k: [s.time, list(s.numbers), s.via] for k, s in self.kept.items()},
             [report.memory() for report in self.reports],
+            [look.memory() for look in self.looks],
+            self.left_out,
         ]
 
     @classmethod
     def of_memory(cls, memory: Sequence[Any]) -> Message:
         """The message that gave a `memory`."""
-        sender, terminals, kept, reports = memory
+        sender, terminals, kept, reports, looks, left_out = memory
         return cls(
             sender,
             {k: Said(time, Gaussian(*state), via) for k, (time, state, via) in terminals.items()},
             {k: Kept(time, tuple(numbers), via) for k, (time, numbers, via) in kept.items()},
             [Report.of_memory(report) for report in reports],
+            [Look.of_memory(look) for look in looks],
+            left_out,
         )
 
 
@@ -242,7 +261,11 @@ class Notes:
         room = ceil(bare.bits / capacity) * capacity - bare.bits
         chosen = new[: max(1, room // REPORT_BITS)]
         told |= {report.key: report.time for report in chosen}
-        return replace(bare, reports=chosen)
+        return replace(bare, reports=chosen, left_out=len(new) - len(chosen))
+
+    def ages(self, time: float) -> tuple[float, ...]:
+        """Of what it has from others and what counts [s]."""
+        return tuple(time - report.time for report, via in self.reports.values() if via)
 
     def memory(self) -> dict[str, Any]:
         """What is known as plain numbers and arrays, for `restore`."""
@@ -270,3 +293,117 @@ class Notes:
             for listener, times in memory["told"].items()
         }
         self.picture.restore(memory["picture"])
+
+
+class Sightings:
+    """What a terminal knows of the detections that others and it have made, and what it has told
+    whom.
+
+    Attributes
+    ----------
+    name : of the terminal
+    terminals : what they said of themselves
+    tracker : what it makes of all detections
+    """
+
+    def __init__(self, name: str, tracker: PooledTracker) -> None:
+        self.name, self.tracker = name, tracker
+        self.terminals: dict[str, Said] = {}
+        self._looks: dict[tuple[float, str], tuple[Look, str]] = {}
+        self._told: dict[str, set[tuple[float, str]]] = {}
+
+    def stand(self, time: float, state: Gaussian) -> None:
+        """Take down where it is itself."""
+        self.terminals[self.name] = Said(time, state)
+
+    def see(self, look: Look) -> None:
+        """Take down the detections of one of its own links after a frame."""
+        self._take(look, "")
+        kept, via = self._looks[look.key]
+        self._looks[look.key] = replace(kept, names=self.tracker.names_of(kept)), via
+
+    def hear(self, message: Message) -> None:
+        """Take down what it does not know yet."""
+        for name, said in message.terminals.items():
+            known = self.terminals.get(name)
+            if name != self.name and (known is None or said.time > known.time):
+                self.terminals[name] = replace(said, via=message.sender)
+        for look in message.looks:
+            if look.key not in self._looks:
+                self._take(look, message.sender)
+
+    def _take(self, look: Look, via: str) -> None:
+        """A look whose transmitter is not known at all says nothing of places."""
+        self._looks[look.key] = look, via
+        tx, rx = look.ends
+        if tx == rx:
+            self.tracker.add(look, None)
+        elif tx in self.terminals:
+            said = self.terminals[tx]
+            self.tracker.add(look, _moved(said.state.mean, look.time - said.time))
+
+    def look(self, time: float, acceleration_std: float) -> list[Fused]:
+        """Its picture at a time [s], after forgetting what was not said for `HOLD_S`."""
+        self._looks = {k: v for k, v in self._looks.items() if time - k[0] <= HOLD_S}
+        self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
+        self.tracker.forget(time)
+        known = {
+            name: advance(said.state, time - said.time, acceleration_std)
+            for name, said in self.terminals.items()
+        }
+        return self.tracker.at(time, known)
+
+    def ages(self, time: float) -> tuple[float, ...]:
+        """Of the detections that it has from others and that count [s]."""
+        return tuple(
+            time - look.time for look, via in self._looks.values() if via for _ in range(len(look))
+        )
+
+    def compose(self, listener: str, capacity: int) -> Message:
+        """What it tells a listener by a channel of `capacity` bits a frame: the newest frames first
+        and of each the strongest detections, those of confirmed tracks before all others. What does
+        not fit is not told later; one detection is told at least."""
+        terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
+        bare = Message(self.name, terminals, {}, [])
+        told = self._told.setdefault(listener, set())
+        new = [
+            look
+            for key, (look, via) in self._looks.items()
+            if len(look) and listener not in (via, look.ends[1]) and key not in told
+        ]
+        new.sort(key=lambda look: (-look.time, look.origin))
+        room = ceil((bare.bits + LOOK_BITS + DETECTION_BITS) / capacity) * capacity - bare.bits
+        chosen, left = [], sum(map(len, new))
+        for look in new:
+            count = min(len(look), (room - LOOK_BITS) // DETECTION_BITS)
+            if count <= 0:
+                break
+            chosen.append(look.select(look.best(count)))
+            room -= LOOK_BITS + DETECTION_BITS * count
+            left -= count
+        self._told[listener] = (told | {look.key for look in new}) & self._looks.keys()
+        return replace(bare, looks=chosen, left_out=left)
+
+    def memory(self) -> dict[str, Any]:
+        """What is known as plain numbers and arrays, for `restore`."""
+        looks = [look for look, _ in self._looks.values()]
+        return {
+            "known": Message(self.name, self.terminals, {}, [], looks).memory(),
+            "via": [via for _, via in self._looks.values()],
+            "told": {k: [list(key) for key in sorted(keys)] for k, keys in self._told.items()},
+            "tracker": self.tracker.memory(),
+        }
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go on from a `memory`."""
+        known = Message.of_memory(memory["known"])
+        self.terminals = dict(known.terminals)
+        pairs = zip(known.looks, memory["via"], strict=True)
+        self._looks = {look.key: (look, via) for look, via in pairs}
+        self._told = {k: {(t, o) for t, o in keys} for k, keys in memory["told"].items()}
+        self.tracker.restore(memory["tracker"])
+
+
+def _moved(state: np.ndarray, interval: float) -> np.ndarray:
+    """Position and velocity (6,) after an interval [s] of straight flight."""
+    return np.concatenate([state[:3] + interval * state[3:], state[3:]])

@@ -360,10 +360,15 @@ PICTURES: dict[str, Column] = {
     "unrecognised": _number(
         "bodies that stand for a terminal without being recognised", "unrecognised", np.int32
     ),
-    "reports": _number("tracks heard from others that count", "reports", np.int32),
+    "reports": _number("tracks or detections heard from others that count", "reports", np.int32),
     "age": Column(float, "s", "mean age of the tracks heard from others", "age", missing=np.nan),
     "messages": _number("messages that ended in the frame", "messages", np.int32),
     "lost": _number("those of them that were lost", "lost", np.int32),
+    "bits": _number("bits of these messages", "bits", np.int64),
+    "room": _number("bits that the ways to the terminal had for messages", "room", np.int64),
+    "left_out": _number(
+        "tracks or detections that the messages had no room for", "left_out", np.int32
+    ),
 }
 """One value for each frame and picture."""
 FUSED: dict[str, Column] = {

@@ -171,6 +171,8 @@ class PictureRecord:
         for a terminal that is not recognised
     reports, age : what was heard from others and counts, and its mean age [s]
     messages, lost : that reached the terminal in this frame, and those of them that were lost
+    bits, room : of these messages, and that the ways to the terminal had in this frame
+    left_out : tracks or detections that these messages had no room for
     origin, number : (B,) name: index of the link and number of its track
     mean, std : (B, 6) position and velocity in world axes [m, m/s]
     members : (B,) how many tracks are taken for it
@@ -189,6 +191,9 @@ class PictureRecord:
     age: float
     messages: int
     lost: int
+    bits: int
+    room: int
+    left_out: int
     origin: np.ndarray
     number: np.ndarray
     mean: np.ndarray

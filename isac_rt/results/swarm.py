@@ -28,13 +28,24 @@ SWARM = "swarm"
 
 @dataclass(frozen=True)
 class Traffic:
-    """Messages whose last frame a frame was: how many, and how many of them were lost."""
+    """Messages to a terminal whose last frame a frame was.
+
+    Attributes
+    ----------
+    messages, lost : how many, and how many of them were lost
+    bits, room : of these messages, and that the ways to the terminal had in the frame
+    left_out : tracks or detections that they had no room for
+    """
 
     messages: int = 0
     lost: int = 0
+    bits: int = 0
+    room: int = 0
+    left_out: int = 0
 
     def __add__(self, other: Traffic) -> Traffic:
-        return Traffic(self.messages + other.messages, self.lost + other.lost)
+        sums = {name: value + getattr(other, name) for name, value in vars(self).items()}
+        return Traffic(**sums)
 
 
 @dataclass(frozen=True)
@@ -140,8 +151,7 @@ class SwarmScorer:
             unrecognised=int(friend.sum()),
             reports=len(view.ages),
             age=float(np.mean(view.ages)) if view.ages else np.nan,
-            messages=view.traffic.messages,
-            lost=view.traffic.lost,
+            **vars(view.traffic),
             origin=np.array([self._origin(b.name) for b in bodies], int),
             number=np.array([b.name.number for b in bodies], int),
             mean=mean,
@@ -217,6 +227,9 @@ def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str,
         "age_s": float(np.nansum(ages * reports) / heard) if heard else None,
         "messages": int(sum(row["messages"] for row in rows)),
         "messages_lost": int(sum(row["lost"] for row in rows)),
+        "bits": int(sum(row["bits"] for row in rows)),
+        "bits_room": int(sum(row["room"] for row in rows)),
+        "left_out": int(sum(row["left_out"] for row in rows)),
         "targets": {
             name: {
                 "in_view": int(seen[:, u].sum()),

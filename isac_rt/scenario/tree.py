@@ -93,11 +93,13 @@ class Scenario(Node):
     """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
     belief: Belief = Belief()
     """What terminals believe wrongly of themselves and of the city. By default nothing."""
-    cooperation: Literal["none", "tracks"] = "none"
+    cooperation: Literal["none", "tracks", "detections"] = "none"
     """What terminals tell each other of what they see. `none`, the default: nothing. `tracks`:
     their confirmed tracks and their own position, an active terminal with its data, a passive one
     by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and hears.
-    What is sent does not depend on it."""
+    `detections`: the detections that their tracks rest on instead; each runs one filter over all of
+    them, with the errors of poses and clocks as states. What is sent otherwise does not depend on
+    it."""
     compare: dict[Name, ReceiverSet] = Field({})
     """Further sets of receivers by name, which hear the same samples. By default none."""
 

@@ -6,15 +6,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from isac_rt.access.messages import CODE_RATE, CORRECTED, Channel, Notes
+import numpy as np
+
+from isac_rt.access.messages import CODE_RATE, CORRECTED, Channel, Notes, Sightings
 from isac_rt.frame.link import Link
+from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
-from isac_rt.terminal.fusion import Picture, in_world, of_itself
+from isac_rt.terminal.fusion import Fused, Picture, in_world, of_itself
+from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
+from isac_rt.terminal.tracker import in_plane
+from isac_rt.world.swarm import Pose
 
 
 class Cooperation:
@@ -23,12 +29,26 @@ class Cooperation:
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         links = setup.timetable.all_links
-        self._notes = {name: Notes(name) for name in dict.fromkeys(link.rx for link in links)}
-        self._swarm = Picture()
-        self._channels: dict[Link, Channel] = {}
+        self._names = list(dict.fromkeys(link.rx for link in links))
         s = setup.scenario
+        self._pools = s.cooperation == "detections"
+        self._notes: dict[str, Notes | Sightings] = {
+            name: Sightings(name, self._pool()) if self._pools else Notes(name)
+            for name in self._names
+        }
+        self._swarm: Picture | PooledTracker = self._pool() if self._pools else Picture()
+        self._channels: dict[Link, Channel] = {}
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
+
+    def _pool(self) -> PooledTracker:
+        """A tracker of all terminals' detections."""
+        setup, w = self._setup, self._setup.waveform
+        s, share = setup.scenario, unambiguous_share(w)
+        period = s.receivers.active_every_frames * setup.timetable.interval
+        spans = 2 * w.max_velocity(2) * share, 2 * w.max_velocity(1)
+        names = dict.fromkeys([*self._names, *(link.tx for link in setup.timetable.all_links)])
+        return PooledTracker([*names], s.tracking, Lives.of(s.tracking, period), spans)
 
     def step(
         self, frame: int, heard: Mapping[Link, Heard], symbols: Mapping[Link, SymbolCount]
@@ -44,39 +64,60 @@ class Cooperation:
         timetable = self._setup.timetable
         time = max(timetable.epoch(frame, tx) for tx in timetable.with_role("active", frame))
         traffic = self._carry(frame, heard, symbols)
-        for link, result in heard.items():
-            self._see(frame, link, result)
         poses = {n: self._setup.believed(p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
             notes.stand(time, of_itself(poses[name]))
+        for link, result in heard.items():
+            self._see(frame, link, result)
         views = {
             name: View(
                 time,
                 tuple(notes.look(time, self._acceleration)),
-                tuple(time - r.time for r, via in notes.reports.values() if via),
+                notes.ages(time),
                 traffic[name],
             )
             for name, notes in self._notes.items()
         }
-        own = [r for n in self._notes.values() for r, via in n.reports.values() if not via]
-        together = self._swarm.update(
-            [report.at(time, self._acceleration) for report in own],
-            {name: of_itself(poses[name]) for name in self._notes},
-        )
+        together = self._together(time, poses)
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
 
+    def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
+        """What all know together at a time [s]."""
+        known = {name: of_itself(poses[name]) for name in self._notes}
+        if isinstance(self._swarm, PooledTracker):
+            self._swarm.forget(time)
+            return self._swarm.at(time, known)
+        own = [
+            report
+            for notes in self._notes.values()
+            if isinstance(notes, Notes)
+            for report, via in notes.reports.values()
+            if not via
+        ]
+        return self._swarm.update([r.at(time, self._acceleration) for r in own], known)
+
     def _see(self, frame: int, link: Link, heard: Heard) -> None:
-        """A terminal takes down the confirmed tracks of one of its links."""
+        """A terminal takes down what one of its links shows: its confirmed tracks, or what its
+        tracks rest on."""
         setup, tracks = self._setup, heard.tracks
         time = setup.timetable.epoch(frame, link.tx)
         own = setup.believed(setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
         if not link.own:
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
-        told = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
-        states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock) for k in told}
-        self._notes[link.rx].see(str(link), time, states)
+        notes = self._notes[link.rx]
+        if isinstance(notes, Notes):
+            told = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
+            states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock) for k in told}
+            notes.see(str(link), time, states)
+            return
+        look = look_of(link, frame, time, own, heard, clock)
+        notes.see(look)
+        if isinstance(self._swarm, PooledTracker):
+            sender = setup.believed(setup.swarm.trajectories[link.tx].pose(time))
+            at = None if link.own else np.concatenate([sender.position, sender.velocity])
+            self._swarm.add(look, at)
 
     def _ways(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active
@@ -108,10 +149,11 @@ class Cooperation:
                 read = read and count.bit_errors <= CORRECTED * count.bits_total
             else:
                 read = heard[Link(way.rx, way.tx)].state == TerminalState.TRACKING
+            came[way.rx] += Traffic(room=capacity)
             done = channel.carry(capacity, read)
             if done is not None:
                 message, arrived = done
-                came[way.rx] += Traffic(1, not arrived)
+                came[way.rx] += Traffic(1, not arrived, message.bits, left_out=message.left_out)
                 if arrived:
                     self._notes[way.rx].hear(message)
         return came
@@ -144,3 +186,30 @@ class Cooperation:
         for tx, rx, kept in memory["channels"]:
             channel = self._channels[Link(tx, rx)] = Channel()
             channel.restore(kept)
+
+
+def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_std: float) -> Look:
+    """The detections of a frame that a receiver's tracks took, its reference's left out.
+
+    Parameters
+    ----------
+    time : middle of the frame [s]
+    own : the receiver's pose as it believes it
+    clock_std : deviation of its ranges by its clock [m]
+    """
+    tracks, found = heard.tracks, in_plane(heard.reception.detections)
+    mine = (tracks.detection >= 0) & ~tracks.is_reference
+    rows = tracks.detection[mine]
+    return Look(
+        str(link),
+        frame,
+        time,
+        own,
+        clock_std,
+        tracks.ids[mine],
+        np.column_stack([found.range, found.velocity, found.direction])[rows],
+        found.std[rows],
+        found.snr[rows],
+        tracks.confirmed[mine],
+        (None,) * len(rows),
+    )

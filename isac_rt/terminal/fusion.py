@@ -253,7 +253,7 @@ class Picture:
         self._join(by_key)
         self._call(by_key)
         states = [intersection_of([by_key[k].state for k in b.members]) for b in self._bodies]
-        whose = _recognise(states, known or {})
+        whose = recognise(states, known or {})
         return [
             Fused(body.name, state, tuple(body.members), terminal)
             for body, state, terminal in zip(self._bodies, states, whose, strict=True)
@@ -308,7 +308,7 @@ class Picture:
             holder[body.name] = body
 
 
-def _recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:
+def recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:
     """The terminal that each body is, by what terminals say of themselves."""
     whose: list[str | None] = [None] * len(states)
     names = list(known)

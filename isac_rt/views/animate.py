@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
+from isac_rt.results.swarm import SWARM
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import STYLE, colour_of, range_doppler, scene_map
 from isac_rt.world.city.mesh import CityMesh
@@ -50,15 +51,14 @@ def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndar
     )
 
 
-def fused_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
-    """(B, 3) where the picture of an observer's terminal has bodies that are no terminals [m];
-    none where terminals do not cooperate."""
+def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray:
+    """(B, 3) where the picture of a terminal, or of the swarm, has bodies that are no terminals
+    [m]; none where terminals do not cooperate."""
     if "picture" not in dataset.variables:
         return np.zeros((0, 3))
-    picture = list(dataset.picture.values).index(str(dataset.receiver.values[observer]))
     mine = (
         (dataset.fused_frame.values == frame)
-        & (dataset.fused_picture.values == picture)
+        & (dataset.fused_picture.values == list(dataset.picture.values).index(picture))
         & (dataset.fused_terminal.values < 0)
     )
     return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
@@ -124,11 +124,15 @@ class _Moving:
             mew=1.6,
             label=f"tracks of {dataset.observer.values[observer]}",
         )
-        (self._fused,) = ax.plot(
-            [], [], "s", color="black", ms=10, mfc="none", label="its picture with what it hears"
-        )
-        if "picture" not in dataset.variables:
-            self._fused.set_label("_nothing is heard")
+        pictures = {
+            str(dataset.receiver.values[observer]): ("s", 10, "its picture with what it hears"),
+            SWARM: ("D", 14, "picture of the whole swarm"),
+        }
+        alone = "" if "picture" in dataset.variables else "_"
+        self._fused = {
+            name: ax.plot([], [], mark, color="black", ms=size, mfc="none", label=alone + words)[0]
+            for name, (mark, size, words) in pictures.items()
+        }
         ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
 
     def show(self, frame: int) -> None:
@@ -138,8 +142,9 @@ class _Moving:
             here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
         found = tracked_positions(self._d, frame, self._observer)
         self._tracks.set_data(found[:, 0], found[:, 1])
-        fused = fused_positions(self._d, frame, self._observer)
-        self._fused.set_data(fused[:, 0], fused[:, 1])
+        for name, marks in self._fused.items():
+            fused = fused_positions(self._d, frame, name)
+            marks.set_data(fused[:, 0], fused[:, 1])
         self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
 
 

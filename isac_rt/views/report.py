@@ -138,18 +138,54 @@ def side_by_side(summary: Mapping[str, Any]) -> Table:
         (
             _link(name),
             set_name,
-            *_rates(links[name], titles.values()),
-            number(links[name]["gospa"]["total_m"]),
+            *_rates(link, titles.values()),
+            number(link["gospa"]["total_m"]),
             number(costs[set_name][name]),
         )
-        for name in summary["links"]
-        for set_name, links in {
-            OWN: summary["links"],
-            **{key: one["links"] for key, one in summary.get("compared", {}).items()},
-        }.items()
-        if set_name in costs
+        for name, set_name, link in _sets(summary)
     ]
     return Table(("Link", "Receivers", *titles, "GOSPA [m]", "Processor time [s]"), rows)
+
+
+def _sets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """(link, set of receivers, figures) where several sets heard the same samples."""
+    sets = {OWN: summary, **summary.get("compared", {})}
+    for link in summary["links"]:
+        for name, one in sets.items():
+            if name in summary["timing_s"].get("by_set", {}):
+                yield link, name, one["links"][link]
+
+
+_CITY = ("ghost", "specular", "diffuse")
+"""Kinds of paths that there would be none of without a city."""
+
+
+def city_costs(summary: Mapping[str, Any]) -> Table:
+    """What the city costs each set of receivers: what it finds, what it would find in noise alone,
+    what hides the rest, and what the city makes it believe; no rows where none are compared."""
+    causes = {"Masked": "masked", "Clutter": "clutter", "Not read": "not_read"}
+    rows = []
+    for link, name, one in _sets(summary):
+        alone, hits = one["bounds"]["clutter_free"], one["hit_rate"]
+        if hits is None or alone is None:
+            continue
+        losses = (one["losses"][cause] for cause in causes.values())
+        false = sum(one["false_tracks"][kind] or 0.0 for kind in _CITY)
+        cost = number(round(alone - hits, 3))
+        figures = (number(one["counts"]["hit_rate"][1]), number(hits), number(alone), cost)
+        rows.append(
+            (
+                _link(link),
+                name,
+                *figures,
+                *map(number, losses),
+                number(false),
+                number(one["ser_delay"]),
+            )
+        )
+    titles = ("In view", "Hit rate", "In noise alone", "The city costs", *causes)
+    ends = ("False tracks of the city", "SER delay")
+    return Table(("Link", "Receivers", *titles, *ends), rows)
 
 
 def _link(name: str) -> str:
@@ -290,7 +326,7 @@ def swarm_table(summary: Mapping[str, Any]) -> Table:
             *(number(p["rmse"][key]) for key in ("position_m", "velocity_mps")),
             number(p["nees"]),
             *(number(p[key]) for key in ("reports_per_frame", "age_s")),
-            f"{p['messages_lost']} of {p['messages']}" if name in swarm["terminals"] else DASH,
+            *_traffic(p, name in swarm["terminals"]),
         )
         for name, p in {"All together": swarm, **swarm["terminals"]}.items()
     ]
@@ -306,9 +342,20 @@ def swarm_table(summary: Mapping[str, Any]) -> Table:
         "NEES",
         "Heard",
         "Age [s]",
+        "Left out",
+        "kbit of room",
         "Lost messages",
     )
     return Table(titles, rows)
+
+
+def _traffic(picture: Mapping[str, Any], told: bool) -> tuple[str, str, str]:
+    """What the messages to a terminal left out, their bits, and those of them that were lost."""
+    if not told:
+        return DASH, DASH, DASH
+    bits = f"{number(picture['bits'] / 1e3)} of {number(picture['bits_room'] / 1e3)}"
+    lost = f"{picture['messages_lost']} of {picture['messages']}"
+    return number(picture["left_out"]), bits, lost
 
 
 def false_table(summary: Mapping[str, Any]) -> Table:
@@ -466,6 +513,7 @@ def write_report(
         terminals=per_terminal(s),
         rmse=rmse_table(s),
         compared=side_by_side(s),
+        city_costs=city_costs(s),
         sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
         gospa=gospa_table(s),
         false_tracks=false_table(s),

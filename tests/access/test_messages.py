@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from isac_rt.access.messages import (
+    DETECTION_BITS,
     HEADER_BITS,
     HOLD_S,
+    LOOK_BITS,
     NUMBER_BITS,
     REPORT_BITS,
     TERMINAL_BITS,
     Channel,
     Notes,
+    Sightings,
 )
+from isac_rt.scenario.receivers import Tracking
 from isac_rt.storage import pack, unpack
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.fusion import Key
+from isac_rt.terminal.pool import Lives, Look, PooledTracker
+from isac_rt.world.swarm import Pose
 
 T = 0.05
 
@@ -174,3 +182,89 @@ def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
     outcomes = [[ch.carry(500, True) for _ in range(2)] for ch in (channel, way)]
     assert [o is None for o in outcomes[0]] == [o is None for o in outcomes[1]] == [True, False]
     assert outcomes[1][1][1] is False
+
+
+def look(frame=0, origin="A->A", count=2, sure=None, snr=None):
+    z = np.array([[30.0, 1, 0.1, 0.0], [40.0, 2, 0.2, 0.0], [50.0, 3, 0.3, 0.0]])[:count]
+    return Look(
+        origin,
+        frame,
+        T * frame,
+        Pose.at_rest((0, 0, 20)),
+        0.0,
+        np.arange(count),
+        z,
+        np.tile([0.01, 0.05, 2e-3, 2e-3], (count, 1)),
+        np.array(snr or [9.0, 3.0, 5.0][:count]),
+        np.array([True] * count if sure is None else sure),
+        (None,) * count,
+    )
+
+
+def sightings(name):
+    tracker = PooledTracker(("A", "B"), Tracking(), Lives(3, 5 * T, 0.36), (30.0, 60.0))
+    out = Sightings(name, tracker)
+    out.stand(0.0, state(0.0))
+    return out
+
+
+def test_the_strongest_of_the_newest_go_first_and_what_does_not_fit_is_not_told_later():
+    """64 + 136 for itself, 208 a frame of a link, 165 a detection: 1100 bits hold four of five in
+    two frames, the newest three first; of the older the confirmed one, though it is weaker. After
+    that nothing is new. Planted bugs: the oldest first; SNR before what is sure."""
+    a = sightings("A")
+    a.see(look(0, count=2, sure=[False, True]))
+    a.see(look(1, count=3))
+    words = a.compose("B", 1300)
+    assert LOOK_BITS == 208 and DETECTION_BITS == 165
+    assert words.bits == 64 + 136 + 2 * 208 + 4 * 165 <= 1300
+    assert [(x.frame, x.numbers.tolist()) for x in words.looks] == [(1, [0, 1, 2]), (0, [1])]
+    assert words.left_out == 1
+    assert not a.compose("B", 1300).looks
+    assert len(a.compose("C", 10**5).looks) == 2
+
+
+def test_a_channel_that_is_too_small_gets_one_detection_in_several_frames():
+    """64 + 136 + 208 + 165 = 573 bits by 100 a frame: room for 600."""
+    a = sightings("A")
+    a.see(look(0, count=3))
+    words = a.compose("B", 100)
+    assert words.bits == 573 and words.left_out == 2
+    assert words.looks[0].numbers.tolist() == [0]
+
+
+def test_detections_are_passed_on_but_not_back():
+    """What A says goes by B to C, never to A again; C has A's body and calls it as A does."""
+    a, b, c = (sightings(name) for name in "ABC")
+    a.see(look(0))
+    b.hear(a.compose("B", 10**5))
+    c.hear(b.compose("C", 10**5))
+    assert not b.compose("A", 10**5).looks and not c.compose("B", 10**5).looks
+    pictures = [[body.name for body in x.look(T, 3.0)] for x in (a, b, c)]
+    assert pictures[0] == pictures[1] == pictures[2] and len(pictures[0]) == 2
+    assert c.ages(T) == pytest.approx((T, T)) and a.ages(T) == ()
+    assert len(c.look(1.0, 3.0)) == 0
+
+
+def test_paths_over_a_transmitter_that_says_nothing_place_nobody():
+    """B's paths are of A's chirps: with A's word for where it is they are bodies."""
+    silent, told = sightings("B"), sightings("B")
+    told.hear(sightings("A").compose("B", 10**5))
+    for one in (silent, told):
+        one.see(replace(look(0, "A->B"), own=Pose.at_rest((0, 20, 20), (0, -1, 0))))
+    assert len(silent.look(T, 3.0)) == 0 and len(told.look(T, 3.0)) == 2
+
+
+def test_sightings_go_on_from_memory():
+    """Planted bugs: `told`, or who said it, left out."""
+    a, b = sightings("A"), sightings("B")
+    a.see(look(0))
+    b.hear(a.compose("B", 10**5))
+    b.compose("C", 10**5)
+    again = sightings("B")
+    again.restore(unpack(*pack(b.memory())))
+    a.see(look(1))
+    for one in (b, again):
+        one.hear(sightings("A").compose("B", 10**5))
+    assert pack(b.memory()) == pack(again.memory())
+    assert not again.compose("C", 10**5).looks and not again.compose("A", 10**5).looks

@@ -3,17 +3,20 @@ changes what the scenario's own receivers hear."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from test_fall_back import scenario as dense_scenario
 from test_resume import SCENES, Stopped, assert_equal_results, stopping_at
 
+from isac_rt.results.losses import LOSSES
 from isac_rt.results.provenance import run_content
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import prepare
-from isac_rt.views.report import side_by_side, write_report
+from isac_rt.views.report import city_costs, side_by_side, write_report
 
 SHORT = ["modulation.acquisition_frames=2", "receivers.active_every_frames=2"]
 SETS = [
@@ -99,3 +102,50 @@ def test_the_report_shows_the_sets_side_by_side(compared, tmp_path):
     assert "Receivers on the same samples" in page
     costs = compared.summary["timing_s"]["by_set"]
     assert all(seconds > 0 for links in costs.values() for seconds in links.values())
+
+
+def test_one_table_says_what_the_city_costs_each(compared, tmp_path):
+    """By hand of a summary with numbers that are set: 30 of 40 found where noise alone would leave
+    0.95; 0.2 + 0.1 + 0.4 false tracks of the city, those of noise not. Planted bugs: the own set's
+    figures for all; the share of noise among the city's."""
+    summary = json.loads(json.dumps(compared.summary))
+    link = summary["compared"]["paper"]["links"]["AT->AT"]
+    link["bounds"]["clutter_free"], link["hit_rate"] = 0.95, 0.75
+    link["counts"]["hit_rate"] = [30, 40]
+    link["losses"] = dict.fromkeys(LOSSES, 1) | {"masked": 5, "clutter": 3}
+    kinds = {"ghost": 0.2, "specular": 0.1, "diffuse": 0.4, "noise": 2.0}
+    link["false_tracks"] = dict.fromkeys(link["false_tracks"], 0.0) | kinds
+    table = city_costs(summary)
+    row = next(r for r in table.rows if r[:2] == ("AT to AT", "paper"))
+    found = dict(zip(table.columns, row, strict=True))
+    assert (found["In view"], found["Hit rate"], found["In noise alone"]) == ("40", "0.75", "0.95")
+    assert (found["The city costs"], found["Masked"], found["Clutter"]) == ("0.2", "5", "3")
+    assert found["False tracks of the city"] == "0.7"
+    assert "What the city costs each" in write_report(compared, tmp_path, []).read_text()
+    alone = {**compared.summary, "compared": {}, "timing_s": {"setup": 0.0}}
+    assert not city_costs(alone).rows
+
+
+def test_every_target_frame_in_view_has_one_cause(compared):
+    """Causes add up to the target-frames in view and hits to those found: of every set, terminal,
+    link and UAV, and frame by frame in the dataset. Planted bugs: a terminal's causes of its last
+    link alone; a UAV behind a wall with a cause."""
+    summary, d = compared.summary, compared.dataset
+    for one in (summary, *summary["compared"].values()):
+        for blocks in (one["terminals"], one["links"]):
+            for b in blocks.values():
+                found, in_view = b["counts"]["hit_rate"]
+                assert sum(b["losses"].values()) == in_view
+                assert b["losses"]["found"] == found
+                of_uavs = b["targets"].values()
+                for t in of_uavs:
+                    assert sum(t["losses"].values()) == t["in_view"]
+                    assert t["losses"]["found"] == t["found"]
+                for cause in LOSSES:
+                    assert sum(t["losses"][cause] for t in of_uavs) == b["losses"][cause]
+    seen = d.in_view.values & ~d.shadowed.values
+    assert seen.any()
+    assert ((d.loss.values >= 0) == seen).all()
+    for i, link in enumerate(summary["links"].values()):
+        counted = [int((d.loss.values[:, i] == k).sum()) for k in range(len(LOSSES))]
+        assert counted == list(link["losses"].values())

@@ -8,11 +8,12 @@ from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
 from isac_rt.results.provenance import run_content
+from isac_rt.results.swarm import SWARM
 from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
 from isac_rt.scenario.swarm import Access
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
-from isac_rt.views.animate import fused_positions
+from isac_rt.views.animate import animate, fused_positions
 from isac_rt.views.report import swarm_table
 
 
@@ -21,15 +22,58 @@ def talked():
     return simulate.run(scenario(), snapshots=2)
 
 
-def test_nothing_else_of_a_run_depends_on_what_is_told(talked):
+@pytest.fixture(scope="module")
+def pooled():
+    return simulate.run(scenario(cooperation="detections"), snapshots=2)
+
+
+def test_nothing_else_of_a_run_depends_on_what_is_told(talked, pooled):
     """The same bits. Planted bug: a picture's track that updates a terminal's tracker."""
     alone = simulate.run(scenario(cooperation="none"), snapshots=2)
-    for name, variable in alone.dataset.variables.items():
-        kind = variable.dtype.kind == "f"
-        assert np.array_equal(talked.dataset[name].values, variable.values, equal_nan=kind), name
-    for key in ("terminals", "links", "paths"):
-        assert talked.summary[key] == alone.summary[key]
+    for told in (talked, pooled):
+        for name, variable in alone.dataset.variables.items():
+            kind = variable.dtype.kind == "f"
+            assert np.array_equal(told.dataset[name].values, variable.values, equal_nan=kind), name
+        for key in ("terminals", "links", "paths"):
+            assert told.summary[key] == alone.summary[key]
     assert alone.summary["swarm"] is None
+
+
+def test_detections_are_heard_as_the_links_carry_them(pooled):
+    """The AT sends what its tentative tracks took from the first data frame on: those of frame 1
+    leave with frame 2. A data frame has 886 bits: 64 + 136 for itself, 208 and 165 for each
+    detection, so that the two of a frame and one of another do not fit, but the newest two do. The
+    feedback has 1000. Planted bugs: what a pilot carries; bits of lost messages left out."""
+    d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
+    k = list(d.picture.values).index("PT")
+    assert d.picture_room.values[:, k].tolist() == [0, 0] + [886] * 7
+    assert d.picture_reports.values[:3, k].tolist()[:2] == [0, 0]
+    assert (d.picture_reports.values[3:, k] > 0).all()
+    assert (d.picture_bits.values[:, k] <= 886).all()
+    assert p["PT"]["bits"] == d.picture_bits.values[:, k].sum()
+    assert p["PT"]["bits_room"] == 886 * 7
+    whole = d.picture_bits.values[3:, k] == 64 + 136 + 208 + 2 * 165
+    assert whole.sum() >= 4
+    assert p["PT"]["left_out"] == d.picture_left_out.values[:, k].sum()
+
+
+def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
+    """Of both terminals' detections, under one name, and nearer to the truth than the deviations
+    stated allow for; the terminals are recognised."""
+    d = pooled.dataset
+    last = d.fused_frame.values == 8
+    names = set()
+    for p in range(d.sizes["picture"]):
+        mine = last & (d.fused_picture.values == p)
+        (k,) = np.flatnonzero(mine & (d.fused_uav.values == 2))
+        assert d.fused_members.values[k] == 2
+        names.add((int(d.fused_origin.values[k]), int(d.fused_number.values[k])))
+        assert (mine & (d.fused_terminal.values < 0)).sum() == 1
+    assert len(names) == 1
+    swarm = pooled.summary["swarm"]
+    assert swarm["targets"]["U"]["switches"] == 0
+    assert swarm["rmse"]["position_m"] < 0.1 and swarm["nees"] < 1.5
+    assert swarm["false_tracks_per_frame"] == 0
 
 
 def test_who_hears_what_and_when(talked):
@@ -87,11 +131,12 @@ def test_a_terminal_that_does_not_decode_hears_nothing():
         assert told[name]["reports_per_frame"] == 0
 
 
-def test_a_stopped_run_goes_on_to_the_same_pictures(tmp_path):
+@pytest.mark.parametrize("told", ["tracks", "detections"])
+def test_a_stopped_run_goes_on_to_the_same_pictures(told, tmp_path):
     """Also of a set that is compared. Planted bugs: the channels, the names or what fed the tracks
     not taken up."""
     other = {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking(confirm_hits=2))}
-    flight = scenario(frames=7, compare=other)
+    flight = scenario(frames=7, compare=other, cooperation=told)
     whole = simulate.run(flight, snapshots=2)
     for stop in (3, 5, None):
         resume = Resume(tmp_path, run_content(flight, 2), every=0.0)
@@ -107,8 +152,18 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     table = swarm_table(talked.summary)
     assert [row[0] for row in table.rows] == ["All together", "AT", "PT"]
     assert table.rows[2][-1].startswith("0 of ")
+    told = talked.summary["swarm"]["terminals"]["PT"]
+    assert table.rows[2][-3] == str(told["left_out"]) and told["left_out"] > 0
+    assert told["bits"] < told["bits_room"] == 886 * 7
     d = talked.dataset
-    (found,) = fused_positions(d, 8, 0)
-    assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
+    for name in ("AT", "PT", SWARM):
+        (found,) = fused_positions(d, 8, name)
+        assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
     alone = d.drop_vars([name for name in d.variables if name == "picture"])
-    assert fused_positions(alone, 8, 0).shape == (0, 3)
+    assert fused_positions(alone, 8, SWARM).shape == (0, 3)
+    figure, moving = animate(talked, 0)
+    moving._func(1)
+    marks = {line.get_label(): line.get_xdata() for line in figure.axes[0].lines}
+    here = d.uav_position.values[int(d.snapshot_frame.values[1]), 2, 0]
+    assert marks["picture of the whole swarm"] == pytest.approx([here], abs=1.0)
+    assert marks["its picture with what it hears"] == pytest.approx([here], abs=1.0)
