@@ -30,11 +30,11 @@ from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.coherent import (
-    CLIMBED,
     DIRECTIONS,
     Bucketed,
     Found,
     Search,
+    climbed,
     denominators,
 )
 from isac_rt.receive.clutter.detectors import FINE, noise_level
@@ -289,17 +289,13 @@ def search_white(
 def _climbed(
     y: np.ndarray, inverse: np.ndarray, cosines: np.ndarray, search: Search
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The largest statistic near directions (S, 2), and where; as at the active terminal."""
-    peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
-    around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(9, 2)
-    for part in CLIMBED:
-        tried = cosines[:, None] + part * (search.cosines[1] - search.cosines[0]) * around
-        a = search.steering(tried)
+    """The largest statistic near directions (S, 2), and where."""
+
+    def statistic(a: np.ndarray) -> np.ndarray:
         norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
-        values = (np.abs(a.conj() @ y.transpose(0, 2, 1)) ** 2).sum(axis=2) / norm
-        best = values.argmax(axis=1)
-        peak, cosines = values[each, best], tried[each, best]
-    return peak, cosines
+        return (np.abs(a.conj() @ y.transpose(0, 2, 1)) ** 2).sum(axis=2) / norm
+
+    return climbed(statistic, cosines, search)
 
 
 def _best(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:

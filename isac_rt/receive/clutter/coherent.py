@@ -37,6 +37,8 @@ DIRECTIONS = 32
 """Values of each direction cosine that are searched; the peak between them is sought from there."""
 CLIMBED = 0.3, 0.12
 """Steps, in those of the grid, by which the peak between them is climbed."""
+BLOCK = 2048
+"""Cells whose lines are looked at together: they stay in the cache."""
 FINE = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
@@ -106,8 +108,7 @@ class Search:
 
     def steering(self, cosines: np.ndarray) -> np.ndarray:
         """(..., L) complex64 exp(-j k v.u) of directions (..., 2)."""
-        turns = self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T)
-        return np.exp(-1j * turns.astype(np.float32))
+        return turned(-self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T))
 
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
@@ -122,6 +123,15 @@ class Search:
             made = [s @ x[m] for m, s in zip(lines.members, lines.spectra, strict=True)]
             out.append(np.array(made, np.complex64).reshape(len(made), DIRECTIONS, x.shape[1]))
         return out[0], out[1]
+
+
+def turned(phases: np.ndarray) -> np.ndarray:
+    """exp(j phi) as complex64: real and imaginary part by themselves, several times faster."""
+    phases = phases.astype(np.float32)
+    out = np.empty(phases.shape, np.complex64)
+    np.cos(phases, out=out.real)
+    np.sin(phases, out=out.imag)
+    return out
 
 
 def _sizes(values: np.ndarray) -> np.ndarray:
@@ -165,25 +175,24 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     """
     c = search.channels
     x = maps.reshape(-1, maps.shape[2] * maps.shape[3])
-    along_x, along_z = search.lines(x[c.tx * maps.shape[1] + c.rx])
+    channel = c.tx * maps.shape[1] + c.rx
     scale = 1 / (len(c) * noise)
     bound = np.zeros(x.shape[1], np.float32)
-    for line in (*along_x, *along_z):
-        _add_largest(line, bound)
+    for first in range(0, bound.size, BLOCK):
+        block = slice(first, first + BLOCK)
+        for lines in (search.along_x, search.along_z):
+            for members, spectra in zip(lines.members, lines.spectra, strict=True):
+                _add_largest(spectra @ x[channel[members], block], bound[block])
     cell = np.flatnonzero(bound**2 * scale >= least)
-    peak, cosines = _best(
-        np.ascontiguousarray(along_x[:, :, cell].transpose(2, 0, 1)),
-        np.ascontiguousarray(along_z[:, :, cell].transpose(2, 0, 1)),
-        np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32),
-        search,
-    )
+    y = np.ascontiguousarray(x[:, cell].T)[:, channel]
+    peak, cosines = _whitened(y, np.full((1, DIRECTIONS, DIRECTIONS), scale), search)
     some = np.flatnonzero(peak >= least)
-    y = np.stack([x[i][cell[some]] for i in c.tx * maps.shape[1] + c.rx], axis=1)
+    y = y[some]
 
     def statistic(a: np.ndarray) -> np.ndarray:
         return scale * np.abs((a.conj() * y[:, None]).sum(axis=-1)) ** 2
 
-    peak[some], cosines[some] = _climbed(statistic, cosines[some], search)
+    peak[some], cosines[some] = climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
 
 
@@ -209,11 +218,11 @@ def search_white(
         norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
         return np.abs((a.conj() * y[some, None]).sum(axis=-1)) ** 2 / norm
 
-    peak[some], cosines[some] = _climbed(statistic, cosines[some], search)
+    peak[some], cosines[some] = climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
 
 
-def _climbed(
+def climbed(
     statistic: Callable[[np.ndarray], np.ndarray], cosines: np.ndarray, search: Search
 ) -> tuple[np.ndarray, np.ndarray]:
     """The largest statistic near directions (S, 2), and where: a parabola between grid points may
@@ -226,11 +235,11 @@ def _climbed(
     around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(9, 2)
     for part in CLIMBED:
         step = part * (search.cosines[1] - search.cosines[0])
-        turned = search.steering(step * around)  # the phases of two directions add
-        values = statistic(towards[:, None] * turned)
+        turns = search.steering(step * around)  # the phases of two directions add
+        values = statistic(towards[:, None] * turns)
         best = values.argmax(axis=1)
         peak, cosines = values[each, best], cosines + step * around[best]
-        towards = towards * turned[best]
+        towards = towards * turns[best]
     return peak, cosines
 
 
@@ -259,13 +268,17 @@ def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:
                 block = np.einsum(
                     "gm,smn,gn->sg", a, matrix[:, m][:, :, n], b.conj(), optimize=True
                 )
+                block = np.expand_dims(block, axis)
+                if i == j:  # its turn is one
+                    out += block.real
+                    continue
                 turn = lines.turns[i] * lines.turns[j].conj()
-                both = block[:, :, None] * turn if axis == 2 else turn[:, None] * block[:, None, :]
-                out += both.real
+                out += (block * (turn if axis == 2 else turn[:, None])).real
     for m, a, turn_z in zip(X.members, X.spectra, X.turns, strict=True):
         for n, b, turn_x in zip(Z.members, Z.spectra, Z.turns, strict=True):
-            block = (a @ matrix[:, m][:, :, n]) @ b.conj().T
-            out += 2 * (block * turn_x.conj()[:, None] * turn_z).real
+            near = np.ascontiguousarray(a * turn_x.conj()[:, None])
+            far = 2 * (b.conj() * turn_z[:, None]).T
+            out += ((near @ matrix[:, m][:, :, n]) @ far).real
     return np.maximum(out, 1e-6)
 
 
@@ -405,7 +418,7 @@ class Bucketed:
             (beat - row + REACH)[order].astype(np.float32),
             (doppler - column)[order].astype(np.float32),
             (clutter.power / noise)[order].astype(np.float32),
-            np.exp(-1j * (known.wavenumber * clutter.arrival[order] @ places.T).astype(np.float32)),
+            turned(-known.wavenumber * (clutter.arrival[order] @ places.T)),
             tables,
             search.spread(taper.cosine),
             w.num_chirps,

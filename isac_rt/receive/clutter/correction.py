@@ -32,6 +32,8 @@ UNTAPERED = Taper(doppler_bins=0.0)
 STEPS = 6
 SETTLED = 0.02
 """Step of the level's logarithm and of the velocity [m/s] from which on the fit stands."""
+ALIKE = 0.05
+"""Velocities [m/s] so near to each other, an eighth of a Doppler bin, have the same slopes."""
 LONGEST_STEP = np.array([1.0, 0.1, 0.1, 0.1])
 """Of the level's logarithm and the velocity [m/s]; a quarter of a Doppler bin is well inside the
 response's main lobe."""
@@ -53,17 +55,22 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
     per_velocity = -w.carrier() * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s
     beat, doppler = cells_of(clutter, w)
     prior = np.array([LEVEL_STD, *[VELOCITY_STD] * 3]) ** -2.0
-    theta = np.zeros(4)
+    theta, at, slopes = np.zeros(4), np.full(3, np.inf), np.zeros((3, rows, power.shape[1]))
     for _ in range(STEPS):
         moved = doppler + per_velocity @ theta[1:]
-        parts = np.exp(theta[0]) * response.of(beat, moved, clutter.power, per_velocity)
+        anew = np.abs(theta[1:] - at).max() > ALIKE
+        along = per_velocity if anew else per_velocity[:, :0]
+        parts = np.exp(theta[0]) * response.of(beat, moved, clutter.power, along)
+        if anew:
+            at, slopes = theta[1:].copy(), parts[1:]
+        parts = np.concatenate([parts[:1], slopes])
         used = parts[0] > noise
         if used.sum() < FEWEST:
             return Correction(0.0, np.zeros(3))
         mean, found = parts[0][used] + noise, power[:rows][used]
         kept = found < OUTLIER * mean
-        slopes, excess = (parts[:, used] / mean)[:, kept], (found / mean - 1)[kept]
-        step = np.linalg.solve(slopes @ slopes.T + np.diag(prior), slopes @ excess - prior * theta)
+        score, excess = (parts[:, used] / mean)[:, kept], (found / mean - 1)[kept]
+        step = np.linalg.solve(score @ score.T + np.diag(prior), score @ excess - prior * theta)
         theta = theta + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
         if np.abs(step).max() < SETTLED:
             break
