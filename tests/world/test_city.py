@@ -605,6 +605,26 @@ def test_cityjson_solid_and_footprint(tmp_path, lod):
     assert city.bounds()[0, 2] == pytest.approx(0.0, abs=ROUNDING)
 
 
+@pytest.mark.parametrize(
+    ("said", "height"),
+    [
+        ({"b3_h_maaiveld": -0.62, "b3_h_dak_70p": 6.91, "b3_h_dak_max": 9.4}, 7.53),
+        ({"b3_h_maaiveld": -0.62, "b3_h_dak_70p": None, "b3_h_dak_max": 9.4}, 10.02),
+        ({"b3_h_maaiveld": -0.62, "b3_h_dak_70p": 6.91, "measuredHeight": "8,2"}, 8.2),
+        ({"b3_h_maaiveld": None, "b3_h_dak_70p": 6.91}, 10.0),
+        ({"b3_h_maaiveld": 3.0, "b3_h_dak_70p": 1.0}, 10.0),
+    ],
+)
+def test_heights_of_the_3d_bag(tmp_path, said, height):
+    """Roof over ground of a building that could not be reconstructed; a height that is stated goes
+    before it, and where nothing is known the default holds. Planted bug: the roof over the sea."""
+    document = cityjson("0", [[[0, 1, 2, 3]]], "MultiSurface", **said)
+    (tmp_path / "town.city.json").write_text(json.dumps(document))
+    source = node(source="footprints", file="town.city.json", ground_margin_m=10.0)
+    low, high = load_city(source, tmp_path, F_C, (690_100.5, 5_334_000.25, 511.5)).bounds()
+    assert high[2] - low[2] == pytest.approx(height, abs=1e-6)
+
+
 def test_canyon_has_its_street():
     keys = {
         "street_width_m": 17.3,

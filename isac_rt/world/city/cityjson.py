@@ -389,11 +389,8 @@ class _Reader:
             if kind not in BUILDING_TYPES:
                 self.counted[kind, next(iter(body.faces))] += 1
         elif not detailed.intersection(item.children) and not isinstance(geometry, _Instance):
-            attributes = item.attributes or {}
             try:
-                height = parse_length(
-                    attributes.get(self.city.height_property, attributes.get("measuredHeight"))
-                )
+                height = _height(item.attributes or {}, self.city.height_property)
             except ValueError as problem:
                 raise CityError(f"{what}: {problem}; correct it") from None
             plan = _footprint(geometry, vertices, what)
@@ -449,6 +446,27 @@ class _Reader:
         others = [f"{n} {kind}: {of}" for (kind, of), n in self.counted.most_common()]
         if others:
             notes.append(f"no buildings, with their materials: {', '.join(others)}")
+
+
+def _height(attributes: Mapping[str, Any], key: str) -> float | None:
+    """What a building says of its height [m]: under `key`, as CityGML's `measuredHeight`, or as the
+    3D BAG's heights of roof and ground over the sea; None if it says nothing.
+
+    Raises
+    ------
+    ValueError  If it is no height.
+    """
+    stated = attributes.get(key, attributes.get("measuredHeight"))
+    if stated is not None:
+        return parse_length(stated)
+    ground = attributes.get("b3_h_maaiveld")
+    roof = next((v for name in _ROOFS if (v := attributes.get(name)) is not None), None)
+    if not isinstance(roof, int | float) or not isinstance(ground, int | float):
+        return None
+    return float(roof - ground) if roof > ground else None
+
+
+_ROOFS = ("b3_h_dak_70p", "b3_h_dak_50p", "b3_h_dak_max")
 
 
 _NO_FACE = np.zeros((0, 3), dtype=np.int64)
