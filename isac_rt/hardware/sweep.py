@@ -17,6 +17,7 @@ for 64 kHz of quadratic error and the longest delay), and third orders of tau.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -107,6 +108,46 @@ def ramp_of(o: scenario.Ramp, waveform: Waveform) -> Ramp | None:
         return None
     parts = o.quadratic_hz, o.cubic_hz, o.ripple_hz, o.ripple_period_s
     return Ramp(*parts, waveform.chirp_duration)
+
+
+READ_ERROR = 1e-3
+"""What `short_read` may be wrong by, over a full tone anywhere in the band."""
+_HALF_BAND = 1 / 3
+_MOST_SHORT = 5  # neighbours to each side, beyond which `read_at` serves
+
+
+@lru_cache(maxsize=16)
+def short_read(most: float) -> np.ndarray | None:
+    r"""Taps that read samples up to `most` of a sample away, for a band of two thirds of the
+    sampling rate about zero, to `READ_ERROR`; None where none so few do.
+
+    .. math:: x(n + s) \approx x(n) + s\sum_t a_t (x_{n+t} - x_{n-t}) + s^2 \Big(b_0 x_n + \sum_t
+        b_t (x_{n+t} + x_{n-t})\Big)
+
+    with a and b of the least largest error over the band and the places.
+
+    Returns
+    -------
+    taps : (1 + T, 2) of each neighbour, the sample itself first: a (0 of it) and b
+    """
+    frequency = np.linspace(0, _HALF_BAND, 41)[:, None]
+    shift = np.linspace(0.2, 1.0, 5) * most
+    angle = 2 * np.pi * frequency
+    for count in range(1, _MOST_SHORT + 1):
+        t = np.arange(1, count + 1)
+        odd = np.einsum("s,ft->fst", shift, 2 * np.sin(angle * t)).reshape(-1, count)
+        waves = np.concatenate([np.ones_like(angle), 2 * np.cos(angle * t)], axis=1)
+        even = np.einsum("s,ft->fst", shift**2, waves).reshape(-1, count + 1)
+        truth = np.exp(1j * angle * shift).ravel() - 1
+        weight = np.ones(truth.size)
+        for _ in range(8):  # Lawson's way from least squares to the least largest error
+            a = np.linalg.lstsq(odd * weight[:, None], truth.imag * weight, rcond=None)[0]
+            b = np.linalg.lstsq(even * weight[:, None], truth.real * weight, rcond=None)[0]
+            error = np.abs(even @ b + 1j * (odd @ a) - truth)
+            weight *= np.sqrt(error / error.max() + 1e-3)
+        if error.max() <= READ_ERROR:
+            return np.column_stack([np.append(0.0, a), b])
+    return None
 
 
 REACH = 6

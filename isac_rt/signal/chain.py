@@ -12,8 +12,10 @@ from isac_rt.kernels.vector import (
     LANES,
     aligned,
     cos_sin_exact,
+    even_twice,
     floor,
     load,
+    odd_twice,
     splat,
     store,
     swap_pairs,
@@ -24,20 +26,34 @@ from isac_rt.signal.noise import add_stream
 
 
 @jit(fast=True)
-def _add_phases(out, values, first, weight, scale):
-    """Add scale times the cubic through `values` to each row of `out`: place n of row i lies after
-    the value first[i] + 2 n."""
+def _add_phase(row, values, first, weight):
+    """Add the cubic through `values` to a row: its place n lies after the value first + 2 n."""
+    a, b, c, d = weight[0], weight[1], weight[2], weight[3]
+    at = first - 1
+    for n in range(row.shape[0]):
+        k = at + 2 * n
+        row[n] += a * values[k] + b * values[k + 1] + c * values[k + 2] + d * values[k + 3]
+
+
+@jit(fast=True)
+def _add_phases(out, values, first, weight):
+    """The same to each row of `out`."""
     for i in range(out.shape[0]):
-        at, row = first[i] - 1, out[i]
-        a, b, c, d = (
-            scale * weight[i, 0],
-            scale * weight[i, 1],
-            scale * weight[i, 2],
-            scale * weight[i, 3],
-        )
-        for n in range(row.shape[0]):
-            k = at + 2 * n
-            row[n] += a * values[k] + b * values[k + 1] + c * values[k + 2] + d * values[k + 3]
+        _add_phase(out[i], values, first[i], weight[i])
+
+
+def places_of(record: Record, begin: np.ndarray, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rows of samples that begin at times (R,) [s] lie in an oscillator's phase.
+
+    Returns
+    -------
+    first : (R,) the value before the first sample
+    weight : (R, 4) of the cubic through those around it, in cycles, with the sign
+    """
+    assert OVERSAMPLING == 2
+    place = (begin - record.start) / record.step
+    first = np.floor(place).astype(np.int64)
+    return first, cubic(place - first) * (sign / (2 * np.pi))
 
 
 def add_phases(out: np.ndarray, record: Record, begin: np.ndarray, sign: float) -> None:
@@ -49,11 +65,7 @@ def add_phases(out: np.ndarray, record: Record, begin: np.ndarray, sign: float) 
     begin : (R,) time of the first sample of each row [s]; the others follow at the IF's rate
     sign : 1 or -1
     """
-    assert OVERSAMPLING == 2
-    place = (begin - record.start) / record.step
-    first = np.floor(place).astype(np.int64)
-    weight = cubic(place - first)
-    _add_phases(out, record.values, first, weight, sign / (2 * np.pi))
+    _add_phases(out, record.values, *places_of(record, begin, sign))
 
 
 @jit(fast=True)
@@ -77,19 +89,53 @@ def phasors(cycles: np.ndarray) -> np.ndarray:
     return out[: 2 * cycles.size].view(np.complex64).reshape(cycles.shape)
 
 
-@jit(fast=True)
-def _turn_row(flat, at, plain, crossed):
-    """Multiply one chirp's samples, interleaved from flat[at], by complex factors: their real parts
-    twice each, and minus and plus their imaginary parts."""
-    size = plain.shape[0]
-    whole = size - size % LANES
-    for i in range(0, whole, LANES):
-        x = load(flat, at + i)
-        store(flat, at + i, x * load(plain, i) + swap_pairs(x) * load(crossed, i))
-    for i in range(whole, size, 2):
-        re, im = flat[at + i], flat[at + i + 1]
-        flat[at + i] = re * plain[i] + im * crossed[i]
-        flat[at + i + 1] = im * plain[i + 1] + re * crossed[i + 1]
+class Turns(NamedTuple):
+    """The complex factor of each chirp's samples that all receive elements share; arrays without
+    elements: nothing of the kind.
+
+    Attributes
+    ----------
+    records : phases of the receiver's and the transmitter's oscillator [rad]
+    first : (R, 2) of each chirp the value before its first sample, in either record
+    weight : (R, 2, 4) of the cubic through those around it, divided by 2 pi, with the sign
+    always : (N,) float64 the same in all chirps [cycles]
+    place, beat : (N,) places of the samples, (R,) cycles per sample by which they turn
+    sent : (A, 2 W) float32 complex gains of each transmit antenna, interleaved
+    antenna, begin : (R,) which of them, and where in it, each chirp begins
+    gain : (2 N,) float32 complex gain of all chirps
+    """
+
+    records: tuple[np.ndarray, np.ndarray]
+    first: np.ndarray
+    weight: np.ndarray
+    always: np.ndarray
+    place: np.ndarray
+    beat: np.ndarray
+    sent: np.ndarray
+    antenna: np.ndarray
+    begin: np.ndarray
+    gain: np.ndarray
+
+    def of_rows(self, every: int) -> Turns:
+        """Those of one chirp in `every`."""
+        rows = ("first", "weight", "beat", "antenna", "begin")
+        return self._replace(**{name: getattr(self, name)[::every] for name in rows})
+
+
+NOTHING = np.zeros(0)
+NO_ROWS = np.zeros((0, 0), np.float32)
+NO_TURNS = Turns(
+    (NOTHING, NOTHING),
+    np.zeros((0, 2), np.int64),
+    np.zeros((0, 2, 4)),
+    NOTHING,
+    NOTHING,
+    NOTHING,
+    NO_ROWS,
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros(0, np.float32),
+)
 
 
 class Work(NamedTuple):
@@ -97,11 +143,13 @@ class Work(NamedTuple):
 
     Attributes
     ----------
-    reads, first, before : (T, 2 N) float32 weights with which samples are read at other places,
-        each twice; the first of the neighbours (`isac_rt.hardware.sweep.read_at`); factors as below
-        that bring their band to the middle first
-    factors : (M P, 2 N) float32, complex factors of each chirp's samples, interleaved
-    elements : (L_rx, 2 N) float32, the same of each element's
+    taps, shift : (1 + T, 2) and (2 N,) float32, with which samples are read at places nearby, each
+        of these twice (`isac_rt.hardware.sweep.short_read`)
+    reads, first : (T, 2 N) float32 weights with which samples are read farther away, each twice;
+        the first of the neighbours (`isac_rt.hardware.sweep.read_at`)
+    beat : (M P,) cycles per sample by which they are turned back before, their band to the middle
+    turns : of each chirp
+    elements : (L_rx, 2 N) float32, complex factors of each element's samples, interleaved
     power, key : of the noise per sample [W] (0: none), and its stream
     saturation : power at which the amplifier saturates [W]
     mixing : (7,) float32: I of I, I of Q, Q of I, Q of Q, the constant, the share of Q that is
@@ -109,10 +157,12 @@ class Work(NamedTuple):
     step, most : of the converters [sqrt(W)], and half their number of steps; 0: none
     """
 
+    taps: np.ndarray
+    shift: np.ndarray
     reads: np.ndarray
     first: int
-    before: np.ndarray
-    factors: np.ndarray
+    beat: np.ndarray
+    turns: Turns
     elements: np.ndarray
     power: float
     key: np.ndarray
@@ -122,33 +172,155 @@ class Work(NamedTuple):
     most: float
 
 
-@jit(fast=True)
-def _spread_row(row, plain, crossed):
-    """Factors as `_turn_row` wants them."""
-    for n in range(row.shape[0] // 2):
-        plain[2 * n] = plain[2 * n + 1] = row[2 * n]
-        crossed[2 * n], crossed[2 * n + 1] = -row[2 * n + 1], row[2 * n + 1]
+class _Room(NamedTuple):
+    """Memory of the pass: phases of a chirp [cycles], its factors and those that turn it back, one
+    chirp with the neighbours beyond its ends, phasors of 16 blocks, the
+    places within one, and the signs of a complex product."""
+
+    cycles: np.ndarray
+    factor: np.ndarray
+    back: np.ndarray
+    padded: np.ndarray
+    starts: np.ndarray
+    places: np.ndarray
+    signs: np.ndarray
+
+
+@jit(inline=True)
+def _product(x, f, signs):
+    """Complex products of interleaved numbers, eight at once."""
+    return x * even_twice(f) + swap_pairs(x) * (odd_twice(f) * signs)
 
 
 @jit(fast=True)
-def _read_row(flat, at, reads, first, padded):
+def _turn(out, to, row, at, signs):
+    """Multiply out[to:], interleaved, by as many complex factors as stand in `row` from `at` on; no
+    more of them than fit in whole vectors of `out` are there."""
+    sign = load(signs, 0)
+    size = out.shape[0] - to
+    whole = size - size % LANES
+    for i in range(0, whole, LANES):
+        store(out, to + i, _product(load(out, to + i), load(row, at + i), sign))
+    for i in range(whole, size, 2):
+        re, im, c, s = out[to + i], out[to + i + 1], row[at + i], row[at + i + 1]
+        out[to + i], out[to + i + 1] = re * c - im * s, re * s + im * c
+
+
+@jit(fast=True)
+def _turn_twice(out, row, other, signs):
+    """Multiply `out` by two rows of complex factors."""
+    sign = load(signs, 0)
+    size = out.shape[0]
+    whole = size - size % LANES
+    for i in range(0, whole, LANES):
+        x = _product(load(out, i), load(row, i), sign)
+        store(out, i, _product(x, load(other, i), sign))
+    for i in range(whole, size, 2):
+        c = row[i] * other[i] - row[i + 1] * other[i + 1]
+        s = row[i] * other[i + 1] + row[i + 1] * other[i]
+        re, im = out[i], out[i + 1]
+        out[i], out[i + 1] = re * c - im * s, re * s + im * c
+
+
+@jit(fast=True)
+def _tone(out, beat, room):
+    """exp(-j 2 pi beat n), interleaved, n from 0 on."""
+    starts, places = room.starts, room.places
+    cycles = load(places, 0) * splat(-beat)
+    lane_re, lane_im = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
+    blocks = out.shape[0] // (2 * LANES)
+    for first in range(0, blocks, LANES):
+        cycles = (load(places, 0) + splat(float(first))) * splat(-beat * LANES)
+        c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
+        store(starts, 0, c)
+        store(starts, LANES, s)
+        for i in range(min(LANES, blocks - first)):
+            c, s = splat(starts[i]), splat(starts[LANES + i])
+            re, im = c * lane_re - s * lane_im, c * lane_im + s * lane_re
+            at = 2 * LANES * (first + i)
+            store(out, at, zip_low(re, im))
+            store(out, at + LANES, zip_high(re, im))
+
+
+@jit(fast=True)
+def _factor(room, turns, row, size):
+    """The factor of one chirp's samples, `size` numbers; False where there is none."""
+    cycles, factor, count = room.cycles, room.factor, size // 2
+    turned = turns.always.shape[0] + turns.first.shape[0] + turns.beat.shape[0] > 0
+    if turned:
+        if turns.always.shape[0]:
+            cycles[:count] = turns.always
+        else:
+            cycles[:count] = 0.0
+        for end in range(turns.first.shape[1] if turns.first.shape[0] else 0):
+            values = turns.records[end]
+            if values.shape[0]:
+                w = turns.weight[row, end]
+                _add_phase(cycles[:count], values, turns.first[row, end], w)
+        if turns.beat.shape[0]:
+            beat = turns.beat[row]
+            for n in range(count):
+                cycles[n] += beat * turns.place[n]
+        _phasors(factor, cycles)
+    else:
+        factor[0::2] = np.float32(1)
+        factor[1::2] = np.float32(0)
+    if turns.sent.shape[0]:
+        at = 2 * turns.begin[row]
+        _turn(factor[:size], 0, turns.sent[turns.antenna[row]], at, room.signs)
+    if turns.gain.shape[0]:
+        _turn(factor[:size], 0, turns.gain, 0, room.signs)
+    return turned or turns.sent.shape[0] + turns.gain.shape[0] > 0
+
+
+@jit(fast=True)
+def _pad(padded, own, margin, back, signs):
+    """One chirp's samples, turned back, between zeros."""
+    size = own.shape[0]
+    padded[margin : margin + size] = own
+    _turn(padded[: margin + size], margin, back, 0, signs)
+
+
+@jit(fast=True)
+def _read_near(own, padded, margin, taps, shift):
+    """Read one chirp's samples a part of a sample away."""
+    size = own.shape[0]
+    whole = size - size % LANES
+    for i in range(0, whole, LANES):
+        middle = load(padded, margin + i)
+        slope, bend = splat(np.float32(0)), middle * splat(taps[0, 1])
+        for t in range(1, taps.shape[0]):
+            after = load(padded, margin + i + 2 * t)
+            before = load(padded, margin + i - 2 * t)
+            slope = slope + (after - before) * splat(taps[t, 0])
+            bend = bend + (after + before) * splat(taps[t, 1])
+        late = load(shift, i)
+        store(own, i, middle + late * (slope + late * bend))
+    for i in range(whole, size):
+        slope, bend = np.float32(0), padded[margin + i] * taps[0, 1]
+        for t in range(1, taps.shape[0]):
+            after, before = padded[margin + i + 2 * t], padded[margin + i - 2 * t]
+            slope += (after - before) * taps[t, 0]
+            bend += (after + before) * taps[t, 1]
+        own[i] = padded[margin + i] + shift[i] * (slope + shift[i] * bend)
+
+
+@jit(fast=True)
+def _read_far(own, padded, reads):
     """Read one chirp's samples at other places; beyond its ends there are none."""
-    taps, size = reads.shape[0], reads.shape[1] // LANES * LANES
-    length = reads.shape[1]
-    margin = -2 * first
-    for i in range(length):
-        padded[margin + i] = flat[at + i]
+    taps, length = reads.shape
+    size = length // LANES * LANES
     weights = reads.reshape(-1)
     for i in range(0, size, LANES):
         total = splat(np.float32(0))
         for tap in range(taps):
             total = total + load(weights, tap * length + i) * load(padded, i + 2 * tap)
-        store(flat, at + i, total)
+        store(own, i, total)
     for i in range(size, length):
-        own = np.float32(0)
+        one = np.float32(0)
         for tap in range(taps):
-            own += weights[tap * length + i] * padded[i + 2 * tap]
-        flat[at + i] = own
+            one += weights[tap * length + i] * padded[i + 2 * tap]
+        own[i] = one
 
 
 @jit(fast=True)
@@ -192,52 +364,69 @@ def _quantise(own, step, most):
 
 
 @jit(fast=True)
-def _pass(flat, shape, work, room):
+def _bent(own, margin, work, room):
+    """Read one chirp's samples where a bent ramp has them."""
+    _pad(room.padded, own, margin, room.back, room.signs)
+    if work.taps.shape[0]:
+        _read_near(own, room.padded, margin, work.taps, work.shift)
+    else:
+        _read_far(own, room.padded, work.reads)
+
+
+@jit(fast=True)
+def _pass(flat, shape, work, room, margin):
     """Do it chirp by chirp, while the chirp's samples lie in the first cache."""
     groups, elements, chirps, num_samples = shape
-    size = 2 * num_samples
-    plain, crossed, padded = room[0], room[1], room[2 + 2 * elements]
-    for r in range(work.elements.shape[0]):
-        _spread_row(work.elements[r], room[2 + 2 * r], room[3 + 2 * r])
-    for m in range(groups):
-        for p in range(chirps):
-            if work.factors.shape[0]:
-                _spread_row(work.factors[m * chirps + p], plain, crossed)
-            if work.reads.shape[0]:
-                _spread_row(work.before[m * chirps + p], room[-2], room[-1])
-            for r in range(elements):
-                at = size * ((m * elements + r) * chirps + p)
-                own = flat[at : at + size]
-                if work.reads.shape[0]:
-                    _turn_row(flat, at, room[-2][:size], room[-1][:size])
-                    _read_row(flat, at, work.reads, work.first, padded)
-                if work.factors.shape[0]:
-                    _turn_row(flat, at, plain[:size], crossed[:size])
-                if work.elements.shape[0]:
-                    _turn_row(flat, at, room[2 + 2 * r][:size], room[3 + 2 * r][:size])
-                if work.power > 0:
-                    power = np.float32(work.power)
-                    add_stream(own, power, work.key[0], work.key[1], np.uint64(at // 2))
-                if work.saturation < np.inf:
-                    _compress(own, work.saturation)
-                if work.mixing[6] > 0:
-                    _mix(own, work.mixing)
-                if work.step > 0:
-                    _quantise(own, work.step, work.most)
-                    if work.mixing[5] == 0:
-                        own[1::2] = np.float32(0)
+    size, signs = 2 * num_samples, room.signs
+    for row in range(groups * chirps):
+        m, p = row // chirps, row % chirps
+        turned = _factor(room, work.turns, row, size)
+        if margin > 0:
+            _tone(room.back, work.beat[row], room)
+        for r in range(elements):
+            at = size * ((m * elements + r) * chirps + p)
+            own = flat[at : at + size]
+            if margin > 0:
+                _bent(own, margin, work, room)
+            if turned and work.elements.shape[0]:
+                _turn_twice(own, room.factor, work.elements[r], signs)
+            elif turned:
+                _turn(own, 0, room.factor, 0, signs)
+            elif work.elements.shape[0]:
+                _turn(own, 0, work.elements[r], 0, signs)
+            if work.power > 0:
+                power = np.float32(work.power)
+                add_stream(own, power, work.key[0], work.key[1], np.uint64(at // 2))
+            if work.saturation < np.inf:
+                _compress(own, work.saturation)
+            if work.mixing[6] > 0:
+                _mix(own, work.mixing)
+            if work.step > 0:
+                _quantise(own, work.step, work.most)
+                if work.mixing[5] == 0:
+                    own[1::2] = np.float32(0)
 
 
 def finish(samples: np.ndarray, work: Work) -> None:
     """Do to samples (M, L_rx, P, N) complex64, in place, what hardware does behind antennas."""
-    size = 2 * samples.shape[3] + 4 * max(-work.first, 0) + LANES
-    room = np.zeros((5 + 2 * samples.shape[1], size), np.float32)
-    _pass(samples.reshape(-1).view(np.float32), samples.shape, work, room)
+    length = -(-samples.shape[3] // LANES) * LANES
+    margin = 2 * (len(work.taps) - 1) if len(work.taps) else -2 * work.first
+    lanes = np.arange(LANES)
+    room = _Room(
+        np.zeros(length),
+        aligned(2 * length),
+        aligned(2 * length),
+        aligned(2 * length + 2 * margin + LANES),
+        aligned(2 * LANES),
+        lanes.astype(float),
+        np.where(lanes % 2, 1, -1).astype(np.float32),
+    )
+    _pass(samples.reshape(-1).view(np.float32), samples.shape, work, room, margin)
 
 
 def rows_of(factors: np.ndarray | None) -> np.ndarray:
     """Complex factors (..., N) as rows for `Work`."""
     if factors is None:
-        return np.zeros((0, 0), np.float32)
+        return NO_ROWS
     flat = np.ascontiguousarray(factors, np.complex64)
     return flat.reshape(-1, factors.shape[-1]).view(np.float32)

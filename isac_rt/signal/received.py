@@ -28,8 +28,19 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.converter import saturated
 from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
-from isac_rt.hardware.sweep import Ramp, read_at
-from isac_rt.signal.chain import Work, add_phases, finish, phasors, rows_of
+from isac_rt.hardware.sweep import Ramp, read_at, short_read
+from isac_rt.signal.chain import (
+    NO_ROWS,
+    NO_TURNS,
+    NOTHING,
+    Turns,
+    Work,
+    add_phases,
+    finish,
+    phasors,
+    places_of,
+    rows_of,
+)
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.if_signal import heard
 from isac_rt.signal.methods import Method
@@ -66,7 +77,7 @@ def received(
     tones = _with_elements(tones, waveform, links, receiver, ends, middle)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
     flicker = _Flicker.of(waveform, reference, ends, tones, delays)
-    factors = _chirp_factors(waveform, tones, ends)
+    turns = _turns(waveform, tones, ends)
     if flicker is None:
         samples = method.samples(waveform, tones)
     else:
@@ -75,9 +86,8 @@ def received(
         samples = method.samples(waveform, rest)
         for k in alone:
             add_direct(samples, waveform, tones.select(np.array([k])), turn=flicker.apart(int(k)))
-        turns = phasors(flicker.common())
-        factors = turns if factors is None else turns * factors
-    finish(samples, _work(waveform, tones, ends, factors, noise, samples))
+        turns = flicker.common(turns)
+    finish(samples, _work(waveform, tones, ends, turns, noise, samples))
     return IFCube(
         samples=samples,
         waveform=waveform,
@@ -98,34 +108,41 @@ def _lag(tones: Tones) -> np.ndarray:
     return np.zeros((1, 1)) if main is None else tones.delay[main] + tones.symbol_delay[0]
 
 
-def _chirp_factors(w: Waveform, tones: Tones, ends: Ends) -> np.ndarray | None:
-    """(M, P, N) complex64 or what broadcasts to it: gains over the chirp that all receive elements
-    share, and the difference of the two ramps; None: 1."""
-    sender = ends.senders[0] if ends.senders else IDEAL
-    out: np.ndarray | None = None
+def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
+    """What turns and scales the samples of all receive elements alike, oscillators apart: gains
+    over the chirp, and the difference of the two ramps."""
+    sender, out = ends.senders[0] if ends.senders else IDEAL, NO_TURNS
     if sender.transmit_response is not None:
         late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
         most = max(int(late.max()), 0)
         place = 2 * np.arange(-most, w.num_samples) / (w.num_samples - 1) - 1
-        table = sender.transmit_response.at(place).astype(np.complex64)
-        rows = np.lib.stride_tricks.sliding_window_view(table, w.num_samples, axis=1)
         antenna = tones.antenna[0] if len(tones.antenna) else np.zeros((1, 1), np.int64)
-        out = rows[antenna, np.clip(most - late, 0, most)]
+        out = out._replace(
+            sent=rows_of(sender.transmit_response.at(place)),
+            antenna=_by_chirp(w, antenna),
+            begin=_by_chirp(w, np.clip(most - late, 0, most)),
+        )
     own = ends.receiver.receive_response
     if own is not None and own.common:
-        gain = own.at(2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1)[0]
-        out = gain.astype(np.complex64) if out is None else out * gain.astype(np.complex64)
+        out = out._replace(gain=rows_of(own.at(_places(w))[:1])[0])
     ramps = sender.ramp, ends.receiver.ramp
     if any(ramps):
         theirs, mine = (0.0 if r is None else r.cycles(w.fast_time) for r in ramps)
-        turn = np.exp(2j * np.pi * (mine - theirs + np.zeros(w.num_samples))).astype(np.complex64)
+        out = out._replace(always=mine - theirs + np.zeros(w.num_samples))
         if sender.ramp is not None:
             place = np.arange(w.num_samples) + _shift(w, tones, sender.ramp)
-            turn = turn * phasors(_band(w, tones)[..., None] * place)
-        out = turn if out is None else out * turn
-    if out is None:
-        return None
-    return np.broadcast_to(out, (w.num_groups, w.num_chirps, w.num_samples))
+            out = out._replace(place=place, beat=_by_chirp(w, _band(w, tones)))
+    return out
+
+
+def _by_chirp(w: Waveform, values: np.ndarray) -> np.ndarray:
+    """(M, P) or what broadcasts to it, as one row."""
+    return np.broadcast_to(values, (w.num_groups, w.num_chirps)).ravel()
+
+
+def _places(w: Waveform) -> np.ndarray:
+    """(N,) of the samples, from -1 to 1."""
+    return 2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1
 
 
 def _shift(w: Waveform, tones: Tones, ramp: Ramp) -> np.ndarray:
@@ -148,28 +165,33 @@ def _work(
     w: Waveform,
     tones: Tones,
     ends: Ends,
-    factors: np.ndarray | None,
+    turns: Turns,
     noise: WhiteNoise,
     samples: np.ndarray,
 ) -> Work:
     """What the pass through the `samples` has to do."""
-    first, reads, before = 0, np.zeros((0, 0), np.float32), rows_of(None)
+    taps, shift, reads, first = NO_ROWS, NO_ROWS[:0].ravel(), NO_ROWS, 0
     ramp = ends.senders[0].ramp if ends.senders else None
     if ramp is not None:
-        first, weights = read_at(_shift(w, tones, ramp))
-        reads = np.repeat(weights, 2, axis=1).astype(np.float32)
-        back = phasors(-_band(w, tones)[..., None] * np.arange(w.num_samples))
-        before = rows_of(np.broadcast_to(back, (w.num_groups, w.num_chirps, w.num_samples)))
+        late = _shift(w, tones, ramp)
+        near = short_read(float(np.abs(late).max()))
+        if near is not None:
+            taps, shift = near.astype(np.float32), np.repeat(late, 2).astype(np.float32)
+        else:
+            first, weights = read_at(late)
+            reads = np.repeat(weights, 2, axis=1).astype(np.float32)
     elements, own = None, ends.receiver.receive_response
     if own is not None and not own.common:
-        elements = own.at(2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1)
+        elements = own.at(_places(w))
     c = ends.receiver.converter
     key = np.asarray(noise.seed_words, np.uint32)
     work = Work(
+        taps,
+        shift,
         reads,
         first,
-        before,
-        rows_of(factors),
+        turns.beat,
+        turns,
         rows_of(elements),
         float(noise.power),
         key,
@@ -192,8 +214,8 @@ def _work(
 def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
     """RMS of the strongest element in a chirp like the first of each group, noise included."""
     trial = np.ascontiguousarray(samples[:, :, :1])
-    rows = [np.ascontiguousarray(rows[::num_chirps]) for rows in (work.before, work.factors)]
-    finish(trial, work._replace(before=rows[0], factors=rows[1]))
+    turns = work.turns.of_rows(num_chirps)
+    finish(trial, work._replace(beat=turns.beat, turns=turns))
     return float(np.sqrt((np.abs(trial) ** 2).mean(axis=(0, 2, 3)).max())) or 1.0
 
 
@@ -284,12 +306,18 @@ class _Flicker:
                 add_phases(out, record, self.begin.ravel() - delay, sign)
         return out.reshape(*self.begin.shape, -1)
 
-    def common(self) -> np.ndarray:
-        """(M, P, N) phase of the strongest path [cycles]."""
+    def common(self, turns: Turns) -> Turns:
+        """`turns` with the phase of the strongest path."""
         theirs = self.theirs[0] if self.theirs else None
         if theirs is not None and theirs is self.mine and self.main == 0:
-            return np.zeros((*self.begin.shape, self.waveform.num_samples))
-        return self._cycles([(self.mine, 0.0, 1.0), (theirs, self.main, -1.0)])
+            return turns
+        begin = self.begin.ravel()
+        first, weight = np.zeros((begin.size, 2), np.int64), np.zeros((begin.size, 2, 4))
+        for end, (one, late, sign) in enumerate([(self.mine, 0.0, 1.0), (theirs, self.main, -1.0)]):
+            if one is not None:
+                first[:, end], weight[:, end] = places_of(one, begin - late, sign)
+        records = tuple(NOTHING if one is None else one.values for one in (self.mine, theirs))
+        return turns._replace(records=records, first=first, weight=weight)
 
     def apart(self, path: int) -> np.ndarray:
         """(M, P, N) complex64, the phase of a path beside the common one, as a factor."""
