@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 
+from isac_rt.kernels.jit import jit
 from isac_rt.randomness import generator
 from isac_rt.scenario import front_end as scenario
 
@@ -105,12 +106,16 @@ class Record(NamedTuple):
     def means(self, duration: float) -> Callable[[np.ndarray], np.ndarray]:
         """Gives the mean phase over `duration` [s] from any times on [rad]: the difference of two
         integrals, of straight lines between the values."""
-        total = np.zeros(self.values.size)
-        np.cumsum((self.values[1:] + self.values[:-1]) / 2, out=total[1:])
-        integral = Record(self.start, self.step, total)
+        total = np.cumsum(self.values)
+
+        def integral(time: np.ndarray) -> np.ndarray:
+            place = (time - self.start) / self.step
+            first = np.floor(place).astype(np.int64)
+            near = (first - 1)[..., None] + np.arange(_SPAN)
+            return ((total[near] - self.values[near] / 2) * cubic(place - first)).sum(axis=-1)
 
         def mean(begin: np.ndarray) -> np.ndarray:
-            return (integral.at(begin + duration) - integral.at(begin)) * (self.step / duration)
+            return (integral(begin + duration) - integral(begin)) * (self.step / duration)
 
         return mean
 
@@ -118,13 +123,31 @@ class Record(NamedTuple):
 def cubic(share: np.ndarray) -> np.ndarray:
     """(..., 4) weights of the samples at -1, 0, 1, 2 of the cubic through them, at `share` of the
     way from 0 to 1."""
-    x = np.asarray(share)[..., None]
-    n = np.array([-1.0, 0.0, 1.0, 2.0])
-    out = np.ones((*np.shape(share), _SPAN))
-    for j in range(_SPAN):
-        other = np.arange(_SPAN) != j
-        out[..., other] *= (x - n[j]) / (n[other] - n[j])
-    return out
+    x = np.asarray(share, float)
+    back, ahead, far = x + 1, x - 1, x - 2
+    parts = -x * ahead * far / 6, back * ahead * far / 2, -back * x * far / 2, back * x * ahead / 6
+    return np.stack(parts, axis=-1)
+
+
+@jit(fast=True)
+def _between(out, coarse, weight, first):
+    """The cubic through `coarse` at as many places between two of its values as `weight` has rows,
+    the first of them `first` places after its second value."""
+    ratio = weight.shape[0]
+    for n in range(first // ratio * ratio, out.shape[0] + first, ratio):
+        k = n // ratio
+        a, b, c, d = coarse[k], coarse[k + 1], coarse[k + 2], coarse[k + 3]
+        low, high = max(n, first), min(n + ratio, out.shape[0] + first)
+        for i in range(low, high):
+            w = weight[i - n]
+            out[i - first] = a * w[0] + b * w[1] + c * w[2] + d * w[3]
+
+
+@jit(fast=True)
+def _add_faded(out, block, weight):
+    """Add a block, faded at its ends."""
+    for n in range(out.shape[0]):
+        out[n] += np.float64(weight[n] * block[n])
 
 
 @dataclass(frozen=True)
@@ -161,10 +184,11 @@ class Oscillator:
         step = fastest.step
         first = int(np.floor(begin / step)) - _SPAN
         count = int(np.ceil(end / step)) + _SPAN - first + 1
-        values = np.zeros(count)
-        if self.mask is not None:
-            values += self._band(0, fastest, first, count)
-            values += self._slower(slower, first, count, step)
+        if self.mask is None:
+            values = np.zeros(count)
+        else:
+            values = self._slower(slower, first, count, step)
+            self._add_band(values, 0, fastest, first)
         start = first * step
         for i, (offset, level) in enumerate(self.spurs):
             phase = generator(self.seed, "spur", self.name, i).uniform(0, 2 * np.pi)
@@ -182,26 +206,27 @@ class Oscillator:
             coarse = round(band.step / bands[0].step)
             begin = (low - 1) // coarse - 1
             size = (low + segments + _SPAN) // coarse + _SPAN - begin
-            own = self._band(number, band, begin, size)
+            own = np.zeros(size)
+            self._add_band(own, number, band, begin)
             place = (low - 1 + np.arange(total.size)) - begin * coarse
             weight, at = cubic(place % coarse / coarse), place // coarse
             total += sum(weight[:, i] * own[at - 1 + i] for i in range(_SPAN))
-        rows = np.lib.stride_tricks.sliding_window_view(total, _SPAN)[:segments]
-        fine = (rows @ cubic(np.arange(ratio) / ratio).T).ravel()
-        return fine[first - low * ratio :][:count]
+        out = np.empty(count)
+        _between(out, total, cubic(np.arange(ratio) / ratio), first - low * ratio)
+        return out
 
-    def _band(self, number: int, band: _Band, first: int, count: int) -> np.ndarray:
-        """One band at places first .. first + count - 1 of its own grid."""
-        out, hop, weight = np.zeros(count), band.hop, _fades(band.size, band.hop)
-        for index in range(first // hop - 1, (first + count - 1) // hop + 1):
+    def _add_band(self, out: np.ndarray, number: int, band: _Band, first: int) -> None:
+        """Add one band at the places of its own grid from `first` on."""
+        hop, weight = band.hop, _fades(band.size, band.hop)
+        last = first + out.size
+        for index in range(first // hop - 1, (last - 1) // hop + 1):
             begin = index * hop
-            low, high = max(begin, first), min(begin + band.size, first + count)
+            low, high = max(begin, first), min(begin + band.size, last)
             if low >= high:
                 continue
             inside = slice(low - begin, high - begin)
-            drawn = _block(self, number, index)
-            out[low - first : high - first] += weight[inside] * drawn[inside]
-        return out
+            block = _block(self, number, index)
+            _add_faded(out[low - first : high - first], block[inside], weight[inside])
 
 
 def _sine(angle: float, first: float, count: int) -> np.ndarray:

@@ -110,7 +110,7 @@ def ramp_of(o: scenario.Ramp, waveform: Waveform) -> Ramp | None:
     return Ramp(*parts, waveform.chirp_duration)
 
 
-READ_ERROR = 1e-3
+READ_ERROR = 2e-3
 """What `short_read` may be wrong by, over a full tone anywhere in the band."""
 _HALF_BAND = 1 / 3
 _MOST_SHORT = 5  # neighbours to each side, beyond which `read_at` serves

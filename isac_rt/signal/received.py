@@ -195,8 +195,8 @@ def _work(
         rows_of(elements),
         float(noise.power),
         key,
-        np.inf if c is None else c.saturation,
-        np.zeros(7, np.float32),
+        0.0 if c is None or np.isinf(c.saturation) else c.saturation,
+        np.array([1, 0, 0, 1, 0, 1, 0], np.float32),
         0.0,
         0.0,
     )
@@ -343,10 +343,11 @@ class _Flicker:
             width = max((high - low) / BINS, 1e-15)
             place = np.clip((self.delays[of_link] - low) // width, 0, BINS - 1).astype(np.int64)
             link[of_link] += place
-            for b in np.unique(place):
-                middle = low + (b + 0.5) * width
-                own = 0.0 if record is None else means[id(record)](self.begin - middle)
-                send[q * BINS + b] *= np.exp(1j * (main - own))
+            cell = np.unique(place)
+            middle = low + (cell[:, None, None] + 0.5) * width
+            own = 0.0 if record is None else means[id(record)](self.begin - middle)
+            turn = main - own + np.zeros(middle.shape)
+            send[q * BINS + cell] *= np.exp(1j * turn)
         return t._replace(
             link=link,
             send=send,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.hardware.sweep import Ramp, read_at, response_of
+from isac_rt.hardware.sweep import READ_ERROR, Ramp, read_at, response_of, short_read
 from isac_rt.scenario.front_end import Response
 
 
@@ -50,3 +50,22 @@ def test_tones_are_read_between_samples():
         found = sum(weights[t] * tone[t : t + 400] for t in range(len(weights)))
         truth = np.exp(2j * np.pi * frequency * (n + shift))
         assert np.abs(found - truth).max() < 2e-3, frequency
+
+
+@pytest.mark.parametrize("most", [0.01, 0.05, 0.1])
+def test_few_taps_read_places_nearby(most):
+    """The same tones up to a tenth of a sample away: by the stated bound at most, while the place
+    itself is off by ten times as much. Beyond, few taps do not. Planted bugs: read to the other
+    side; the bend left out."""
+    n = np.arange(8, 200)
+    shift = most * np.sin(n / 9)
+    taps = short_read(most)
+    for frequency in (-0.33, -0.1, 0.0, 0.21, 0.33):
+        tone = np.exp(2j * np.pi * frequency * np.arange(210))
+        slope = sum(a * (tone[n + t] - tone[n - t]) for t, (a, _) in enumerate(taps))
+        bend = taps[0, 1] * tone[n]
+        bend = bend + sum(b * (tone[n + t] + tone[n - t]) for t, (_, b) in enumerate(taps) if t)
+        truth = np.exp(2j * np.pi * frequency * (n + shift))
+        found = tone[n] + shift * (slope + shift * bend)
+        assert np.abs(found - truth).max() < 1.05 * READ_ERROR, frequency
+    assert short_read(0.4) is None

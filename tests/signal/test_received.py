@@ -13,7 +13,7 @@ from isac_rt.hardware.channels import elements_of
 from isac_rt.hardware.converter import converter_of
 from isac_rt.hardware.front_end import IDEAL, Ends, FrontEnd
 from isac_rt.hardware.oscillator import Mask, Oscillator, spread
-from isac_rt.hardware.sweep import Ramp, response_of
+from isac_rt.hardware.sweep import Ramp, response_of, short_read
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario import front_end as scenario
 from isac_rt.signal.gridded import ACCURATE
@@ -214,6 +214,23 @@ def test_a_bent_ramp_against_the_phases_of_both_chirps(both_ways):
     ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
     assert error(found[..., inner], truth[..., inner]) < 0.04
     assert error(ideal[..., inner], truth[..., inner]) > 0.2
+
+
+def test_a_slightly_bent_ramp_is_read_by_few_taps():
+    """A transmitter's ramp off by a twentieth of a sample, in the receiver's band: what is left is
+    the bound of the taps and tau/2 of one path for all. Planted bugs: turned back by the receiver's
+    band; the last samples of a chirp read from the next."""
+    links, ear = scene(6, seed=9, reach=0.5)
+    size = 0.05 * W.slope / W.sampling_rate
+    theirs = Ramp(size, 0.3 * size, 0.2 * size, 4e-6, W.chirp_duration)
+    assert short_read(1.2 * 0.05) is not None
+    ends = Ends(IDEAL, (FrontEnd(ramp=theirs),))
+    still = Ramp(0.0, 0.0, 0.0, 1e-5, W.chirp_duration)
+    found = received(W, links, ear, Reference(START), ends, Direct(), SILENT).samples
+    truth, inner = ramped(links, ear, still, theirs), slice(6, -6)
+    ideal = if_signal(W, links, ear, Reference(START), Direct()).samples
+    assert error(found[..., inner], truth[..., inner]) < 5e-3
+    assert error(ideal[..., inner], truth[..., inner]) > 0.05
 
 
 def test_gains_over_the_chirp_follow_what_was_sent():

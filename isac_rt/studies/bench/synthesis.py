@@ -148,13 +148,17 @@ class Job:
             setting=setting,
         ).spectra
 
-    def behind(self, links: list, stated: dict[str, Any]) -> np.ndarray:
-        """The samples with noise, from one terminal to another with such front ends."""
+    def ends(self, stated: dict[str, Any]) -> Ends:
+        """One terminal to another with such front ends."""
         node = FrontEnd.model_validate(stated)
         tx, rx = (front_end_of(node, self.waveform, self.antennas, 1, name) for name in "AB")
+        return Ends(rx, (tx,))
+
+    def behind(self, links: list, ends: Ends) -> np.ndarray:
+        """The samples with noise behind real front ends."""
         noise = WhiteNoise(1e3, np.array([1, 2], np.uint32))
         job = self.waveform, links, self.receiver, Reference(0.0)
-        return received(*job, Ends(rx, (tx,)), Auto(noise_power=noise.power), noise).samples
+        return received(*job, ends, Auto(noise_power=noise.power), noise).samples
 
     def by_finufft(self, links: list) -> np.ndarray:
         """The samples by a library's transform, narrowband."""
@@ -272,7 +276,7 @@ def rows(quick: bool) -> list[dict[str, Any]]:
             together = {key: value for part in REAL.values() for key, value in part.items()}
             behind: dict[str, dict[str, Any]] = {"ideal": {}, **REAL, "all": together}
             for name, stated in behind.items():
-                seconds = cpu_seconds(partial(job.behind, links, stated), times)
+                seconds = cpu_seconds(partial(job.behind, links, job.ends(stated)), times)
                 add(f"with noise, front ends: {name}", size, "paths", seconds, None)
         if size in PROFILE_SIZES and nufft.NAME in error:
             seconds = cpu_seconds(partial(job.by_finufft, links), times)
