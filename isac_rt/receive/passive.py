@@ -155,6 +155,15 @@ class PassiveReceiver:
         reception = self._reception(cube, known, found, detections, reference, maps=maps)
         return _decoded(reception, symbols)
 
+    def learn(
+        self, cube: IFCube, detections: Detections, reception: Reception
+    ) -> np.ndarray | None:
+        """What the reader remembers of a frame; `detections` as in the samples."""
+        if not reception.decoded:
+            return self.reader.learn(cube, detections)
+        mine = cube if self.groups is None else cube.of_groups(self.groups)
+        return self.reader.learn(mine, detections, reception.raw_delay_symbols)
+
     def peaks(self, cube: IFCube, time: float, modulated: bool) -> Peaks:
         """What is kept of a frame that could not be read, `time` its middle [s]."""
         mine = cube if self.groups is None else cube.of_groups(self.groups)

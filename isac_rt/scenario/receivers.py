@@ -38,9 +38,9 @@ class Receivers(Node):
     symbol_decision: Literal["powers", "profile", "beams"] = "powers"
     """How a passive terminal reads symbols. `powers`, the default and the paper's: the powers of
     the receive antennas are added. `profile`: delay symbols by correlation with the range profile
-    of the last frame without data, in which clutter counts too. `beams`: the antennas are added in
-    phase towards the tracked paths, with a log-likelihood ratio for every bit; the most
-    sensitive."""
+    of the last frame that was read or held no data, in which clutter counts too. `beams`: the
+    antennas are added in phase towards the tracked paths, with a log-likelihood ratio for every
+    bit; the most sensitive."""
     separate_reference: bool = False
     """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
     reflection in the same cell, by direction, before it believes its range. Costs time only in

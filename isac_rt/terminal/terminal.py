@@ -312,9 +312,6 @@ class PassiveTerminal:
         refused = reception.line_of_sight and not self._plausible(reception)
         if refused:
             reception = reception.without_reference()
-        if not modulated and reception.line_of_sight:
-            heard = self._late(reception.detections, 1)
-            self._profile = self._receiver.reader.learn(cube, heard)
         anchored = not modulated
         if self._retrospect is not None:
             reception, anchored = self._look_back(
@@ -327,6 +324,10 @@ class PassiveTerminal:
                 maps=maps,
             )
         self._follow(reception, own_pose, anchored)
+        believed = self.reference is not None and self.reference.missed == 0
+        if reception.line_of_sight and (believed or not modulated):
+            heard = self._late(reception.detections, 1)
+            self._profile = self._receiver.learn(cube, heard, reception)
         if self.reference is not None and reception.line_of_sight:
             self._track(in_plane(reception.detections), own_pose, self.reference)
         tracks = self.tracker.snapshot(own_pose, self.reference)

@@ -163,8 +163,11 @@ class ByPowers:
         """The symbols of a modulated frame; `profile` is what `learn` has found last."""
         return demodulate(cube, prediction, self.order, self.run_cells)
 
-    def learn(self, cube: IFCube, detections: Detections) -> np.ndarray | None:
-        """What the reader remembers of an unmodulated frame with its reference."""
+    def learn(
+        self, cube: IFCube, detections: Detections, symbols: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        """What the reader remembers of a frame with its reference, whose delay symbols (M, P) it
+        has read; None: without data."""
         return None
 
 

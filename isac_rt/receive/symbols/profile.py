@@ -10,7 +10,7 @@ of a symbol D grows with
 
 a correlation over the cells, by FFT for all D at once. The plain decision takes the strongest cell
 for the reference's, and stronger clutter takes its place. The profile is learned from an
-unmodulated frame.
+unmodulated frame, and anew from every frame whose data were read.
 """
 
 from __future__ import annotations
@@ -31,13 +31,16 @@ FALSE_RATE = 1e-3
 """Of an empty cell in the profile."""
 
 
-def learn_profile(cube: IFCube, prediction: Prediction) -> np.ndarray:
-    """Power over noise in every cell, counted from the reference path, of an unmodulated frame.
+def learn_profile(
+    cube: IFCube, prediction: Prediction, symbols: np.ndarray | None = None
+) -> np.ndarray:
+    """Power over noise in every cell, counted from the reference path.
 
     Parameters
     ----------
-    cube : IFCube of a frame without data
+    cube : IFCube
     prediction : row 0 is the reference path
+    symbols : (M, P) delay symbols as read; None: a frame without data
 
     Returns
     -------
@@ -46,7 +49,7 @@ def learn_profile(cube: IFCube, prediction: Prediction) -> np.ndarray:
     """
     w = cube.waveform
     total = np.zeros(w.num_samples)
-    for samples, turn in zip(cube.samples, derotation(w, prediction), strict=True):
+    for samples, turn in zip(cube.samples, derotation(w, prediction, symbols), strict=True):
         for one in samples:
             spectrum = scipy.fft.fft(one * turn, axis=-1, workers=1)
             total += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
@@ -70,12 +73,16 @@ def reference_of(detections: Detections) -> Prediction:
     )
 
 
-def derotation(waveform: Waveform, prediction: Prediction) -> np.ndarray:
-    """(M, P, N) complex64 by which every chirp's reference is moved to cell 0."""
+def derotation(
+    waveform: Waveform, prediction: Prediction, symbols: np.ndarray | None = None
+) -> np.ndarray:
+    """(M, P, N) complex64 by which every chirp's reference is moved to cell 0, with its delay
+    symbol where there are `symbols` (M, P)."""
     w = waveform
     beats = w.beat_cells(
         prediction.range[0] / SPEED_OF_LIGHT, prediction.velocity[0] / SPEED_OF_LIGHT
     )
+    beats = beats if symbols is None else beats + symbols
     cycles = (beats[..., None] * (np.arange(w.num_samples) / w.num_samples)) % 1.0
     return np.exp(-2j * np.pi * cycles).astype(np.complex64)
 
@@ -118,7 +125,8 @@ def decide_by_profile(
 
 
 class ByProfile(ByPowers):
-    """Delay symbols by correlation with the range profile of the last unmodulated frame."""
+    """Delay symbols by correlation with the range profile of the last frame that was read, or held
+    no data."""
 
     def read(
         self,
@@ -130,6 +138,8 @@ class ByProfile(ByPowers):
         decision = None if profile is None else partial(decide_by_profile, profile)
         return demodulate(cube, prediction, self.order, self.run_cells, decision)
 
-    def learn(self, cube: IFCube, detections: Detections) -> np.ndarray | None:
-        found = learn_profile(cube, reference_of(detections))
+    def learn(
+        self, cube: IFCube, detections: Detections, symbols: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        found = learn_profile(cube, reference_of(detections), symbols)
         return found if found.any() else None
