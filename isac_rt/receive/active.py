@@ -10,6 +10,7 @@ from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
 from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
@@ -53,7 +54,7 @@ class ActiveReceiver:
         found = self.detector.sense(spectra, known, clutter)
         detections = found.detections
         if self.refiner is not None and isinstance(cube, IFCube):
-            detections = self.refiner(cube.samples, known, detections)[0]
+            detections = self.refiner(Moments(cube.samples, known), detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
         out = Reception.undecoded(
             cube.waveform, detections, picture, found.sparse, found.correction

@@ -17,8 +17,8 @@ from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.clutter.sample_matrix import SampleMatrix
 from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.estimate import Estimator
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import refine_jointly
-from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, LatinUnion
 from isac_rt.receive.omp import Omp
 from isac_rt.receive.pursuit import BySchedule, Pursuit
@@ -29,8 +29,8 @@ from isac_rt.receive.symbols.profile import ByProfile
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers
 
-Refiner = Callable[[np.ndarray, Known, Detections], tuple[Detections, np.ndarray]]
-"""From samples, what is known of them and near estimates to better ones and the paths' powers."""
+Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
+"""From the sums of samples and near estimates to better ones and the paths' powers."""
 
 FILTERS: dict[str, Callable[[Receivers], ClutterFilter | None]] = {
     "none": lambda settings: None,

@@ -13,6 +13,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.chain import Refiner, passive_detector_of, reader_of, refiner_of
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.fit import JointPath
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
@@ -97,12 +98,13 @@ class PassiveReceiver:
         w = cube.waveform
         if not modulated:
             known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
+            moments = Moments(cube.samples, known)
             spectra = clean_spectrum(cube, known)
             found = self.detector.sense(spectra, known, clutter)
             detections, reference = self._earliest(found, known)
             found = replace(found, looks=self._look(spectra, known, detections, reference))
-            detections, reference = self._alone(cube, known, detections, reference)
-            return self._reception(cube, known, found, detections, reference, maps=maps)
+            detections, reference = self._alone(moments, detections, reference)
+            return self._reception(cube, moments, found, detections, reference, maps=maps)
         symbols = None
         if prediction is not None:
             symbols = self.reader.read(cube, prediction, self.antennas, profile)
@@ -111,13 +113,14 @@ class PassiveReceiver:
             picture = make_maps(power, cube, self.settings, 1) if maps else None
             return Reception.undecoded(w, no_detections(), picture)
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
-        found, detections, reference = self._sense_data(cube, known, prediction, clutter)
+        moments = Moments(cube.samples, known)
+        found, detections, reference = self._sense_data(cube, moments, prediction, clutter)
         phases = None
         if self.refiner is not None and reference is not None:
-            phases = self._phases(cube, known, detections)
+            phases = self._phases(moments, detections)
         if phases is not None:
-            known = replace(known, phases=phases)
-            found, detections, reference = self._sense_data(cube, known, prediction, clutter)
+            moments = moments.read_by(replace(known, phases=phases))
+            found, detections, reference = self._sense_data(cube, moments, prediction, clutter)
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -125,7 +128,7 @@ class PassiveReceiver:
         wrong = transition_error_rate(symbols, self.reader.order) * symbols.transitions.size
         if phases is None and wrong > MOST_WRONG:
             chain = replace(self, refiner=None)
-        reception = chain._reception(cube, known, found, detections, reference, maps=maps)
+        reception = chain._reception(cube, moments, found, detections, reference, maps=maps)
         return reception if reference is None else _decoded(reception, symbols)
 
     def receive_over(
@@ -148,11 +151,12 @@ class PassiveReceiver:
         if not self._believed(symbols, w):
             return Reception.undecoded(w, no_detections())
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        moments = Moments(cube.samples, known)
         found = self.detector.sense(clean_spectrum(cube, known), known, clutter)
-        detections, reference = self._alone(cube, known, *self._earliest(found, known))
+        detections, reference = self._alone(moments, *self._earliest(found, known))
         spread = velocity_spread(symbols, self.reader.order, path, w)
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
-        reception = self._reception(cube, known, found, detections, reference, maps=maps)
+        reception = self._reception(cube, moments, found, detections, reference, maps=maps)
         return _decoded(reception, symbols)
 
     def learn(
@@ -177,14 +181,14 @@ class PassiveReceiver:
         out = _decoded(Reception.undecoded(peaks.waveform, no_detections()), symbols)
         return out if self.groups is None else _among_all(out, self.groups, waveform)
 
-    def _phases(self, cube: IFCube, known: Known, detections: Detections) -> np.ndarray | None:
+    def _phases(self, moments: Moments, detections: Detections) -> np.ndarray | None:
         """The phases as the reference, row 0 of the detections, shows them over the whole frame."""
         if not np.isfinite(detections.direction[0]).all():
             return None
         first = detections
         delay, rate = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT
         path = JointPath(delay, rate, first.direction[0], np.ones(1), np.zeros(4))
-        return decide_phases(cube.samples, known, path, self.reader.order)
+        return decide_phases(moments, path, self.reader.order)
 
     def _believed(self, symbols: Symbols, waveform: Waveform) -> bool:
         """Whether the decisions look neither like noise nor like a path that moves otherwise."""
@@ -195,16 +199,17 @@ class PassiveReceiver:
     def _sense_data(
         self,
         cube: IFCube,
-        known: Known,
+        moments: Moments,
         prediction: Prediction,
         clutter: ExpectedClutter | None,
     ) -> tuple[Sensed, Detections, Estimate | None]:
         """What a frame shows once its symbols are taken out, with the reference put first."""
+        known = moments.known
         spectra = clean_spectrum(cube, known)
         found = self.detector.sense(spectra, known, clutter)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
         found = replace(found, looks=self._look(spectra, known, detections, reference))
-        return found, *self._alone(cube, known, detections, reference)
+        return found, *self._alone(moments, detections, reference)
 
     def _look(
         self,
@@ -219,20 +224,20 @@ class PassiveReceiver:
         return look_at(spectra, known, [reference], detections.snr[detections.is_reference])
 
     def _alone(
-        self, cube: IFCube, known: Known, detections: Detections, reference: Estimate | None
+        self, moments: Moments, detections: Detections, reference: Estimate | None
     ) -> tuple[Detections, Estimate | None]:
         """The reference told apart from another path in its cell, where one wave does not explain
         it, and the other one among the detections."""
         if reference is None or not self.settings.separate_reference:
             return detections, reference
         first = detections.select(detections.is_reference)
-        apart = None if first.starts[0] else separate(cube.samples, known, first)
+        apart = None if first.starts[0] else separate(moments, first)
         if apart is None:
             return detections, reference
         both, power = apart
         line = float(power[both.is_reference][0])
         channels = reference.channels * np.sqrt(line / _power(reference))
-        kept = detections.select(_off(detections, both, known) & ~detections.is_reference)
+        kept = detections.select(_off(detections, both, moments.known) & ~detections.is_reference)
         return Detections.joined([both, kept]), replace(reference, channels=channels)
 
     def _earliest(self, found: Sensed, known: Known) -> tuple[Detections, Estimate | None]:
@@ -275,7 +280,7 @@ class PassiveReceiver:
     def _reception(
         self,
         cube: IFCube,
-        known: Known,
+        moments: Moments,
         found: Sensed,
         detections: Detections,
         reference: Estimate | None,
@@ -290,7 +295,7 @@ class PassiveReceiver:
             out = replace(out, line_of_sight=True, reference_power=level, looks=found.looks)
         if self.refiner is None:
             return out
-        detections, power = self.refiner(cube.samples, known, detections)
+        detections, power = self.refiner(moments, detections)
         mine = power[detections.is_reference]
         fitted = mine.size and np.isfinite(mine[0])
         return replace(

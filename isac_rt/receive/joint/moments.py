@@ -1,36 +1,39 @@
-"""Sums of a frame's samples against tones that move little: the samples are read once for a path,
-and what a fit asks of them again and again comes from sums over short blocks.
+"""Sums of a frame's samples against tones, and of tones against each other: the samples are
+transformed once, and every tone reads its sums from the transform.
 
-A block of L samples s about its middle n_b, turned back by the tone for which it was made, is kept
-as S_0 = sum s and S_1 = sum nu s, nu the place in the block. A tone that is off by x cycles per
-sample then finds, with t = 2 pi x,
+The sums over a chirp are
 
-    sum_nu s exp(-j t nu) = S_0 (1 - t^2 V / 2) - j t S_1,    V = (L^2 - 1) / 12,
+    Z_k(f) = sum_n n^k s_n exp(-j 2 pi f n),    k = 0, 1,
 
-to 1e-5 of a tone, and 2e-3 of noise, for half a cell and sixteen blocks.
+n from the chirp's middle. The samples are divided by the transform of a Kaiser-Bessel kernel and
+transformed on a grid of 1.5 N frequencies; a tone between grid points adds `TAPS` of them, weighted
+by the kernel for Z_0 and by its derivative for Z_1 (a non-uniform Fourier transform of the second
+type). The curvature of a tone, 0.003 cycles at the chirp's ends, is left out.
+
+References
+----------
+.. [1] A. Barnett et al., "A parallel nonuniform fast Fourier transform library based on an
+   'exponential of semicircle' kernel", 2019, section 2.
 """
 
 from __future__ import annotations
 
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy.fft
+from numpy.polynomial import Chebyshev
+from scipy.special import i0
 
 from isac_rt.kernels.jit import jit
 from isac_rt.receive.known import Known
 
-BLOCKS = 16
-MOST_OFF = 0.5
-"""Cells by which a tone may be off the one for which blocks were made."""
-
-
-class _Blocks(NamedTuple):
-    """`sums` (2, M, L_rx, P, blocks) about tones of a `frequency` (M, P) and a `ramp` (L_rx,)
-    [cycles per sample]."""
-
-    frequency: np.ndarray
-    ramp: np.ndarray
-    sums: np.ndarray
+OVERSAMPLING, TAPS = 1.5, 8
+"""Frequencies per cell, and those that a tone reads: an error of 1e-6 of the largest tone."""
+SHAPE = 0.98 * np.pi * TAPS * (1 - 0.5 / OVERSAMPLING)
+STEPS = 1024
+"""Places between two frequencies at which the kernel is tabled; a parabola between them."""
 
 
 class Moments:
@@ -39,132 +42,225 @@ class Moments:
     Attributes
     ----------
     known : Known
-    energy : sum of the samples' squares
     size : number of samples
     """
 
     def __init__(self, samples: np.ndarray, known: Known) -> None:
         """`samples` is (M, L_rx, P, N)."""
-        self.known = known
-        self.energy, self.size = float(np.vdot(samples, samples).real), samples.size
-        self._samples = np.ascontiguousarray(samples, np.complex64)
-        self._kept: list[_Blocks] = []
+        self.known, self.size, self._samples = known, samples.size, samples
+
+    def read_by(self, known: Known) -> Moments:
+        """The same samples with other data in them; they are transformed once."""
+        out = Moments(self._samples, known)
+        out.spectrum, out.noise, out.energy = self.spectrum, self.noise, self.energy
+        return out
+
+    @cached_property
+    def energy(self) -> float:
+        """Sum of the samples' squares."""
+        return float(np.vdot(self._samples, self._samples).real)
+
+    @cached_property
+    def spectrum(self) -> np.ndarray:
+        """(M, P, G, L_rx) transform of the weighted samples, counted from sample N // 2."""
+        num_groups, num_rx, num_chirps, length = self._samples.shape
+        size = scipy.fft.next_fast_len(int(np.ceil(OVERSAMPLING * length)) + TAPS)
+        middle, weight = length // 2, _weights(length, size)
+        out = np.empty((num_groups, num_chirps, size, num_rx), np.complex64)
+        part = np.zeros((num_rx, size), np.complex64)
+        for m in range(num_groups):
+            for p in range(num_chirps):
+                mine = self._samples[m, :, p]
+                np.multiply(mine[:, middle:], weight[middle:], out=part[:, : length - middle])
+                np.multiply(mine[:, :middle], weight[:middle], out=part[:, size - middle :])
+                out[m, p] = scipy.fft.fft(part, axis=1, workers=1).T
+        return out
+
+    @cached_property
+    def noise(self) -> float:
+        """Power of the noise in a sample, from the median of one receiver's spectrum under Hann's
+        window."""
+        window = np.hanning(self._samples.shape[-1]).astype(np.float32)
+        spectrum = scipy.fft.fft(self._samples[0, 0] * window, axis=1, workers=1)
+        gain = np.log(2) * float((window**2).sum())
+        return max(float(np.median(np.abs(spectrum) ** 2)) / gain, 1e-30)
 
     def of(
-        self, frequency: np.ndarray, curvature: float, ramp: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Sums of s T* and n s T* over each chirp, n from its middle: two of (M, L_rx, P).
+        self, cycles: np.ndarray, frequency: np.ndarray, ramp: np.ndarray, apart: np.ndarray
+    ) -> np.ndarray:
+        """Sums of s T* and n s T* over each chirp, n from its middle, (2, M, P, L_rx).
 
         Parameters
         ----------
-        frequency : (M, P) of the tones T [cycles per sample]
-        curvature : half of their chirp rate [cycles per sample^2]
+        cycles, frequency : (M, P) of the tones T at mid-chirp [cycles, cycles per sample], but for
+            the data's phases
         ramp : (L_rx,) further frequency at each receiver
+        apart : (M, P, L_rx) further phase there [cycles]
         """
-        blocks = self._blocks(frequency, curvature, ramp)
-        out = np.empty((2, *blocks.sums.shape[1:4]), np.complex128)
-        _evaluate(
-            blocks.sums,
-            frequency - blocks.frequency,
-            ramp - blocks.ramp,
-            self._samples.shape[-1] // blocks.sums.shape[-1],
-            out,
-        )
-        out *= self.known.phases.conj()[:, None, :]
-        return out[0], out[1]
+        length = self._samples.shape[-1]
+        num_groups, num_rx, num_chirps, _ = self._samples.shape
+        out = np.empty((2, num_groups, num_chirps, num_rx), np.complex128)
+        late = length // 2 - (length - 1) / 2
+        _interpolate(self.spectrum, (cycles, frequency, ramp, apart), late, _kernel(), out)
+        out *= self.known.phases.conj()[..., None]
+        return out
 
-    def _blocks(self, frequency: np.ndarray, curvature: float, ramp: np.ndarray) -> _Blocks:
-        size = self._samples.shape[-1]
-        for kept in self._kept:
-            off = np.abs(frequency - kept.frequency).max() + np.abs(ramp - kept.ramp).max()
-            if off * size < MOST_OFF:
-                return kept
-        length = max(d for d in range(1, max(size // BLOCKS, 1) + 1) if size % d == 0)
-        n = np.arange(size) - (size - 1) / 2
-        ramps = np.exp(-2j * np.pi * np.outer(ramp, n)).astype(np.complex64)
-        sums = np.empty((2, *self._samples.shape[:3], size // length), np.complex64)
-        _compress(self._samples, frequency, curvature, ramps, length, sums)
-        made = _Blocks(frequency, ramp, sums)
-        self._kept.append(made)
-        return made
+
+@lru_cache(maxsize=8)
+def _weights(length: int, size: int) -> np.ndarray:
+    """(N,) float32, one over the kernel's transform."""
+    at = (np.arange(length) - length // 2) / size
+    root = np.sqrt(SHAPE**2 - (np.pi * TAPS * at) ** 2)
+    return (i0(SHAPE) * root / (TAPS * np.sinh(root))).astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _kernel() -> np.ndarray:
+    """(STEPS, 4, TAPS) the kernel and its three derivatives at the taps about a frequency, in the
+    middle of each step from one grid point to the next."""
+    place = (np.arange(STEPS) + 0.5) / STEPS
+    out = np.empty((STEPS, 4, TAPS))
+    for j in range(TAPS):
+
+        def kernel(part: np.ndarray, j: int = j) -> np.ndarray:
+            x = 2 * (part + TAPS // 2 - 1 - j) / TAPS
+            return i0(SHAPE * np.sqrt(np.maximum(1 - x**2, 0))) / i0(SHAPE)
+
+        exact = Chebyshev.interpolate(kernel, 17, [0, 1])
+        for order in range(4):
+            out[:, order, j] = exact.deriv(order)(place) if order else exact(place)
+    return out
 
 
 @jit(fast=True)
-def _compress(samples, frequency, curvature, ramps, length, sums):
-    """`_Blocks.sums` of samples times ramps[rx] and the conjugate tone of each chirp."""
-    num_groups, num_rx, num_chirps, size = samples.shape
-    cosine, sine = np.empty(size, np.float32), np.empty(size, np.float32)
+def _interpolate(spectrum, tone, late, kernel, out):
+    """`Moments.of` but for the data; `late` is the place of sample N // 2 from the middle."""
+    cycles, frequency, ramp, apart = tone
+    num_groups, num_chirps, size, num_rx = spectrum.shape
+    steps, _, taps = kernel.shape
     for m in range(num_groups):
         for p in range(num_chirps):
-            for i in range(size):
-                n = i - (size - 1) / 2
-                cycles = (frequency[m, p] + curvature * n) * n
-                angle = np.float32(2 * np.pi * (cycles - np.floor(cycles)))
-                cosine[i], sine[i] = np.cos(angle), -np.sin(angle)
             for rx in range(num_rx):
-                line, ramp = samples[m, rx, p], ramps[rx]
-                for b in range(size // length):
-                    re0 = im0 = re1 = im1 = np.float32(0.0)
-                    place = np.float32(-(length - 1) / 2)
-                    for i in range(b * length, (b + 1) * length):
-                        c = ramp[i].real * cosine[i] - ramp[i].imag * sine[i]
-                        s = ramp[i].real * sine[i] + ramp[i].imag * cosine[i]
-                        re = line[i].real * c - line[i].imag * s
-                        im = line[i].real * s + line[i].imag * c
-                        re0 += re
-                        im0 += im
-                        re1 += place * re
-                        im1 += place * im
-                        place += np.float32(1.0)
-                    sums[0, m, rx, p, b] = complex(re0, im0)
-                    sums[1, m, rx, p, b] = complex(re1, im1)
+                f = frequency[m, p] + ramp[rx]
+                whole = np.floor(f * size)
+                part = (f * size - whole) * steps
+                step = min(int(part), steps - 1)
+                x = (part - step - 0.5) / steps
+                at = (int(whole) - taps // 2 + 1) % size
+                table = kernel[step]
+                re0 = im0 = re1 = im1 = 0.0
+                for j in range(taps):
+                    k0, k1, k2, k3 = table[0, j], table[1, j], table[2, j], table[3, j]
+                    weight = k0 + x * (k1 + x / 2 * k2)
+                    change = k1 + x * (k2 + x / 2 * k3)
+                    s = spectrum[m, p, at, rx]
+                    re0 += weight * s.real
+                    im0 += weight * s.imag
+                    re1 += change * s.real
+                    im1 += change * s.imag
+                    at += 1
+                    if at == size:
+                        at = 0
+                turns = cycles[m, p] + apart[m, p, rx] + f * late
+                angle = 2 * np.pi * (turns - np.floor(turns))
+                back = complex(np.cos(angle), -np.sin(angle))
+                total = complex(re0, im0) * back
+                out[0, m, p, rx] = total
+                slope = size / (2 * np.pi) * complex(-im1, re1) * back
+                out[1, m, p, rx] = slope + late * total
 
 
-@jit
-def _evaluate(sums, frequency, ramp, length, out):
-    """Moments of tones that are off the blocks' by frequency[m, p] + ramp[rx]."""
-    _, num_groups, num_rx, num_chirps, blocks = sums.shape
-    spread = (length * length - 1) / 12
-    first = -(blocks - 1) / 2 * length
-    for m in range(num_groups):
-        for rx in range(num_rx):
-            for p in range(num_chirps):
-                t = 2 * np.pi * (frequency[m, p] + ramp[rx])
-                turn = complex(np.cos(t * first), -np.sin(t * first))
-                step = complex(np.cos(t * length), -np.sin(t * length))
-                zeroth, moment, middle = 0j, 0j, first
-                for b in range(blocks):
-                    s0, s1 = sums[0, m, rx, p, b], sums[1, m, rx, p, b]
-                    at0 = turn * (s0 * (1 - t * t * spread / 2) - 1j * t * s1)
-                    zeroth += at0
-                    moment += middle * at0 + turn * (s1 - 1j * t * spread * s0)
-                    turn *= step
-                    middle += length
-                out[0, m, rx, p], out[1, m, rx, p] = zeroth, moment
+class Apart(NamedTuple):
+    """What a tone T' has before another one T.
+
+    Attributes
+    ----------
+    frequency, cycles : (M, P) at mid-chirp [cycles per sample, cycles]
+    ramp : (L_rx,) further frequency at each receiver
+    turn : (L_rx,) complex, further turn there
+    delay, wobble : (L_rx,) and (M, P), of which the product is what is left of that turn, under a
+        hundredth of a cycle [cycles]
+    size : samples of a chirp
+    """
+
+    frequency: np.ndarray
+    cycles: np.ndarray
+    ramp: np.ndarray
+    turn: np.ndarray
+    delay: np.ndarray
+    wobble: np.ndarray
+    size: float
 
 
-@jit
-def tone_sums(offset, cycles, size, out):
-    """out[k] (3, ...), sums over n = -(N-1)/2 .. (N-1)/2 of n^k exp(j 2 pi (x n + c)), x an
-    `offset` below a half in magnitude [cycles per sample], c `cycles`."""
+@jit(fast=True)
+def cross_sums(apart, out):
+    """Sums of 1, n and n^2 times T' T* over each chirp, out (3, M, P, L_rx)."""
+    ends = _ends(apart)
+    for m in range(out.shape[1]):
+        for p in range(out.shape[2]):
+            start = _start(apart, m, p)
+            for rx in range(out.shape[3]):
+                sum0, sum1, sum2, turn = _sums(apart, ends, start, rx)
+                out[0, m, p, rx] = sum0 * turn
+                out[1, m, p, rx] = 1j * sum1 * turn
+                out[2, m, p, rx] = sum2 * turn
+
+
+@jit(fast=True)
+def exchange(apart, own, other, left, left_other):
+    """Take what T' of amplitudes `other` (M, P) puts into the sums `left` (2, M, P, L_rx) of T out
+    of them, and what T of amplitudes `own` puts into `left_other`, in place."""
+    ends = _ends(apart)
+    for m in range(left.shape[1]):
+        for p in range(left.shape[2]):
+            start = _start(apart, m, p)
+            a, b = other[m, p], own[m, p]
+            for rx in range(left.shape[3]):
+                sum0, sum1, _, turn = _sums(apart, ends, start, rx)
+                there, back = a * turn, b * turn.conjugate()
+                left[0, m, p, rx] -= sum0 * there
+                left[1, m, p, rx] -= 1j * sum1 * there
+                left_other[0, m, p, rx] -= sum0 * back
+                left_other[1, m, p, rx] += 1j * sum1 * back
+
+
+@jit(inline=True)
+def _ends(apart):
+    """Sines and cosines of the receivers' ramps at a chirp's ends, and over a sample."""
+    wide, narrow = np.pi * apart.size * apart.ramp, np.pi * apart.ramp
+    return np.sin(wide), np.cos(wide), np.sin(narrow), np.cos(narrow)
+
+
+@jit(inline=True)
+def _start(apart, m, p):
+    """Frequency of a chirp, its sines and cosines, its turn, and how much it wobbles."""
+    x, cycles = apart.frequency[m, p], apart.cycles[m, p]
+    angle = 2 * np.pi * (cycles - np.floor(cycles))
+    wide, narrow = np.pi * apart.size * x, np.pi * x
+    turn = complex(np.cos(angle), np.sin(angle))
+    edge = np.sin(wide), np.cos(wide), np.sin(narrow), np.cos(narrow)
+    return x, edge, turn, 2 * np.pi * apart.wobble[m, p]
+
+
+@jit(inline=True)
+def _sums(apart, ends, start, rx):
+    """Sums of exp(j 2 pi x n) times 1, -j n and n^2 over a chirp, and the turn before them."""
+    size, (x0, (e, f, g, h), common, wobble) = apart.size, start
+    x = x0 + apart.ramp[rx]
+    a, b, c, d = ends[0][rx], ends[1][rx], ends[2][rx], ends[3][rx]
     second = size * (size * size - 1) / 12
-    fourth = size * (size * size - 1) * (3 * size * size - 7) / 240
-    flat, turns, sums = offset.ravel(), cycles.ravel(), out.reshape(3, -1)
-    for i in range(flat.size):
-        x = flat[i]
-        if abs(x) < 1e-2 / size:  # the closed forms lose digits there
-            y = 2 * np.pi * x
-            sum0 = size - second * y**2 / 2
-            sum1 = second * y - fourth * y**3 / 6
-            sum2 = second - fourth * y**2 / 2
-        else:
-            s, c = np.sin(np.pi * size * x), np.cos(np.pi * size * x)
-            t, k = np.sin(np.pi * x), np.cos(np.pi * x)
-            sum0 = s / t
-            sum1 = -(size * c * t - s * k) / (2 * t**2)
-            sum2 = -((1 - size**2) * s / (4 * t) - k * (size * c * t - s * k) / (2 * t**3))
-        whole = turns[i] - np.floor(turns[i])
-        turn = complex(np.cos(2 * np.pi * whole), np.sin(2 * np.pi * whole))
-        sums[0, i] = sum0 * turn
-        sums[1, i] = 1j * sum1 * turn
-        sums[2, i] = sum2 * turn
+    if abs(x) < 1e-2 / size:  # the closed forms lose digits there
+        y = 2 * np.pi * x
+        fourth = second * (3 * size * size - 7) / 20
+        sum0 = size - second * y * y / 2
+        sum1 = second * y - fourth * y * y * y / 6
+        sum2 = second - fourth * y * y / 2
+    else:
+        s, k, t, u = e * b + f * a, f * b - e * a, g * d + h * c, h * d - g * c
+        under = 1 / t
+        edge = (size * k * t - s * u) * under * under / 2
+        sum0 = s * under
+        sum1 = -edge
+        sum2 = u * under * edge - (1 - size * size) * s * under / 4
+    z = wobble * apart.delay[rx]
+    return sum0, sum1, sum2, common * apart.turn[rx] * complex(1 - z * z / 2, z)

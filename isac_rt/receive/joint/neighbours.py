@@ -1,9 +1,10 @@
 """Detections through the joint model: estimates at the Cramer-Rao bound, and paths that share a
 cell told apart by direction and velocity.
 
-Takes what the windowed map found, fits the strongest of it at once (`isac_rt.receive.joint.fit`),
-and looks in what the fit leaves about each path for another one that the map could not show: at the
-same delay, within two Doppler bins, from any other direction in view. What is found joins the fit.
+Takes what the windowed map found, fits it at once (`isac_rt.receive.joint.fit`), and looks in what
+the fit leaves about the strongest paths for further ones that the map could not show: at the same
+delay, within two Doppler bins, from any other direction in view. A path that is found is fitted
+with those close to it; the others stay as they are.
 """
 
 from __future__ import annotations
@@ -16,21 +17,30 @@ from scipy.special import gammainccinv
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.joint.fit import (
+    Fit,
     JointPath,
+    energy,
     fit,
+    places,
     rate_bin,
     residual_channels,
     units,
 )
+from isac_rt.receive.joint.interaction import clusters, shared
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Detections
 
-MAX_PATHS = 8
+MAX_PATHS = 12
 """Strongest detections that are fitted; the others keep their own estimates."""
+MAX_SEARCHED = 6
+"""Strongest paths beside which others are looked for."""
 MAX_HIDDEN = 3
+"""Further paths that are fitted in a frame."""
 FALSE_RATE = 1e-4
 """Chance that noise invents a path in one search."""
+MOST_STEPS = 8
+"""Of a fit with a path that was found, which starts a fraction of a lobe off."""
 WEAKEST_DB = 25.0
 """A path this far under the one whose cell it shares is not told from what the model leaves
 (acceleration, near field)."""
@@ -44,44 +54,92 @@ LINE_OF_SIGHT_DB = 10.0
 the line of sight."""
 
 
-def refine_jointly(
-    samples: np.ndarray, known: Known, detections: Detections
-) -> tuple[Detections, np.ndarray]:
+def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections, np.ndarray]:
     """Detections with joint estimates, strongest first after a reference, and the power of each
     path per sample (NaN if not fitted)."""
-    d = detections
+    known, d = moments.known, detections
     usable = np.flatnonzero(np.isfinite(d.direction).all(axis=1) & (d.range > 0))
     order = usable[np.argsort(~d.is_reference[usable], kind="stable")][:MAX_PATHS]
     if not order.size:
         return d, np.full(len(d), np.nan)
     start = [_path(known, d, i) for i in order]
-    moments = Moments(samples, known)
-    paths = fit(moments, start)
-    parent = list(range(len(paths)))
-    if not all(_near(known, p, s) for p, s in zip(paths, start, strict=True)):
-        # two detections of one path: the fit has no single answer
-        return d, np.full(len(d), np.nan)
-    for _ in range(MAX_HIDDEN):
-        found = _hidden(moments, paths)
-        if found is None:
-            break
-        beside, other = found
-        trial = fit(moments, [*paths, other], iterations=8)
-        if not _credible(known, trial, [*paths, paths[beside]]):
-            break
-        paths, parent = trial, [*parent, parent[beside]]
-    return _merged(known, d, order, paths, parent)
+    found = fit(moments, start)
+    # two detections of one path run away from each other: neither has an answer of its own
+    near = [_near(known, p, s) for p, s in zip(found.paths, start, strict=True)]
+    group = _clusters(known, start)
+    settled = ~np.isin(group, group[~np.array(near)])
+    found, parent = _with_hidden(moments, found, settled)
+    settled = np.append(settled, np.ones(len(parent), bool))
+    return _merged(known, d, order, found.paths, parent, settled)
 
 
-def separate(
-    samples: np.ndarray, known: Known, reference: Detections
-) -> tuple[Detections, np.ndarray] | None:
+def _with_hidden(moments: Moments, found: Fit, settled: np.ndarray) -> tuple[Fit, list[int]]:
+    """A fit with the paths that are found beside its strongest settled ones behind, and beside
+    which path each was. Only what is close to a new path is fitted again."""
+    parent = list(range(len(found.paths)))
+    power = np.array([float((np.abs(p.amplitude) ** 2).mean()) for p in found.paths])
+    searched = np.flatnonzero(settled)[np.argsort(-power[settled], kind="stable")][:MAX_SEARCHED]
+    stale, spent = set(searched.tolist()), 0
+    best: dict[int, tuple[float, int, JointPath]] = {}
+    while spent < MAX_HIDDEN:
+        best |= {k: b for k in stale if (b := _hidden(moments, found, [k])) is not None}
+        stale = set()
+        if not best:
+            break
+        surest = max(best, key=lambda k: best[k][0])
+        trial = _joined(moments, found, surest, best.pop(surest)[2], settled)
+        spent += 1
+        if trial is None:
+            continue
+        found = trial
+        parent.append(parent[surest])
+        settled = np.append(settled, True)
+        # what was found elsewhere may have been a sidelobe of the new one
+        stale = {surest, *best, len(found.paths) - 1}
+        best = {}
+    return found, parent[power.size :]
+
+
+def _joined(
+    moments: Moments, found: Fit, beside: int, other: JointPath, settled: np.ndarray
+) -> Fit | None:
+    """A fit with another path behind, for which those close to it are fitted again; None where it
+    does not settle."""
+    known = moments.known
+    group = _clusters(known, [*found.paths, other])
+    mine = np.flatnonzero((group[:-1] == group[-1]) & settled)
+    mine = np.union1d(mine, [beside])
+    rest = np.setdiff1d(np.arange(len(found.paths)), mine)
+    members = [found.paths[k] for k in mine]
+    trial = fit(
+        moments,
+        [*members, other],
+        iterations=MOST_STEPS,
+        fixed=[found.paths[k] for k in rest],
+        energy=found.left + energy(known, members),
+    )
+    at = int(np.searchsorted(mine, beside))
+    if trial.left > found.left or not _credible(known, trial.paths, members, at):
+        return None
+    paths = [*found.paths, trial.paths[-1]]
+    for k, path in zip(mine, trial.paths, strict=False):
+        paths[k] = path
+    return Fit(paths, trial.left)
+
+
+def _clusters(known: Known, paths: list[JointPath]) -> np.ndarray:
+    """(K,) number of the cluster of each path."""
+    where = places(known, paths)
+    return clusters(shared(known, where, where))
+
+
+def separate(moments: Moments, reference: Detections) -> tuple[Detections, np.ndarray] | None:
     """A reference that shares its cell with another path told apart from it by direction, delay and
     velocity.
 
     Parameters
     ----------
-    samples : (M, L_rx, P, N)
+    moments : of the frame's samples
     reference : one detection, whose estimate the other path may have pulled
 
     Returns
@@ -91,15 +149,17 @@ def separate(
     """
     if not np.isfinite(reference.direction).all() or reference.range[0] <= 0:
         return None
-    moments, start = Moments(samples, known), _path(known, reference, 0)
-    paths = fit(moments, [start])
-    found = _hidden(moments, paths, PROBED_CELLS) if _near(known, paths[0], start) else None
+    known = moments.known
+    start = _path(known, reference, 0)
+    one = fit(moments, [start])
+    near = _near(known, one.paths[0], start)
+    found = _hidden(moments, one, [0], PROBED_CELLS) if near else None
     if found is None:
         return None
-    trial = fit(moments, [*paths, found[1]], iterations=12)
-    if not _credible(known, trial, [*paths, paths[0]]):
+    trial = fit(moments, [*one.paths, found[2]], iterations=MOST_STEPS)
+    if trial.left > one.left or not _credible(known, trial.paths, one.paths, 0):
         return None
-    return _merged(known, reference, np.zeros(1, int), trial, [0, 0])
+    return _merged(known, reference, np.zeros(1, int), trial.paths, [0], np.ones(2, bool))
 
 
 def _path(known: Known, d: Detections, i: int) -> JointPath:
@@ -122,45 +182,47 @@ def _near(known: Known, path: JointPath, start: JointPath) -> bool:
     )
 
 
-def _credible(known: Known, paths: list[JointPath], near: list[JointPath]) -> bool:
-    """Whether a fit stayed near its start, and the new path, the last, is within `WEAKEST_DB` of
-    its neighbour and not on top of it."""
+def _credible(known: Known, paths: list[JointPath], before: list[JointPath], beside: int) -> bool:
+    """Whether a fit stayed near what was `before`, and the new path, the last, is within
+    `WEAKEST_DB` of the one `beside` which it was found and not on top of it."""
+    near = [*before, before[beside]]
     if not all(_near(known, p, n) for p, n in zip(paths, near, strict=True)):
         return False
     power = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
-    beside = max(power[i] for i, n in enumerate(near[:-1]) if n is near[-1])
-    return power[-1] > beside * 10 ** (-WEAKEST_DB / 10) and power[-1] < beside * 10
+    return power[beside] * 10 ** (-WEAKEST_DB / 10) < power[-1] < power[beside] * 10
 
 
 def _hidden(
-    moments: Moments, paths: list[JointPath], delays: tuple[float, ...] = ()
-) -> tuple[int, JointPath] | None:
-    """The surest path that the residual of a fit holds about one of its paths, with that path's
-    number; sought at its delay and at so many cells off it."""
+    moments: Moments, found: Fit, which: list[int], delays: tuple[float, ...] = ()
+) -> tuple[float, int, JointPath] | None:
+    """The surest path that the residual of a fit holds about some of its paths, with its power over
+    the noise and the number of the path that it is beside; sought at that path's delay and at so
+    many cells off it."""
     known = moments.known
     limit = known.antennas.view_limit
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[(grid**2).sum(axis=1) < 0.98]
+    noise, sums = found.left / moments.size, 1 if known.passes == 2 else known.antennas.num_tx
+    own = [found.paths[k] for k in which]
+    beside = [*own, *(_probe(known, p, cells) for p in own for cells in delays)]
+    parents = [*which, *(k for k in which for _ in delays)]
+    tried = len(grid) * len(DOPPLER_OFFSETS) * MAX_SEARCHED * (1 + len(delays))
+    level = gammainccinv(sums, FALSE_RATE / tried)
     best: tuple[float, int, JointPath] | None = None
-    sums = 1 if known.passes == 2 else known.antennas.num_tx
-    places = [*paths, *(_probe(known, p, cells) for p in paths for cells in delays)]
-    parents = [*range(len(paths)), *(k for k in range(len(paths)) for _ in delays)]
-    level = gammainccinv(sums, FALSE_RATE / (len(grid) * len(DOPPLER_OFFSETS) * len(places)))
-    around = residual_channels(moments, places, DOPPLER_OFFSETS)
-    for k, (path, channels, counts, noise) in zip(parents, around, strict=True):
+    around = residual_channels(moments, found, beside, DOPPLER_OFFSETS)
+    for k, path, (channels, counts) in zip(parents, beside, around, strict=True):
+        strength = float((np.abs(found.paths[k].amplitude) ** 2 * counts).sum()) / noise
+        least = max(level, 10 ** (-WEAKEST_DB / 10) * strength, 0.0 if best is None else best[0])
+        if (np.abs(channels) ** 2).sum(axis=(1, 2)).max() <= least * noise:
+            continue  # no beam holds more than all channels
         # (direction, offset), a sum of `sums` exponentials in noise
         power = _beams(known, path, channels, grid) / noise
         i, j = np.unravel_index(power.argmax(), power.shape)
-        floor = (
-            10 ** (-WEAKEST_DB / 10)
-            * float((np.abs(paths[k].amplitude) ** 2 * counts).sum())
-            / noise
-        )
-        if power[i, j] > max(level, floor) and (best is None or power[i, j] > best[0]):
+        if power[i, j] > least:
             rate = path.delay_rate + DOPPLER_OFFSETS[j] * rate_bin(known.waveform)
             best = float(power[i, j]), k, replace(path, delay_rate=rate, direction=grid[i].copy())
-    return None if best is None else best[1:]
+    return best
 
 
 def _probe(known: Known, path: JointPath, cells: float) -> JointPath:
@@ -188,22 +250,28 @@ def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray
 
 
 def _merged(
-    known: Known, d: Detections, order: np.ndarray, paths: list[JointPath], parent: list[int]
+    known: Known,
+    d: Detections,
+    order: np.ndarray,
+    paths: list[JointPath],
+    parent: list[int],
+    settled: np.ndarray,
 ) -> tuple[Detections, np.ndarray]:
-    """The detections with the fitted ones in place of theirs and the new ones behind."""
+    """The detections with the fitted and `settled` ones in place of theirs, and the new ones, each
+    beside its `parent`, behind."""
     old, scale = len(d), known.metres
-    source = np.append(np.arange(old), order[parent[order.size :]])
-    rows = np.append(order, np.arange(old, source.size))
+    source = np.append(np.arange(old), order[parent])
+    rows = np.append(order, np.arange(old, source.size))[settled]
+    paths = [p for p, kept in zip(paths, settled, strict=True) if kept]
     power = np.full(source.size, np.nan)
     power[rows] = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     v = {name: value[source] for name, value in vars(d).items()}
     v["range"][rows] = [p.delay * scale for p in paths]
     v["velocity"][rows] = [p.delay_rate * scale for p in paths]
     limit = known.antennas.view_limit
-    v["direction"][rows] = [
-        np.where(np.abs(p.direction) <= limit, p.direction, np.nan) for p in paths
-    ]
-    v["std"][rows] = [p.std * [scale, scale, 1, 1] for p in paths]
+    for row, p in zip(rows, paths, strict=True):
+        v["direction"][row] = np.where(np.abs(p.direction) <= limit, p.direction, np.nan)
+        v["std"][row] = p.std * [scale, scale, 1, 1]
     v["snr"][old:] *= power[old:] / power[source[old:]]
     v["is_reference"][old:] = False
     v["is_reference"] = _earlier_reference(v["is_reference"], v["range"], power, source, old)

@@ -30,9 +30,7 @@ FALSE_RATE = 1e-3
 ROUNDS = 2
 
 
-def decide_phases(
-    samples: np.ndarray, known: Known, path: JointPath, order: int
-) -> np.ndarray | None:
+def decide_phases(moments: Moments, path: JointPath, order: int) -> np.ndarray | None:
     """(M, P) running phases of a modulated frame at a PT; None where it shows no carrier.
 
     Hard decisions add up nearly in phase whatever the carrier and the velocity: of uniform phases
@@ -41,8 +39,7 @@ def decide_phases(
 
     Parameters
     ----------
-    samples : (M, L_rx, P, N)
-    known : with the phases decided so far
+    moments : of the frame's samples, with the phases decided so far
     path : near estimate of the reference path, within 1.5 Doppler bins
     order : D
 
@@ -51,10 +48,9 @@ def decide_phases(
     phases : as sent, but for whole steps that an antenna has in common over the frame: those belong
         to its amplitude
     """
-    phases = None
+    known, phases = moments.known, None
     for _ in range(ROUNDS):
-        moments = Moments(samples, known)
-        path = fit(moments, [path])[0]
+        path = fit(moments, [path]).paths[0]
         matched = match_chirps(moments, path)
         found = _decide(known, matched * known.phases, order)
         if found is None:
@@ -62,6 +58,7 @@ def decide_phases(
         phases, offset = found
         path = replace(path, delay_rate=path.delay_rate + offset * rate_bin(known.waveform))
         known = replace(known, phases=phases)
+        moments = moments.read_by(known)
     return phases
 
 
