@@ -62,7 +62,7 @@ class ActiveReceiver:
         if self.settings.self_calibration == "none":
             return out
         looks = look_at(spectra, known, found.estimates, found.detections.snr)
-        return replace(out, looks=looks)
+        return replace(out, looks=looks, neighbours=found.neighbours)
 
 
 def receive_active(

@@ -31,7 +31,7 @@ from isac_rt.receive.maps import (
     slow_window,
 )
 from isac_rt.receive.omp import Omp, sparse_enough
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps, Neighbours
 from isac_rt.scenario.receivers import Receivers
 
 MIXED = 0.1
@@ -45,7 +45,8 @@ MOST_LOOKS = 24
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`, `correction`, `looks`: see `Reception`."""
+    its background (`CfarRule.detect`). `sparse`, `correction`, `looks`, `neighbours`: see
+    `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
@@ -54,6 +55,7 @@ class Sensed:
     sparse: bool | None = None
     correction: Correction | None = None
     looks: tuple[Look, ...] = ()
+    neighbours: Neighbours | None = None
 
 
 class Detector(Protocol):

@@ -164,6 +164,24 @@ class Look:
     snr: float
 
 
+@dataclass(frozen=True)
+class Neighbours:
+    """By how much virtual channels differ in phase from their neighbours, as the frame's clutter
+    shows it.
+
+    Attributes
+    ----------
+    first, second : (Q,) int, channels by transmit antenna and then by receive antenna
+    phase, std : (Q,) of the second over the first beyond what the clutter's directions make, and
+        its standard deviation [rad]
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    phase: np.ndarray
+    std: np.ndarray
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reception:
     """What one terminal made of one frame.
@@ -197,6 +215,8 @@ class Reception:
         terminal expects; None where a detector does not ask
     looks : what strong paths show of the channels, at a PT its reference alone; empty where
         `receivers.self_calibration` is none
+    neighbours : what clutter shows of the channels; None where nobody asks, or the detector does
+        not know the mesh
     """
 
     detections: Detections
@@ -215,6 +235,7 @@ class Reception:
     sparse: bool | None = None
     correction: Correction | None = None
     looks: tuple[Look, ...] = ()
+    neighbours: Neighbours | None = None
 
     @classmethod
     def undecoded(

@@ -30,7 +30,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
-from isac_rt.receive.types import Look
+from isac_rt.receive.types import Look, Neighbours
 from isac_rt.scenario.receivers import Receivers
 
 GAIN_STD = 0.2, 0.6
@@ -56,6 +56,9 @@ LEAST_SNR = 1.0
 """Of a channel, under which a look says nothing."""
 FLOOR = 1e-4
 """Least noise of a channel over its power: what plane waves and seven range rows leave out."""
+LEAST_PHASE, MESH_PHASE = 0.01, 0.05
+"""Of neighbouring channels as clutter shows them [rad]: the least deviation that is believed, and
+what a mesh and the power of its scatterers are off by."""
 MISFIT = 1.5
 """Misfit beyond what chance makes, from which on a look counts for less."""
 
@@ -186,11 +189,16 @@ class SelfCalibration:
 
     # ---- looks
 
-    def learn_all(self, seen: Sequence[tuple[Look, Sight]]) -> Change:
-        """Take in the looks of a frame, and say how paths are seen otherwise from now on."""
+    def learn_all(
+        self, seen: Sequence[tuple[Look, Sight]], neighbours: Neighbours | None = None
+    ) -> Change:
+        """Take in the looks of a frame and what clutter shows of neighbouring channels, and say how
+        paths are seen otherwise from now on."""
         before, clock = self.gains.value[1], self.clock
         for look, sight in seen:
             self.learn(look, sight)
+        if neighbours is not None:
+            self._learn_of_neighbours(neighbours)
         phases = self._elements @ (self.gains.value[1] - before)
         _, across = self._steering(Sight(np.zeros(2), np.inf, FREE))
         lines = np.hstack([self._amplitudes, across])
@@ -294,6 +302,18 @@ class SelfCalibration:
         information = self._common_information + seen * weight.sum()
         self.common = self.common + new * (seen * weight.sum() / information)
         self._common_information = information
+
+    def _learn_of_neighbours(self, seen: Neighbours) -> None:
+        """Phases between channels, of which the frame's samples still hold what it has learnt."""
+        X = self._elements[seen.second] - self._elements[seen.first]
+        left = seen.phase - X @ (self.gains.value[1] - self._taken_out[0][1])
+        left = np.angle(np.exp(1j * left))
+        weight = 1 / (np.maximum(seen.std, LEAST_PHASE) ** 2 + MESH_PHASE**2)
+        own = self.gains.information
+        full = own[1] + (X.T * weight) @ X
+        step = np.linalg.solve(full, X.T @ (weight * left))
+        value = self.gains.value + np.stack([0 * step, step])
+        self.gains = Belief(value, np.stack([own[0], full]))
 
     def _learn_clock(self, look: Look, sight: Sight, learnt: np.ndarray) -> None:
         """By how much the path comes late, of which the frame's samples still hold what it has

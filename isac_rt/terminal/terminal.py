@@ -175,7 +175,7 @@ class ActiveTerminal:
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
             seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
-            change = self.calibration.learn_all(seen)
+            change = self.calibration.learn_all(seen, reception.neighbours)
             for track in self.tracker.tracks:
                 track.state = seen_after(track.state, own_pose, change, 2)
         return reception, tracks

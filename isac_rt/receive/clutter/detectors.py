@@ -18,6 +18,7 @@ from isac_rt.receive.arms import Channels, arm, both_arms
 from isac_rt.receive.cfar import first_row, strongest_peaks, without_sidelobes
 from isac_rt.receive.clutter.adaptive import Beams, Scan, beams_of, scan_threshold
 from isac_rt.receive.clutter.correction import fit
+from isac_rt.receive.clutter.neighbours import phases
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
 from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
 from isac_rt.receive.known import Known
@@ -126,7 +127,12 @@ class ClutterDetector:
         if first:
             starts &= ~in_skirt(rows, bins, power, first)
         detections = replace(detections, direction=direction, starts=starts)
-        return Sensed(found, detections, power, judged.level, correction=correction)
+        out = Sensed(found, detections, power, judged.level, correction=correction)
+        if clutter is None or self.settings.self_calibration != "positions":
+            return out
+        expected = expected_power(clutter, known, len(power), self.taper)
+        noise = noise_level(power, expected, known.channels)
+        return replace(out, neighbours=phases(maps, expected, noise, known, clutter))
 
     def expectation(
         self, powers: list[np.ndarray], known: Known, clutter: ExpectedClutter | None
