@@ -106,7 +106,8 @@ class Receivers(Node):
     chirp from strong paths, frame by frame, and take them out of their samples. `none`, the
     default. `tracks`: from tracked paths, whose directions are as they were measured: what turns
     all directions alike stays. `positions`: also from the terminals' positions, which they send
-    each other, so that directions and clocks are found too."""
+    each other, and, where the active terminal's detector knows the city's mesh, from clutter, so
+    that directions and clocks are found too."""
     active_input: Literal["samples", "profiles"] = "samples"
     """What an active terminal starts from: `samples`, the default, simulates IF samples and
     transforms them; `profiles` makes range profiles directly, which is faster and has another draw

@@ -132,8 +132,8 @@ def test_tracked_directions_leave_what_turns_all_alike_and_nothing_else():
 
 def test_clutter_shows_phases_of_neighbours_however_wide_its_directions():
     """Six thousand cells with four scatterers each, spread over half the view, 3 dB over the noise:
-    """Six thousand cells with four scatterers each, spread over half the view, 3 dB over the noise:
-    neighbours differ as their elements do, all directions off by 0.05 and -0.04 besides, within
+    neighbours differ as their elements do, all directions off by 0.05 and -0.04 besides, within the
+    deviations that are stated, and so do the
     phases of the elements that follow, in which a line along an arm is not left out. Planted bugs:
     the conjugate of the expected coherence, neighbours taken the wrong way round."""
     rng, waves = np.random.default_rng(6), replace(W, num_chirps=120, num_samples=256)
