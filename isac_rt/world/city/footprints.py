@@ -251,12 +251,13 @@ def footprints(
 
 def _bodies(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
     """What has surfaces of its own, down to the ground."""
-    standing = {id(body) for body in feet_of(model.bodies)[0]}
+    standing = feet_of(model.bodies)[0]
+    down = dict(zip(map(id, standing), lowered(standing, base), strict=True))
     surfaces, deep = list[Surface](), list[float]()
     for body in model.bodies:
         if replaced and body.kind == "TINRelief":
             continue
-        grounded, by = lowered(body, base) if id(body) in standing else (body, 0.0)
+        grounded, by = down.get(id(body), (body, 0.0))
         surfaces += grounded.surfaces()
         deep += [by] if by > SEEN_LOWERED_M else []
     if deep:

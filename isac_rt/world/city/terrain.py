@@ -249,10 +249,22 @@ def _stands_on(body: Body, parts: Sequence[Body]) -> bool:
     return False
 
 
-def lowered(body: Body, base: Ground) -> tuple[Body, float]:
-    """A body whose feet reach down to the ground, and by how much the farthest of them went. [m]"""
-    foot = body.vertices[body.foot]
-    down = foot[:, 2] - base.under(foot[:, :2])
+def lowered(bodies: Sequence[Body], base: Ground) -> list[tuple[Body, float]]:
+    """Bodies whose feet reach down to the ground, and by how much the farthest of each went [m]; the
+    ground is asked once for all of them."""
+    if not bodies:
+        return []
+    feet = [body.vertices[body.foot] for body in bodies]
+    ends = np.cumsum([len(foot) for foot in feet])[:-1]
+    under = np.split(base.height(np.concatenate(feet)[:, :2]), ends)
+    return [
+        _lowered(body, foot[:, 2] - float(below.min()))
+        for body, foot, below in zip(bodies, feet, under, strict=True)
+    ]
+
+
+def _lowered(body: Body, down: NDArray[np.float64]) -> tuple[Body, float]:
+    """A body whose feet went down by so much [m], where that is down."""
     if not (down > 0).any():
         return body, 0.0
     vertices = body.vertices.copy()
