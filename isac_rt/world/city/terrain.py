@@ -250,8 +250,8 @@ def _stands_on(body: Body, parts: Sequence[Body]) -> bool:
 
 
 def lowered(bodies: Sequence[Body], base: Ground) -> list[tuple[Body, float]]:
-    """Bodies whose feet reach down to the ground, and by how much the farthest of each went [m]; the
-    ground is asked once for all of them."""
+    """Bodies whose feet reach down to the ground, and by how much the farthest of each went [m].
+    The ground is asked once for all of them."""
     if not bodies:
         return []
     feet = [body.vertices[body.foot] for body in bodies]
