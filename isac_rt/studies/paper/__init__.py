@@ -28,6 +28,7 @@ TITLES = {
     "ghosts": "Ghost tracks in a street and a geometric test of them",
     "city": "Receivers that know the city in several cities, with several seeds",
     "hardware": "What real front ends do to data, floors, ranges and flights",
+    "self_calibration": "Errors of the elements found in flight: bounds, and a flight over Munich",
     "claims": "Claims of the text that have no figure",
 }
 
