@@ -454,13 +454,21 @@ OF_CASES = {
     ),
     "each part of a board counts": Bug(
         "capture/calibrate.py",
-        "out = out * turn * (1 + one.response_slope * off / one.half_sweep_hz)",
-        "out = out * turn * (1 + 0 * one.response_slope * off / one.half_sweep_hz)",
+        "out = out * turn * (1 + one.response_slope * place)",
+        "out = out * turn * (1 + 0 * one.response_slope * place)",
     ),
     "people in a measured frame": Bug(
         "capture/readers.py",
         "np.where(values >= 32768, values - 65536.0, values)",
         "np.where(values >= 65536, values - 65536.0, values)",
+    ),
+    "channels of a measured mover in line": Bug(
+        "capture/types.py",
+        "np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2",
+        "np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 9",
+    ),
+    "phase shifters of a cascade": Bug(
+        "scenario/front_end.py", '"errors_std_deg": 2.2}', '"errors_std_deg": 3.2}'
     ),
     "small uav as published": Bug(
         "propagation/rcs.py", '{"small": 3.74, "large": 2.50}', '{"small": 3.47, "large": 2.50}'

@@ -485,7 +485,8 @@ def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.nd
     out = level * np.exp(2j * np.pi * late * off)
     if "response" in parts:
         turn = np.exp(2j * np.pi * one.response_delay * off)
-        out = out * turn * (1 + one.response_slope * off / one.half_sweep_hz)
+        place = np.clip(off / one.half_sweep_hz, -1, 1)  # beyond what was swept it is held
+        out = out * turn * (1 + one.response_slope * place)
     return np.asarray(out)
 
 

@@ -13,11 +13,13 @@ from pydantic import Field
 from isac_rt.frame.antennas import CASCADE_HZ, Antennas, ti_cascade
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.scenario.document import Document
-from isac_rt.scenario.node import Finite, Node, Positive, Problem
+from isac_rt.scenario.node import Node, Problem
 
 Format = Literal["ti_calibration", "dca1000", "numpy", "sigmf"]
 Axis = Literal["frame", "loop", "chirp", "receiver", "sample"]
-Place = tuple[Finite, Finite]
+Offset = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+Place = tuple[Offset, Offset]
+Hertz = Annotated[float, Field(ge=1.0, le=1e13, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 MOST_ELEMENTS = 256
 """Antennas of an array."""
@@ -27,7 +29,7 @@ Places = Annotated[tuple[Place, ...], Field(min_length=1, max_length=MOST_ELEMEN
 class Elements(Node):
     """Places of the antenna elements in a plane, x to the right and z up as seen from behind."""
 
-    unit_hz: Positive = CASCADE_HZ
+    unit_hz: Hertz = CASCADE_HZ
     """Places are counted in half wavelengths of this frequency [Hz]."""
     transmitters: Places
     """[x, z] of each transmit element [half wavelengths], in the order of its numbers."""
@@ -45,13 +47,13 @@ class Description(Node):
 
     format: Format | None = None
     """Kind of file; by default what the file's name ends in says."""
-    carrier_hz: Positive = 77e9
+    carrier_hz: Hertz = 77e9
     """Frequency at which the ramp starts [Hz]."""
-    slope_mhz_per_us: Positive | None = None
+    slope_mhz_per_us: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Slope of the ramp [MHz/us]; TI's calibration files state theirs."""
     adc_start_us: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 6.0
     """From the start of the ramp to the first sample [us]."""
-    sampling_rate_hz: Positive | None = None
+    sampling_rate_hz: Hertz | None = None
     """Samples per second of each receiver, complex or real [Hz]."""
     samples_per_chirp: Annotated[int, Field(ge=16, le=65536)] | None = None
     """Samples of a chirp."""
@@ -66,7 +68,7 @@ class Description(Node):
     """Frames in the file."""
     frame: Annotated[int, Field(ge=0)] = 0
     """Frame that is read, counted from 0."""
-    chirp_interval_us: Positive | None = None
+    chirp_interval_us: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """From the start of a ramp to the start of the next [us]: idle time and ramp. Velocities need
     it."""
     sampling: Literal["complex_1x", "complex_2x", "real"] = "complex_1x"

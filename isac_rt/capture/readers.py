@@ -36,8 +36,16 @@ SUFFIXES = {
     ".sigmf-meta": "sigmf",
     ".sigmf-data": "sigmf",
 }
-_SIGMF_TYPES = {"cf32_le": "<c8", "cf64_le": "<c16", "rf32_le": "<f4", "rf64_le": "<f8"}
-_SIGMF_TYPES |= {"ri16_le": "<i2", "ru16_le": "<u2", "ci16_le": "<i2", "cu16_le": "<u2"}
+_SIGMF_TYPES = {
+    f"{part}{kind}{8 * size}{end}": f"{mark}{kind}{size}"
+    for part in "rc"
+    for kind, sizes in (("f", (4, 8)), ("i", (2, 4)), ("u", (2, 4)))
+    for size in sizes
+    for end, mark in (("_le", "<"), ("_be", ">"))
+} | {f"{part}{kind}8": f"{kind}1" for part in "rc" for kind in "iu"}
+"""Numpy's names of a number of each; of a complex sample there are two."""
+MOST_AMPLITUDE = 1e12
+"""No converter counts so far; powers of larger samples overflow."""
 
 
 def import_file(
@@ -70,6 +78,12 @@ def import_file(
             f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such chirps "
             "out"
         )
+    largest = float(np.abs(found.cube.samples).max(initial=0.0))
+    if largest > MOST_AMPLITUDE:
+        raise CaptureError(
+            f"{file}: the largest sample is {largest:g}, at most {MOST_AMPLITUDE:g} can be read; "
+            "scale them to counts of the converter or volts"
+        )
     return found
 
 
@@ -94,10 +108,9 @@ def _ti_calibration(file: Path, d: Description) -> Capture:
             f"transmitters, at most {MOST_ELEMENTS} of each can be read"
         )
     params = params if isinstance(params, dict) else {}
-    slope = _stated(file, params.get("Slope_MHzperus"), d.slope_mhz_per_us, "slope", "MHz/us")
-    rate = _stated(
-        file, params.get("Sampling_Rate_sps"), d.sampling_rate_hz, "sampling rate", "samples/s"
-    )
+    stated = params.get("Slope_MHzperus"), params.get("Sampling_Rate_sps")
+    slope = _stated(file, stated[0], d.slope_mhz_per_us, ("slope", "MHz/us", 1e-6, 1e6))
+    rate = _stated(file, stated[1], d.sampling_rate_hz, ("sampling rate", "samples/s", 1.0, 1e13))
     if slope is None:
         raise CaptureError(f"{file}: no slope is stated; give slope_mhz_per_us in a description")
     samples = _without_window(file, spectra, d.samples_per_chirp)
@@ -120,13 +133,21 @@ def _ti_calibration(file: Path, d: Description) -> Capture:
     return _capture(file, said, chirps, antennas, "ti_calibration")
 
 
-def _stated(file: Path, found: Any, described: float | None, what: str, unit: str) -> float | None:
-    """A number that the file states or the description; refused where they differ."""
+def _stated(
+    file: Path, found: Any, described: float | None, about: tuple[str, str, float, float]
+) -> float | None:
+    """A number that the file states or the description; refused where they differ. `about`: what it
+    is, its unit, the least and the largest that there is."""
+    what, unit, least, most = about
     if not isinstance(found, np.ndarray) or found.size == 0:
         return described
     value = float(np.ravel(found)[0].real)
     if found.size != 1 or not (math.isfinite(value) and value > 0):
         raise CaptureError(f"{file}: the {what} is {value:g} {unit}, it must be above 0")
+    if not least <= value <= most:
+        raise CaptureError(
+            f"{file}: the {what} is {value:g} {unit}, between {least:g} and {most:g} can be read"
+        )
     if described is not None and abs(described / value - 1) > 1e-6:
         raise CaptureError(
             f"{file}: the file states a {what} of {value:g} {unit}, the description {described:g}; "
@@ -227,10 +248,10 @@ def _sigmf(file: Path, d: Description) -> Capture:
             f"{data}: {len(content)} bytes are no whole number of samples of {dtype.itemsize} bytes"
         )
     flat = np.frombuffer(content, dtype)
-    if kind.startswith("c") and dtype.kind != "c":
+    if kind.startswith("c"):
         if flat.size % 2:
             raise CaptureError(f"{data}: {flat.size} numbers are no pairs of I and Q")
-        pairs = _unwrapped(flat, d).astype(np.float32).reshape(-1, 2)
+        pairs = _unwrapped(flat, d).astype(np.float64).reshape(-1, 2)
         return _ordered(data, pairs[:, 0] + 1j * pairs[:, 1], d, "sigmf")
     return _ordered(data, flat, d, "sigmf")
 
@@ -369,6 +390,12 @@ def waveform_described(d: Description) -> Waveform:
     )
 
 
+def _single(chirps: np.ndarray) -> np.ndarray:
+    """In single precision; what overflows is infinite, which is refused later."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.ascontiguousarray(chirps, np.complex64)
+
+
 def _capture(
     file: Path, d: Description, chirps: np.ndarray, antennas: Antennas | None, kind: str
 ) -> Capture:
@@ -377,7 +404,7 @@ def _capture(
         _same(file, "receivers", chirps.shape[1], antennas.num_rx)
         _same(file, "transmitters", d.num_tx, antennas.num_tx)
     cube = IFCube(
-        samples=np.ascontiguousarray(chirps, np.complex64),
+        samples=_single(chirps),
         waveform=waveform_described(d),
         schedule=np.tile(np.array(d.chirps, np.int64), d.loops)[None],
         start_time=0.0,

@@ -27,6 +27,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.randomness import generator
 from isac_rt.scenario import front_end as scenario
 
+_MOST_DRIFT = 60 * np.log(10) / 20  # gains that drift for long stop there
+
 
 @dataclass(frozen=True)
 class Elements:
@@ -72,9 +74,9 @@ class Elements:
         frequency : at which phases are taken [Hz]
         time : since the start of the run [s]
         """
-        out = np.broadcast_to(
-            self.gain * np.exp(self.drift * time), (len(direction), self.gain.size)
-        )
+        louder = np.clip(self.drift.real * time, -_MOST_DRIFT, _MOST_DRIFT)
+        gain = self.gain * np.exp(louder + 1j * self.drift.imag * time)
+        out = np.broadcast_to(gain, (len(direction), self.gain.size))
         if not np.array_equal(self.coupling, np.eye(self.gain.size)):
             steering = np.exp(-2j * np.pi * frequency / SPEED_OF_LIGHT * (direction @ positions.T))
             out = out * (steering @ self.coupling.conj().T) / steering

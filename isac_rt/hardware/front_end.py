@@ -9,6 +9,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.channels import Elements, elements_of
 from isac_rt.hardware.converter import Converter, converter_of, watts
 from isac_rt.hardware.oscillator import Oscillator, oscillator_of
+from isac_rt.hardware.shifter import Shifter, shifter_of
 from isac_rt.hardware.sweep import Ramp, Response, ramp_of, response_of
 from isac_rt.scenario import front_end as scenario
 
@@ -22,6 +23,7 @@ class FrontEnd:
     oscillator : its phase noise
     transmit, receive : errors of the elements
     transmit_response, receive_response : gain over the chirp
+    shifter : phases of the transmit antennas' shifters
     ramp : errors of the chirp's frequency
     converter : of the receiver
     saturation : power at which the transmit amplifier saturates [W]
@@ -32,6 +34,7 @@ class FrontEnd:
     receive: Elements | None = None
     transmit_response: Response | None = None
     receive_response: Response | None = None
+    shifter: Shifter | None = None
     ramp: Ramp | None = None
     converter: Converter | None = None
     saturation: float | None = None
@@ -89,6 +92,7 @@ def front_end_of(
         elements_of(node.receive, antennas.rx_positions, wave, seed, name, "rx"),
         response_of(node.transmit_response, antennas.num_tx, seed, name, "tx"),
         response_of(node.receive_response, antennas.num_rx, seed, name, "rx"),
+        shifter_of(node.shifter, antennas.num_tx, seed, name),
         ramp_of(node.ramp, waveform),
         converter_of(node.converter),
         None if node.saturation_dbm is None else watts(node.saturation_dbm),

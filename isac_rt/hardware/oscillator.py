@@ -130,7 +130,7 @@ def cubic(share: np.ndarray) -> np.ndarray:
 
 
 @jit(fast=True)
-def _between(out, coarse, weight, first):
+def _between(out: np.ndarray, coarse: np.ndarray, weight: np.ndarray, first: int) -> None:
     """The cubic through `coarse` at as many places between two of its values as `weight` has rows,
     the first of them `first` places after its second value."""
     ratio = weight.shape[0]
@@ -144,7 +144,7 @@ def _between(out, coarse, weight, first):
 
 
 @jit(fast=True)
-def _add_faded(out, block, weight):
+def _add_faded(out: np.ndarray, block: np.ndarray, weight: np.ndarray) -> None:
     """Add a block, faded at its ends."""
     for n in range(out.shape[0]):
         out[n] += np.float64(weight[n] * block[n])

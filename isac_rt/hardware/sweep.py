@@ -42,7 +42,7 @@ class Response:
     @property
     def common(self) -> bool:
         """Whether all elements have the same."""
-        return not self.slopes.any()
+        return not (self.slopes.any() or self.of.element_tables_db or self.of.element_tables_deg)
 
     def at(self, place: np.ndarray) -> np.ndarray:
         """Gain of the elements at places from -1 to 1 over the samples: (L, ...) complex128. Beyond
@@ -58,7 +58,14 @@ class Response:
             if polynomial:
                 total += np.polynomial.polynomial.polyval(x, polynomial)
         exponent = db * (np.log(10) / 20) + 1j * np.radians(deg)
-        return np.exp(exponent + np.multiply.outer(self.slopes, x))
+        exponent = exponent + np.multiply.outer(self.slopes, x)
+        for tables, unit in (
+            (o.element_tables_db, np.log(10) / 20),
+            (o.element_tables_deg, 1j * np.pi / 180),
+        ):
+            for own, table in zip(exponent, tables, strict=False):
+                own += unit * np.interp(x, np.linspace(-1, 1, len(table)), table)
+        return np.exp(exponent)
 
 
 def response_of(o: scenario.Response, size: int, seed: int, *name: str) -> Response | None:

@@ -18,7 +18,8 @@ class AspectTable(Node):
 
     azimuth_deg: Rising
     """Azimuths of the columns, rising, from the boresight to the right [degrees]. Beyond the first
-    and last the nearest counts; a table from -180 to 180 goes round."""
+    and last the nearest counts; a table that leaves out no more than a step of the circle, such as
+    one from 0 to 350, goes round."""
     elevation_deg: Rising
     """Elevations of the rows, rising, from the horizontal upwards [degrees]."""
     values_db: tuple[tuple[Decibels, ...], ...]

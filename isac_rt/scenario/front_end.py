@@ -58,6 +58,12 @@ class Oscillator(Node):
 
 Degrees = Annotated[float, Field(ge=-3600, le=3600, allow_inf_nan=False)]
 Spread = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
+GREATEST_DB = 120.0
+"""No part of a front end has more gain or loss; samples stay finite in single precision."""
+Gain = Annotated[float, Field(ge=-GREATEST_DB, le=GREATEST_DB, allow_inf_nan=False)]
+GainSpread = Annotated[float, Field(ge=0, le=20, allow_inf_nan=False)]
+Power = Annotated[float, Field(ge=-200, le=100, allow_inf_nan=False)]
+"""Powers in dBm between that of a noiseless receiver's hum and ten megawatts."""
 Picoseconds = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 """A delay of 100 ns is 15 m of cable; more is no error of an antenna."""
 Part = tuple[Finite, Finite]
@@ -66,7 +72,7 @@ Part = tuple[Finite, Finite]
 class Elements(Node):
     """Errors of the elements of one array: what is stated of each, and what is drawn for each."""
 
-    gain_db: tuple[Decibels, ...] = ()
+    gain_db: tuple[Gain, ...] = ()
     """Gain of each element over what it should be [dB], in the order of the elements. Empty, the
     default: 0."""
     phase_deg: tuple[Degrees, ...] = ()
@@ -83,7 +89,7 @@ class Elements(Node):
     tilt_deg: tuple[Part, ...] = ()
     """Turn of each element's pattern [degrees], to the right and upwards. Empty, the default: all
     look ahead."""
-    gain_std_db: Spread = 0.0
+    gain_std_db: GainSpread = 0.0
     """Standard deviation of gains that are drawn for each element once a run [dB]; they add to
     those stated. By default none."""
     phase_std_deg: Spread = 0.0
@@ -94,9 +100,9 @@ class Elements(Node):
     """The same for places, along each axis [mm]. By default none."""
     tilt_std_deg: Spread = 0.0
     """The same for the turns of patterns, to both sides [degrees]. By default none."""
-    gain_drift_std_db_per_s: Spread = 0.0
+    gain_drift_std_db_per_s: GainSpread = 0.0
     """Standard deviation of the rates at which gains change from the start of the run on [dB/s],
-    one rate for each element. By default they stay."""
+    one rate for each element; by 60 dB at most. By default they stay."""
     phase_drift_std_deg_per_s: Spread = 0.0
     """The same for phases [degrees/s]. By default they stay."""
     coupling_db: Annotated[float, Field(ge=-400, le=-3, allow_inf_nan=False)] | None = None
@@ -128,7 +134,7 @@ class Elements(Node):
 class Response(Node):
     """Complex gain over the sampled part of the chirp, from its beginning to its end."""
 
-    table_db: tuple[Decibels, ...] = ()
+    table_db: tuple[Gain, ...] = ()
     """Gain at places evenly spread over the samples of a chirp, the first and the last among them
     [dB]; straight lines between them. Empty, the default: 0."""
     table_deg: tuple[Degrees, ...] = ()
@@ -138,7 +144,12 @@ class Response(Node):
     goes from -1 to 1 over the samples of a chirp. Empty, the default: 0."""
     polynomial_deg: tuple[Finite, ...] = ()
     """The same for the phase of the IF samples [degrees]. Empty, the default: none."""
-    slope_std_db: Spread = 0.0
+    element_tables_db: tuple[tuple[Gain, ...], ...] = ()
+    """The same for each element, which adds to what all have in common: a table for each, in the
+    order of the elements. Empty, the default: all elements are alike."""
+    element_tables_deg: tuple[tuple[Degrees, ...], ...] = ()
+    """The same for the phases of each [degrees]."""
+    slope_std_db: GainSpread = 0.0
     """Standard deviation of slopes that are drawn for each element [dB from the middle of the
     chirp to its end]. By default all elements are alike."""
     slope_std_deg: Spread = 0.0
@@ -150,13 +161,30 @@ class Response(Node):
         """Whether it is 1 at all elements."""
         return self == Response()
 
+    @property
+    def differs(self) -> bool:
+        """Whether elements have responses of their own."""
+        drawn = self.slope_std_db or self.slope_std_deg
+        return bool(drawn or self.element_tables_db or self.element_tables_deg)
+
+    def counts(self) -> Iterator[tuple[str, int]]:
+        """Keys that state something of each element, and of how many."""
+        for name in ("element_tables_db", "element_tables_deg"):
+            if stated := getattr(self, name):
+                yield name, len(stated)
+
     def problems(self) -> Iterator[Problem]:
         for name in ("table_db", "table_deg"):
             if len(getattr(self, name)) == 1:
                 yield Problem(((name,),), "one value is no table over the chirp; give two or more")
-        for name in ("polynomial_db", "polynomial_deg"):
-            if sum(map(abs, getattr(self, name))) > 3600:
-                said = "goes beyond 3600 at the ends, -1 and 1, of the chirp; give less"
+        for name in ("element_tables_db", "element_tables_deg"):
+            for i, row in enumerate(getattr(self, name)):
+                if len(row) < 2:
+                    said = f"{len(row)} values are no table over the chirp; give two or more"
+                    yield Problem(((name, i),), said)
+        for name, most in (("polynomial_db", GREATEST_DB), ("polynomial_deg", 3600.0)):
+            if sum(map(abs, getattr(self, name))) > most:
+                said = f"goes beyond {most:g} at the ends, -1 and 1, of the chirp; give less"
                 yield Problem(((name,),), said)
 
 
@@ -194,18 +222,48 @@ class Ramp(Node):
                 yield Problem(((name,),), said)
 
 
+class Shifter(Node):
+    """Phase shifters of the transmit antennas, by which those that send at once (`scheme: ddm` or
+    `bpm`) turn their chirps. Where antennas take turns none is used."""
+
+    bits: Annotated[int, Field(ge=1, le=10)] | None = None
+    """Bits of a phase: it is rounded to the nearest of 2^bits equal steps. null, the default: any
+    phase."""
+    errors_deg: tuple[Degrees, ...] = ()
+    """What each of the 2^bits steps, from 0 on, has over its nominal phase [degrees]. Empty, the
+    default: none."""
+
+    errors_std_deg: Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)] = 0.0
+    """Standard deviation of errors that are drawn for each antenna and step once a run [degrees];
+    they add to those stated. By default none."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether any phase can be sent as it is."""
+        return self.bits is None
+
+    def problems(self) -> Iterator[Problem]:
+        if (self.errors_deg or self.errors_std_deg) and self.bits is None:
+            name = "errors_deg" if self.errors_deg else "errors_std_deg"
+            said = "is of steps of which there are none; state bits, or leave it out"
+            yield Problem(((name,), ("bits",)), said)
+        elif self.bits is not None and len(self.errors_deg) not in (0, 2**self.bits):
+            said = f"{len(self.errors_deg)} values for the {2**self.bits} steps of {self.bits} bits"
+            yield Problem((("errors_deg",), ("bits",)), f"{said}; state one of each step")
+
+
 class Converter(Node):
     """What the receiver does behind its antennas: amplifier, mixer, converters, on signal and noise
     alike."""
 
-    compression_dbm: Decibels | None = None
+    compression_dbm: Power | None = None
     """Power at the receiver's input at which its gain is 1 dB lower [dBm]. null, the default: the
     amplifier is linear."""
     iq_gain_db: Annotated[float, Field(ge=-20, le=20, allow_inf_nan=False)] = 0.0
     """Gain of the quadrature channel over the in-phase one [dB]. By default they are alike."""
     iq_phase_deg: Annotated[float, Field(ge=-45, le=45, allow_inf_nan=False)] = 0.0
     """How far the two are from a right angle [degrees]. By default none."""
-    dc_dbm: Decibels | None = None
+    dc_dbm: Power | None = None
     """Power of a constant in the samples, as if it came in at the input [dBm]. null, the default:
     none."""
     real: bool = False
@@ -213,7 +271,7 @@ class Converter(Node):
     less its own frequency, of the same level. Off by default."""
     bits: Annotated[int, Field(ge=1, le=24)] | None = None
     """Bits of each converter. null, the default: neither quantisation nor saturation."""
-    full_scale_dbm: Decibels | None = None
+    full_scale_dbm: Power | None = None
     """Power at the input of a sine that just fills the converters [dBm]. null, the default: an
     automatic gain sets it by `headroom_db` over the mean power of the strongest element in a chirp
     before the frame's first."""
@@ -243,6 +301,16 @@ class Converter(Node):
                 yield name
 
 
+_AWR2243_SHIFTER_DEG = [
+    float(x)
+    for x in """
+    -0.9 -0.2 1.3 2.2 2.8 3.0 2.8 2.4 1.6 0.7 -0.2 -0.7 -1.1 -1.2 -1.1 -0.7
+    0.0 0.5 1.1 1.2 1.2 1.0 0.6 -0.1 -0.8 -1.6 -2.1 -2.3 -2.4 -2.3 -2.1 -1.7
+    -0.9 -0.2 1.3 2.3 2.9 3.0 2.8 2.5 1.8 0.8 -0.1 -0.8 -1.1 -1.4 -1.3 -0.9
+    -0.7 0.0 0.7 1.0 1.1 0.9 0.6 -0.1 -0.8 -1.5 -2.0 -2.4 -2.5 -2.3 -2.1 -1.6
+    """.split()
+]
+"""Mean error of each phase step over the twelve antennas of a cascade."""
 _AWR_MASK = [[3e5, -85.0], [1e7, -115.5]]
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "ideal": {},
@@ -261,6 +329,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4},
         "transmit_response": {"polynomial_db": [0.0, -0.6]},
         "receive_response": {"polynomial_db": [0.0, -0.6]},
+        "shifter": {"bits": 6, "errors_deg": _AWR2243_SHIFTER_DEG, "errors_std_deg": 2.2},
     },
 }
 """What each preset says of the parts; where the numbers are from stands in `docs/hardware.md`."""
@@ -288,11 +357,13 @@ class FrontEnd(Node):
     """Gain of what is sent over the chirp. By default it is flat."""
     receive_response: Response = Response()
     """Gain of what is received over the chirp. By default it is flat."""
+    shifter: Shifter = Shifter()
+    """Phase shifters of the transmit elements. Ideal by default."""
     ramp: Ramp = Ramp()
     """Errors of the chirp's frequency. By default it is a straight line."""
     converter: Converter = Converter()
     """Amplifier, mixer and converters of the receiver. Ideal by default."""
-    saturation_dbm: Decibels | None = None
+    saturation_dbm: Power | None = None
     """Power at which the transmit amplifier saturates [dBm]; `noise.tx_power_dbm` is what it would
     send if it did not. null, the default: it does not."""
 
@@ -319,6 +390,7 @@ class FrontEnd(Node):
             self.receive,
             self.transmit_response,
             self.receive_response,
+            self.shifter,
             self.ramp,
             self.converter,
         )

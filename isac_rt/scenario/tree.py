@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from isac_rt.scenario.environment import Accuracy, Belief, City, Clutter, Propagation
-from isac_rt.scenario.front_end import Elements, FrontEnd
+from isac_rt.scenario.front_end import Elements, FrontEnd, Response
 from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
 from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
@@ -473,12 +473,14 @@ class Scenario(Node):
         for key, one in stated.items():
             yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
             yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
-            sent = one.transmit_response
-            if (sent.slope_std_db or sent.slope_std_deg) and self.radio.bands(self.num_tx) > 1:
+            sent, heard = one.transmit_response, one.receive_response
+            yield from self._element_problems((*key, "transmit_response"), sent, self.num_tx)
+            yield from self._element_problems((*key, "receive_response"), heard, self.num_rx)
+            if sent.differs and self.radio.bands(self.num_tx) > 1:
                 said = (
                     "antennas that send at once have one response over the chirp here; state it by "
-                    "a table or a polynomial and set its slope_std_db and slope_std_deg to 0, or "
-                    "take another scheme"
+                    "a table or a polynomial of all and set its slope_std_db and slope_std_deg to "
+                    "0, or take another scheme"
                 )
                 yield Problem(((*key, "transmit_response"), ("radio", "scheme")), said)
             powers: list[Key] = [("converter", name) for name in one.converter.powers()]
@@ -491,10 +493,11 @@ class Scenario(Node):
                 yield Problem(((*key, *powers[0]), ("noise", "model")), said)
 
     @staticmethod
-    def _element_problems(key: Key, elements: Elements, size: int) -> Iterator[Problem]:
+    def _element_problems(key: Key, elements: Elements | Response, size: int) -> Iterator[Problem]:
         for name, count in elements.counts():
             if count != size:
-                said = f"{count} values for {size} {key[-1]} elements; state one of each element"
+                end = str(key[-1]).removesuffix("_response")
+                said = f"{count} values for {size} {end} elements; state one of each element"
                 yield Problem(((*key, name), ("array",)), said)
                 return
 

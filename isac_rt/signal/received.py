@@ -24,6 +24,7 @@ from functools import lru_cache
 import numpy as np
 
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
+from isac_rt.frame.schedule import codes_of
 from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.converter import saturated
 from isac_rt.hardware.front_end import IDEAL, Ends
@@ -237,6 +238,7 @@ def _with_elements(
     driven = [saturated(p, one.saturation) for p, one in zip(powers, ends.senders, strict=True)]
     if set(driven) - {1.0}:
         tones = tones._replace(send=tones.send * np.array(driven)[:, None, None])
+    tones = _with_shifters(tones, w, links, ends)
     if all(one.transmit is None for one in ends.senders) or not tones.size:
         return tones
     delay, gain = tones.tx_delay.copy(), np.ones(tones.tx_delay.shape, complex)
@@ -248,6 +250,19 @@ def _with_elements(
         delay[here] += one.transmit.delays(departure)
         gain[here] = one.transmit.factors(departure, at.tx_positions, at, frequency, middle)
     return tones._replace(tx_delay=delay, tx_gain=gain)
+
+
+def _with_shifters(tones: Tones, w: Waveform, links: Links, ends: Ends) -> Tones:
+    """The tones as phase shifters send the codes of antennas that send at once."""
+    codes = codes_of(w)
+    if codes is None or all(one.shifter is None for one in ends.senders):
+        return tones
+    send = tones.send.copy()
+    for q, ((sent, _), one) in enumerate(zip(links, ends.senders, strict=True)):
+        if one.shifter is not None:
+            antenna = int(sent.schedule[0, 0])
+            send[q] *= one.shifter.sent(antenna, codes[antenna]) / codes[antenna]
+    return tones._replace(send=send)
 
 
 @dataclass(frozen=True)
@@ -316,8 +331,8 @@ class _Flicker:
         for end, (one, late, sign) in enumerate([(self.mine, 0.0, 1.0), (theirs, self.main, -1.0)]):
             if one is not None:
                 first[:, end], weight[:, end] = places_of(one, begin - late, sign)
-        records = tuple(NOTHING if one is None else one.values for one in (self.mine, theirs))
-        return turns._replace(records=records, first=first, weight=weight)
+        mine, sent = (NOTHING if one is None else one.values for one in (self.mine, theirs))
+        return turns._replace(records=(mine, sent), first=first, weight=weight)
 
     def apart(self, path: int) -> np.ndarray:
         """(M, P, N) complex64, the phase of a path beside the common one, as a factor."""

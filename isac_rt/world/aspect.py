@@ -17,6 +17,11 @@ def _interpolator(table: AspectTable) -> RegularGridInterpolator:
     for i, axis in enumerate(axes):
         if axis.size == 1:  # the same everywhere along an axis with one number
             axes[i], values = np.array([axis[0], axis[0] + 1]), np.repeat(values, 2, axis=i)
+    azimuth = np.array(table.azimuth_deg)
+    open_deg = 360 - (azimuth[-1] - azimuth[0])
+    if azimuth.size > 2 and 0 < open_deg < 1.01 * np.diff(azimuth).max():  # all round but one step
+        axes[1] = np.append(azimuth, azimuth[0] + 360)
+        values = np.concatenate([values, values[:, :1]], axis=1)
     return RegularGridInterpolator(axes, values)
 
 
@@ -33,10 +38,8 @@ def in_table(table: AspectTable, direction: np.ndarray) -> np.ndarray:
     elevation = np.degrees(np.arcsin(np.clip(direction[..., 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(direction[..., 0], direction[..., 1]))
     low, high = found.grid[1][[0, -1]]
-    if high > 180:
-        azimuth = np.where(azimuth < low, azimuth + 360, azimuth)
-    elif low < -180:
-        azimuth = np.where(azimuth > high, azimuth - 360, azimuth)
+    azimuth = low + (azimuth - low) % 360
+    azimuth = np.where(azimuth - high > low + 360 - azimuth, low, azimuth)
     points = [
         np.clip(a, g[0], g[-1]) for a, g in zip((elevation, azimuth), found.grid, strict=True)
     ]

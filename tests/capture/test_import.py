@@ -191,6 +191,31 @@ def refused(tmp_path, pattern, name="adc.bin", **changes):
         import_file(tmp_path / name, Description(**{**COMMON, **changes}))
 
 
+@pytest.mark.parametrize(
+    ("kind", "dtype"), [("ci8", "i1"), ("ci16_be", ">i2"), ("ci32_le", "<i4"), ("cf64_be", ">f8")]
+)
+def test_sigmf_of_any_width_and_order_of_bytes(tmp_path, kind, dtype):
+    """Pairs of I and Q. Planted bug: the order of bytes of this machine."""
+    rng = np.random.default_rng(1)
+    pairs = rng.integers(-100, 100, (FRAMES, LOOPS * len(CHIRPS), RX, SIZE, 2))
+    (tmp_path / "a.sigmf-data").write_bytes(pairs.astype(dtype).tobytes())
+    (tmp_path / "a.sigmf-meta").write_text(json.dumps({"global": {"core:datatype": kind}}))
+    found = import_file(tmp_path / "a.sigmf-meta", Description(**COMMON)).cube.samples[0]
+    truth = (pairs[..., 0] + 1j * pairs[..., 1])[1]
+    assert np.array_equal(found, truth.transpose(1, 0, 2))
+
+
+def test_numbers_beyond_any_board_are_refused(tmp_path):
+    """Powers of 1e300 overflow far behind the import. Planted bug: the largest real part."""
+    np.save(tmp_path / "a.npy", np.full((2, 9, 4, 16), 3e20j))
+    refused(tmp_path, r"the largest sample is 3e\+20, at most 1e\+12", name="a.npy")
+    np.save(tmp_path / "b.npy", np.full((2, 9, 4, 16), 1e300))
+    refused(tmp_path, "576 of 576 samples are not finite", name="b.npy")
+    for key in ("slope_mhz_per_us", "sampling_rate_hz", "carrier_hz", "chirp_interval_us"):
+        with pytest.raises(ValueError, match="less than or equal to"):
+            Description(**{**COMMON, key: 1e300})
+
+
 def test_sizes_that_do_not_fit_are_refused_with_both_numbers(counts, tmp_path):
     i, q = counts
     content = stream(i, q, "complex_1x", False, False)
@@ -233,10 +258,11 @@ def test_what_is_missing_or_no_number_is_said(tmp_path):
         ({"calibResult": {"Rx_fft": np.zeros((640, 4, 2))}}, "zero everywhere"),
         ({"calibResult": {"Rx_fft": np.full((640, 4, 2), np.nan)}}, "5120 of 5120 numbers"),
         ({"params": {"Slope_MHzperus": -3.0}}, "the slope is -3 MHz/us"),
+        ({"params": {"Slope_MHzperus": 1e300}}, r"slope is 1e\+300 MHz/us, between 1e-06 and"),
         ({"params": {}}, "no slope is stated"),
         ({"calibResult": {"Rx_fft": np.ones((80, 2, 600))}}, "600 transmitters, at most 256"),
     ],
-    ids=["no spectra", "two axes", "zero", "nan", "slope", "no slope", "600 antennas"],
+    ids=["no spectra", "two axes", "zero", "nan", "slope", "steep", "no slope", "600 antennas"],
 )
 def test_bent_calibrations_are_refused(tmp_path, change, pattern):
     write_ti(tmp_path / "b.mat", channels()[0], 61.3, **change)

@@ -28,6 +28,22 @@ def test_slopes_differ_by_element():
     assert (20 * np.log10(np.abs(end))).std() == pytest.approx(1.0, rel=0.15)
 
 
+def test_elements_have_tables_of_their_own():
+    """In decibels and degrees beside what all have in common: 1 dB in common, and at the end 2 dB
+    more at element 0, 30 degrees at element 1. Planted bug: the tables of the first for all."""
+    stated = Response(
+        polynomial_db=(1,),
+        element_tables_db=((0, 2), (0, 0)),
+        element_tables_deg=((0, 0), (0, 0, 30)),
+    )
+    one = response_of(stated, 2, 1, "A")
+    assert not one.common
+    db = 20 * np.log10(np.abs(one.at(np.array([-1.0, 0.0, 1.0]))))
+    np.testing.assert_allclose(db, [[1, 2, 3], [1, 1, 1]], atol=1e-9)
+    deg = np.angle(one.at(np.array([-1.0, 0.5, 1.0])), deg=True)
+    np.testing.assert_allclose(deg, [[0, 0, 0], [0, 15, 30]], atol=1e-9)
+
+
 def test_cycles_are_the_integral_of_the_frequency():
     """Planted bug: x^4/3."""
     ramp = Ramp(64e3, -20e3, 5e3, 7e-6, 54e-6)

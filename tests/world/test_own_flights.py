@@ -195,3 +195,18 @@ def test_a_table_of_azimuths_may_begin_at_minus_360():
     )
     ways = np.array([[1.0, 0, 0], [0, -1.0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     assert in_table(table, ways) == pytest.approx([10, 20, 30, 1])
+
+
+def test_a_table_of_azimuths_from_0_to_350_goes_round():
+    """Half way from 350 back to 0, to either end of the circle, and beyond a table that leaves more
+    than a step out the nearer end. Planted bug: clipped to the last."""
+    line = tuple(range(0, 360, 10))
+    values = (tuple(float(a) for a in line),)
+    table = AspectTable(azimuth_deg=line, elevation_deg=(0,), values_db=values)
+    angles = np.radians([-5.0, -8.0, 4.0, 175.0, -175.0])
+    ways = np.stack([np.sin(angles), np.cos(angles), 0 * angles], axis=1)
+    assert in_table(table, ways) == pytest.approx([175, 280, 4, 175, 185])
+    table = AspectTable(azimuth_deg=(0, 90), elevation_deg=(0,), values_db=((1, 2),))
+    angles = np.radians([-20.0, 110.0, -170.0])
+    ways = np.stack([np.sin(angles), np.cos(angles), 0 * angles], axis=1)
+    assert in_table(table, ways) == pytest.approx([1, 2, 2])

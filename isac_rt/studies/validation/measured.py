@@ -11,13 +11,15 @@ import numpy as np
 from isac_rt.capture.calibrate import PARTS, Calibration, calibrate
 from isac_rt.capture.description import Description
 from isac_rt.capture.explain import unexplained_by
+from isac_rt.capture.matfile import read_mat
 from isac_rt.capture.readers import import_file
-from isac_rt.capture.types import MEASURED, Capture, measured_folder
+from isac_rt.capture.types import MEASURED, Capture, measured_folder, ti_window
 from isac_rt.frame.antennas import Antennas
 from isac_rt.propagation.rcs import SMALL_MEAN_DBSM, TR38901_STD_DB
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, doppler_bins
 from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.studies.validation.case import Errors, Skipped, case
 
 BOARDS = {
@@ -129,6 +131,49 @@ def people_in_a_measured_frame() -> float:
     if (int(row), int(bins[own][column])) != (60, 7):
         return float("inf")
     return abs(10 * float(np.log10(moving.max() / np.median(power[:, own]))) - 48.9)
+
+
+@case(
+    "the frame's own description: 0.993 as it is, 0.996 after the phase of the second slot",
+    "1.0 half digits",
+    "to the last digit; the channels are a line of eight, two transmitters times four receivers",
+)
+def channels_of_a_measured_mover_in_line() -> Errors:
+    """Largest sum in phase of the eight channels of that mover over the sum of their amplitudes,
+    before and after taking out what it moves from one transmitter's slot to the next's."""
+    capture = import_file(_here("tdm_frame/doppler_example_1.npy"), FRAME)
+    samples = capture.cube.samples[0].reshape(4, 128, 2, 128)  # receiver, loop, chirp, sample
+    window = ti_window(128)
+    cells = (samples * window) @ np.exp(-2j * np.pi * 60 / 128 * np.arange(128))
+    moving = np.exp(-2j * np.pi * 7 / 128 * np.arange(128)) * window
+    line = np.einsum("rlc,l->cr", cells, moving)
+    steering = np.exp(-1j * np.outer(np.linspace(-np.pi, np.pi, 4001), np.arange(8)))
+    for late, stated in ((0.0, 0.993), (np.pi * 7 / 128, 0.996)):
+        channels = (line * np.exp(np.array([[0.0], [-1j * late]]))).ravel()
+        found = np.abs(steering @ channels).max() / np.abs(channels).sum()
+        yield abs(round(float(found), 3) - stated) * 2 * 10**3
+
+
+@case(
+    "another program's table of the same file; the preset awr2243_cascade",
+    "1.0 half digits",
+    "to the last digit: 5.60 degrees, 2.7, 11.1; the preset keeps a digit of each mean",
+)
+def phase_shifters_of_a_cascade() -> Errors:
+    """Mean step of twelve measured transmit phase shifters, standard deviation and largest size of
+    what they are off 5.625 degrees a step, and the errors that the preset has of each step."""
+    steps = -np.unwrap(read_mat(_here("phaseShifterCalibration.mat"))["Ph"], axis=0, period=360)
+    yield abs(round(float(np.diff(steps, axis=0).mean()), 2) - 5.60) * 2 * 10**2
+    off = steps - 5.625 * np.arange(1, 64)[:, None, None]
+    off = off - off.mean(axis=0)
+    yield abs(round(float(off.std()), 1) - 2.7) * 2 * 10
+    yield abs(round(float(np.abs(off).max()), 1) - 11.1) * 2 * 10
+    mean = np.append(0.0, steps.mean(axis=(1, 2))) - 5.625 * np.arange(64)
+    stated = FrontEnd(preset="awr2243_cascade").shifter
+    yield np.abs(np.array(stated.errors_deg) - (mean - mean.mean())).max() * 2 * 10 - 0.01
+    apart = steps.mean(axis=1) - steps.mean(axis=(1, 2))[:, None]
+    apart = apart - apart.mean(axis=0)
+    yield abs(round(float(apart.std()), 1) - stated.errors_std_deg) * 2 * 10
 
 
 @case("TR 38.901 v19.4.0, table 7.9.2.1-1 as published", "0 dB", "the same digits")
