@@ -106,9 +106,9 @@ def test_antennas_that_send_at_once_have_their_own_gains():
 
 
 def test_a_wrong_step_of_a_phase_shifter_shows_where_the_code_takes_it():
-    """Codes of four phases, shifters of 64 steps of which that of 90 degrees is 10 off: antenna 1
-    (160 dB over the others, 60 over the noise of before) takes it in every fourth chirp, antenna 2, which goes from 0 to 180 degrees, never. Planted bug:
-    the step of the neighbouring antenna's code."""
+    """Codes of four phases, shifters of 64 steps of which that of 90 degrees is 10 off: antenna 1,
+    160 dB over the others, takes it in every fourth chirp; antenna 2, which goes from 0 to 180
+    degrees, never. Planted bug: the step of the neighbouring antenna's code."""
     errors = np.zeros(64)
     errors[16] = 10.0
     alone = [{"gain_db": (160 * np.eye(3)[a] - 100).tolist()} for a in (1, 2)]
