@@ -8,6 +8,12 @@ import pytest
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
+LONG = ("9_learned_detector",)
+"""A minute and more."""
+QUICK = [
+    pytest.param(source, marks=pytest.mark.slow if source.stem in LONG else ())
+    for source in SOURCES
+]
 
 
 def test_there_are_notebooks():
@@ -28,7 +34,7 @@ def test_what_jupyter_opens_is_in_step(source):
 
 
 @pytest.mark.sionna
-@pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("source", QUICK, ids=lambda p: p.stem)
 def test_a_notebook_runs(source, monkeypatch):
     """Every code cell in one name space, as a kernel would; figures are drawn to nowhere."""
     jupytext = pytest.importorskip("jupytext")
