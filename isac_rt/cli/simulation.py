@@ -378,7 +378,8 @@ def figures(
         typer.Option(metavar="DIR", help="Where they go; default DIR/figures_STYLE."),
     ] = None,
 ) -> None:
-    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style."""
+    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style; the maps of
+    every snapshot."""
     from isac_rt.results.files import open_results
 
     results = open_results(folder)

@@ -16,6 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import AutoLocator
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.dataset import MEASURES, errors_of
@@ -78,6 +79,8 @@ _SHOWN_DB = 60.0
 """Depth of a map's colour scale [dB]."""
 _LEAKAGE_CELLS = 3.0
 """Range cells in which an active terminal's own leakage decides how bright a map is."""
+_STEPS = 5
+"""Steps of an axis at most: every tick takes as long to draw as a curve."""
 _TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 _UNITS = {
     "range": (1.0, "m"),
@@ -573,6 +576,10 @@ def _figure(drawing: Drawing, style: Style) -> Figure:
     )
     for ax, drawn in zip(axes.flat, drawing.axes, strict=True):
         drawn(ax)
+        for axis in (ax.xaxis, ax.yaxis):
+            locator = axis.get_major_locator()
+            if isinstance(locator, AutoLocator):
+                locator.set_params(nbins=_STEPS)
     return figure
 
 
@@ -588,11 +595,11 @@ def _maps(
         yield Drawing(f"{name}_{_moment(d, snapshot)[1]:04d}", draw, height)
 
 
-def _all(d: xr.Dataset, city: CityMesh | None) -> Iterator[Drawing]:
-    """The figures of a run."""
+def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]:
+    """The figures of a run; the maps of `every` snapshot or of the middle one."""
     observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
     yield Drawing("scene", [partial(scene_map, dataset=d, city=city)], 6.4)
-    for s in sorted({0, kept // 2, kept - 1}) if kept else ():
+    for s in range(kept) if every else [kept // 2][:kept]:
         yield from _maps(d, s, "range_doppler", range_doppler, 4.1)
     if kept:  # every frame shows the same
         yield from _maps(d, kept // 2, "equivalent_range", equivalent_range, 3.2)
@@ -632,23 +639,24 @@ def _written(
 
 def make_figures(results: Results, folder: str | Path, city: CityMesh | None = None) -> list[Path]:
     """Write all figures of a run as ``figures/*.png`` under `folder`; the scene shows the `city` if
-    it is given.
+    it is given, and of the range-Doppler maps there are those of the middle snapshot.
 
     Raises
     ------
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
-    return _written(_all(results.dataset, city), Path(folder) / "figures")
+    return _written(_all(results.dataset, city, False), Path(folder) / "figures")
 
 
 def redraw(results: Results, folder: Path, city: CityMesh, form: str, style: str) -> list[Path]:
-    """Write all figures of a run into a folder in one of `FORMS` and one of `STYLES`.
+    """Write all figures of a run, maps of every snapshot among them, into a folder in one of
+    `FORMS` and one of `STYLES`.
 
     Raises
     ------
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
-    return _written(_all(results.dataset, city), folder, form, style)
+    return _written(_all(results.dataset, city, True), folder, form, style)
 
 
 def sweep_curves(

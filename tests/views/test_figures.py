@@ -14,6 +14,7 @@ from matplotlib.image import imread
 from isac_rt.cli.cli import main
 from isac_rt.results.files import save
 from isac_rt.results.records import KINDS
+from isac_rt.views import figures
 from isac_rt.views.figures import (
     KIND_COLOURS,
     error_cdf,
@@ -57,6 +58,19 @@ def test_all_figures_are_there_and_hold_ink(written):
         pixels = imread(file)[..., :3]
         assert pixels.var() > INK_VARIANCE, file
         assert min(pixels.shape[:2]) > 200
+
+
+def test_a_run_draws_the_middle_maps_and_figures_those_of_every_snapshot(run):
+    """Maps take longest to draw. Seen failing with the first snapshot's, and with all of them."""
+    d = run.dataset.isel(snapshot=[0, 0, 0]).assign(snapshot_frame=("snapshot", [0, 1, 2]))
+
+    def maps(every: bool) -> list[str]:
+        names = [drawing.name for drawing in figures._all(d, None, every)]
+        return [name for name in names if name.startswith("range_doppler")]
+
+    numbers = d.frame.values[:3]
+    assert maps(False) == [f"range_doppler_{numbers[1]:04d}"]
+    assert maps(True) == [f"range_doppler_{number:04d}" for number in numbers]
 
 
 def test_a_run_without_detections_maps_or_paths_still_makes_figures(tmp_path):
