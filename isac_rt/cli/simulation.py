@@ -378,7 +378,7 @@ def figures(
         typer.Option(metavar="DIR", help="Where they go; default DIR/figures_STYLE."),
     ] = None,
 ) -> None:
-    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style; the maps of
+    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style; maps of
     every snapshot."""
     from isac_rt.results.files import open_results
 
