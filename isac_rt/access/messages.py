@@ -93,8 +93,7 @@ class Message:
             + TERMINAL_BITS * len(self.terminals)
             + NUMBER_BITS * numbers
             + REPORT_BITS * len(self.reports)
-            + LOOK_BITS * len(self.looks)
-            + DETECTION_BITS * sum(map(len, self.looks))
+            + sum(_bits(look, len(look)) for look in self.looks)
         )
 
     def memory(self) -> list[Any]:
@@ -369,17 +368,18 @@ class Sightings:
         new = [
             look
             for key, (look, via) in self._looks.items()
-            if len(look) and listener not in (via, look.ends[1]) and key not in told
+            if listener not in (via, look.ends[1]) and key not in told
         ]
         new.sort(key=lambda look: (-look.time, look.origin))
-        room = ceil((bare.bits + LOOK_BITS + DETECTION_BITS) / capacity) * capacity - bare.bits
+        least = bare.bits + (_bits(new[0], min(1, len(new[0]))) if new else 0)
+        room = ceil(least / capacity) * capacity - bare.bits
         chosen, left = [], sum(map(len, new))
         for look in new:
-            count = min(len(look), (room - LOOK_BITS) // DETECTION_BITS)
-            if count <= 0:
+            count = min(len(look), (room - _bits(look, 0)) // DETECTION_BITS)
+            if count < min(1, len(look)):
                 break
             chosen.append(look.select(look.best(count)))
-            room -= LOOK_BITS + DETECTION_BITS * count
+            room -= _bits(look, count)
             left -= count
         self._told[listener] = (told | {look.key for look in new}) & self._looks.keys()
         return replace(bare, looks=chosen, left_out=left)
@@ -402,6 +402,11 @@ class Sightings:
         self._looks = {look.key: (look, via) for look, via in pairs}
         self._told = {k: {(t, o) for t, o in keys} for k, keys in memory["told"].items()}
         self.tracker.restore(memory["tracker"])
+
+
+def _bits(look: Look, detections: int) -> int:
+    """Of a look with so many of its detections."""
+    return LOOK_BITS + NUMBER_BITS * len(look.kept) + DETECTION_BITS * detections
 
 
 def _moved(state: np.ndarray, interval: float) -> np.ndarray:

@@ -212,4 +212,5 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
         found.snr[rows],
         tracks.confirmed[mine],
         (None,) * len(rows),
+        tuple(tracks.ids[~tracks.is_reference].tolist()),
     )

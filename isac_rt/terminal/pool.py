@@ -72,6 +72,7 @@ class Look:
     snr : (D,) linear
     sure : (D,) bool, whether its track is confirmed
     names : by which the terminal knows the bodies, None: by none
+    kept : numbers of all tracks that the receiver keeps
     """
 
     origin: str
@@ -85,6 +86,7 @@ class Look:
     snr: np.ndarray
     sure: np.ndarray
     names: tuple[Name | None, ...]
+    kept: tuple[int, ...]
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -116,14 +118,15 @@ class Look:
         """As plain numbers and arrays, for `of_memory`."""
         head = [self.origin, self.frame, self.time, self.clock_std, list(vars(self.own).values())]
         names = [None if name is None else list(name) for name in self.names]
-        return [*head, self.numbers, self.z, self.std, self.snr, self.sure, names]
+        return [*head, self.numbers, self.z, self.std, self.snr, self.sure, names, list(self.kept)]
 
     @classmethod
     def of_memory(cls, memory: Sequence[Any]) -> Look:
         """The look that gave a `memory`."""
-        origin, frame, time, clock, pose, numbers, z, std, snr, sure, names = memory
+        origin, frame, time, clock, pose, numbers, z, std, snr, sure, names, kept = memory
         named = tuple(None if name is None else Name(*name) for name in names)
-        return cls(origin, frame, time, Pose(*pose), clock, numbers, z, std, snr, sure, named)
+        tables = numbers, z, std, snr, sure
+        return cls(origin, frame, time, Pose(*pose), clock, *tables, named, tuple(kept))
 
 
 @dataclass(frozen=True)
@@ -352,8 +355,9 @@ class PooledTracker:
                 pool = self._update(pool, view, k, q)
             free = [q for q in free if q not in {q for _, q in pairs}]
         for q in free:
-            pool = self._born(pool, view, q)
-        return _named_apart(self._merged(pool))
+            if not self._strays(pool, look, q):
+                pool = self._born(pool, view, q)
+        return _named_apart(self._merged(_kept(pool, look)))
 
     def _costs(
         self, pool: Pool, view: _View, rows: Sequence[int], free: Sequence[int]
@@ -427,6 +431,13 @@ class PooledTracker:
             or (len(hits) >= lives.hits and len({*fed, look.origin}) > 1),
         )
 
+    def _strays(self, pool: Pool, look: Look, q: int) -> bool:
+        """Whether the track of a detection that no body explains fed one lately: it is an outlier,
+        and no body of its own unless this goes on."""
+        feeds = [body.fed.get(look.origin, (None, -np.inf)) for body in pool.bodies]
+        mine = [time for number, time in feeds if number == int(look.numbers[q])]
+        return any(look.time - time < self._lives.window for time in mine)
+
     def _born(self, pool: Pool, view: _View, q: int) -> Pool:
         """One more body, from a detection that no other explains; its position has the terminal's
         errors with the opposite sign."""
@@ -454,12 +465,12 @@ class PooledTracker:
         return Pool(pool.time, np.append(pool.mean, made.mean), P, (*pool.bodies, body))
 
     def _merged(self, pool: Pool) -> Pool:
-        """Two bodies in one place that no terminal follows apart are one: the surer stays."""
+        """Two bodies in one place that no receiver saw in one frame are one: the surer stays."""
         first, gone = self._first(pool, 0), set[int]()
         bodies = list(pool.bodies)
         for i in range(len(bodies)):
             for j in range(i):
-                if {i, j} & gone or set(bodies[i].fed) & set(bodies[j].fed):
+                if {i, j} & gone or _apart(bodies[i], bodies[j]):
                     continue
                 if not bodies[i].confirmed or not bodies[j].confirmed:
                     continue
@@ -557,6 +568,24 @@ def _cross(e: np.ndarray) -> np.ndarray:
     """(3, 3) matrix of the cross product with e from the left."""
     x, y, z = e
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _apart(a: Body, b: Body) -> bool:
+    """Whether a receiver saw both in one frame."""
+    return any(of[1] == b.fed[link][1] for link, of in a.fed.items() if link in b.fed)
+
+
+def _kept(pool: Pool, look: Look) -> Pool:
+    """Without the bodies that rest on nothing but tracks that the look's receiver has given up."""
+    bodies, gone = list(pool.bodies), set[int]()
+    for k, body in enumerate(bodies):
+        if body.fed.get(look.origin, (None, 0.0))[0] in (None, *look.kept):
+            continue
+        fed = {origin: of for origin, of in body.fed.items() if origin != look.origin}
+        bodies[k] = replace(body, fed=fed)
+        if not fed:
+            gone.add(k)
+    return replace(pool, bodies=tuple(bodies)).without(gone)
 
 
 def _named_apart(pool: Pool) -> Pool:

@@ -41,9 +41,9 @@ def test_nothing_else_of_a_run_depends_on_what_is_told(talked, pooled):
 
 def test_detections_are_heard_as_the_links_carry_them(pooled):
     """The AT sends what its tentative tracks took from the first data frame on: those of frame 1
-    leave with frame 2. A data frame has 886 bits: 64 + 136 for itself, 208 and 165 for each
-    detection, so that the two of a frame and one of another do not fit, but the newest two do. The
-    feedback has 1000. Planted bugs: what a pilot carries; bits of lost messages left out."""
+    leave with frame 2. A data frame has 886 bits: 64 + 136 for itself, 208, and for each of its two
+    tracks 16 and 165; the newest frame's fit and no other's. The feedback has 1000. Planted
+    bugs: what a pilot carries; bits of lost messages left out."""
     d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
     k = list(d.picture.values).index("PT")
     assert d.picture_room.values[:, k].tolist() == [0, 0] + [886] * 7
@@ -52,7 +52,7 @@ def test_detections_are_heard_as_the_links_carry_them(pooled):
     assert (d.picture_bits.values[:, k] <= 886).all()
     assert p["PT"]["bits"] == d.picture_bits.values[:, k].sum()
     assert p["PT"]["bits_room"] == 886 * 7
-    whole = d.picture_bits.values[3:, k] == 64 + 136 + 208 + 2 * 165
+    whole = d.picture_bits.values[3:, k] == 64 + 136 + 208 + 2 * (16 + 165)
     assert whole.sum() >= 4
     assert p["PT"]["left_out"] == d.picture_left_out.values[:, k].sum()
 

@@ -69,6 +69,7 @@ def look_at(rx, frame, errors, rng, sure=True, which=(0, 1)):
         np.array([100.0, 50.0])[rows],
         np.full(len(rows), sure),
         (None,) * len(rows),
+        (0, 1),
     )
     return look, None if rx == "A" else state + errors["A"][:6]
 
@@ -195,6 +196,36 @@ def test_a_body_ends_without_detections():
     pool.add(*look_at("A", 0, NONE, np.random.default_rng(1)))
     assert len(pool.at(0.35)) == 2
     assert len(pool.at(0.37)) == 0
+
+
+def test_a_body_ends_with_the_tracks_that_it_rests_on():
+    """A gives up its track 1: the body of both links stays with B's, and ends when B has given it
+    up too. Planted bug: a body that goes with the first of its tracks."""
+    rng = np.random.default_rng(8)
+    pool = tracker()
+    for rx in "AB":
+        pool.add(*look_at(rx, 0, NONE, rng))
+    look, sender = look_at("A", 1, NONE, rng, which=(0,))
+    pool.add(replace(look, kept=(0,)), sender)
+    members = [set(body.members) for body in pool.at(T)]
+    assert {Key("A->B", 1)} in members and len(members) == 2
+    look, sender = look_at("B", 2, NONE, rng, which=(0,))
+    pool.add(replace(look, kept=(0,)), sender)
+    assert [set(b.members) for b in pool.at(2 * T)] == [{Key("A->A", 0), Key("A->B", 0)}]
+
+
+def test_an_outlier_is_no_body_of_its_own():
+    """B's track has fed a body that A follows well; one detection of it lies 1.5 m off. A second
+    body appears only where the track stays there for longer than the window."""
+    rng = np.random.default_rng(8)
+    pool, counts = tracker(), []
+    for frame in range(12):
+        pool.add(*look_at("A", frame, NONE, rng, which=(0,)))
+        look, sender = look_at("B", frame, NONE, rng, which=(0,))
+        off = np.array([1.5, 0.0, 0.0, 0.0]) if frame >= 4 else np.zeros(4)
+        pool.add(replace(look, z=look.z + off), sender)
+        counts.append(len(pool.latest.bodies))
+    assert counts == [1] * 8 + [2] * 4
 
 
 def test_everyone_calls_a_body_by_the_earliest_name_that_was_told():
