@@ -142,7 +142,9 @@ def _stated(
     if not isinstance(found, np.ndarray) or found.size == 0:
         return described
     value = float(np.ravel(found)[0].real)
-    if found.size != 1 or not (math.isfinite(value) and value > 0):
+    if found.size != 1:
+        raise CaptureError(f"{file}: states {found.size} numbers for the {what}; state one")
+    if not (math.isfinite(value) and value > 0):
         raise CaptureError(f"{file}: the {what} is {value:g} {unit}, it must be above 0")
     if not least <= value <= most:
         raise CaptureError(
@@ -240,7 +242,8 @@ def _sigmf(file: Path, d: Description) -> Capture:
         return Capture(cube=read_sigmf(base), source={"file": file.name, "format": "sigmf"})
     if kind not in _SIGMF_TYPES:
         raise CaptureError(
-            f"{meta}: samples of type {kind} are not read; {', '.join(_SIGMF_TYPES)} are"
+            f"{meta}: samples of type {kind} are not read; r or c with f32, f64, i16, u16, i32 or "
+            "u32 and _le or _be are, such as ci16_le, and ri8, ru8, ci8, cu8"
         )
     content, dtype = _read(data), np.dtype(_SIGMF_TYPES[kind])
     if len(content) % dtype.itemsize:

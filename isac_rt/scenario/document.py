@@ -338,7 +338,11 @@ class Document:
         """All complaints of a validation, in the order of the tree."""
         lines: dict[Any, str] = {}
         for found in error.errors():
-            key: Key = tuple(part for part in found["loc"] if part != "[key]")
+            key: Key = tuple(
+                part
+                for part in found["loc"]
+                if part != "[key]" and not str(part).startswith("function-")
+            )
             if found["type"] == "inconsistent":
                 for problem in found["ctx"]["problems"]:
                     lines[key, problem] = self.complaint(problem, key)

@@ -259,10 +259,21 @@ def test_what_is_missing_or_no_number_is_said(tmp_path):
         ({"calibResult": {"Rx_fft": np.full((640, 4, 2), np.nan)}}, "5120 of 5120 numbers"),
         ({"params": {"Slope_MHzperus": -3.0}}, "the slope is -3 MHz/us"),
         ({"params": {"Slope_MHzperus": 1e300}}, r"slope is 1e\+300 MHz/us, between 1e-06 and"),
+        ({"params": {"Slope_MHzperus": [60.0, 61.0]}}, "states 2 numbers for the slope"),
         ({"params": {}}, "no slope is stated"),
         ({"calibResult": {"Rx_fft": np.ones((80, 2, 600))}}, "600 transmitters, at most 256"),
     ],
-    ids=["no spectra", "two axes", "zero", "nan", "slope", "steep", "no slope", "600 antennas"],
+    ids=[
+        "no spectra",
+        "two axes",
+        "zero",
+        "nan",
+        "slope",
+        "steep",
+        "two slopes",
+        "no slope",
+        "600 antennas",
+    ],
 )
 def test_bent_calibrations_are_refused(tmp_path, change, pattern):
     write_ti(tmp_path / "b.mat", channels()[0], 61.3, **change)
@@ -288,6 +299,7 @@ def test_a_description_that_contradicts_the_file_is_refused_with_both(tmp_path):
         ("chirps: [0, 0, 1]", r"send \[2, 1\] times in a loop"),
         ("axes: [loop, chirp]", "axes: must|axes = .*: must"),
         ("frame: 3", "there are frames 0 to 0"),
+        ("elements: {transmitters: [], receivers: [[0, 0]]}", r"elements\.transmitters"),
         ("slope_mhz_per_us: .nan", "slope_mhz_per_us"),
         ("slope: 3", "unknown key; did you mean loops|unknown key"),
     ],
