@@ -455,7 +455,8 @@ _UNITS = {"_dbm": " [dBm]", "_db": " [dB]", "_m": " [m]", "_s_per_m": " [S/m]"}
 def _title(key: str) -> str:
     """A key as a column title, its unit in brackets."""
     ending = next((e for e in sorted(_UNITS, key=len, reverse=True) if key.endswith(e)), "")
-    return key.removesuffix(ending).replace("_", " ").replace("snr", "SNR") + _UNITS.get(ending, "")
+    words = key.removesuffix(ending).replace("_", " ").replace("snr", "SNR")
+    return words[:1].upper() + words[1:] + _UNITS.get(ending, "")
 
 
 def _timing(seconds: Mapping[str, Any]) -> Table:

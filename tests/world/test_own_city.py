@@ -521,3 +521,27 @@ def test_cityjson_by_lines_and_one_bad_object(tmp_path):
     assert said(city, "1 of 4 objects left out", "vertex 99")
     assert city.place is not None
     assert city.place.crs == "EPSG:2056"
+
+
+@pytest.mark.parametrize(
+    ("said", "height"),
+    [
+        ({"height": -1}, 10.0),
+        ({"height": -9999.0, "num_floors": 5}, 15.0),
+        ({"GESAMTHOEHE": 13.5, "DACH_MAX": 421.5}, 13.5),
+        ({"b3_h_dak_70p": 420.1, "b3_h_maaiveld": 408.6}, 11.5),
+    ],
+)
+def test_heights_of_national_tables(tmp_path, said, height):
+    """A negative number is a table's way to say that it does not know; the Swiss and the Dutch
+    words for a building's height. Planted bugs: the whole file refused for a height of -1; the
+    roof's height over the sea."""
+    ring = [[7.1, 46.2], [7.1003, 46.2], [7.1003, 46.2002], [7.1, 46.2002], [7.1, 46.2]]
+    shape = {"type": "Polygon", "coordinates": [ring]}
+    feature = {"type": "Feature", "properties": said, "geometry": shape}
+    (tmp_path / "f.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": [feature]})
+    )
+    node = scenario.City.model_validate({"source": "footprints", "file": "f.geojson"})
+    low, high = load_city(node, tmp_path, 77e9, (0.0, 0.0, 0.0)).bounds()
+    assert high[2] - low[2] == pytest.approx(height)

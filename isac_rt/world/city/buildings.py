@@ -13,7 +13,7 @@ import shapely
 from pydantic_core import from_json
 
 from isac_rt import scenario
-from isac_rt.world.city.heights import parse_length
+from isac_rt.world.city.heights import parse_length, roof_over_ground
 from isac_rt.world.city.materials import CityError
 
 Tags = Mapping[str, Any]
@@ -26,6 +26,8 @@ PLATE_M = 0.3
 """Thickness of a roof without walls."""
 MOST_COVERED = 0.5
 """Building parts replace an outline of which they cover at least this share; else both stand."""
+_HEIGHTS = ("height", "building:height", "est_height", "measuredHeight", "gesamthoehe")
+"""Keys of heights beside the scenario's own: OpenStreetMap's, CityGML's, swissBUILDINGS3D's."""
 _NO = ("no", "none", "false", "0", "")
 _HSTORE = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
@@ -113,10 +115,14 @@ class _Heights:
     wrong: list[str] = field(default_factory=list)
 
     def metres(self, tags: Tags, what: str, *keys: str) -> float | None:
-        """Of the first key that holds a length; zero is none."""
+        """Of the first key that holds a length; zero is none, and a negative number is how tables
+        write that it is not known."""
         for key in keys:
+            value = _value(tags, key)
+            if isinstance(value, int | float) and value < 0:
+                continue
             try:
-                found = parse_length(_value(tags, key))
+                found = parse_length(value)
             except ValueError as problem:
                 self.wrong.append(f"{what}: {key} {problem}")
                 continue
@@ -133,7 +139,7 @@ class _Heights:
     def outline(self, feature: Feature, tags: Tags) -> Outline:
         """A building as its tags describe it."""
         what, own = feature.what, self.city.height_property
-        keys = dict.fromkeys((own, "height", "building:height", "est_height", "measuredHeight"))
+        keys = dict.fromkeys((own, *_HEIGHTS))
         height = self.metres(tags, what, *keys)
         roof = self.metres(tags, what, "roof:height", "roof_height")
         if roof is None:
@@ -141,6 +147,8 @@ class _Heights:
         if height is None:
             storeys = self.levels(tags, what, "building:levels", "levels", "num_floors")
             height = storeys if storeys is None else storeys + (roof or 0.0)
+        if height is None:
+            height = roof_over_ground(tags)
         above = self.metres(tags, what, "min_height", "building:min_height")
         if above is None:
             above = self.levels(tags, what, "building:min_level", "min_floor") or 0.0

@@ -18,7 +18,7 @@ from isac_rt import scenario
 from isac_rt.world.city.buildings import Outline
 from isac_rt.world.city.extrude import check_corners, triangulate
 from isac_rt.world.city.files import Items, Part, parsed
-from isac_rt.world.city.heights import parse_length
+from isac_rt.world.city.heights import parse_length, roof_over_ground
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, check_coordinates
 
@@ -457,16 +457,7 @@ def _height(attributes: Mapping[str, Any], key: str) -> float | None:
     ValueError  If it is no height.
     """
     stated = attributes.get(key, attributes.get("measuredHeight"))
-    if stated is not None:
-        return parse_length(stated)
-    ground = attributes.get("b3_h_maaiveld")
-    roof = next((v for name in _ROOFS if (v := attributes.get(name)) is not None), None)
-    if not isinstance(roof, int | float) or not isinstance(ground, int | float):
-        return None
-    return float(roof - ground) if roof > ground else None
-
-
-_ROOFS = ("b3_h_dak_70p", "b3_h_dak_50p", "b3_h_dak_max")
+    return roof_over_ground(attributes) if stated is None else parse_length(stated)
 
 
 _NO_FACE = np.zeros((0, 3), dtype=np.int64)

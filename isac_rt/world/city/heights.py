@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 HIGHEST_M = 1500.0
@@ -66,3 +67,22 @@ def parse_length(value: Any) -> float | None:
     if not 0 <= number <= HIGHEST_M:
         raise ValueError(f"{str(value)[:_LONGEST]!r} is no height of a building in metres")
     return float(number)
+
+
+def roof_over_ground(attributes: Mapping[str, Any]) -> float | None:
+    """Height of a building of the Dutch 3D BAG [m], which states roof and ground over the sea; None
+    where it does not.
+
+    Examples
+    --------
+    >>> roof_over_ground({"b3_h_dak_70p": 7.5, "b3_h_maaiveld": -0.5})
+    8.0
+    """
+    ground = attributes.get("b3_h_maaiveld")
+    roof = next((v for name in _ROOFS if (v := attributes.get(name)) is not None), None)
+    if not isinstance(roof, int | float) or not isinstance(ground, int | float):
+        return None
+    return float(roof - ground) if roof > ground else None
+
+
+_ROOFS = ("b3_h_dak_70p", "b3_h_dak_50p", "b3_h_dak_max")
