@@ -370,7 +370,7 @@ class Belief(Node):
     """Turn of the attitude that each terminal believes to have, about the axes east, north and up
     [deg]. By default none."""
     level_db: Decibels = 0.0
-    """Error of the clutter's level that active terminals expect [dB]. By default none."""
+    """Error of the clutter's level that terminals expect [dB]. By default none."""
     mesh_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     """Standard deviation of the error of each face of the terminals' mesh along its normal [m], for
     the clutter that they expect. By default none."""

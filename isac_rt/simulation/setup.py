@@ -292,6 +292,12 @@ class Setup:
             rotation=turn @ pose.rotation,
         )
 
+    @property
+    def mistakes(self) -> Mistakes:
+        """What terminals believe wrongly of the clutter beside their pose."""
+        belief = self.scenario.belief
+        return Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
+
     @cached_property
     def coverage(self) -> Coverage:
         """What the links can see, and what of the swarm they cannot."""
@@ -360,13 +366,13 @@ class Setup:
     def _expected_clutter(self, frame: int, active: list[str]) -> dict[str, ExpectedClutter]:
         if self.expectation is None:
             return {}
-        belief = self.scenario.belief
-        wrong = Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
         out = {}
         for name in active:
             when = self.timetable.epoch(frame, name)
             pose = self.believed(self.swarm.trajectories[name].pose(when))
-            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude, wrong)
+            out[name] = self.expectation.clutter(
+                name, pose, when, self.plan.amplitude, self.mistakes
+            )
         return out
 
 

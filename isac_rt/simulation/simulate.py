@@ -70,7 +70,8 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
         return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
     clutter = None
     if s.receivers.passive_detector == "beams" and setup.expectation is not None:
-        clutter = partial(setup.expectation.between, link, setup.plan.amplitude)
+        known = link, setup.plan.amplitude
+        clutter = partial(setup.expectation.between, *known, mistakes=setup.mistakes)
     return PassiveTerminal(
         setup.waveform,
         setup.antennas,

@@ -87,9 +87,7 @@ class MeshExpectation:
             velocity=pose.velocity + np.array(wrong.velocity),
         )
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
-        error = wrong.mesh_std * generator(wrong.seed, "mesh error").standard_normal(
-            self._city.num_faces
-        )
+        error = self._errors(wrong)
         state = LinkState(Link(name, name), time, local, local)
         once = self._field.seen(state)
         parts = [self._expected(once, once.departure, once.arrival, error, amplitude, state)]
@@ -103,8 +101,18 @@ class MeshExpectation:
             parts.append(self._expected(s, there, back, error, amplitude, state, moved))
         return ExpectedClutter.joined(parts)
 
+    def _errors(self, wrong: Mistakes) -> np.ndarray:
+        """Of each face along its normal [m]."""
+        drawn = generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
+        return wrong.mesh_std * drawn
+
     def between(
-        self, link: Link, amplitude: float, sender: np.ndarray, own: Pose
+        self,
+        link: Link,
+        amplitude: float,
+        sender: np.ndarray,
+        own: Pose,
+        mistakes: Mistakes | None = None,
     ) -> ExpectedClutter:
         """What a passive terminal hears of the mesh by one bounce.
 
@@ -120,15 +128,24 @@ class MeshExpectation:
         -------
         clutter : departures in the axes of the terminal's own body
         """
-        end = replace(own, position=own.position - self._city.origin)
+        wrong = mistakes or Mistakes()
+        end = replace(
+            own,
+            position=own.position - self._city.origin,
+            velocity=own.velocity + np.array(wrong.velocity),
+        )
+        amplitude = amplitude * 10 ** (wrong.level_db / 20)
         place, velocity = sender[:3] - self._city.origin, sender[3:]
         start = replace(end, position=place, velocity=velocity, acceleration=np.zeros(3))
         seen = self._field.from_places(LinkState(link, 0.0, start, end))
         heard = self._antennas.element_gain(end.to_body(seen.arrival))
         power = (amplitude * seen.magnitude) ** 2 * self._antennas.gain * heard
         some = power > 0
+        face = self._field.cells.face[seen.index]
+        slopes = (self._city.normals[face] * (seen.departure + seen.arrival)).sum(axis=1)
+        length = seen.length + self._errors(wrong)[face] * slopes
         return ExpectedClutter(
-            seen.length[some] / SPEED_OF_LIGHT,
+            length[some] / SPEED_OF_LIGHT,
             seen.rate[some] / SPEED_OF_LIGHT,
             power[some],
             end.to_body(seen.departure)[some],
@@ -177,7 +194,12 @@ class ClutterExpectation(Protocol):
         ...
 
     def between(
-        self, link: Link, amplitude: float, sender: np.ndarray, own: Pose
+        self,
+        link: Link,
+        amplitude: float,
+        sender: np.ndarray,
+        own: Pose,
+        mistakes: Mistakes | None = None,
     ) -> ExpectedClutter:
         """Clutter of a link from a transmitter in a state (6,) to a passive terminal at a pose, in
         world coordinates."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.frame.antennas import unit_vector
+from isac_rt.frame.antennas import Antennas, unit_vector
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose
@@ -44,6 +45,12 @@ class Standing:
         by = [step * turn if step else 0.0 for step in steps]
         self._aliases = np.array([(x, z) for x in by for z in by])
 
+    @classmethod
+    def of(cls, antennas: Antennas, waveform: Waveform, passes: int) -> Standing:
+        """For the array of an active terminal (passes = 2) or a passive one."""
+        step = antennas.step(passes)
+        return cls(waveform.wavelength / step if step else np.inf)
+
     def memory(self) -> np.ndarray:
         """(n, 4) times and places, for `restore`."""
         return self._seen
@@ -52,7 +59,14 @@ class Standing:
         """Go on from a `memory`."""
         self._seen = memory
 
-    def look(self, d: Detections, own: Pose, time: float, period: float) -> np.ndarray:
+    def look(
+        self,
+        d: Detections,
+        own: Pose,
+        time: float,
+        period: float,
+        sender: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Take down a frame's echoes that stand still, of those that may start a track. What would
         stand still in a direction that it may be an alias of stands there.
 
@@ -60,6 +74,7 @@ class Standing:
         ----------
         time : of the frame [s]
         period : span of unambiguous velocities [m/s]
+        sender : at a passive terminal (6,) of its transmitter, world coordinates
 
         Returns
         -------
@@ -68,13 +83,14 @@ class Standing:
         u = d.direction[:, None] + self._aliases
         real = (u**2).sum(axis=-1) < 1
         towards = own.to_world(unit_vector(np.where(real[..., None], u, 0.0)))
-        off = d.velocity[:, None] + towards @ own.velocity
+        place, rate, speed = _still(d.range, towards, own, sender)
+        off = d.velocity[:, None] - rate
         off = np.where(real, np.abs(off - period * np.round(off / period)), np.inf)
         best = off.argmin(axis=1)  # the direction in which it would stand still
         each = np.arange(len(d))
-        across = np.linalg.norm(own.velocity) * np.linalg.norm(d.std[:, 2:], axis=1)
+        across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
-        place = own.position + d.range[:, None] * towards[each, best]
+        place = place[each, best]
         new = np.column_stack([np.full(len(d), time), place])[still & d.starts]
         self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
         return still & self.crowded(place)
@@ -84,8 +100,31 @@ class Standing:
         apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:], axis=-1)
         return ((apart > BESIDE_M[0]) & (apart < BESIDE_M[1])).sum(axis=1) >= CROWD
 
+    def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
+        """Tracks but those that stand still within a crowd, and those among `new` that an echo (Q,)
+        of one confirms: from beyond the view they seem to move."""
+        part = {t.id for t in tracks if t.detection >= 0 and crowd[t.detection]} & new
+        return [t for t in tracks if not (self.holds(t) or (t.confirmed and t.id in part))]
+
     def holds(self, track: Track) -> bool:
         """Whether a track stands still, as far as is known of it, within a crowd."""
         velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
         d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
         return bool(d2 < STANDS and self.crowded(track.state.mean[None, :3])[0])
+
+
+def _still(
+    range: np.ndarray, towards: np.ndarray, own: Pose, sender: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where echoes (Q,) are if they come from directions (Q, A, 3), the rate (Q, A) at which they
+    recede if they stand still there, and how fast the ends fly."""
+    speed = float(np.linalg.norm(own.velocity))
+    rate = -(towards @ own.velocity)
+    if sender is None:
+        return own.position + range[:, None, None] * towards, rate, speed
+    span, r = sender[:3] - own.position, range[:, None]
+    far = (r**2 - span @ span) / (2 * np.maximum(r - towards @ span, 1e-9))
+    place = own.position + far[..., None] * towards
+    away = place - sender[:3]
+    rate = rate - (away @ sender[3:]) / np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
+    return place, rate, speed + float(np.linalg.norm(sender[3:]))

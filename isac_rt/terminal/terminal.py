@@ -134,8 +134,7 @@ class ActiveTerminal:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
             self._doubts = Doubts(walls, antennas, waveform)
         self.calibration = calibration_of(receivers, waveform, antennas, 2)
-        step = antennas.step(2)
-        self._standing = Standing(waveform.wavelength / step if step else np.inf)
+        self._standing = Standing.of(antennas, waveform, 2)
         self._correction: Correction | None = None
 
     def step(
@@ -170,8 +169,7 @@ class ActiveTerminal:
             found = replace(found, starts=found.starts & ~crowd)
             self.tracker.update(found, own_pose)
             self._doubts.remove_ghosts(self.tracker, new, own_pose)
-            kept = [t for t in self.tracker.tracks if not self._standing.holds(t)]
-            self.tracker.tracks = kept
+            self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
             seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
@@ -266,6 +264,7 @@ class PassiveTerminal:
         self._doubts = None
         if tracking.births == "unexplained" and self._surroundings.walls is not None:
             self._doubts = Doubts(self._surroundings.walls, antennas, waveform, passes=1)
+        self._standing = Standing.of(antennas, waveform, 1)
         self.tracker = Tracker(tracking, self._period)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
@@ -392,8 +391,11 @@ class PassiveTerminal:
             detections = replace(detections, starts=np.zeros(len(detections), bool))
         new = {track.id for track in self.tracker.tracks if not track.confirmed}
         allowed = self._doubts.births(detections, own, sender.mean[:6])
+        crowd = self._standing.look(allowed, own, self._time, self._period, sender.mean[:6])
+        allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
         self._doubts.remove_ghosts(self.tracker, new, own, reference)
+        self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
 
     @property
     def _placed(self) -> bool:
@@ -424,6 +426,7 @@ class PassiveTerminal:
             "slips_repaired": self.slips_repaired,
             "ends": list(self._ends),
             "profile": self._profile,
+            "standing": self._standing.memory(),
             "calibration": None if self.calibration is None else self.calibration.memory(),
             "retrospect": None if self._retrospect is None else self._retrospect.memory(),
         }
@@ -431,6 +434,7 @@ class PassiveTerminal:
     def restore(self, memory: dict[str, Any]) -> None:
         """Go on from a `memory`."""
         self.tracker.restore(memory["tracker"])
+        self._standing.restore(memory["standing"])
         reference = memory["reference"]
         self.reference = None if reference is None else Track.of_memory(reference)
         self._time, self.state = memory["time"], TerminalState(memory["state"])

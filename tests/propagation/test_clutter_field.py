@@ -666,3 +666,13 @@ def test_expected_bistatic_clutter_is_that_of_the_field_between_two_terminals():
     assert found.delay_rate * C == pytest.approx(rate, rel=0, abs=1e-9)
     truth = amplitude**2 * lambertian_wall(there, at, 0.43)
     assert abs(10 * np.log10(found.power.sum() / truth)) < 0.05
+    from isac_rt.terminal.expectation import Mistakes
+
+    # a terminal that is wrong: 3 dB, its own velocity, and either triangle of the wall moved
+    mistakes = Mistakes((0.3, 0.0, 0.0), 3.0, 0.1)
+    wrong = copy.between(Link("A", "B"), amplitude, sender, pose, mistakes)
+    assert wrong.power == pytest.approx(10**0.3 * found.power)
+    slower = (wrong.delay_rate - found.delay_rate) * C
+    assert slower == pytest.approx(-0.3 * home[:, 0] / far[1], rel=0, abs=1e-9)
+    moved = (wrong.delay - found.delay) * C / (out[:, 1] / far[0] + home[:, 1] / far[1])
+    assert np.unique(moved.round(9)).size == 2 and 0 < np.abs(moved).max() < 0.4

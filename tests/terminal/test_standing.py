@@ -114,3 +114,37 @@ def test_a_track_that_stands_still_within_a_crowd(place, velocity, std, expected
     P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 10.0)
     assert standing.holds(track) is expected
+
+
+def test_a_wall_stands_still_for_a_passive_terminal():
+    """Way lengths and their rates by hand, of a transmitter that flies elsewhere to a terminal at
+    `own`, over the places of a wall and over a UAV among them that flies off at 5 m/s. Planted
+    bugs: places at the length of the whole way; the transmitter's own motion left out."""
+    sender = np.array([24.0, 12.0, 9.0, -2.0, 7.0, 1.0])
+    places = np.array([*WALL, (0.0, 29.0, 6.0)])
+    moving = np.array([(0.0, 0.0, 0.0)] * 5 + [(0.0, 5.0, 0.0)])
+    back, there = places - own(0.0).position, places - sender[:3]
+    far = np.linalg.norm(back, axis=1), np.linalg.norm(there, axis=1)
+    rate = (back * (moving - FLIGHT)).sum(1) / far[0] + (there * (moving - sender[3:])).sum(
+        1
+    ) / far[1]
+    d = seen(0.0, places)
+    d = Detections(**{**vars(d), "range": far[0] + far[1], "velocity": rate})
+    standing = Standing(np.inf)
+    assert standing.look(d, own(0.0), 0.0, PERIOD, sender).tolist() == [True] * 5 + [False]
+    np.testing.assert_allclose(standing.memory()[:, 1:], WALL, atol=1e-9)
+
+
+def test_a_track_that_an_echo_of_a_crowd_confirms_is_none():
+    """Of three tracks that seem to fly, the new one that such an echo confirms goes; one that was
+    confirmed before, and one that another echo confirms, stay. Planted bug: all of the crowd go."""
+
+    def track(number: int, detection: int, confirmed: bool = True) -> Track:
+        mean, flies = np.zeros(9), np.array([0.0, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        return Track(
+            number, Gaussian(mean + flies, np.eye(9)), 9.0, confirmed=confirmed, detection=detection
+        )
+
+    tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, confirmed=False), track(5, -1)]
+    kept = Standing(1.71).without(tracks, {1, 3, 4, 5}, np.array([True, False]))
+    assert [t.id for t in kept] == [2, 3, 4, 5]
