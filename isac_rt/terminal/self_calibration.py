@@ -81,12 +81,13 @@ class Sight(NamedTuple):
 
 
 class Change(NamedTuple):
-    """How much less paths are seen late [s], with their delay's rate, and off (2,) in u_x and u_z
-    than before a frame."""
+    """How much less paths are seen late [s], with their delay's rate, and off in u_x and u_z (2,)
+    than before a frame; `spread` (2,) is what an estimate of direction may differ from that."""
 
     delay: float
     rate: float
     direction: np.ndarray
+    spread: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -199,12 +200,12 @@ class SelfCalibration:
             self.learn(look, sight)
         if neighbours is not None:
             self._learn_of_neighbours(neighbours)
-        phases = self._elements @ (self.gains.value[1] - before)
+        change = self.gains.value[1] - before
         _, across = self._steering(Sight(np.zeros(2), np.inf, FREE))
-        lines = np.hstack([self._amplitudes, across])
-        turn = np.linalg.lstsq(lines, phases, rcond=None)[0][-2:]
+        lines = np.linalg.pinv(np.hstack([self._amplitudes, across]))[-2:] @ self._elements
         delay, rate = self.clock - clock
-        return Change(delay, rate, turn)
+        spread = np.sqrt(np.mean(change**2) * (lines**2).sum(axis=1))
+        return Change(delay, rate, lines @ change, spread)
 
     def learn(self, look: Look, sight: Sight) -> None:
         """Take in a look at corrected samples."""

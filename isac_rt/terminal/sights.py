@@ -90,4 +90,6 @@ def seen_after(state: Gaussian, own: Pose, change: Change, passes: int) -> Gauss
     mean, metres = state.mean.copy(), SPEED_OF_LIGHT / passes
     mean[:3] = own.position + towards * (distance - change.delay * metres)
     mean[3:6] -= towards * (change.rate * metres)
-    return Gaussian(mean, state.covariance)
+    covariance, axes = state.covariance.copy(), own.rotation[:, [0, 2]] * distance
+    covariance[:3, :3] += (axes * change.spread**2) @ axes.T
+    return Gaussian(mean, covariance)

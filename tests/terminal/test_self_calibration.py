@@ -17,7 +17,9 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter, Look
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.self_calibration import FREE, SelfCalibration, Sight
+from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.terminal.sights import seen_after
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.world.swarm import Pose
 
@@ -242,6 +244,21 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
     assert tracks.range[0] == pytest.approx(20.0, abs=0.05)
     assert tracks.velocity[0] == pytest.approx(0.0, abs=0.1)
     assert reception.detections.direction[0] == pytest.approx(u, abs=2e-3)
+
+
+def test_bodies_are_seen_elsewhere_once_the_hardware_is_known_better():
+    """Twenty metres ahead, 0.01 to the right and 2 ns later than it is, of an echo 0.3 m; the
+    direction is known to 0.02 and 0.03 besides. Planted bugs: the shift's own deviation left out,
+    so that a turn of the picture is taken for a motion; one way taken for two."""
+    turned = replace(OWN, rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+    mean = np.concatenate([turned.to_world(place(20.3, (0.11, -0.2))), np.zeros(6)])
+    change = Change(2e-9, 1e-9, np.array([0.01, 0.0]), np.array([0.02, 0.03]))
+    after = seen_after(Gaussian(mean, np.zeros((9, 9))), turned, change, 2)
+    expected = turned.to_world(place(20.3 - C * 1e-9, (0.10, -0.2)))
+    assert after.mean[:3] == pytest.approx(expected, abs=1e-6)
+    assert np.linalg.norm(after.mean[3:6]) == pytest.approx(C * 0.5e-9)
+    inside = turned.rotation.T @ after.covariance[:3, :3] @ turned.rotation
+    assert np.sqrt(np.diag(inside)) == pytest.approx([20.3 * 0.02, 0, 20.3 * 0.03])
 
 
 def test_a_kept_state_goes_on_to_the_same_bits():
