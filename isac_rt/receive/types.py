@@ -213,6 +213,8 @@ class Reception:
         one (`isac_rt.access.fall_back`). None elsewhere
     correction : what the frame's clutter says of the own velocity and of the level that the
         terminal expects; None where a detector does not ask
+    placed : whether what it shows can be placed: not where data were read over a path that nothing
+        explains
     looks : what strong paths show of the channels, at a PT its reference alone; empty where
         `receivers.self_calibration` is none
     neighbours : what clutter shows of the channels; None where nobody asks, or the detector does
@@ -236,6 +238,7 @@ class Reception:
     correction: Correction | None = None
     looks: tuple[Look, ...] = ()
     neighbours: Neighbours | None = None
+    placed: bool = True
 
     @classmethod
     def undecoded(
@@ -288,9 +291,12 @@ class Reception:
             line_of_sight=False,
         )
 
-    def data_only(self) -> Reception:
-        """The same frame read over a path that is not known: what it shows has no place yet."""
-        return replace(self, detections=no_detections(), line_of_sight=False)
+    def without_sight(self, named: bool) -> Reception:
+        """The same frame read over another path than the line of sight; unless that is `named`,
+        what it shows has no place."""
+        d = self.detections
+        found = replace(d, is_reference=np.zeros(len(d), bool)) if named else no_detections()
+        return replace(self, detections=found, line_of_sight=False, placed=named)
 
     def __repr__(self) -> str:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"

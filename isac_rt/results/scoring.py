@@ -110,7 +110,7 @@ class Scorer:
         if self._passes == 1:
             symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
         read = symbols.delay_errors <= MISREAD * symbols.delay_total
-        read &= symbols.frames == 0 or reception.line_of_sight
+        read &= symbols.frames == 0 or reception.placed
         chances = self._chances(view, paths, sees)
         loss = np.full(len(hit), -1, np.int8)
         for i, chance in chances.items():

@@ -48,8 +48,9 @@ class Receivers(Node):
     link_acquisition: Literal["pilots", "blind"] = "pilots"
     """From which frames a passive terminal learns over which path it reads data. `pilots`, the
     default and the paper's: its line of sight in frames without data. `blind`: any path, from data
-    frames too; those that wait for it are read some frames late. The terminal senses only with its
-    line of sight."""
+    frames too; those that wait for it are read some frames late. The terminal senses with its
+    line of sight, or over walls that the mesh explains where the transmitter says where it is
+    (`cooperation`)."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""

@@ -133,11 +133,18 @@ class _Observer:
             assert isinstance(cube, IFCube)  # profiles are for active terminals only
             modulated = timetable.modulated(frame.number)
             reception, tracks = self.terminal.step(
-                cube, own, when, modulated, mates=mates, maps=maps
+                cube, own, when, modulated, mates=mates, sender=self._told(when), maps=maps
             )
             state, late = int(self.terminal.state), self.terminal.late
         self.seconds += time.thread_time() - begun
         return Heard(reception, tracks, state, late)
+
+    def _told(self, when: float) -> Pose | None:
+        """Where the link's transmitter says with its data that it is; None: it says nothing."""
+        s = self.setup
+        if s.scenario.cooperation == "none":
+            return None
+        return s.believed(s.swarm.trajectories[self.link.tx].pose(when))
 
     def _mates(self, frame: int, when: float) -> list[Pose]:
         """Where the other end of the link, or at an active terminal those of all links, say that

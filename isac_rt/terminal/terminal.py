@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import gammainccinv
 
 from isac_rt.frame.antennas import Antennas
@@ -31,13 +32,15 @@ from isac_rt.terminal.filter import (
     Gaussian,
     birth,
     expected,
+    measure,
     measurement_covariance,
     predict,
     update,
     wrapped,
 )
+from isac_rt.terminal.fusion import of_itself
 from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.images import WELL_INSIDE, Doubts
+from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
 from isac_rt.terminal.retrospect import Late, Retrospect
 from isac_rt.terminal.self_calibration import calibration_of
 from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
@@ -70,6 +73,8 @@ MOTION_BINS = 1.0
 """Doppler bins to which the transmitter's motion must be known before the mesh explains clutter."""
 PATIENCE = 25
 """So many frames of disbelief in a row, and the next pilot is right and the track wrong."""
+NAMED_CELLS = 1.5
+"""Cells of length and of its rate within which a path is one that the city explains."""
 REFERENCE_STD_CELLS = 0.02
 """Floor of the reference's range and velocity deviations in cells, for what other paths beside it
 leave."""
@@ -273,6 +278,7 @@ class PassiveTerminal:
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
         self._profile: np.ndarray | None = None
         self._clutter: ExpectedClutter | None = None
+        self._teller: Track | None = None
         self._retrospect: Retrospect | None = None
         if receivers.link_acquisition == "blind":
             self._retrospect = Retrospect(self._receiver, waveform)
@@ -290,10 +296,12 @@ class PassiveTerminal:
         modulated: bool,
         *,
         mates: Sequence[Pose] = (),
+        sender: Pose | None = None,
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `modulated` is public, `mates` is
-        where the transmitter says that it is."""
+        where the transmitter says that it is, `sender` where its data do, which count once a frame
+        was read."""
         if self.calibration is not None:
             cube = self.calibration.correct(cube, time)
         if self.reference is not None:
@@ -304,6 +312,7 @@ class PassiveTerminal:
             self.reference.detection = -1
         self._time = time
         self.tracker.predict(time)
+        self._teller = self._told(sender)
         self._clutter = self._expected_clutter(own_pose)
         reception = self._hear(cube, self._expect(own_pose) if modulated else None, modulated, maps)
         if reception.decoded:
@@ -317,7 +326,7 @@ class PassiveTerminal:
                 self._retrospect,
                 cube,
                 reception,
-                time,
+                own_pose,
                 refused=refused,
                 anchored=anchored,
                 maps=maps,
@@ -327,8 +336,10 @@ class PassiveTerminal:
         if reception.line_of_sight and (believed or not modulated):
             heard = self._late(reception.detections, 1)
             self._profile = self._receiver.learn(cube, heard, reception)
-        if self.reference is not None and reception.line_of_sight:
-            self._track(in_plane(reception.detections), own_pose, self.reference)
+        sight = self.reference if reception.line_of_sight else self._teller
+        seen = reception.line_of_sight or reception.decoded
+        if sight is not None and seen and reception.placed:
+            self._track(in_plane(reception.detections), own_pose, sight)
         tracks = self.tracker.snapshot(own_pose, self.reference)
         self._calibrate(reception, own_pose, mates)
         return reception, tracks
@@ -348,7 +359,7 @@ class PassiveTerminal:
         kept: Retrospect,
         cube: IFCube,
         reception: Reception,
-        time: float,
+        own: Pose,
         *,
         refused: bool,
         anchored: bool,
@@ -356,7 +367,7 @@ class PassiveTerminal:
     ) -> tuple[Reception, bool]:
         """A data frame that the reference does not read, read over any path where one is known, and
         whether it shows the line of sight as a frame without data does (`anchored`)."""
-        kept.late = ()
+        kept.late, time = (), self._time
         if anchored:
             kept.look(cube, time)
             if refused:
@@ -372,7 +383,30 @@ class PassiveTerminal:
         if out.line_of_sight and self._plausible(out) and self._well_inside(out):
             kept.forget()
             return out, True
-        return out.data_only(), False
+        return out.without_sight(self._named(kept, own)), False
+
+    def _told(self, sender: Pose | None) -> Track | None:
+        """The transmitter where its data say that it is; None unless they are read over another
+        path than the line of sight."""
+        if sender is None or self._retrospect is None or self._retrospect.path is None:
+            return None
+        told, spread = of_itself(sender), np.full(3, self._acceleration)
+        mean = np.concatenate([told.mean, np.zeros(3)])
+        covariance = block_diag(told.covariance, np.diag(spread**2))
+        return Track(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=self._time)
+
+    def _named(self, kept: Retrospect, own: Pose) -> bool:
+        """Whether the path that is read over is as long, and changes as fast, as a way from the
+        transmitter over the city's walls or about an edge."""
+        walls = self._surroundings.walls
+        if walls is None or self._teller is None or kept.path is None:
+            return False
+        there = self._teller.state.mean
+        length = kept.path.mean[:2] - SPEED_OF_LIGHT * np.array(self._clock)
+        straight = measure(there, own)[None, :2]
+        ways = sender_images(there[:6], own, walls, float(length[0]) + 1)
+        apart = np.abs(np.concatenate([straight, ways]) - length)
+        return bool((apart < NAMED_CELLS * self._cells).all(axis=1).any())
 
     def _well_inside(self, reception: Reception) -> bool:
         """Whether the reference is not so near the edge of the view that it may have come from the
@@ -387,7 +421,7 @@ class PassiveTerminal:
         if self._doubts is None:
             self.tracker.update(detections, own, sender)
             return
-        if self._surroundings.clutter is not None and not self._placed:
+        if self._surroundings.clutter is not None and not self._placed(sender):
             detections = replace(detections, starts=np.zeros(len(detections), bool))
         new = {track.id for track in self.tracker.tracks if not track.confirmed}
         allowed = self._doubts.births(detections, own, sender.mean[:6])
@@ -397,22 +431,19 @@ class PassiveTerminal:
         self._doubts.remove_ghosts(self.tracker, new, own, reference)
         self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
 
-    @property
-    def _placed(self) -> bool:
+    def _placed(self, sender: Gaussian) -> bool:
         """Whether the transmitter's motion is known to a Doppler bin: what is expected of the city
         before that explains nothing."""
-        if self.reference is None:
-            return False
-        spread = np.linalg.eigvalsh(self.reference.state.covariance[3:6, 3:6])[-1]
+        spread = np.linalg.eigvalsh(sender.covariance[3:6, 3:6])[-1]
         return bool(np.sqrt(spread) < MOTION_BINS * self._cells[1])
 
     def _expected_clutter(self, own: Pose) -> ExpectedClutter | None:
         """What the mesh returns of the transmitter as it is tracked; None where neither is
         known."""
-        known = self._surroundings.clutter
-        if known is None or self.reference is None or not self._placed:
+        known, sender = self._surroundings.clutter, self._teller or self.reference
+        if known is None or sender is None or not self._placed(sender.state):
             return None
-        clutter = known(self.reference.state.mean[:6], own)
+        clutter = known(sender.state.mean[:6], own)
         delay, rate = self._clock
         return replace(clutter, delay=clutter.delay + delay, delay_rate=clutter.delay_rate + rate)
 
