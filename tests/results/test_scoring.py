@@ -221,7 +221,7 @@ def test_what_became_of_a_uav_at_the_active_terminal(name):
         ([BESIDE], {}, Loss.FOUND),
         ([], {}, Loss.NOT_READ),
         ([], read(DATA), Loss.OTHER),
-        ([], read(DATA) | {"line_of_sight": False}, Loss.NOT_READ),
+        ([], read(DATA) | {"placed": False}, Loss.NOT_READ),
         ([], read(DATA, 0.6), Loss.NOT_READ),
         ([], read(DATA, 0.4), Loss.OTHER),
         ([BESIDE], read(DATA, 0.6), Loss.FOUND),

@@ -1,5 +1,5 @@
-"""A passive terminal that reads data over a wall, and senses with them where the city's mesh and what
-the transmitter says of its place explain that path."""
+"""A passive terminal that reads data over a wall, and senses with them where the city's mesh and
+what the transmitter says of its place explain that path."""
 
 from __future__ import annotations
 
