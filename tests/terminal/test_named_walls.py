@@ -17,9 +17,9 @@ from isac_rt.world.swarm import Pose
 W = Waveform(num_samples=256, num_chirps=48)
 INTERVAL = 0.0041
 OWN = pose([1.7, -3.1, 4.2], [1.0, 0.3, 0.0])
-SENDER = ORIGIN + [3.7, 8.9, 2.2]
-TARGET = ORIGIN + [5.9, 1.4, 5.1]
-IMAGE = SENDER + [2 * (11.3 - 3.7), 0.0, 0.0]
+SENDER = ORIGIN + np.array([3.7, 8.9, 2.2])
+TARGET = ORIGIN + np.array([5.9, 1.4, 5.1])
+IMAGE = SENDER + np.array([2 * (11.3 - 3.7), 0.0, 0.0])
 """The transmitter flies as the terminal does, so that its image comes nearer by twice the wall's
 speed."""
 
