@@ -3,7 +3,9 @@ table."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from isac_rt.studies.paper.city_flights import (
     repeated,
     seeds_wanted,
 )
-from isac_rt.sweep.execute import SweepError, run_job
+from isac_rt.sweep.execute import SweepError, run_job, run_points
 from isac_rt.sweep.outcomes import Outcomes
 
 
@@ -156,6 +158,30 @@ def test_what_is_done_is_not_flown_again(flown, monkeypatch):
     fly(flights, folder, lambda done, total: told.append((done, total)))
     assert told == [(2, 2)]
     assert len({p.tree["seed"] for p in flights.points()}) == 2
+
+
+def test_only_what_is_missing_goes_to_the_workers(flown, monkeypatch):
+    """A third seed: its one flight, as a job with its own scenario; `run_points` is called as it
+    is defined. The bug that was there: the count of what is done in the place of the points."""
+    flights, folder = flown
+    given = []
+
+    def serve(plan, outcomes, client, job, missing, done, retry_failed, progress):
+        given.extend(missing)
+        assert (done, retry_failed) == (2, True)
+        (fields,) = [
+            {"key": p.key, "tree": p.tree, "ground": p.ground, "scenario_folder": ""} for p in given
+        ]
+        assert isinstance(job(given[0], **fields, folder="", threads=1), FlightJob)
+        progress(3, 0, 3)
+
+    served = create_autospec(run_points, side_effect=serve)
+    monkeypatch.setattr(city_flights, "run_points", served)
+    monkeypatch.setattr(city_flights, "connected", lambda *_: nullcontext())
+    told = []
+    fly(replace(flights, seeds=3), folder, lambda done, total: told.append((done, total)))
+    assert [p.index for p in given] == [(2, 0)]
+    assert told == [(2, 3), (3, 3)]
 
 
 def test_a_flight_that_fails_is_one_message(flown, tmp_path):

@@ -185,11 +185,11 @@ def fly(flights: Flights, folder: Path, progress: Progress) -> None:
     """
     outcomes = Outcomes(folder.resolve())
     outcomes.begin({"places": list(flights.scenarios), "seed": flights.seed})
-    todo, total = sum(1 for _ in pending(flights, outcomes, True)), flights.num_points
-    progress(total - todo, total)
-    if not todo:
+    missing, total = [*pending(flights, outcomes, True)], flights.num_points
+    done = total - len(missing)
+    progress(done, total)
+    if not missing:
         return
-    done = total - todo
 
     def moved(done: int, failed: int, total: int) -> None:
         progress(done + failed, total)
@@ -198,7 +198,7 @@ def fly(flights: Flights, folder: Path, progress: Progress) -> None:
         return FlightJob(**fields)
 
     with connected(None, None) as client:
-        run_points(flights, outcomes, client, job, done, True, moved)
+        run_points(flights, outcomes, client, job, iter(missing), done, True, moved)
 
 
 def outcomes_of(flights: Flights, folder: Path) -> dict[str, list[dict[str, Any]]]:
