@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from isac_rt.views.interchange import from_sionna as from_sionna
     from isac_rt.views.interchange import stonesoup_detections as stonesoup_detections
     from isac_rt.views.interchange import write_sigmf as write_sigmf
+    from isac_rt.views.plots import Plots as Plots
 
 _NAMES = {
     "capture.calibrate": "Calibration calibrate",
@@ -96,6 +97,7 @@ _NAMES = {
     "views.animate": "animate write_animation",
     "views.interactive": "scene_3d",
     "views.interchange": "from_sionna stonesoup_detections write_sigmf",
+    "views.plots": "Plots",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
