@@ -148,7 +148,7 @@ class Response(Node):
     """The same for each element, which adds to what all have in common: a table for each, in the
     order of the elements. Empty, the default: all elements are alike."""
     element_tables_deg: tuple[tuple[Degrees, ...], ...] = ()
-    """The same for the phases of each [degrees]."""
+    """The same for the phases of each [degrees]. Empty, the default: all elements are alike."""
     slope_std_db: GainSpread = 0.0
     """Standard deviation of slopes that are drawn for each element [dB from the middle of the
     chirp to its end]. By default all elements are alike."""
