@@ -137,7 +137,9 @@ class PathSet:
 
     def select(self, which: np.ndarray) -> PathSet:
         """The paths that a mask or an index array chooses."""
-        return replace(self, **{name: a[which] for name, a in self.arrays().items()})
+        rows = np.flatnonzero(which) if np.asarray(which).dtype == bool else which
+        chosen: dict[str, Any] = {n: a.take(rows, axis=0) for n, a in self.arrays().items()}
+        return replace(self, **chosen)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The columns by name."""

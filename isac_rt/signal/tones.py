@@ -66,9 +66,10 @@ class Tones(NamedTuple):
     def select(self, which: np.ndarray) -> Tones:
         """The paths that a mask or an index array chooses."""
         shared = ("cross", "symbol_delay", "send", "antenna")
+        rows = np.flatnonzero(which) if np.asarray(which).dtype == bool else which
         return self._replace(
             **{
-                name: v[which]
+                name: v.take(rows, axis=0)
                 for name, v in self._asdict().items()
                 if name not in shared and v is not NO_GAIN
             }

@@ -39,6 +39,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.model import Census
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -271,6 +272,16 @@ def motion(paths: PathSet, waveform: Waveform) -> np.ndarray:
     return np.abs(paths.delay_rate) * t + np.abs(paths.delay_accel) * t**2 / 2
 
 
+@jit
+def _sums(cell: np.ndarray, power: np.ndarray) -> np.ndarray:
+    """Running sums of powers (K,) from the first of each cell on, cells one after the other."""
+    out = power.copy()
+    for i in range(1, power.size):
+        if cell[i] == cell[i - 1]:
+            out[i] += out[i - 1]
+    return out
+
+
 def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
     """The faintest of each cell whose powers together stay within a limit.
 
@@ -288,10 +299,7 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
         return np.zeros(0, bool), 0.0
     order = np.lexsort([power, cell])
     sorted_cell, sorted_power = cell[order], power[order]
-    total = np.zeros(len(power))
-    first = np.flatnonzero(np.diff(sorted_cell, prepend=sorted_cell[:1] - 1))
-    for begin, end in zip(first, np.append(first[1:], len(power)), strict=True):
-        total[begin:end] = np.cumsum(sorted_power[begin:end])
+    total = _sums(sorted_cell, sorted_power)
     gone = total <= limit
     mask = np.zeros(len(power), bool)
     mask[order] = gone
