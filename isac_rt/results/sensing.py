@@ -42,7 +42,10 @@ class Sensing:
         parameters, and by the receiver's detector in noise alone
     gospa, gospa_targets : (F, 3) localisation, missed, false [m^2]; of all, and without terminals
     num_false, num_clutter : (F,) detections
-    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`
+    shown : (F, U) bool, hidden, and strongly enough shown by one wall
+    mirrored : (F, 2) confirmed tracks placed by a wall where no UAV is, and rightly
+    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`,
+        without those rightly placed by a wall
     ghosts : (F, U) those of them that ghosts of each UAV feed
     """
 
@@ -62,6 +65,8 @@ class Sensing:
     gospa_targets: np.ndarray
     num_false: np.ndarray
     num_clutter: np.ndarray
+    shown: np.ndarray
+    mirrored: np.ndarray
     false_tracks: np.ndarray
     ghosts: np.ndarray
 
@@ -102,6 +107,8 @@ class Sensing:
             parts("gospa_targets"),
             column("num_false", int, ()),
             column("num_clutter", int, ()),
+            column("shown", bool),
+            np.array([_mirrored(row["track"]) for row in rows], int).reshape(count, 2),
             np.array([f for f, _ in false], int).reshape(count, len(FALSE_CAUSES)),
             np.array([g for _, g in false], int).reshape(count, num_uavs),
         )
@@ -138,6 +145,11 @@ class Sensing:
             "false_tracks_per_frame": share(int(false.sum()), frames),
             "false_tracks": {
                 name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
+            },
+            "mirrors": {
+                "shown": int(self.shown.sum()),
+                "placed": int(self.mirrored.sum()),
+                "right": int(self.mirrored[:, 1].sum()),
             },
             "losses": _counts(self.loss),
         }
@@ -208,6 +220,7 @@ def _false_tracks(track: Row, num_uavs: int) -> tuple[np.ndarray, np.ndarray]:
     """Confirmed tracks of a frame that follow no UAV in view: by `FALSE_CAUSES`, and those of
     ghosts by UAV."""
     false = np.asarray(track["confirmed"], bool) & (np.asarray(track["uav"]) < 0)
+    false &= np.asarray(track["mirror"], int) < 2
     kind = np.asarray(track["kind"], int)[false]
     ghost_of = np.asarray(track["target"], int)[false][kind == PathKind.GHOST]
     causes = np.where(kind < 0, len(KINDS), kind)
@@ -215,6 +228,12 @@ def _false_tracks(track: Row, num_uavs: int) -> tuple[np.ndarray, np.ndarray]:
         np.bincount(causes, minlength=len(FALSE_CAUSES)),
         np.bincount(ghost_of[ghost_of >= 0], minlength=num_uavs),
     )
+
+
+def _mirrored(track: Row) -> list[int]:
+    """Confirmed tracks of a frame that a wall places, wrongly and rightly."""
+    code = np.asarray(track["mirror"], int)[np.asarray(track["confirmed"], bool)]
+    return [int((code == value).sum()) for value in (1, 2)]
 
 
 def _breaks(rows: Sequence[Row], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -196,6 +196,11 @@ class Tracking(Node):
     at the edge of the view, nor, at an active one, those that stand still beside each other as a
     building does that the mesh lacks; and no track is confirmed that is a wall's image of a nearer
     one or lies behind a wall."""
+    mirrors: Literal["ignore", "place"] = "ignore"
+    """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
+    terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a
+    nearer track over a wall and the wall can show the place, it is taken for the image of a UAV out
+    of sight, and reported where that UAV is."""
 
     @property
     def needs_mesh(self) -> bool:
@@ -208,6 +213,12 @@ class Tracking(Node):
                 (("confirm_hits",), ("confirm_window",)),
                 f"{self.confirm_hits} hits cannot be reached within confirm_window = "
                 f"{self.confirm_window}; lower it or widen the window",
+            )
+        if self.mirrors == "place" and self.births == "all":
+            yield Problem(
+                (("mirrors",), ("births",)),
+                "place has no meaning with births all, only with unexplained; leave it out, or "
+                "change births",
             )
 
 
@@ -224,7 +235,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "false_alarm_rate": 1e-6,
         "update_false_alarm_rate": None,
     },
-    "tracking": {"drop_after_s": None, "births": "all"},
+    "tracking": {"drop_after_s": None, "births": "all", "mirrors": "ignore"},
 }
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {
@@ -247,7 +258,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
         },
-        "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
+        "tracking": {"drop_after_s": 0.36, "births": "unexplained", "mirrors": "ignore"},
     },
 }
 """What each preset says of `receivers` and `tracking`, all of them of the same keys; of the rest

@@ -55,6 +55,11 @@ class Walls:
         return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
 
     @cached_property
+    def planes(self) -> np.ndarray:
+        """(W,) numbers of the mirrors' planes in the mesh."""
+        return self.city.plane_of_face[self.mirrors[0]]
+
+    @cached_property
     def _faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces of the mirrors one after the other, where each mirror's begin, and the lowest and
         highest corner of each (2, W, 3), world coordinates."""
@@ -177,7 +182,7 @@ def suspicion(
     sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
     seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
     for k in np.flatnonzero(~tracks.is_reference):
-        out.behind[k] = _hidden_by(
+        out.behind[k] = hidden_by(
             own.position + tracks.mean[k, :3],
             tracks.covariance[k, :3, :3],
             seen_from,
@@ -282,7 +287,7 @@ def _apart(body: np.ndarray, end: np.ndarray) -> tuple[float, float]:
     return distance, float(offset @ moved) / distance
 
 
-def _hidden_by(
+def hidden_by(
     place: np.ndarray,
     covariance: np.ndarray,
     seen_from: list[np.ndarray],

@@ -17,6 +17,7 @@ from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.ghosts import Walls, suspicion
+from isac_rt.terminal.mirrors import mirror_of
 from isac_rt.terminal.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
 
@@ -42,12 +43,14 @@ class Doubts:
     antennas : Antennas
     waveform : Waveform
     passes : 2 at an active terminal, 1 at a passive one
+    places : whether tracks behind a wall are placed where the wall shows them (`tracking.mirrors`)
     """
 
     walls: Walls
     antennas: Antennas
     waveform: Waveform
     passes: int = 2
+    places: bool = False
 
     def births(
         self, detections: Detections, own: Pose, sender: np.ndarray | None = None
@@ -75,14 +78,24 @@ class Doubts:
         self, tracker: Tracker, new: set[int], own: Pose, reference: Track | None = None
     ) -> None:
         """Take out the tracks, among those `new` to be confirmed, that a wall explains; at a
-        passive terminal with its `reference`."""
-        confirmed = {t.id for t in tracker.tracks if t.confirmed} & new
-        if not confirmed:
-            return
-        tracks = tracker.snapshot(own, reference)
+        passive terminal with its `reference`. Where mirrors are eyes, those stay that a wall shows
+        and nothing else explains, as long as it does."""
         cells = resolutions(self.waveform, self.antennas, self.passes)
-        suspect = suspicion(tracks, own, self.walls, cells, self._period).suspect
-        out = confirmed & set(tracks.ids[suspect].tolist())
+        old = {t.id for t in tracker.tracks if t.mirror.size}
+        confirmed = {t.id for t in tracker.tracks if t.confirmed} & new
+        hidden = set(old)
+        out: set[int] = set()
+        if confirmed:
+            tracks = tracker.snapshot(own, reference)
+            said = suspicion(tracks, own, self.walls, cells, self._period)
+            out = confirmed & set(tracks.ids[said.suspect].tolist())
+            if self.places:
+                hidden |= out & set(tracks.ids[said.mirrored < 0].tolist())
+        for track in tracker.tracks:
+            if track.id in hidden:
+                track.mirror = mirror_of(track.state, own, self.walls, cells[0])
+        shown = {t.id for t in tracker.tracks if t.mirror.size}
+        out = (out | old) - shown
         tracker.tracks = [t for t in tracker.tracks if t.id not in out]
 
     @property

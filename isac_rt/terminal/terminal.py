@@ -137,7 +137,8 @@ class ActiveTerminal:
         if tracking.births == "unexplained":
             if walls is None:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
-            self._doubts = Doubts(walls, antennas, waveform)
+            places = tracking.mirrors == "place"
+            self._doubts = Doubts(walls, antennas, waveform, places=places)
         self.calibration = calibration_of(receivers, waveform, antennas, 2)
         self._standing = Standing.of(antennas, waveform, 2)
         self._correction: Correction | None = None

@@ -25,6 +25,7 @@ from isac_rt.terminal.filter import (
     mahalanobis,
     measurement_covariance,
     predict,
+    reflected,
     reported,
     update,
     wrapped,
@@ -79,6 +80,8 @@ class Track:
     confirmed : M hits in N frames were reached
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
+    mirror : (4,) plane of the wall by which the body is seen, of which the state is the image;
+        (0,): it is seen straight
     """
 
     id: int
@@ -90,6 +93,7 @@ class Track:
     confirmed: bool = False
     detection: int = -1
     last: float = -np.inf
+    mirror: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def memory(self) -> dict[str, Any]:
         """The track as plain numbers and arrays, for `of_memory`."""
@@ -119,6 +123,8 @@ class TrackSet:
     age : (K,) int, frames since the first detection
     confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
     detection : (K,) int, row among the frame's detections that updated it, -1: none
+    mirrored : (K,) bool, seen by one wall (`tracking.mirrors`): `mean` and `covariance` are of the
+        body, and `range`, `velocity` and `direction` of its image. By default none
     """
 
     ids: np.ndarray
@@ -132,6 +138,11 @@ class TrackSet:
     confirmed: np.ndarray
     is_reference: np.ndarray
     detection: np.ndarray
+    mirrored: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def __post_init__(self) -> None:
+        if self.mirrored.size != self.ids.size:
+            object.__setattr__(self, "mirrored", np.zeros(self.ids.size, bool))
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -142,8 +153,9 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
     bistatic."""
     everyone = ([] if reference is None else [reference]) + list(tracks)
     count = len(everyone)
-    mean = np.array([t.state.mean[:6] for t in everyone]).reshape(count, 6)
-    covariance = np.array([t.state.covariance[:6, :6] for t in everyone]).reshape(count, 6, 6)
+    bodies = [reflected(t.mirror, t.state) if t.mirror.size else t.state for t in everyone]
+    mean = np.array([b.mean[:6] for b in bodies]).reshape(count, 6)
+    covariance = np.array([b.covariance[:6, :6] for b in bodies]).reshape(count, 6, 6)
     is_reference = np.arange(count) < (reference is not None)
     states = [t.state for t in everyone]
     if reference is None:
@@ -163,6 +175,7 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
         confirmed=np.array([t.confirmed for t in everyone], bool),
         is_reference=is_reference,
         detection=np.array([t.detection for t in everyone], np.int64),
+        mirrored=np.array([t.mirror.size > 0 for t in everyone], bool),
     )
 
 

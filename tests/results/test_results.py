@@ -47,6 +47,7 @@ TERMINAL_KEYS = {
     "gospa",
     "apart",
     "bounds",
+    "mirrors",
     "false_tracks_per_frame",
     "false_tracks",
     "losses",
