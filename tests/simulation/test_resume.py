@@ -58,9 +58,9 @@ def assert_equal_results(found, expected):
 
 
 def scenarios():
-    """Tracks, acquisition, data and fall-back; feedback, clocks and slips; ray tracing, shadows and
-    clutter in a city."""
-    access = ["frames=9", "access.feedback=true"]
+    """Tracks, acquisition, data and fall-back; feedback, clocks, slips and self-calibration; ray
+    tracing, shadows and clutter in a city."""
+    access = ["frames=9", "access.feedback=true", "receivers.self_calibration=positions"]
     return {
         "dense": lambda: dense_scenario(frames=7),
         "access": lambda: load(SCENES / "access_swarm.yaml", access),

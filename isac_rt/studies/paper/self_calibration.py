@@ -50,7 +50,7 @@ munich: In Munich hit rates and angles come back too
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     """Angles by the number of looks, and Munich with ideal elements, with errors, and with errors
     that are found in flight."""
-    arrays, frames = (60, 12) if quick else (400, 78)
+    arrays, frames = (400, 12) if quick else (2000, 78)
     looks = []
     for step, (name, passes) in enumerate((("active", 2), ("passive", 1))):
         rms = ratios(passes, arrays, seed)
