@@ -56,14 +56,14 @@ def look_at(rx, frame, errors, rng, sure=True, which=(0, 1)):
     z = np.array([measure(b, own, None if rx == "A" else state) for b in bodies_at(time)])
     z += rng.normal(size=z.shape) * STD
     z[:, 0] += errors[rx][9]
-    rows = list(which)
+    rows = np.array(which, int)
     look = Look(
         f"A->{rx}",
         frame,
         time,
         believed(own, errors[rx]),
         CLOCK_STD if rx == "B" else 0.0,
-        np.array(rows),
+        rows,
         z[rows],
         np.tile(STD, (len(rows), 1)),
         np.array([100.0, 50.0])[rows],
@@ -127,6 +127,18 @@ def test_the_clock_of_a_passive_terminal_is_found_by_what_both_see():
     std = np.sqrt(pool.latest.covariance[at, at])
     assert std < CLOCK_STD / 2
     assert abs(pool.latest.mean[at] - 0.3) < 4 * std
+
+
+def test_errors_that_nobody_sees_stay_as_uncertain_as_they_were():
+    """A stationary process: after 5 s without detections the prior variances. Planted bug: noise
+    of 1 - k for a memory of k instead of 1 - k^2."""
+    pool = tracker()
+    look, _ = look_at("A", 0, NONE, np.random.default_rng(1), which=())
+    pool.add(look, None)
+    later = np.diag(pool._predicted(pool.latest, 5.0).covariance)[: ERRORS - 1]
+    assert later == pytest.approx(
+        np.square([*[POSE_STD[0]] * 3, *[POSE_STD[1]] * 3, *[ATTITUDE_STD] * 3])
+    )
 
 
 @pytest.mark.parametrize("rx", ["A", "B"])
