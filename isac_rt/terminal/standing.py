@@ -98,7 +98,10 @@ class Standing:
     def crowded(self, places: np.ndarray) -> np.ndarray:
         """(n,) whether places (n, 3) lie among echoes that stood still."""
         apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:], axis=-1)
-        return ((apart > BESIDE_M[0]) & (apart < BESIDE_M[1])).sum(axis=1) >= CROWD
+        beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
+        some = beside.sum(axis=1) >= CROWD
+        some[some] = [_spots(self._seen[near, 1:]) >= CROWD for near in beside[some]]
+        return some
 
     def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
         """Tracks but those that stand still within a crowd, and those among `new` that an echo (Q,)
@@ -111,6 +114,18 @@ class Standing:
         velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
         d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
         return bool(d2 < STANDS and self.crowded(track.state.mean[None, :3])[0])
+
+
+def _spots(places: np.ndarray) -> int:
+    """How many of places (n, 3) are apart from each other, up to `CROWD`: a body that hovers nearby
+    is one, however often it was seen."""
+    spots: list[np.ndarray] = []
+    for place in places:
+        if all(np.linalg.norm(place - spot) > BESIDE_M[0] for spot in spots):
+            spots.append(place)
+        if len(spots) >= CROWD:
+            break
+    return len(spots)
 
 
 def _still(

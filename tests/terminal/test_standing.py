@@ -148,3 +148,13 @@ def test_a_track_that_an_echo_of_a_crowd_confirms_is_none():
     tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, confirmed=False), track(5, -1)]
     kept = Standing(1.71).without(tracks, {1, 3, 4, 5}, np.array([True, False]))
     assert [t.id for t in kept] == [2, 3, 4, 5]
+
+
+def test_two_uavs_that_hover_near_each_other_are_no_crowd():
+    """10 m apart, thirty frames: each is one place beside the other, however often it is seen.
+    Planted bug: every echo counted."""
+    standing = Standing(1.71)
+    for frame in range(30):
+        time = 0.03 * frame
+        d = seen(time, [(8.0, 24.0, 4.0), (-1.7, 27.0, 6.0)])
+        assert not standing.look(d, own(time), time, PERIOD).any()
