@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from crb_model import bound
+from crb_model import bound, samples
 from receiver_cubes import ANTENNAS, Path, cube
 
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
@@ -174,7 +175,7 @@ def test_clutter_shows_phases_of_neighbours_however_wide_its_directions():
     assert np.abs(line[1:]).max() < 0.012  # three deviations: 0.08 rad a pair, 15 pairs, 4 frames
 
 
-def bent(samples: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
+def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
     """Samples behind elements with errors, slopes of phase and level over the chirp, and a response
     that all have in common."""
     x = np.linspace(-1, 1, W.num_samples)
@@ -182,7 +183,7 @@ def bent(samples: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
     slope = np.array([0.03, 0.05j]) @ rng.normal(size=(2, 15))
     common = np.exp(-0.15 * x + (0.1 - 0.2j) * (x**2 - 1 / 3))
     gain = heard[:, None] * np.exp(slope[:, None] * x) * common
-    out = samples * gain[None, :, None, :]
+    out = values * gain[None, :, None, :]
     return (out * sent[schedule][:, None, :, None]).astype(np.complex64)
 
 
@@ -278,27 +279,33 @@ def test_a_kept_state_goes_on_to_the_same_bits():
 
 @pytest.mark.slow
 def test_ten_frames_of_samples_bring_angles_within_1_db_of_the_bound():
-    """From samples at -10 dB to directions by `refinement: joint`: the same claim as above by the
-    whole chain of an active terminal, against the bound of the samples. Forty arrays with two
-    frames after the tenth know the ratio to 6 %."""
+    """From samples of points in space at -10 dB to directions by `refinement: joint`: the same
+    claim as above by the whole chain of an active terminal that sees two others, against the bound
+    of the samples. Looks are windowed, which costs 3.5 dB: twenty of them add 0.11 of the bound.
+    Two hundred cosines know the ratio to 5 %."""
     settings = Receivers(refinement="joint", self_calibration="positions")
     payload = random_payload(W, SCHEDULE, 8, np.random.default_rng(1))
     theta = np.array([11.7, 2.0, 0.1, 0.1, 0.3, 1.0])
     std = np.sqrt(bound(W, SCHEDULE, payload, ANTENNAS, theta, 2, 0.1)[2:4])
     ratios = []
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
         sent, heard = errors(rng, 3), errors(rng, 15)
         gain = heard[None, :, None] * sent[SCHEDULE][:, None, :]
         at = ActiveTerminal(W, ANTENNAS, settings, Tracking())
-        for frame in range(12):
-            mate, other = rng.uniform(-0.5, 0.5, (2, 2))
-            waves = [echo(6.3, mate, rng.uniform(0, 6)), replace(echo(11.7, other), rate=4.0)]
-            one = cube(W, SCHEDULE, payload, waves, noise=10.0, seed=100 * seed + frame)
-            one = replace(one, samples=(one.samples * gain[..., None]).astype(np.complex64))
-            poses = [replace(OWN, position=place(6.3, mate))]
-            found = at.step(one, payload, OWN, 0.05 * frame, mates=poses)[0].detections
+        for frame in range(14):
+            u = rng.uniform(-0.5, 0.5, (3, 2))
+            places = (6.3, 0.0, *u[0]), (8.6, 0.0, *u[1]), (11.7, 2.0, *u[2])
+            waves = [
+                samples(W, SCHEDULE, payload, ANTENNAS, np.array([*p, 6 * rng.uniform(), 1.0]), 2)
+                for p in places
+            ]
+            thermal = rng.normal(size=(*waves[0].shape, 2)) @ np.array([1, 1j]) * np.sqrt(5)
+            one = (sum(waves) * gain[..., None] + thermal).astype(np.complex64)
+            frame_of = IFCube(samples=one, waveform=W, schedule=SCHEDULE, start_time=0.0)
+            poses = [replace(OWN, position=place(p[0], p[2:])) for p in places[:2]]
+            found = at.step(frame_of, payload, OWN, 0.05 * frame, mates=poses)[0].detections
             near = np.flatnonzero(np.abs(found.range - 11.7) < 0.5)
             if frame >= 10:
-                ratios.append((found.direction[near[0]] - other) / std)
+                ratios.append((found.direction[near[0]] - u[2]) / std)
     assert np.sqrt(np.mean(np.square(ratios))) < ONE_DECIBEL
