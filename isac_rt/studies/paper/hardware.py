@@ -329,7 +329,8 @@ def _floor_verdicts(f: pd.DataFrame) -> tuple[Verdict, Verdict]:
 
 
 def _bias_verdicts(b: pd.DataFrame) -> tuple[Verdict, Verdict]:
-    """A range holds to 2 mm, a hundredth of its cell; a direction to a fifth of the bias and 0.02 degrees, RMS."""
+    """A range holds to 2 mm, a hundredth of its cell; a direction to a fifth of the bias and 0.02
+    degrees, RMS."""
     ranges, angles, kept = [], [], []
     for name, part in b.groupby("front_end", sort=False):
         found = part[["u_x", "u_z"]].to_numpy()
