@@ -204,3 +204,22 @@ def test_what_is_no_value_is_one_message(part, said):
     """Seen as a TypeError and a ZeroDivisionError."""
     with pytest.raises(ScenarioError, match=said):
         load({"swarm": SWARM} | part)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"receivers": {"active_input": "profiles"}}, "self-calibration corrects samples"),
+        ({"radio": {"groups": 2}}, "as many groups as the 3 transmit antennas"),
+    ],
+)
+def test_self_calibration_needs_samples_and_all_groups(changes, words):
+    """Also in a set that is compared."""
+    wanted = {"self_calibration": "tracks"}
+    receivers = {**changes.get("receivers", {}), **wanted}
+    radio = changes.get("radio", {})
+    with pytest.raises(ValueError, match=words):
+        Scenario(swarm=SWARM, radio=radio, receivers=receivers)
+    if radio:
+        with pytest.raises(ValueError, match=words):
+            Scenario(swarm=SWARM, radio=radio, compare={"other": {"receivers": wanted}})
