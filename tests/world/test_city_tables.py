@@ -3,6 +3,7 @@ here. Without the extra one message names it."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
@@ -56,6 +57,16 @@ OSM = """<?xml version="1.0" encoding="UTF-8"?>
  <way id="12" version="1"><nd ref="5"/><nd ref="6"/><nd ref="7"/><nd ref="8"/><nd ref="5"/>
   <tag k="landuse" v="forest"/></way>
 </osm>"""
+
+
+PBF = (
+    "AAAADQoJT1NNSGVhZGVyGDsQLxo3eJxT4vMvzg1OzkjNTdQNM9AzU+JySc0rTvXLT0ktbmIUyMlMyi/OzSzN1TfS"
+    "MzLWMwQAX2cOkwAAAAsKB09TTURhdGEYUhB2Gk54nONi4WLgYhDKE8rh4mCCAi0jLg5GKBDiYIACKThLCc7S4mCC"
+    "spz4G/ad2cHM8EGPYUMuiPQSbPh/y/mAHcN+uwVzGMF0EFwfAIOlEUYAAAALCgdPU01EYXRhGG0QeBppeJzjsuBi"
+    "4OJIKs3MScnMS+fih7GsclLLUnOKuZgrU4u5GE2BithzEvNSSotTudjS8otSi0uEbKRkObiFmBiZpJiYWZS4OBgF"
+    "GCQYFBg0WJ1YmYCAVUqag0eIkU2KkR1VkgskCQB4PxR7"
+)
+"""The same town as OSM, packed by osmium."""
 
 
 def osm(folder: Path) -> None:
@@ -117,10 +128,12 @@ def test_a_layer_without_shapes_is_one_message(tmp_path):
         read(tmp_path, "town.gpkg", layer="owners")
 
 
-def test_openstreetmap_xml(tmp_path):
+@pytest.mark.parametrize("name", ["town.osm", "town.osm.pbf"])
+def test_openstreetmap(name, tmp_path):
     pytest.importorskip("pyogrio")
     osm(tmp_path)
-    city = read(tmp_path, "town.osm", origin=[7.1, 46.2, 0], ground_margin_m=0.0)
+    (tmp_path / "town.osm.pbf").write_bytes(base64.b64decode(PBF))
+    city = read(tmp_path, name, origin=[7.1, 46.2, 0], ground_margin_m=0.0)
     assert city.bounds()[1, 2] == pytest.approx(15.0)
     assert city.bounds()[1, 0] == pytest.approx(4e-4 * 77_186, rel=1e-3)  # a degree there [m]
     assert any("1 of landuse" in note for note in city.notes)
