@@ -334,22 +334,24 @@ def test_reflectors_are_tracked_by_way_of_the_sender_while_it_is_in_sight():
 
 
 def test_what_was_learned_last_goes_to_the_receiver():
-    """A frame without data and with a line of sight teaches the reader; one with data, or without a
-    line of sight, teaches nothing and what was learned before stays. Planted bugs: nothing kept;
-    learned from every frame."""
+    """A frame with a line of sight teaches the reader, with data or without; one without a line of
+    sight teaches nothing, and what was learned before stays. Planted bugs: nothing kept; learned
+    from every frame."""
     pt = PassiveTerminal(W, STEERED, Receivers(), Tracking(), 8, AMPLITUDE)
-    answers = [heard(sight()), heard(), heard(sight(0.04)), heard(sight(0.06)), heard(sight(0.08))]
+    answers = [heard(sight()), heard(), heard(sight(0.04)), heard(), heard(sight(0.08))]
     given, lessons = [], iter(["first", "second", "third"])
 
     def receive(cube, prediction, modulated, profile, clutter, *, maps):
         given.append(profile)
         return answers[len(given) - 1]
 
-    reader = SimpleNamespace(learn=lambda cube, detections: next(lessons))
-    vars(pt)["_receiver"] = SimpleNamespace(receive=receive, reader=reader)
+    def learn(cube, detections, reception):
+        return next(lessons)
+
+    vars(pt)["_receiver"] = SimpleNamespace(receive=receive, learn=learn)
     for k, modulated in enumerate((False, False, True, False, True)):
         pt.step(EMPTY, OWN, 0.02 * k, modulated)
-    assert given == [None, "first", "first", "first", "second"]
+    assert given == [None, "first", "first", "second", "second"]
 
 
 def outside(*symbols: int) -> np.ndarray:
