@@ -341,7 +341,7 @@ class Document:
             key: Key = tuple(
                 part
                 for part in found["loc"]
-                if part != "[key]" and not str(part).startswith("function-")
+                if part != "[key]" and not str(part).startswith("function-wrap[")
             )
             if found["type"] == "inconsistent":
                 for problem in found["ctx"]["problems"]:

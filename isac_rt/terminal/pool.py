@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,7 @@ ERRORS, BODY = 10, 9
 clock [m, m/s, rad, m]; those of a body."""
 ERROR_TIME = 10.0
 """Correlation time of a terminal's errors [s]: satellites and inertial sensors drift in seconds to
-minutes."""
+minutes. A clock's error stays, and grows as looks state."""
 MOST_LATE = 0.5
 """Detections that come later count for nothing [s]."""
 _ROUNDS = 5
@@ -150,12 +150,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Pool:
-    """All states at a time: `ERRORS` of each terminal, then `BODY` of each body."""
+    """All states at a time: `ERRORS` of each terminal, then `BODY` of each body; `clocks` is the
+    variance of ranges by a terminal's clock that looks have stated [m^2]."""
 
     time: float
     mean: np.ndarray
     covariance: np.ndarray
     bodies: tuple[Body, ...] = ()
+    clocks: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, gone: set[int]) -> Pool:
         """The same without some bodies."""
@@ -164,7 +166,8 @@ class Pool:
         rows = [np.arange(first), *(first + BODY * k + np.arange(BODY) for k in keep)]
         at = np.concatenate(rows)
         bodies = tuple(self.bodies[k] for k in keep)
-        return Pool(self.time, self.mean[at], self.covariance[np.ix_(at, at)], bodies)
+        covariance = self.covariance[np.ix_(at, at)]
+        return replace(self, mean=self.mean[at], covariance=covariance, bodies=bodies)
 
 
 @dataclass(frozen=True)
@@ -260,16 +263,17 @@ class PooledTracker:
             for o in b.bodies
         ]
         looks = [[look.memory(), transmitter] for look, transmitter in self._looks]
-        return {"begin": [b.time, b.mean, b.covariance, bodies], "looks": looks}
+        begin = [b.time, b.mean, b.covariance, bodies, dict(b.clocks)]
+        return {"begin": begin, "looks": looks}
 
     def restore(self, memory: Mapping[str, Any]) -> None:
         """Go on from a `memory`."""
-        time, mean, covariance, rows = memory["begin"]
+        time, mean, covariance, rows, clocks = memory["begin"]
         bodies = tuple(
             Body(Name(*name), Name(*born), tuple(hits), {k: (n, t) for k, n, t in fed}, confirmed)
             for name, born, hits, fed, confirmed in rows
         )
-        self._begin = Pool(time, mean, covariance, bodies)
+        self._begin = Pool(time, mean, covariance, bodies, clocks)
         self._looks = [(Look.of_memory(look), tx) for look, tx in memory["looks"]]
         self._pools = []
         self._replay(0)
@@ -323,13 +327,13 @@ class PooledTracker:
         if not np.isfinite(interval) or interval <= 0:
             return replace(pool, time=time) if interval else pool
         F, Q = singer(interval, self._settings.acceleration_std_mps2)
-        kept = np.exp(-interval / ERROR_TIME)
+        kept = np.append(np.full(ERRORS - 1, np.exp(-interval / ERROR_TIME)), 1.0)
         count, terminals = len(pool.bodies), len(self._terminals)
         drift = _error_variance() * (1 - kept**2)
-        step = block_diag(kept * np.eye(ERRORS * terminals), *[F] * count)
+        step = block_diag(np.diag(np.tile(kept, terminals)), *[F] * count)
         noise = block_diag(np.diag(np.tile(drift, terminals)), *[Q] * count)
         P = step @ pool.covariance @ step.T + noise
-        return Pool(time, step @ pool.mean, (P + P.T) / 2, pool.bodies)
+        return replace(pool, time=time, mean=step @ pool.mean, covariance=(P + P.T) / 2)
 
     def _alive(self, pool: Pool) -> Pool:
         """Without the bodies whose time is over."""
@@ -412,7 +416,7 @@ class PooledTracker:
         P = A @ P @ A.T + K @ R @ K.T
         body = self._fed(pool.bodies[k], view.look, q)
         bodies = (*pool.bodies[:k], body, *pool.bodies[k + 1 :])
-        return Pool(pool.time, x, (P + P.T) / 2, bodies)
+        return replace(pool, mean=x, covariance=(P + P.T) / 2, bodies=bodies)
 
     def _fed(self, body: Body, look: Look, q: int) -> Body:
         """A body after one more detection: its track, and the earliest name that is known of it."""
@@ -462,7 +466,8 @@ class PooledTracker:
         P[size:, size:] = made.covariance + D @ pool.covariance @ D.T
         born = Name(look.time, look.origin, int(look.numbers[q]))
         body = self._fed(Body(born, born, (), {}), look, q)
-        return Pool(pool.time, np.append(pool.mean, made.mean), P, (*pool.bodies, body))
+        mean = np.append(pool.mean, made.mean)
+        return replace(pool, mean=mean, covariance=P, bodies=(*pool.bodies, body))
 
     def _merged(self, pool: Pool) -> Pool:
         """Two bodies in one place that no receiver saw in one frame are one: the surer stays."""
@@ -504,13 +509,15 @@ class _View:
         return ERRORS * self.terminals.index(name)
 
     def with_clock(self, pool: Pool) -> Pool:
-        """With the deviation of the clock that the look states, where it was not known before."""
-        at = self._at(self.look.ends[1]) + ERRORS - 1
-        if pool.covariance[at, at] > 0:
+        """With the deviation of the clock that the look states: what it has grown by counts as
+        noise since the last one."""
+        rx, stated = self.look.ends[1], self.look.clock_std**2
+        grown = stated - pool.clocks.get(rx, 0.0)
+        if grown <= 0:
             return pool
-        P = pool.covariance.copy()
-        P[at, at] = self.look.clock_std**2
-        return replace(pool, covariance=P)
+        at, P = self._at(rx) + ERRORS - 1, pool.covariance.copy()
+        P[at, at] += grown
+        return replace(pool, covariance=P, clocks={**pool.clocks, rx: stated})
 
     def corrected(self, x: np.ndarray) -> tuple[Pose, np.ndarray | None]:
         """The receiver's pose and the transmitter's state (6,) without the errors that are known of

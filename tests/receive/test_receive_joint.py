@@ -764,7 +764,7 @@ def test_energy_of_a_few_paths():
 def test_two_detections_of_one_path_leave_the_others_alone():
     """Two detections a hundredth of a cell apart where one echo is, whose amplitudes have no single
     answer, and another echo far off: that one is fitted, within five of its deviations. Planted
-    bug: a cluster that has not settled spoils all others."""
+    bug: none is called settled as soon as one cluster is not."""
     w, schedule, payload = frame(waveform=SHORT)
     ends = np.array([[20.3, 2.1, 0.2, -0.1], [44.6, -6.3, 0.1, 0.3]])
     clean = sum(signal(w, schedule, payload, e, 1.0) for e in ends)

@@ -141,6 +141,20 @@ def test_errors_that_nobody_sees_stay_as_uncertain_as_they_were():
     )
 
 
+def test_a_clock_that_nobody_sees_is_as_uncertain_as_was_stated_last():
+    """B states 0.2 m, 5 s later 0.5 m and then 0.4 m: the prior deviation is the largest of what
+    was said, however long ago. Planted bugs: a clock's error is forgotten as a pose's is; only the
+    first statement counts."""
+    pool, rng = tracker(), np.random.default_rng(1)
+    at = 2 * ERRORS - 1
+    for frame, stated, expected in ((0, 0.2, 0.2), (100, 0.5, 0.5), (101, 0.4, 0.5)):
+        look, sender = look_at("B", frame, NONE, rng, which=())
+        pool.add(replace(look, clock_std=stated), sender)
+        assert np.sqrt(pool.latest.covariance[at, at]) == pytest.approx(expected)
+    later = pool._predicted(pool.latest, 30.0)
+    assert np.sqrt(later.covariance[at, at]) == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize("rx", ["A", "B"])
 def test_derivatives_by_differences(rx):
     """Of what is measured with respect to the errors of both ends, at errors that are not zero;

@@ -175,6 +175,30 @@ def test_clutter_shows_phases_of_neighbours_however_wide_its_directions():
     assert np.abs(line[1:]).max() < 0.012  # three deviations: 0.08 rad a pair, 15 pairs, 4 frames
 
 
+@pytest.mark.parametrize("rows", [[], [64, 65], [20, 64, 90]], ids=["none", "two rows", "three"])
+def test_clutter_in_hardly_a_cell_says_nothing_of_phases(rows):
+    """Clutter over the noise nowhere, or in two or three rows, of which nobody knows how they
+    scatter: the deviations are infinite, and no phase and no information of the elements changes.
+    Planted bug: the scatter of nothing is 0, so that phases of 0 are taken for sure."""
+    rng, waves = np.random.default_rng(8), replace(W, num_chirps=120, num_samples=256)
+    delay = np.repeat(np.array(rows, float) * waves.delay_step, 50)
+    towards = np.tile([0.1, np.sqrt(0.98), 0.1], (delay.size, 1))
+    ones = np.ones(delay.size)
+    clutter = ExpectedClutter(delay, 0 * ones, ones, towards, towards)
+    expected = np.zeros((128, 120))
+    expected[rows] = 5.0
+    frame = cube(waves, pseudo_random_schedule(3, 120, 3, rng), unmodulated(waves), [])
+    known = Known.of(frame, unmodulated(waves), ANTENNAS, 2)
+    maps = rng.normal(size=(3, 15, 128, 120, 2)) @ np.array([1, 1j])
+    seen = phases(maps, expected, 2.0, known, clutter)
+    assert np.isinf(seen.std).all()
+    one = SelfCalibration(W, ANTENNAS, 2)
+    before = one.gains
+    one.learn_all([], seen)
+    assert np.array_equal(one.gains.value, before.value)
+    assert np.array_equal(one.gains.information, before.information)
+
+
 def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
     """Samples behind elements with errors, slopes of phase and level over the chirp, and a response
     that all have in common."""

@@ -29,6 +29,8 @@ OUTLIER = 8.0
 """A cell with this many times its mean holds something else than clutter."""
 BLOCKS = 64
 """Parts of the range axis, by whose scatter the deviation of the sum is told."""
+LEAST_BLOCKS = 5
+"""So many of them must hold clutter: of fewer, the scatter may be small by chance."""
 
 
 @lru_cache(maxsize=16)
@@ -76,6 +78,10 @@ def phases(
     maps : (L_tx, L_rx, rows, P) of `channel_maps`
     expected : (rows, P) clutter power of a channel, Doppler centred
     noise : of a cell
+
+    Returns
+    -------
+    neighbours : of infinite deviation where too few cells hold clutter to tell
     """
     shape = maps.shape[2:]
     channels = maps.reshape(-1, *shape)
@@ -100,6 +106,9 @@ def phases(
             )
     total = sums.sum(axis=0)
     turned = sums * np.exp(-1j * np.angle(total))
-    # sums of blocks scatter about 0 across the mean phase: that is the total's own deviation
-    std = np.sqrt((turned.imag**2).sum(axis=0)) / np.maximum(np.abs(total), 1e-300)
-    return Neighbours(first, second, np.angle(total), std)
+    # sums of blocks scatter about 0 across the mean phase: that is the total's own deviation, but
+    # for the degree of freedom that the mean takes
+    blocks = (sums != 0).sum(axis=0)
+    spread = np.sqrt((turned.imag**2).sum(axis=0) * blocks / np.maximum(blocks - 1, 1))
+    std = spread / np.maximum(np.abs(total), 1e-300)
+    return Neighbours(first, second, np.angle(total), np.where(blocks < LEAST_BLOCKS, np.inf, std))
