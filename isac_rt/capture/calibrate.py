@@ -29,6 +29,9 @@ stand 32 dB and more; second harmonics of the mixer, which have rank one too, re
 REACH = 6
 """Range cells on each side of the echo that belong to it, and about zero that belong to the
 leakage."""
+MOST_LEFT_DB = -6.0
+"""What one tone per channel leaves of a reflector at most. Measured boards leave -11.5 dB and less;
+of two reflectors in neighbouring cells, or of a spectrum that is cut, most is left."""
 PADDING = 5
 """Points of the spectrum in a range cell, as TI's calibration has them."""
 PASSED = 0.9
@@ -152,6 +155,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     spread = np.abs(left - 1) * np.sqrt(left.size / free)
     levels, metres = _decibels(amplitude), w.range_cell(2)
     plain, fit = (_unexplained(y, cells, respond=respond) for respond in (False, True))
+    _refuse_two(share, plain.left_db, cells.mean() * metres)
     pair = fit.amplitude / (rx[:, None] * tx)
     pair_late = (fit.beat - cells + delay / w.delay_step) * w.delay_step
     rx_late, tx_late = _late(capture, cells.mean() * metres, cosines)
@@ -244,6 +248,17 @@ def _refuse_faint(amplitude: np.ndarray) -> None:
             f"receiver {r} hears the reflector by transmitter {t} more than {FAINT_DB:g} dB below "
             f"the mean of all, and so do {faint.sum()} of {faint.size} channels; see whether these "
             "antennas are connected"
+        )
+
+
+def _refuse_two(share: float, left_db: float, metres: float) -> None:
+    """Raise a `CaptureError` if the echo that was fitted is not that of one reflector."""
+    if share < LEAST_SHARE or left_db > MOST_LEFT_DB:
+        raise CaptureError(
+            f"no clear reflector: what stands at {metres:.2f} m has a rank-one share of "
+            f"{share:.3f} (at least {LEAST_SHARE:g}), and one tone leaves {left_db:.1f} dB of it "
+            f"(at most {MOST_LEFT_DB:g}); keep other things out of the reflector's range cells, "
+            "and see whether the file holds whole spectra"
         )
 
 

@@ -245,7 +245,11 @@ def _sigmf(file: Path, d: Description) -> Capture:
             f"{meta}: samples of type {kind} are not read; r or c with f32, f64, i16, u16, i32 or "
             "u32 and _le or _be are, such as ci16_le, and ri8, ru8, ci8, cu8"
         )
+    d = _as_stated(meta, info, d)
     content, dtype = _read(data), np.dtype(_SIGMF_TYPES[kind])
+    checksum = info.get("core:sha512")
+    if checksum is not None and hashlib.sha512(content).hexdigest() != str(checksum).lower():
+        raise CaptureError(f"{data}: is not what core:sha512 of {meta.name} says; copy both again")
     if len(content) % dtype.itemsize:
         raise CaptureError(
             f"{data}: {len(content)} bytes are no whole number of samples of {dtype.itemsize} bytes"
@@ -257,6 +261,26 @@ def _sigmf(file: Path, d: Description) -> Capture:
         pairs = _unwrapped(flat, d).astype(np.float64).reshape(-1, 2)
         return _ordered(data, pairs[:, 0] + 1j * pairs[:, 1], d, "sigmf")
     return _ordered(data, flat, d, "sigmf")
+
+
+def _as_stated(meta: Path, info: dict[str, Any], d: Description) -> Description:
+    """The description with what the recording says of itself; refused where they differ."""
+    rate, channels = (info.get(f"core:{key}") for key in ("sample_rate", "num_channels"))
+    for key, value in (("sample_rate", rate), ("num_channels", channels)):
+        if value is not None and not isinstance(value, int | float):
+            raise CaptureError(f"{meta}: core:{key} is {str(value)[:40]!r}, no number; correct it")
+    if channels is not None and channels != 1:  # 1 is what writers state of one interleaved stream
+        _same(meta, "channels", int(channels), d.receivers)
+        if d.axes[-1] != "receiver":
+            raise CaptureError(
+                f"{meta}: {channels:g} channels take turns sample by sample, the description's "
+                f"axes end with {d.axes[-1]}; let them end with receiver"
+            )
+    if rate is None:
+        return d
+    about = ("sampling rate", "samples/s", 1.0, 1e13)
+    found = _stated(meta, np.array(rate, np.float64), d.sampling_rate_hz, about)
+    return d.model_copy(update={"sampling_rate_hz": found})
 
 
 def read_sigmf(file: str | Path) -> IFCube:
@@ -304,6 +328,12 @@ def _ordered(file: Path, array: np.ndarray, d: Description, kind: str) -> Captur
             f"{file}: an array of {' x '.join(map(str, array.shape))} has {array.size} numbers, "
             f"{' x '.join(f'{n} {name}s' for name, n in zip(d.axes, shape, strict=True))} make "
             f"{math.prod(shape)}; correct the description"
+        )
+    if np.iscomplexobj(array) == (d.sampling == "real"):
+        holds, other = ("complex", "complex_1x") if d.sampling == "real" else ("real", "real")
+        raise CaptureError(
+            f"{file}: holds {holds} numbers, the description states sampling: {d.sampling}; "
+            f"state {other}, or save the numbers that it means"
         )
     if np.iscomplexobj(array):
         array = _unwrapped(array.real, d) + 1j * _unwrapped(array.imag, d)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 from synthetic import C, channels, write_ti
 
 from isac_rt.capture.calibrate import (
@@ -159,6 +160,29 @@ def test_a_scene_without_a_reflector_is_refused_with_the_reason(board):
     samples = sum(channels(seed=s, distance=4.37 + 0.02 * rng.normal())[0] for s in range(10))
     with pytest.raises(CaptureError, match="no clear reflector"):
         calibrate(replace_samples(capture, samples))
+
+
+def test_two_reflectors_side_by_side_and_half_a_spectrum_are_refused(board, tmp_path):
+    """A second reflector of the same strength 1.6 cells behind the first, in another direction: the
+    strongest point between them passes for one. Of a spectrum cut in half the range would be
+    twice what it is.
+
+    Planted bug: no `_refuse_two`."""
+    capture, _ = board(num_rx=16, num_tx=12)
+    cell = capture.cube.waveform.range_cell(2)
+    samples = sum(
+        channels(seed=k, num_rx=16, num_tx=12, distance=4.37 + 1.6 * k * cell)[0] for k in range(2)
+    )
+    with pytest.raises(CaptureError, match=r"no clear reflector: what stands at .* leaves -?\d"):
+        calibrate(replace_samples(capture, samples))
+    whole, _ = channels(num_rx=4, num_tx=3)
+    write_ti(tmp_path / "half.mat", whole, 61.3, 9.1e6, 5)
+    content = scipy.io.loadmat(tmp_path / "half.mat", simplify_cells=True)
+    spectra = content["calibResult"]["Rx_fft"]
+    content["calibResult"] = {"Rx_fft": spectra[: len(spectra) // 2]}
+    scipy.io.savemat(tmp_path / "half.mat", {k: content[k] for k in ("calibResult", "params")})
+    with pytest.raises(CaptureError, match=r"no clear reflector.*whole spectra"):
+        calibrate(import_file(tmp_path / "half.mat"))
 
 
 def test_one_transmitter_has_no_rank(board):

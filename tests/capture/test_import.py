@@ -106,8 +106,9 @@ def test_numpy_axes_are_those_that_are_named(counts, tmp_path, dtype):
     at = values.reshape(FRAMES, LOOPS, len(CHIRPS), RX, SIZE)
     file = at.transpose(4, 2, 3, 0, 1).reshape(SIZE, -1, FRAMES * LOOPS).astype(dtype)
     np.save(tmp_path / "a.npy", file)
-    said = Description(axes=("sample", "chirp", "receiver", "frame", "loop"), **COMMON)
-    found = import_file(tmp_path / "a.npy", said)
+    sampling = "real" if dtype == np.int16 else "complex_1x"
+    axes = ("sample", "chirp", "receiver", "frame", "loop")
+    found = import_file(tmp_path / "a.npy", Description(axes=axes, sampling=sampling, **COMMON))
     assert np.array_equal(found.cube.samples[0], values[1].transpose(1, 0, 2))
 
 
@@ -205,11 +206,52 @@ def test_sigmf_of_any_width_and_order_of_bytes(tmp_path, kind, dtype):
     assert np.array_equal(found, truth.transpose(1, 0, 2))
 
 
+def test_what_a_recording_says_of_itself_is_held(tmp_path):
+    """Rate, channels and checksum of SigMF; a rate that nobody else states is its own.
+
+    Planted bug: `_as_stated` returns the description."""
+    content = np.ones((FRAMES, LOOPS * len(CHIRPS), RX, SIZE), "<c8").tobytes()
+    (tmp_path / "a.sigmf-data").write_bytes(content)
+
+    def write(**said):
+        said = {"core:datatype": "cf32_le"} | {f"core:{key}": said[key] for key in said}
+        (tmp_path / "a.sigmf-meta").write_text(json.dumps({"global": said}))
+
+    write(sample_rate=1e6)
+    refused(tmp_path, r"rate of 1e\+06 samples/s, the description 2.5e\+06", name="a.sigmf-meta")
+    write(sample_rate="fast")
+    refused(tmp_path, "core:sample_rate is 'fast', no number", name="a.sigmf-meta")
+    write(num_channels=3)
+    refused(tmp_path, "has 3 channels, the description states 4", name="a.sigmf-meta")
+    write(num_channels=RX)
+    refused(tmp_path, "axes end with sample; let them end with rec", name="a.sigmf-meta")
+    write(sha512="0" * 128)
+    refused(tmp_path, "is not what core:sha512 of a.sigmf-meta says", name="a.sigmf-meta")
+    said = {"sample_rate": 2e6, "num_channels": RX, "sha512": hashlib.sha512(content).hexdigest()}
+    write(**said)
+    told = {key: value for key, value in COMMON.items() if key != "sampling_rate_hz"}
+    told["axes"] = ("frame", "loop", "chirp", "sample", "receiver")
+    found = import_file(tmp_path / "a.sigmf-meta", Description(**told))
+    assert found.cube.waveform.sampling_rate == 2e6
+
+
+@pytest.mark.parametrize(("sampling", "dtype"), [("real", "c8"), ("complex_1x", "f4")])
+def test_real_and_complex_numbers_are_not_taken_for_each_other(sampling, dtype, tmp_path):
+    """Of real samples the upper half of the range cells are images. Planted bug: no such check."""
+    np.save(tmp_path / "a.npy", np.ones((FRAMES, LOOPS * len(CHIRPS), RX, SIZE), dtype))
+    refused(
+        tmp_path,
+        f"numbers, the description states sampling: {sampling}",
+        "a.npy",
+        sampling=sampling,
+    )
+
+
 def test_numbers_beyond_any_board_are_refused(tmp_path):
     """Powers of 1e300 overflow far behind the import. Planted bug: the largest real part."""
     np.save(tmp_path / "a.npy", np.full((2, 9, 4, 16), 3e20j))
     refused(tmp_path, r"the largest sample is 3e\+20, at most 1e\+12", name="a.npy")
-    np.save(tmp_path / "b.npy", np.full((2, 9, 4, 16), 1e300))
+    np.save(tmp_path / "b.npy", np.full((2, 9, 4, 16), 1e300j))
     refused(tmp_path, "576 of 576 samples are not finite", name="b.npy")
     for key in ("slope_mhz_per_us", "sampling_rate_hz", "carrier_hz", "chirp_interval_us"):
         with pytest.raises(ValueError, match="less than or equal to"):
@@ -225,10 +267,10 @@ def test_sizes_that_do_not_fit_are_refused_with_both_numbers(counts, tmp_path):
     refused(tmp_path, rf"has {size} bytes, .* {3 * size // 4}: ", receivers=3)
     (tmp_path / "adc.bin").write_bytes(content[:-2])
     refused(tmp_path, rf"has {size - 2} bytes, the description asks for {size}: 2 frames x 3 loops")
-    np.save(tmp_path / "a.npy", np.zeros((2, 9, 4, 15)))
+    np.save(tmp_path / "a.npy", np.zeros((2, 9, 4, 15), np.complex64))
     refused(tmp_path, r"2 x 9 x 4 x 15 has 1080 numbers, .* make 1152", name="a.npy")
     elements = {"transmitters": [[0, 0]] * 3, "receivers": [[0, 0]] * 5}
-    np.save(tmp_path / "a.npy", np.zeros((2, 9, 4, 16)))
+    np.save(tmp_path / "a.npy", np.zeros((2, 9, 4, 16), np.complex64))
     refused(tmp_path, "has 4 receivers, .* states 5", name="a.npy", elements=elements)
     refused(tmp_path, "has 4 receivers, .* states 16", "a.npy", elements="ti_cascade")
     elements = {"transmitters": [[0, 0]] * 2, "receivers": [[0, 0]] * 4}
@@ -237,7 +279,7 @@ def test_sizes_that_do_not_fit_are_refused_with_both_numbers(counts, tmp_path):
 
 def test_what_is_missing_or_no_number_is_said(tmp_path):
     refused(tmp_path, "No such file", name="none.bin")
-    bad = np.zeros((2, 9, 4, 16))
+    bad = np.zeros((2, 9, 4, 16), np.complex64)
     bad[1, 0, 0, :3] = np.nan
     np.save(tmp_path / "a.npy", bad)
     refused(tmp_path, "3 of 576 samples are not finite", name="a.npy")
