@@ -188,7 +188,8 @@ _PLAN_WORDS = (
 def _say_summary(results: Results) -> None:
     from isac_rt.views.report import gospa_table, number, per_terminal, rmse_table, side_by_side
 
-    left_out = ("Role", "Matched", "Matched, tracked")
+    left_out = {"Role", "Matched", "Matched, tracked"}
+    left_out |= {"Data frames read", "Of these late", "Frames late, at most"}  # a line below
     compared = side_by_side(results.summary)
     for part in (
         per_terminal(results.summary),
@@ -202,6 +203,12 @@ def _say_summary(results: Results) -> None:
         f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n
     )
     for name, block in results.summary["links"].items():
+        late = block.get("latency_frames")
+        if late is not None and late["late"]:
+            say(
+                f"{name.replace('->', ' to ')}: {late['late']} of {late['read']} data frames read "
+                f"late, by {late['most']} frames at most"
+            )
         counts = {k.replace("_", " "): n for k, n in block["losses"].items() if n}
         if counts:
             became = ", ".join(f"{n} {cause}" for cause, n in counts.items())

@@ -726,7 +726,7 @@ def test_paths_are_shared_by_what_differs_in_nothing_that_they_depend_on(folder)
     list, and paths of scenarios that differ in these are the same. Planted bug: the swarm in the
     list."""
     text = BASE.replace("{leakage", "{model: ray_traced, leakage") + "city: {source: blocks}\n"
-    (folder / "base.yaml").write_text(text)
+    (folder / "base.yaml").write_text(text + "receiver_preset: plain\n")
     plan = plan_of(folder)
     base = plain_tree(plan.base)
     assert set(CHANGES) == set(Scenario.model_fields)
