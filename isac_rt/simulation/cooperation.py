@@ -189,7 +189,8 @@ class Cooperation:
 
 
 def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_std: float) -> Look:
-    """The detections of a frame that a receiver's tracks took, its reference's left out.
+    """The detections of a frame that a receiver's tracks took. The reference's is left out, and
+    so are those by way of a wall, which show no body where they point.
 
     Parameters
     ----------
@@ -198,7 +199,8 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
     clock_std : deviation of its ranges by its clock [m]
     """
     tracks, found = heard.tracks, in_plane(heard.reception.detections)
-    mine = (tracks.detection >= 0) & ~tracks.is_reference
+    straight = ~tracks.is_reference & ~tracks.mirrored
+    mine = (tracks.detection >= 0) & straight
     rows = tracks.detection[mine]
     return Look(
         str(link),
@@ -212,5 +214,5 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
         found.snr[rows],
         tracks.confirmed[mine],
         (None,) * len(rows),
-        tuple(tracks.ids[~tracks.is_reference].tolist()),
+        tuple(tracks.ids[straight].tolist()),
     )

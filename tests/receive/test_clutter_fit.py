@@ -7,7 +7,8 @@ import pytest
 from receiver_cubes import ANTENNAS, frame, known
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.clutter.correction import fit
+from isac_rt.receive.clutter import correction
+from isac_rt.receive.clutter.correction import UNTAPERED, fit
 from isac_rt.receive.clutter.power import expected_power
 from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.types import ExpectedClutter
@@ -99,6 +100,28 @@ def test_velocity_and_level_come_back_from_the_clutter(targets: int):
         np.testing.assert_allclose(
             mended.delay_rate, -2 * towards @ (wrong + found.velocity) / C, rtol=0, atol=1e-16
         )
+
+
+@pytest.mark.parametrize("level_db", [-15.0, 10.0])
+def test_slopes_that_are_used_again_follow_the_level(monkeypatch, level_db: float):
+    """Mean powers without scatter, a level far off and a velocity 0.04 m/s off: the velocity comes
+    out as if its slopes were computed in every step, to 0.003 m/s, a third of what the fit's own
+    six steps leave. Planted bug: the slopes keep the level at which they were computed."""
+    towards, ranges, powers = surroundings(COUNT, np.random.default_rng(4))
+    _, schedule, payload = frame(waveform=W)
+    one, noise = known(W, schedule, payload), 0.02 * W.num_samples * W.num_chirps
+
+    def clutter_at(velocity: np.ndarray, factor: float) -> ExpectedClutter:
+        rate = -2 * (towards @ velocity) / C
+        return ExpectedClutter(2 * ranges / C, rate, factor * powers, towards, towards)
+
+    truth = clutter_at(VELOCITY + [0.02, -0.03, 0.01], 10 ** (level_db / 10))
+    power = expected_power(truth, one, ROWS, UNTAPERED) + noise
+    guess = clutter_at(VELOCITY, 1.0)
+    found = fit(power, noise, guess, one)
+    monkeypatch.setattr(correction, "ALIKE", -1.0)
+    assert found.velocity == pytest.approx(fit(power, noise, guess, one).velocity, abs=0.003)
+    assert 10 * np.log10(np.exp(found.level)) == pytest.approx(level_db, abs=0.1)
 
 
 def test_detectors_judge_with_the_corrected_clutter():

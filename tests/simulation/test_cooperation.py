@@ -7,14 +7,23 @@ import pytest
 from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
+from isac_rt.frame.link import Link
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive import Reception
+from isac_rt.receive.types import Detections
 from isac_rt.results.provenance import run_content
+from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM
 from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
 from isac_rt.scenario.swarm import Access
 from isac_rt.simulation import simulate
+from isac_rt.simulation.cooperation import look_of
 from isac_rt.simulation.resume import Resume
+from isac_rt.terminal.filter import Gaussian, measure
+from isac_rt.terminal.tracker import Track, track_set
 from isac_rt.views.animate import animate, fused_positions
 from isac_rt.views.report import swarm_table
+from isac_rt.world.swarm import Pose
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +176,30 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     here = d.uav_position.values[int(d.snapshot_frame.values[1]), 2, 0]
     assert marks["picture of the whole swarm"] == pytest.approx([here], abs=1.0)
     assert marks["its picture with what it hears"] == pytest.approx([here], abs=1.0)
+
+
+def test_what_a_wall_shows_is_not_told_as_a_detection():
+    """Of two tracks that a frame has fed, one is of a body's image behind a wall: its detection
+    points where nobody is, and bodies that rest on it are to end. Planted bug: all but the
+    reference are told."""
+    own = Pose.at_rest((0.0, 0.0, 20.0), (0, 1, 0))
+    states = [np.array([1.0, 20, 22, 0, 3, 0, 0, 0, 0]), np.array([9.0, 31, 24, 1, 2, 0, 0, 0, 0])]
+    tracks = [
+        Track(k, Gaussian(mean, np.eye(9)), 50.0, confirmed=True, detection=1 - k)
+        for k, mean in enumerate(states)
+    ]
+    tracks[1].mirror = np.array([1.0, 0.0, 0.0, 5.0])
+    z = np.array([measure(mean, own) for mean in states[::-1]])
+    found = Detections(
+        range=z[:, 0],
+        velocity=z[:, 1],
+        direction=z[:, 2:],
+        snr=np.full(2, 80.0),
+        std=np.full((2, 4), 0.01),
+        is_reference=np.zeros(2, bool),
+    )
+    waveform = Waveform(num_samples=256)
+    heard = Heard(Reception.undecoded(waveform, found), track_set(tracks, own), 1)
+    look = look_of(Link("AT", "AT"), 3, 0.15, own, heard, 0.0)
+    assert look.numbers.tolist() == [0] and look.kept == (0,)
+    np.testing.assert_allclose(look.z, z[1:])

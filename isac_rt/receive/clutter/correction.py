@@ -60,10 +60,10 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
         moved = doppler + per_velocity @ theta[1:]
         anew = np.abs(theta[1:] - at).max() > ALIKE
         along = per_velocity if anew else per_velocity[:, :0]
-        parts = np.exp(theta[0]) * response.of(beat, moved, clutter.power, along)
+        parts = response.of(beat, moved, clutter.power, along)
         if anew:
             at, slopes = theta[1:].copy(), parts[1:]
-        parts = np.concatenate([parts[:1], slopes])
+        parts = np.exp(theta[0]) * np.concatenate([parts[:1], slopes])
         used = parts[0] > noise
         if used.sum() < FEWEST:
             return Correction(0.0, np.zeros(3))
