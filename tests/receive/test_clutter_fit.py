@@ -115,7 +115,7 @@ def test_slopes_that_are_used_again_follow_the_level(monkeypatch, level_db: floa
         rate = -2 * (towards @ velocity) / C
         return ExpectedClutter(2 * ranges / C, rate, factor * powers, towards, towards)
 
-    truth = clutter_at(VELOCITY + [0.02, -0.03, 0.01], 10 ** (level_db / 10))
+    truth = clutter_at(VELOCITY + np.array([0.02, -0.03, 0.01]), 10 ** (level_db / 10))
     power = expected_power(truth, one, ROWS, UNTAPERED) + noise
     guess = clutter_at(VELOCITY, 1.0)
     found = fit(power, noise, guess, one)
