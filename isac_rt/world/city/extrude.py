@@ -72,15 +72,16 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
                 f"{what}: the polygon is not valid ({why}) and repair leaves no area; redraw or "
                 "remove it"
             )
-    parts = [
-        p
-        for p in shapely.get_parts(geometry, return_index=False)
-        if p.geom_type in ("Polygon", "MultiPolygon")
-    ]
-    polygons = [q for p in parts for q in shapely.get_parts(p) if q.area > 0]
+    parts = [geometry] if geometry.geom_type == "Polygon" else shapely.get_parts(geometry).tolist()
+    flat = [p for p in parts if p.geom_type in ("Polygon", "MultiPolygon")]
+    polygons = [q for p in flat for q in _simple(p) if q.area > 0]
     if not polygons:
         raise CityError(f"{what}: the polygon has no area; redraw or remove it")
     return [shapely.remove_repeated_points(shapely.force_2d(p)) for p in polygons]
+
+
+def _simple(part: shapely.Polygon | shapely.MultiPolygon) -> list[shapely.Polygon]:
+    return [part] if part.geom_type == "Polygon" else shapely.get_parts(part).tolist()
 
 
 def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -90,10 +91,11 @@ def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int6
     Constrained Delaunay: ear clipping may pass over a corner on a straight edge, and the roof would
     not meet the wall there.
     """
-    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
-    corners = np.array([shapely.get_coordinates(t)[:3] for t in pieces])
-    known, first = np.unique(plan, axis=0, return_index=True)
-    place = {point: int(i) for point, i in zip(map(tuple, known.tolist()), first, strict=True)}
+    pieces = shapely.constrained_delaunay_triangles(polygon)
+    corners = shapely.get_coordinates(pieces).reshape(-1, 4, 2)[:, :3]
+    place: dict[tuple[float, ...], int] = {}
+    for i, point in enumerate(plan.tolist()):
+        place.setdefault(tuple(point), i)
     triangles = np.array([[place[tuple(p)] for p in t] for t in corners.tolist()], dtype=np.int64)
     flipped = _turn(corners) < 0
     triangles[flipped] = triangles[flipped][:, ::-1]
@@ -102,7 +104,7 @@ def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int6
 
 def _turn(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Twice the signed area of plane triangles (T, 3, 2). [m^2]"""
-    a, b, c = np.moveaxis(corners, 1, 0)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
@@ -155,7 +157,9 @@ def building(
     rings = [shapely.get_coordinates(r)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     plan = np.concatenate(rings)
     num = len(plan)
-    vertices = np.concatenate([np.column_stack([plan, np.full(num, z)]) for z in (base, top)])
+    vertices = np.empty((2 * num, 3))
+    vertices[:num, :2], vertices[num:, :2] = plan, plan
+    vertices[:num, 2], vertices[num:, 2] = base, top
     cap = _cap(polygon, plan)
     covered = _turn(plan[cap]).sum() / 2
     if abs(covered - polygon.area) > 1e-6 * polygon.area:
@@ -163,14 +167,13 @@ def building(
             f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 "
             "covered); simplify the outline"
         )
-    start = np.cumsum([0] + [len(r) for r in rings[:-1]])
+    lengths = np.array([len(ring) for ring in rings])
+    ends = np.cumsum(lengths)
     here = np.arange(num)
-    nxt = np.concatenate(
-        [s + np.roll(np.arange(len(r)), -1) for s, r in zip(start, rings, strict=True)]
-    )
-    walls = np.concatenate(
-        [np.column_stack([here, nxt, nxt + num]), np.column_stack([here, nxt + num, here + num])]
-    )
+    after = here + 1
+    after[ends - 1] = ends - lengths  # rings close
+    halves = np.array([[here, after, after + num], [here, after + num, here + num]])
+    walls = halves.transpose(0, 2, 1).reshape(-1, 3)
     return [
         Surface(vertices, walls, finish.wall),
         Surface(vertices, cap + num, finish.roof),
