@@ -32,6 +32,8 @@ GATE_CELLS = 0.4
 """Cells within which the path is found again in a frame that was read over it."""
 STD_CELLS = 0.02
 """Floor of its range and velocity deviations in cells."""
+FIRST_BEND = 3.0
+"""Deviation of the acceleration of a path that is seen for the first time [m/s^2]."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class Retrospect:
         if len(d):
             i = int(d.snr.argmax())
             mean = np.array([d.range[i], d.velocity[i], 0.0])
-            spread = np.append(self._deviations(d, i), 3.0) ** 2
+            spread = np.append(self._deviations(d, i), FIRST_BEND) ** 2
             self.path = DataPath(time, mean, np.diag(spread), d.direction[i])
 
     def forget(self) -> None:
@@ -105,7 +107,7 @@ class Retrospect:
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        kept = ("time", "modulated", "schedule", "cells", "places", "values", "noise")
+        kept = ("time", "modulated", "schedule", "cells", "values", "noise")
         return {
             "batch": [{name: getattr(one, name) for name in kept} for one in self._batch],
             "path": None if self.path is None else dict(vars(self.path)),

@@ -41,7 +41,7 @@ from isac_rt.terminal.filter import (
 from isac_rt.terminal.fusion import of_itself
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
-from isac_rt.terminal.retrospect import Late, Retrospect
+from isac_rt.terminal.retrospect import COAST_CELLS, Late, Retrospect
 from isac_rt.terminal.self_calibration import calibration_of
 from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
 from isac_rt.terminal.standing import Standing
@@ -52,9 +52,6 @@ LEVEL_DROP = 10.0
 """A reference this factor in power under what free space gives at its range is a reflection. Off
 boresight both ends lose some 4 dB at most inside the field of view; a mirror reflection off a wall
 loses more than the rest, scattering far more."""
-COAST_CELLS = 0.2
-"""A prediction whose range is known worse than this many cells cannot read the fraction of a
-cell."""
 EVIDENCE_FRAMES = 12
 """How long a symbol outside the alphabet is remembered."""
 SLIP_FALSE_RATE = 1e-6

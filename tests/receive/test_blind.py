@@ -96,8 +96,7 @@ def test_the_path_over_frames_far_apart():
         ahead = from_there[..., :1] * x + from_there[..., 1:] * z
         values = 4 * np.exp(-2j * np.pi * w.effective_carrier * ahead / C)
         values += rng.standard_normal((*values.shape, 2)).view(complex)[..., 0] / np.sqrt(2)
-        places = np.round(2 * cells).astype(int)
-        parts = (a[:, :, None] for a in (cells, places, values))
+        parts = (a[:, :, None] for a in (cells, values))
         kept.append(Peaks(0.045 * n, True, w, None, *parts, 1.0))
     found = acquire(kept, ANTENNAS, ORDER)
     t = 0.135

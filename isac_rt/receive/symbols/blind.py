@@ -75,8 +75,7 @@ class Peaks:
     modulated : whether the frame carries data
     waveform, schedule : public parameters of the frame
     cells : (M, P, K) where they lie, between half cells, strongest first
-    places : (M, P, K) half cells that `values` are of
-    values : (M, P, K, L_rx) complex64, phases as in the middle of the samples
+    values : (M, P, K, L_rx) complex64 of the half cells there, phases as in the middle of the samples
     noise : mean power of an empty cell of one antenna
     """
 
@@ -85,7 +84,6 @@ class Peaks:
     waveform: Waveform
     schedule: np.ndarray
     cells: np.ndarray
-    places: np.ndarray
     values: np.ndarray
     noise: float
 
@@ -170,7 +168,6 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
         w,
         cube.schedule,
         cells.astype(np.float32),
-        places.astype(np.int16),
         (values * turn[..., None]).astype(np.complex64),
         float(noise.mean()),
     )
@@ -188,8 +185,7 @@ def acquire(batch: Sequence[Peaks], antennas: Antennas, order: int) -> DataPath 
     Returns
     -------
     path : None unless the comb shows one, its rate tells the DPSK symbols apart, and one whole
-    number
-        of cells is left
+        number of cells is left
     """
     w = batch[0].waveform
     direction = _direction(batch, antennas, w)
