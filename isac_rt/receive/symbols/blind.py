@@ -75,7 +75,7 @@ class Peaks:
     modulated : whether the frame carries data
     waveform, schedule : public parameters of the frame
     cells : (M, P, K) where they lie, between half cells, strongest first
-    values : (M, P, K, L_rx) complex64 of the half cells there, phases as in the middle of the samples
+    values : (M, P, K, L_rx) complex64 of the half cells there, phases as in mid-chirp
     noise : mean power of an empty cell of one antenna
     """
 
