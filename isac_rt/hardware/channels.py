@@ -79,8 +79,8 @@ class Elements:
         out = np.broadcast_to(gain, (len(direction), self.gain.size))
         if not np.array_equal(self.coupling, np.eye(self.gain.size)):
             steering = np.exp(-2j * np.pi * frequency / SPEED_OF_LIGHT * (direction @ positions.T))
-            out = out * (steering @ self.coupling.conj().T) / steering
-        if self.tilt.any():
+            out = out * (steering @ self.coupling.conj().T) * steering.conj()
+        if self.tilt.any() and antennas.pattern != "isotropic":
             straight = antennas.element_gain(direction)
             own = antennas.element_gain(_turned(direction[:, None], self.tilt))
             ratio = np.divide(

@@ -23,6 +23,7 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.randomness import generator
 from isac_rt.scenario import front_end as scenario
 
@@ -35,6 +36,7 @@ _STEPS = 8  # samples of a slower band's highest frequency
 _SIZE, _FASTEST_SIZE = 8192, 65_536
 _FADE = 8  # a block's length over that of its overlap
 _SPAN = 4  # samples that a place between two is interpolated from
+_SUMMED = 16  # values of a record to each sum that its means are made from
 
 
 @dataclass(frozen=True)
@@ -106,16 +108,14 @@ class Record(NamedTuple):
     def means(self, duration: float) -> Callable[[np.ndarray], np.ndarray]:
         """Gives the mean phase over `duration` [s] from any times on [rad]: the difference of two
         integrals, of straight lines between the values."""
-        total = np.cumsum(self.values)
-
-        def integral(time: np.ndarray) -> np.ndarray:
-            place = (time - self.start) / self.step
-            first = np.floor(place).astype(np.int64)
-            near = (first - 1)[..., None] + np.arange(_SPAN)
-            return ((total[near] - self.values[near] / 2) * cubic(place - first)).sum(axis=-1)
+        total = np.zeros(self.values.size // _SUMMED + 1)
+        _sum_up(total, self.values)
 
         def mean(begin: np.ndarray) -> np.ndarray:
-            return (integral(begin + duration) - integral(begin)) * (self.step / duration)
+            out = np.empty(np.shape(begin))
+            place = ((begin - self.start) / self.step).ravel()
+            _mean(out.reshape(-1), self.values, total, place, duration / self.step)
+            return out
 
         return mean
 
@@ -130,21 +130,67 @@ def cubic(share: np.ndarray) -> np.ndarray:
 
 
 @jit(fast=True)
-def _between(out: np.ndarray, coarse: np.ndarray, weight: np.ndarray, first: int) -> None:
-    """The cubic through `coarse` at as many places between two of its values as `weight` has rows,
-    the first of them `first` places after its second value."""
-    ratio = weight.shape[0]
+def _sum_up(total, values):
+    """Sums of the values before each `_SUMMED`-th one."""
+    for k in range(total.shape[0] - 1):
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for n in range(_SUMMED * k, _SUMMED * (k + 1), 4):
+            a, b, c, d = a + values[n], b + values[n + 1], c + values[n + 2], d + values[n + 3]
+        total[k + 1] = total[k] + (a + b + c + d)
+
+
+@jit(fast=True)
+def _integral(values, total, place):
+    """Of straight lines between the values up to a place, by the cubic through four of its own."""
+    first = int(np.floor(place))
+    x = place - first
+    back, ahead, far = x + 1, x - 1, x - 2
+    weight = -x * ahead * far / 6, back * ahead * far / 2, -back * x * far / 2, back * x * ahead / 6
+    whole = (first - 1) // _SUMMED
+    before, out = total[whole], 0.0
+    for n in range(whole * _SUMMED, first - 1):
+        before += values[n]
+    for i in range(_SPAN):
+        value = values[first - 1 + i]
+        out += weight[i] * (before + value / 2)
+        before += value
+    return out
+
+
+@jit(fast=True)
+def _mean(out, values, total, place, length):
+    """Means of the values over `length` of their steps from each place on."""
+    for i in range(out.shape[0]):
+        end = _integral(values, total, place[i] + length)
+        out[i] = (end - _integral(values, total, place[i])) / length
+
+
+@jit(fast=True)
+def _between(out, coarse, weight, first):
+    """The cubic through `coarse` at as many places between two of its values as the (4, ratio)
+    `weight` has columns, the first of them `first` places after its second value."""
+    ratio = weight.shape[1]
+    whole = ratio - ratio % LANES
     for n in range(first // ratio * ratio, out.shape[0] + first, ratio):
         k = n // ratio
         a, b, c, d = coarse[k], coarse[k + 1], coarse[k + 2], coarse[k + 3]
         low, high = max(n, first), min(n + ratio, out.shape[0] + first)
-        for i in range(low, high):
-            w = weight[i - n]
+        done = low
+        if high - low == ratio:
+            done += whole
+            before, here = splat(a), splat(b)
+            after, beyond = splat(c), splat(d)
+            for i in range(0, whole, LANES):
+                value = before * load(weight[0], i) + here * load(weight[1], i)
+                value = value + after * load(weight[2], i) + beyond * load(weight[3], i)
+                store(out, n - first + i, value)
+        for i in range(done, high):
+            w = weight[:, i - n]
             out[i - first] = a * w[0] + b * w[1] + c * w[2] + d * w[3]
 
 
 @jit(fast=True)
-def _add_faded(out: np.ndarray, block: np.ndarray, weight: np.ndarray) -> None:
+def _add_faded(out, block, weight):
     """Add a block, faded at its ends."""
     for n in range(out.shape[0]):
         out[n] += np.float64(weight[n] * block[n])
@@ -212,7 +258,8 @@ class Oscillator:
             weight, at = cubic(place % coarse / coarse), place // coarse
             total += sum(weight[:, i] * own[at - 1 + i] for i in range(_SPAN))
         out = np.empty(count)
-        _between(out, total, cubic(np.arange(ratio) / ratio), first - low * ratio)
+        weight = np.ascontiguousarray(cubic(np.arange(ratio) / ratio).T)
+        _between(out, total, weight, first - low * ratio)
         return out
 
     def _add_band(self, out: np.ndarray, number: int, band: _Band, first: int) -> None:

@@ -425,10 +425,10 @@ def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) ->
     count with their whole power."""
     if oscillator is None:
         return np.zeros(apart.shape)
-    grid, table = _within(oscillator.mask, duration, oscillator.rate)
+    grid, table, of_two = _within(oscillator.mask, duration, oscillator.rate)
     far = np.isinf(apart)
     out = np.interp(np.where(far, 0.0, apart), grid, table)
-    out[far] = spread(oscillator.mask, np.inf, duration, oscillator.rate)[1]
+    out[far] = of_two
     for offset, level in oscillator.spurs:
         swing = np.where(far, 2.0, 4 * np.sin(np.pi * offset * np.where(far, 0.0, apart)) ** 2)
         out += 2 * 10 ** (level / 10) * swing
@@ -436,7 +436,10 @@ def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) ->
 
 
 @lru_cache(maxsize=16)
-def _within(mask: Mask | None, duration: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Delays [s] and the variances within a chirp at them."""
+def _within(
+    mask: Mask | None, duration: float, rate: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Delays [s] and the variances within a chirp at them, and that of two oscillators."""
     grid = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 60) / rate])
-    return grid, np.array([spread(mask, apart, duration, rate)[1] for apart in grid])
+    table = np.array([spread(mask, apart, duration, rate)[1] for apart in grid])
+    return grid, table, float(spread(mask, np.inf, duration, rate)[1])

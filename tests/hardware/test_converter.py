@@ -91,8 +91,8 @@ def test_one_decibel_of_compression_where_it_is_stated():
     assert 20 * np.log10(saturated(1.0, 1.0)) == pytest.approx(-10 * np.log10(2) / 2)
     assert saturated(1e-4, 1.0) == pytest.approx(1.0, abs=1e-8)
     driven = 2.0 * watts(-10.0) * np.geomspace(1e-3, 1e3, 64)
-    for power in driven:  # by two steps of Newton's, 2e-5
+    for power in driven:  # by a polynomial, 4e-6, and float32
         made = behind(np.full((1, 1, 1, 40), np.sqrt(power), np.complex64), compression_dbm=-10.0)
         ratio = saturated(power, watts(-10.0) / (10**0.2 - 1) ** 0.5)
-        np.testing.assert_allclose(made, np.sqrt(power) * ratio, rtol=3e-5)
+        np.testing.assert_allclose(made, np.sqrt(power) * ratio, rtol=6e-6)
     assert saturated(1e4, 1.0) * 100 == pytest.approx(1.0, abs=1e-8)
