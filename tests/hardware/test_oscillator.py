@@ -134,7 +134,8 @@ def test_cubic_goes_through_cubics():
 
 def test_means_are_integrals_of_the_phase():
     """Over 51.2 us from any instant: the trapezoid through every value, whose ends are the cubic's.
-    What is left is the curve between two values. Planted bugs: sums of one block fewer; half of the value left out."""
+    What is left is the curve between two values. Planted bugs: sums of one block fewer; half of
+    the value left out."""
     record = oscillator(LOCKED).record(0.0, 0.002)
     begin = np.array([[1.3e-5, 2.71e-4], [9.002e-4, 1.717e-3]])
     found = record.means(51.2e-6)(begin)
