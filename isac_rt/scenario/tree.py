@@ -437,14 +437,18 @@ class Scenario(Node):
         """Schedules by which the channels of an echo cannot be told in one frame."""
         if self.radio.groups == self.num_tx and self.radio.bands(self.num_tx) == 1:
             return
+        said = (
+            f"needs as many groups as the {self.num_tx} transmit antennas, one of which sends at a "
+            f"time, and there are {self.radio.groups}; set it to none, or change radio.groups"
+        )
+        if self.radio.mode == "fmcw":
+            said = (
+                f"needs one transmit antenna in mode fmcw, and there are {self.num_tx}; set it to "
+                "none, or send from one antenna"
+            )
         for at, receivers in self._all_receivers().items():
             if receivers.self_calibration != "none":
-                yield Problem(
-                    ((*at, "self_calibration"), ("radio", "groups")),
-                    f"needs as many groups as the {self.num_tx} transmit antennas, one of which "
-                    f"sends at a time, and there are {self.radio.groups}; set it to none, or "
-                    "change radio.groups",
-                )
+                yield Problem(((*at, "self_calibration"), ("radio", "groups")), said)
 
     def _front_end_problems(self) -> Iterator[Problem]:
         real = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Measure = Literal["range", "velocity", "azimuth", "elevation"]
+Against = Literal["delay", "doppler"]
 
 
 class Plots:
@@ -28,7 +29,7 @@ class Plots:
     Raises
     ------
     ResultsError  If it is the folder of no run; of a method, if the run has no such terminal or
-        nothing to draw.
+        nothing to draw, or there is no such measure.
 
     Examples
     --------
@@ -56,20 +57,23 @@ class Plots:
         self, observer: str | None = None, measure: Measure = "range", ax: Axes | None = None
     ) -> Axes:
         """Truth, detections and tracks of every UAV over time."""
+        _check(measure, Measure)
         number = self._number(observer)
         return figures.over_time(_axes(ax), self.results.dataset, number, measure)
 
     def errors(self, measure: Measure = "range", ax: Axes | None = None) -> Axes:
         """Distribution of the absolute errors at every terminal."""
+        _check(measure, Measure)
         return figures.error_cdf(_axes(ax), self.results.dataset, measure)
 
     def paths(
         self,
         observer: str | None = None,
-        against: Literal["delay", "doppler"] = "delay",
+        against: Against = "delay",
         ax: Axes | None = None,
     ) -> Axes:
         """Power of every path of the kept frames."""
+        _check(against, Against)
         self._snapshot(-1)
         number = self._number(observer)
         return figures.path_power(_axes(ax), self.results.dataset, number, against)
@@ -95,6 +99,11 @@ class Plots:
                 f"snapshot {snapshot}: the run kept {count} frames; give --snapshots to the run"
             )
         return int(np.arange(count)[snapshot])
+
+
+def _check(name: str, choices: Any) -> None:
+    if name not in get_args(choices):
+        raise ResultsError(f"{name}: choose from {', '.join(get_args(choices))}")
 
 
 def _axes(ax: Axes | None) -> Axes:

@@ -223,3 +223,13 @@ def test_self_calibration_needs_samples_and_all_groups(changes, words):
     if radio:
         with pytest.raises(ValueError, match=words):
             Scenario(swarm=SWARM, radio=radio, compare={"other": {"receivers": wanted}})
+
+
+def test_self_calibration_of_a_sensor_is_told_what_helps():
+    """`radio.groups` is refused in mode fmcw, so that it is no remedy there."""
+    sensor = {"AT": SWARM["AT"]}
+    receivers = {"self_calibration": "tracks"}
+    with pytest.raises(ValueError, match="needs one transmit antenna in mode fmcw") as told:
+        Scenario(swarm=sensor, sensor="awr1843", receivers=receivers)
+    assert "change radio.groups" not in str(told.value)
+    Scenario(swarm=sensor, sensor="bgt24mtr12", receivers=receivers)

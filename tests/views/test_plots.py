@@ -52,3 +52,13 @@ def test_what_is_not_there_is_one_message(run, tmp_path):
         plots.range_doppler(snapshot=3)
     with pytest.raises(ResultsError, match="cannot read results"):
         irt.Plots(tmp_path)
+
+
+def test_a_measure_that_there_is_not_is_refused(run):
+    """Seen as a KeyError, and as a plot over delay. Planted bug: no `_check` in `paths`."""
+    plots = irt.Plots(run)
+    for draw in (plots.tracks, plots.errors):
+        with pytest.raises(ResultsError, match="height: choose from range, velocity, azimuth, el"):
+            draw(measure="height")
+    with pytest.raises(ResultsError, match="range: choose from delay, doppler"):
+        plots.paths(against="range")
