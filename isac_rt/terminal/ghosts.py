@@ -88,6 +88,15 @@ class Walls:
         away = np.maximum(np.maximum(low - place, place - high), 0.0)
         return np.flatnonzero((away**2).sum(axis=1) < reach**2)
 
+    def within(self, place: np.ndarray, reach: float) -> bool:
+        """Whether a face of a mirror lies within reach [m] of a place (3,)."""
+        near = self.about(place, reach)
+        _, normals, offsets = self.mirrors
+        off = normals[near] @ place - offsets[near]
+        near, off = near[np.abs(off) < reach], off[np.abs(off) < reach]
+        feet = place - off[:, None] * normals[near]
+        return bool(self.holds(near, feet, reach).any())
+
     def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""
         low, high = self._faces[2]

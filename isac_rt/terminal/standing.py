@@ -2,7 +2,8 @@
 
 A UAV may hover, but it hovers alone and in one place. What stands still in the world at several
 places near each other, and is explained by nothing that the terminal knows, is a surface. The
-terminal remembers such echoes for a while, because each frame shows other parts of it.
+terminal remembers such echoes for a while, because each frame shows other parts of it. Echoes of
+one surface are about as strong as each other: what stands far out of its neighbours is a body.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
+from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose
 
@@ -28,6 +30,8 @@ STANDS = 11.3
 squared of three."""
 CROWD = 3
 """So many beside it make an echo part of a surface."""
+STANDS_OUT = 10.0
+"""An echo weaker than another by more than this factor is not of the same surface."""
 
 
 class Standing:
@@ -37,22 +41,26 @@ class Standing:
     ----------
     turn : by which direction cosines are ambiguous, the wavelength over the array's spacing: an
         echo from beyond the view is seen so far beside its direction; inf: by nothing
+    walls : the mesh; None: nothing is known of it
     """
 
-    def __init__(self, turn: float) -> None:
-        self._seen = np.zeros((0, 4))
+    def __init__(self, turn: float, walls: Walls | None = None) -> None:
+        self._walls = walls
+        self._seen = np.zeros((0, 5))
         steps = (0, -1, 1) if np.isfinite(turn) else (0,)
         by = [step * turn if step else 0.0 for step in steps]
         self._aliases = np.array([(x, z) for x in by for z in by])
 
     @classmethod
-    def of(cls, antennas: Antennas, waveform: Waveform, passes: int) -> Standing:
+    def of(
+        cls, antennas: Antennas, waveform: Waveform, passes: int, walls: Walls | None
+    ) -> Standing:
         """For the array of an active terminal (passes = 2) or a passive one."""
         step = antennas.step(passes)
-        return cls(waveform.wavelength / step if step else np.inf)
+        return cls(waveform.wavelength / step if step else np.inf, walls)
 
     def memory(self) -> np.ndarray:
-        """(n, 4) times and places, for `restore`."""
+        """(n, 5) times, places and signal-to-noise ratios, for `restore`."""
         return self._seen
 
     def restore(self, memory: np.ndarray) -> None:
@@ -91,16 +99,27 @@ class Standing:
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         place = place[each, best]
-        new = np.column_stack([np.full(len(d), time), place])[still & d.starts]
+        new = np.column_stack([np.full(len(d), time), place, d.snr])
+        new = new[still & d.starts & ~d.is_reference]
         self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
-        return still & self.crowded(place)
+        return still & self.crowded(place, d.snr)
 
-    def crowded(self, places: np.ndarray) -> np.ndarray:
-        """(n,) whether places (n, 3) lie among echoes that stood still."""
-        apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:], axis=-1)
+    def crowded(self, places: np.ndarray, snr: np.ndarray) -> np.ndarray:
+        """(n,) whether what is seen at places (n, 3), so far above the noise (n,), lies among
+        echoes that stood still, and does not stand out of them. What touches the mesh does not:
+        the foot of a wall shines too."""
+        apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:4], axis=-1)
         beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
+        some = self._among(beside)
+        out = some & ~self._among(beside & (STANDS_OUT * self._seen[:, 4] > snr[:, None]))
+        if self._walls is not None:
+            out[out] = [not self._walls.within(place, BESIDE_M[0]) for place in places[out]]
+        return some & ~out
+
+    def _among(self, beside: np.ndarray) -> np.ndarray:
+        """(n,) whether what is seen beside each (n, S) makes a crowd."""
         some = beside.sum(axis=1) >= CROWD
-        some[some] = [_spots(self._seen[near, 1:]) >= CROWD for near in beside[some]]
+        some[some] = [_spots(self._seen[near, 1:4]) >= CROWD for near in beside[some]]
         return some
 
     def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
@@ -113,7 +132,7 @@ class Standing:
         """Whether a track stands still, as far as is known of it, within a crowd."""
         velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
         d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
-        return bool(d2 < STANDS and self.crowded(track.state.mean[None, :3])[0])
+        return bool(d2 < STANDS and self.crowded(track.state.mean[None, :3], np.array([track.snr]))[0])
 
 
 def _spots(places: np.ndarray) -> int:

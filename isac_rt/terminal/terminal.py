@@ -137,7 +137,7 @@ class ActiveTerminal:
             places = tracking.mirrors == "place"
             self._doubts = Doubts(walls, antennas, waveform, places=places)
         self.calibration = calibration_of(receivers, waveform, antennas, 2)
-        self._standing = Standing.of(antennas, waveform, 2)
+        self._standing = Standing.of(antennas, waveform, 2, walls)
         self._correction: Correction | None = None
 
     def step(
@@ -267,7 +267,7 @@ class PassiveTerminal:
         self._doubts = None
         if tracking.births == "unexplained" and self._surroundings.walls is not None:
             self._doubts = Doubts(self._surroundings.walls, antennas, waveform, passes=1)
-        self._standing = Standing.of(antennas, waveform, 1)
+        self._standing = Standing.of(antennas, waveform, 1, self._surroundings.walls)
         self.tracker = Tracker(tracking, self._period)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
@@ -419,11 +419,14 @@ class PassiveTerminal:
         if self._doubts is None:
             self.tracker.update(detections, own, sender)
             return
-        if self._surroundings.clutter is not None and not self._placed(sender):
+        known = self._surroundings.clutter
+        if known is not None and not self._placed(sender):
             detections = replace(detections, starts=np.zeros(len(detections), bool))
         new = {track.id for track in self.tracker.tracks if not track.confirmed}
         allowed = self._doubts.births(detections, own, sender.mean[:6])
-        crowd = self._standing.look(allowed, own, self._time, self._period, sender.mean[:6])
+        crowd = np.zeros(len(allowed), bool)
+        if known is None or self._clutter is not None:  # else the city's own echoes are among them
+            crowd = self._standing.look(allowed, own, self._time, self._period, sender.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
         self._doubts.remove_ghosts(self.tracker, new, own, reference)

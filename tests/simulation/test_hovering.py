@@ -20,13 +20,15 @@ HOVERING = (
 
 @pytest.mark.slow
 @pytest.mark.sionna
-def test_uavs_that_hover_are_found_and_one_that_hovers_near_another_is_no_wall():
-    """The passive terminal finds both in every frame, the active one that in open air; nothing
-    false is confirmed, and the passive terminal follows the one in open air (13 of 16 frames were
-    measured; none with every echo of the other counted as a place of its own)."""
+def test_uavs_that_hover_are_found_and_followed():
+    """The passive terminal finds and follows both, the active one that in open air; nothing false
+    is confirmed. Tracked were 13 and 13 of 16 frames at PT1 and 14 at the AT: a track is confirmed
+    by its third detection, and PT1 needs two frames to acquire. U1, in the cells of its wall, is
+    out of the AT's reach."""
     blocks = simulate.run(load(SCENE, HOVERING, frames=16), snapshots=0).summary["terminals"]
     targets = {name: block["targets"] for name, block in blocks.items()}
     assert [targets["PT1"][name]["found"] for name in ("U1", "U4")] == [16, 16]
+    assert [targets["PT1"][name]["tracked"] >= 12 for name in ("U1", "U4")] == [True, True]
     assert targets["AT"]["U4"]["found"] == 16
-    assert targets["PT1"]["U4"]["tracked"] >= 10
-    assert all(block["false_tracks_per_frame"] < 0.3 for block in blocks.values())
+    assert targets["AT"]["U4"]["tracked"] >= 13
+    assert all(block["false_tracks_per_frame"] < 0.1 for block in blocks.values())

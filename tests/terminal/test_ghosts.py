@@ -325,3 +325,17 @@ def test_the_street_has_ghosts_and_the_test_finds_them():
     assert len(ghosts) and (ghosts.order > 0).all() and (ghosts.face >= 0).all()
     assert set(ghosts.terminal) == {"passive"} and ghosts.suspect.mean() > 0.5
     assert not tracks[tracks.what == "uav"].suspect.any()
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((WALL_X - 1.4, 20.0, 3.0), True),
+        ((WALL_X + 1.4, 20.0, 3.0), True),
+        ((WALL_X - 1.6, 20.0, 3.0), False),
+        ((WALL_X - 0.5, 45.0, 3.0), False),  # in the plane's reach, beside its faces
+    ],
+)
+def test_a_place_within_reach_of_a_wall(place, expected):
+    """The wall ends at y = 40. Planted bugs: the plane without its end; the origin left out."""
+    assert Walls(wall()).within(np.array(place) + ORIGIN, 1.5) is expected

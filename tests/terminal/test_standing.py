@@ -7,8 +7,10 @@ import pytest
 
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.standing import MEMORY_S, Standing
 from isac_rt.terminal.tracker import Track
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 PERIOD = 60.0
@@ -132,7 +134,7 @@ def test_a_wall_stands_still_for_a_passive_terminal():
     d = Detections(**{**vars(d), "range": far[0] + far[1], "velocity": rate})
     standing = Standing(np.inf)
     assert standing.look(d, own(0.0), 0.0, PERIOD, sender).tolist() == [True] * 5 + [False]
-    np.testing.assert_allclose(standing.memory()[:, 1:], WALL, atol=1e-9)
+    np.testing.assert_allclose(standing.memory()[:, 1:4], WALL, atol=1e-9)
 
 
 def test_a_track_that_an_echo_of_a_crowd_confirms_is_none():
@@ -158,3 +160,43 @@ def test_two_uavs_that_hover_near_each_other_are_no_crowd():
         time = 0.03 * frame
         d = seen(time, [(8.0, 24.0, 4.0), (-1.7, 27.0, 6.0)])
         assert not standing.look(d, own(time), time, PERIOD).any()
+
+
+def above(d: Detections, snr: list[float]) -> Detections:
+    return Detections(**{**vars(d), "snr": np.array(snr)})
+
+
+@pytest.mark.parametrize(("snr", "crowd"), [(390.0, True), (410.0, False)])
+def test_a_uav_that_stands_out_of_a_wall_by_ten_decibels_is_none_of_it(snr, crowd):
+    """Hovering before five places of a wall at 40; the wall stays one, and a track at the UAV's
+    place is held to the same. Planted bugs: strength ignored; the wall's echoes spared too."""
+    place = (0.0, 28.0, 6.0)
+    standing = Standing(1.71)
+    found = standing.look(
+        above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0, PERIOD
+    )
+    assert found.tolist() == [True] * 5 + [crowd]
+    state = Gaussian(np.array([*place, *np.zeros(6)]), np.diag([0.01] * 3 + [0.09] * 3 + [9.0] * 3))
+    assert standing.holds(Track(1, state, snr)) is crowd
+
+
+@pytest.mark.parametrize(("height", "crowd"), [(1.4, True), (1.6, False)])
+def test_what_touches_the_mesh_does_not_stand_out(height, crowd):
+    """A bright echo before a wall that the mesh lacks, over the ground that it has. Planted bug:
+    the mesh not asked."""
+    corners = np.array([[-60.0, -9, 0], [60, -9, 0], [60, 90, 0], [-60, 90, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    ground = CityMesh("ground", corners, faces, np.zeros(2, np.int16), (), np.zeros(3))
+    d = above(seen(0.0, [*WALL, (0.0, 28.0, height)]), [40.0] * 5 + [4000.0])
+    found = Standing(1.71, Walls(ground)).look(d, own(0.0), 0.0, PERIOD)
+    assert found.tolist() == [True] * 5 + [crowd]
+
+
+def test_a_line_of_sight_is_no_echo():
+    """Planted bug: a passive terminal's reference remembered."""
+    standing = Standing(1.71)
+    d = seen(0.0, WALL)
+    standing.look(
+        Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0, PERIOD
+    )
+    assert len(standing.memory()) == 0
