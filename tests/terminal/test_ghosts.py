@@ -343,6 +343,8 @@ def test_a_place_within_reach_of_a_wall(place, expected):
 
 def test_a_place_beside_a_face_within_its_box_is_not_within_reach():
     """Half of the wall, cut along its diagonal. Planted bug: the box about the faces."""
-    half = replace(wall(), faces=np.array([[0, 1, 2]], np.int32), face_material=np.zeros(1, np.int16))
+    half = replace(
+        wall(), faces=np.array([[0, 1, 2]], np.int32), face_material=np.zeros(1, np.int16)
+    )
     for place, expected in (((WALL_X, 5.0, 11.0), False), ((WALL_X, 35.0, 0.0), True)):
         assert Walls(half).within(np.array(place) + ORIGIN, 1.5) is expected
