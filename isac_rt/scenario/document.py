@@ -24,6 +24,8 @@ from isac_rt.scenario.node import Key, Node, Problem, dotted
 
 Tree = typing.TypeVar("Tree", bound=Node)
 
+_OF_A_TYPE = re.compile(r"\[key\]$|function-\w+\[\w+\(\)|literal\[")
+"""What pydantic puts between keys: of a mapping's key, and of each type that a value may have."""
 MAX_MESSAGES = 10
 MAX_BYTES = 4_000_000
 MAX_NODES = 200_000
@@ -338,11 +340,7 @@ class Document:
         """All complaints of a validation, in the order of the tree."""
         lines: dict[Any, str] = {}
         for found in error.errors():
-            key: Key = tuple(
-                part
-                for part in found["loc"]
-                if part != "[key]" and not str(part).startswith("function-wrap[")
-            )
+            key: Key = tuple(part for part in found["loc"] if not _OF_A_TYPE.match(str(part)))
             if found["type"] == "inconsistent":
                 for problem in found["ctx"]["problems"]:
                     lines[key, problem] = self.complaint(problem, key)
