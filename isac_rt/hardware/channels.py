@@ -78,8 +78,12 @@ class Elements:
         gain = self.gain * np.exp(louder + 1j * self.drift.imag * time)
         out = np.broadcast_to(gain, (len(direction), self.gain.size))
         if not np.array_equal(self.coupling, np.eye(self.gain.size)):
-            steering = np.exp(-2j * np.pi * frequency / SPEED_OF_LIGHT * (direction @ positions.T))
-            out = out * (steering @ self.coupling.conj().T) * steering.conj()
+            cycles = frequency / SPEED_OF_LIGHT * (direction @ positions.T)
+            angle = (-2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
+            steering = np.empty(angle.shape, np.complex64)  # to 4e-7, as are the samples
+            steering.real, steering.imag = np.cos(angle), np.sin(angle)
+            coupled = steering @ self.coupling.conj().T.astype(np.complex64)
+            out = out * (coupled * steering.conj())
         if self.tilt.any() and antennas.pattern != "isotropic":
             straight = antennas.element_gain(direction)
             own = antennas.element_gain(_turned(direction[:, None], self.tilt))

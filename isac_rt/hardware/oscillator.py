@@ -166,6 +166,17 @@ def _mean(out, values, total, place, length):
 
 
 @jit(fast=True)
+def _add_between(out, coarse, first, ratio):
+    """Add the cubic through `coarse` at places `ratio` to one of its steps, from `first` on."""
+    for n in range(out.shape[0]):
+        k = (first + n) // ratio
+        x = (first + n - k * ratio) / ratio
+        back, ahead, far = x + 1, x - 1, x - 2
+        near = back * ahead * far / 2 * coarse[k] - back * x * far / 2 * coarse[k + 1]
+        out[n] += near - x * ahead * far / 6 * coarse[k - 1] + back * x * ahead / 6 * coarse[k + 2]
+
+
+@jit(fast=True)
 def _between(out, coarse, weight, first):
     """The cubic through `coarse` at as many places between two of its values as the (4, ratio)
     `weight` has columns, the first of them `first` places after its second value."""
@@ -254,9 +265,7 @@ class Oscillator:
             size = (low + segments + _SPAN) // coarse + _SPAN - begin
             own = np.zeros(size)
             self._add_band(own, number, band, begin)
-            place = (low - 1 + np.arange(total.size)) - begin * coarse
-            weight, at = cubic(place % coarse / coarse), place // coarse
-            total += sum(weight[:, i] * own[at - 1 + i] for i in range(_SPAN))
+            _add_between(total, own, low - 1 - begin * coarse, coarse)
         out = np.empty(count)
         weight = np.ascontiguousarray(cubic(np.arange(ratio) / ratio).T)
         _between(out, total, weight, first - low * ratio)

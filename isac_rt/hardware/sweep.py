@@ -26,7 +26,7 @@ from isac_rt.randomness import generator
 from isac_rt.scenario import front_end as scenario
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Response:
     """Complex gain over the chirp of each element of an array.
 
@@ -66,6 +66,14 @@ class Response:
             for own, table in zip(exponent, tables, strict=False):
                 own += unit * np.interp(x, np.linspace(-1, 1, len(table)), table)
         return np.exp(exponent)
+
+
+@lru_cache(maxsize=32)
+def sampled(response: Response, count: int, before: int = 0) -> np.ndarray:
+    """Gain of each element at so many samples of a chirp, and at `before` more ahead of them:
+    (L, before + count) complex64, kept for the next frame: not to be written to."""
+    place = 2 * np.arange(-before, count) / (count - 1) - 1
+    return response.at(place).astype(np.complex64)
 
 
 def response_of(o: scenario.Response, size: int, seed: int, *name: str) -> Response | None:

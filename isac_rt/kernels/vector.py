@@ -166,6 +166,9 @@ zip_high = _two(
     )
 )
 
+evens = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(range(0, 2 * LANES, 2))))
+odds = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(range(1, 2 * LANES, 2))))
+
 
 @intrinsic
 def swap_pairs(typingctx, value):

@@ -14,10 +14,12 @@ from isac_rt.kernels.vector import (
     cos_sin,
     cos_sin_exact,
     even_twice,
+    evens,
     floor,
     load,
     narrow,
     odd_twice,
+    odds,
     splat,
     store,
     swap_pairs,
@@ -32,7 +34,14 @@ def _add_phase(row, values, first, weight):
     """Add the cubic through `values` to a row: its place n lies after the value first + 2 n."""
     a, b, c, d = weight[0], weight[1], weight[2], weight[3]
     at = first - 1
-    for n in range(row.shape[0]):
+    whole = row.shape[0] - row.shape[0] % LANES
+    for n in range(0, whole, LANES):
+        k = at + 2 * n
+        low, high = load(values, k), load(values, k + LANES)
+        here = load(row, n) + splat(a) * evens(low, high) + splat(b) * odds(low, high)
+        low, high = load(values, k + 2), load(values, k + 2 + LANES)
+        store(row, n, here + splat(c) * evens(low, high) + splat(d) * odds(low, high))
+    for n in range(whole, row.shape[0]):
         k = at + 2 * n
         row[n] += a * values[k] + b * values[k + 1] + c * values[k + 2] + d * values[k + 3]
 

@@ -29,7 +29,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.converter import saturated
 from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
-from isac_rt.hardware.sweep import Ramp, read_at, short_read
+from isac_rt.hardware.sweep import Ramp, read_at, sampled, short_read
 from isac_rt.signal.chain import (
     NO_ROWS,
     NO_TURNS,
@@ -116,16 +116,15 @@ def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
     if sender.transmit_response is not None:
         late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
         most = max(int(late.max()), 0)
-        place = 2 * np.arange(-most, w.num_samples) / (w.num_samples - 1) - 1
         antenna = tones.antenna[0] if len(tones.antenna) else np.zeros((1, 1), np.int64)
         out = out._replace(
-            sent=rows_of(sender.transmit_response.at(place)),
+            sent=rows_of(sampled(sender.transmit_response, w.num_samples, most)),
             antenna=_by_chirp(w, antenna),
             begin=_by_chirp(w, np.clip(most - late, 0, most)),
         )
     own = ends.receiver.receive_response
     if own is not None and own.common:
-        out = out._replace(gain=rows_of(own.at(_places(w))[:1])[0])
+        out = out._replace(gain=rows_of(sampled(own, w.num_samples)[:1])[0])
     ramps = sender.ramp, ends.receiver.ramp
     if any(ramps):
         theirs, mine = (0.0 if r is None else r.cycles(w.fast_time) for r in ramps)
@@ -139,11 +138,6 @@ def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
 def _by_chirp(w: Waveform, values: np.ndarray) -> np.ndarray:
     """(M, P) or what broadcasts to it, as one row."""
     return np.broadcast_to(values, (w.num_groups, w.num_chirps)).ravel()
-
-
-def _places(w: Waveform) -> np.ndarray:
-    """(N,) of the samples, from -1 to 1."""
-    return 2 * np.arange(w.num_samples) / (w.num_samples - 1) - 1
 
 
 def _shift(w: Waveform, tones: Tones, ramp: Ramp) -> np.ndarray:
@@ -183,7 +177,7 @@ def _work(
             reads = np.repeat(weights, 2, axis=1).astype(np.float32)
     elements, own = None, ends.receiver.receive_response
     if own is not None and not own.common:
-        elements = own.at(_places(w))
+        elements = sampled(own, w.num_samples)
     c = ends.receiver.converter
     key = np.asarray(noise.seed_words, np.uint32)
     work = Work(

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from isac_rt.hardware.oscillator import Mask, Oscillator, cubic, spread
+from isac_rt.hardware.oscillator import Mask, Oscillator, Record, _add_between, cubic, spread
+from isac_rt.signal.chain import add_phases
 
 RATE = 20e6
 SLOT = 64.8e-6
@@ -154,3 +155,23 @@ def test_spread_adds_up():
     mean, inside = spread(white, 1e-3, 50e-6, RATE)
     assert mean + inside == pytest.approx(4e-5, rel=0.03)  # sin^2 of 10,000 turns on 4000 places
     assert mean == pytest.approx(2 * 2e-12 / (2 * 50e-6), rel=0.05)  # its noise bandwidth: 1/(2 T)
+
+
+def test_bands_are_read_between_their_values():
+    """A third-degree polynomial is exact; it is added to what is there."""
+    poly = np.polynomial.Polynomial([0.3, -1.1, 0.07, 0.013])
+    out = np.arange(61.0)
+    _add_between(out, poly(np.arange(14)), 19, 7)
+    truth = poly((19 + np.arange(61)) / 7)
+    np.testing.assert_allclose(out - np.arange(61), truth, atol=1e-11)
+
+
+def test_rows_of_samples_lie_in_the_phase():
+    """Rows that are not a multiple of the vector's length, against a polynomial of the time."""
+    poly = np.polynomial.Polynomial([0.4, 31.0, -170.0, 900.0])
+    step, start, begin = 1e-3, -0.02, np.array([-0.0117, 0.00031])
+    record = Record(start, step, poly(start + step * np.arange(140)))
+    out = np.full((2, 37), 0.25)
+    add_phases(out, record, begin, -1.0)
+    time = begin[:, None] + 2 * step * np.arange(37)
+    np.testing.assert_allclose(out, 0.25 - poly(time) / (2 * pi), atol=1e-9)
