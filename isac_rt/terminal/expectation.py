@@ -81,11 +81,7 @@ class MeshExpectation:
         amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
         """
         wrong = mistakes or Mistakes()
-        local = replace(
-            pose,
-            position=pose.position - self._city.origin,
-            velocity=pose.velocity + np.array(wrong.velocity),
-        )
+        local = self._believed(pose, wrong)
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
         error = self._errors(wrong)
         state = LinkState(Link(name, name), time, local, local)
@@ -100,6 +96,14 @@ class MeshExpectation:
             moved = 2 * error[part.mirror.faces[0]] * (met @ n)
             parts.append(self._expected(s, there, back, error, amplitude, state, moved))
         return ExpectedClutter.joined(parts)
+
+    def _believed(self, pose: Pose, wrong: Mistakes) -> Pose:
+        """A pose in the axes of the city's mesh, with the velocity that the terminal believes."""
+        return replace(
+            pose,
+            position=pose.position - self._city.origin,
+            velocity=pose.velocity + np.array(wrong.velocity),
+        )
 
     def _errors(self, wrong: Mistakes) -> np.ndarray:
         """Of each face along its normal [m]."""
@@ -129,11 +133,7 @@ class MeshExpectation:
         clutter : departures in the axes of the terminal's own body
         """
         wrong = mistakes or Mistakes()
-        end = replace(
-            own,
-            position=own.position - self._city.origin,
-            velocity=own.velocity + np.array(wrong.velocity),
-        )
+        end = self._believed(own, wrong)
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
         place, velocity = sender[:3] - self._city.origin, sender[3:]
         start = replace(end, position=place, velocity=velocity, acceleration=np.zeros(3))

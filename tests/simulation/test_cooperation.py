@@ -66,10 +66,9 @@ def test_detections_are_heard_as_the_links_carry_them(pooled):
     assert p["PT"]["left_out"] == d.picture_left_out.values[:, k].sum()
 
 
-def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
-    """Of both terminals' detections, under one name, and nearer to the truth than the deviations
-    stated allow for; the terminals are recognised."""
-    d = pooled.dataset
+def one_body_in_all_pictures(d):
+    """The last frame's rows (bool), in which every picture has the target once, of two terminals
+    and under one name, and nothing else that is no terminal."""
     last = d.fused_frame.values == 8
     names = set()
     for p in range(d.sizes["picture"]):
@@ -79,6 +78,13 @@ def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
         names.add((int(d.fused_origin.values[k]), int(d.fused_number.values[k])))
         assert (mine & (d.fused_terminal.values < 0)).sum() == 1
     assert len(names) == 1
+    return last
+
+
+def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
+    """Of both terminals' detections, under one name, and nearer to the truth than the deviations
+    stated allow for; the terminals are recognised."""
+    one_body_in_all_pictures(pooled.dataset)
     swarm = pooled.summary["swarm"]
     assert swarm["targets"]["U"]["switches"] == 0
     assert swarm["rmse"]["position_m"] < 0.1 and swarm["nees"] < 1.5
@@ -105,16 +111,7 @@ def test_the_target_is_one_body_of_two_tracks_and_the_terminals_are_none(talked)
     """In the last frame every picture has the target once, of both terminals' tracks, under one
     name, and the PT's echo at the AT is recognised by what the PT says of itself."""
     d = talked.dataset
-    last = d.fused_frame.values == 8
-    names = set()
-    for p in range(d.sizes["picture"]):
-        mine = last & (d.fused_picture.values == p)
-        (k,) = np.flatnonzero(mine & (d.fused_uav.values == 2))
-        assert d.fused_members.values[k] == 2
-        names.add((int(d.fused_origin.values[k]), int(d.fused_number.values[k])))
-        strange = mine & (d.fused_terminal.values < 0)
-        assert strange.sum() == 1
-    assert len(names) == 1
+    last = one_body_in_all_pictures(d)
     assert (d.fused_terminal.values[last] == 1).any()
     swarm = talked.summary["swarm"]
     assert swarm["targets"].keys() == {"U"}
