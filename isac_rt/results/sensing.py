@@ -165,6 +165,7 @@ class Sensing:
         return {
             "in_view": int(self.seen[:, i].sum()),
             "hidden": int(self.hidden[:, i].sum()),
+            "shown": int(self.shown[:, i].sum()),
             "found": int(self.hit[:, i].sum()),
             "tracked": int(followed.sum()),
             "switches": int(self.switched[:, i].sum()),
