@@ -10,12 +10,12 @@ import numpy as np
 
 from isac_rt.access.messages import CODE_RATE, CORRECTED, Channel, Notes, Sightings
 from isac_rt.frame.link import Link
-from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
+from isac_rt.terminal.filter import Ambiguity
 from isac_rt.terminal.fusion import Fused, Picture, in_world, of_itself
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
@@ -44,11 +44,11 @@ class Cooperation:
     def _pool(self) -> PooledTracker:
         """A tracker of all terminals' detections."""
         setup, w = self._setup, self._setup.waveform
-        s, share = setup.scenario, unambiguous_share(w)
+        s = setup.scenario
         period = s.receivers.active_every_frames * setup.timetable.interval
-        spans = 2 * w.max_velocity(2) * share, 2 * w.max_velocity(1)
+        ambiguities = Ambiguity.of(w, 2), Ambiguity.of(w, 1)
         names = dict.fromkeys([*self._names, *(link.tx for link in setup.timetable.all_links)])
-        return PooledTracker([*names], s.tracking, Lives.of(s.tracking, period), spans)
+        return PooledTracker([*names], s.tracking, Lives.of(s.tracking, period), ambiguities)
 
     def step(
         self, frame: int, heard: Mapping[Link, Heard], symbols: Mapping[Link, SymbolCount]

@@ -11,6 +11,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from isac_rt.frame.antennas import unit_vector
+from isac_rt.frame.schedule import unambiguous_share
+from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.world.swarm import Pose
 
@@ -37,6 +39,26 @@ class Gaussian(NamedTuple):
 
     mean: np.ndarray
     covariance: np.ndarray
+
+
+class Ambiguity(NamedTuple):
+    """What a detection leaves open: the Doppler tells velocities a `period` [m/s] apart from each
+    other no more. The beat is of range and of Doppler, so that a detection whose velocity was read
+    one period too high was read too short by `shift` [m]."""
+
+    period: float = np.inf
+    shift: float = 0.0
+
+    @classmethod
+    def of(cls, waveform: Waveform, passes: int) -> Ambiguity:
+        """At an active terminal (2 passes) or a passive one (1)."""
+        period = 2 * waveform.max_velocity(passes)
+        if passes == 2:
+            period *= unambiguous_share(waveform)
+        return cls(period, period * waveform.effective_carrier / waveform.slope)
+
+
+UNAMBIGUOUS = Ambiguity()
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,18 +226,19 @@ def _settled(
     rows: np.ndarray,
     own: np.ndarray,
     transmitter: np.ndarray,
-    velocity_period: float,
+    ambiguity: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, gain K and derivative H at which the iterated update of `rows` of a measurement
     stands."""
     x, deviation = mean, np.sqrt(np.diag(P))
     for _ in range(_ITERATIONS):
         z, full = _linearised(x, own, transmitter)
-        y, H = (measurement - z)[rows], full[rows]
-        if np.isfinite(velocity_period):
-            for i in range(rows.size):
-                if rows[i] == 1:
-                    y[i] -= velocity_period * np.round(y[i] / velocity_period)
+        off = measurement - z
+        if np.isfinite(ambiguity[0]) and np.isfinite(off[1]):
+            periods = np.round(off[1] / ambiguity[0])
+            off[0] += periods * ambiguity[1]
+            off[1] -= periods * ambiguity[0]
+        y, H = off[rows], full[rows]
         K = np.linalg.solve(H @ P @ H.T + R, H @ P).T.copy()
         new = mean + K @ (y - H @ (mean - x))
         settled = np.all(np.abs(new - x) <= 1e-3 * deviation)
@@ -232,20 +255,20 @@ def update(
     own: Pose,
     transmitter: np.ndarray | None = None,
     *,
-    velocity_period: float = np.inf,
+    ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian:
     """Condition on one measurement (4,) with covariance R (4, 4); components that are NaN were not
     measured.
 
     Iterated EKF: the measurement is linearised again at the new mean until it stands (Gauss-Newton
     on the posterior), because a range known to a millimetre across a direction known to a metre
-    bends visibly. Joseph form. `velocity_period` [m/s] is the span of velocities that the Doppler
-    tells apart; differences are taken modulo it.
+    bends visibly. Joseph form. Of what the `ambiguity` leaves open the reading nearest in velocity
+    counts.
     """
     rows = np.flatnonzero(np.isfinite(measurement))
     R = R[np.ix_(rows, rows)]
     P = g.covariance
-    x, K, H = _settled(g.mean, P, measurement, R, rows, *_terms(own, transmitter), velocity_period)
+    x, K, H = _settled(g.mean, P, measurement, R, rows, *_terms(own, transmitter), tuple(ambiguity))
     A = np.eye(len(x)) - K @ H
     return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))
 
@@ -290,13 +313,16 @@ def reported(
     return z, std
 
 
-def wrapped(difference: np.ndarray, velocity_period: float) -> np.ndarray:
-    """Differences of measurements (..., 4) with the velocity brought to within half a period of
-    zero."""
-    if not np.isfinite(velocity_period):
+def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
+    """Differences (..., 2 or 4) of what was measured from what is expected, by the reading of the
+    former that is nearest in velocity."""
+    period, shift = ambiguity
+    if not np.isfinite(period):
         return difference
     out = difference.copy()
-    out[..., 1] -= velocity_period * np.round(out[..., 1] / velocity_period)
+    periods = np.round(out[..., 1] / period)
+    out[..., 0] += np.where(np.isfinite(periods), periods, 0.0) * shift
+    out[..., 1] -= periods * period
     return out
 
 
@@ -317,11 +343,13 @@ def birth(
     transmitter: Gaussian | None = None,
     *,
     acceleration_std: float,
+    ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian | None:
     """State after a first detection (4,) with deviations (4,); None where it does not fix a
     position.
 
-    The position from range and direction (front half-space), its covariance through the inverse
+    Of what the `ambiguity` leaves open the reading counts that is nearest to standing still. The
+    position from range and direction (front half-space), its covariance through the inverse
     Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
     measured rate: the component along the line of sight (or the bisector) is then known, the others
     are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
@@ -329,14 +357,16 @@ def birth(
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
         return None
-    e = own.to_world(unit_vector([u_x, u_z]))
-    rho = float(measurement[0])
-    if transmitter is not None:
-        rho = bistatic_distance(rho, transmitter.mean[:3] - own.position, e)
-    if rho <= 0:
-        return None
-    mean = np.concatenate([own.position + rho * e, np.zeros(6)])
     t = None if transmitter is None else transmitter.mean
+    mean = _resting(measurement, own, t)
+    if mean is None:
+        return None
+    still = measure(mean, own, t)
+    measurement = still + wrapped(measurement - still, ambiguity)
+    mean = _resting(measurement, own, t)
+    if mean is None:
+        return None
+    rho = np.linalg.norm(mean[:3] - own.position)
     J = jacobian(mean, own, t)[_POSITION, :3]
     if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
         return None
@@ -350,6 +380,17 @@ def birth(
     P[6:, 6:] = acceleration_std**2 * np.eye(3)
     rate_only = np.array([np.nan, measurement[1], np.nan, np.nan])
     return update(Gaussian(mean, _symmetric(P)), rate_only, R, own, t)
+
+
+def _resting(
+    measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None
+) -> np.ndarray | None:
+    """State (9,) of a body at rest where range and direction place it; None: nowhere."""
+    e = own.to_world(unit_vector(measurement[2:]))
+    rho = float(measurement[0])
+    if transmitter is not None:
+        rho = bistatic_distance(rho, transmitter[:3] - own.position, e)
+    return np.concatenate([own.position + rho * e, np.zeros(6)]) if rho > 0 else None
 
 
 def mahalanobis(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

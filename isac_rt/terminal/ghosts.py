@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isac_rt.terminal.filter import measure
+from isac_rt.terminal.filter import Ambiguity, measure, wrapped
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
@@ -166,7 +166,7 @@ class Suspicion:
 
 
 def suspicion(
-    tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, velocity_period: float
+    tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, ambiguity: Ambiguity
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
@@ -178,7 +178,7 @@ def suspicion(
     walls : the mesh
     resolution : (4,) range [m], velocity [m/s], u_x, u_z, of
         `frame.antennas.resolutions`; of one pass at a passive terminal
-    velocity_period : span of velocities that the Doppler tells apart [m/s]
+    ambiguity : what detections leave open
     """
     count = len(tracks)
     out = Suspicion(
@@ -206,8 +206,7 @@ def suspicion(
                 tracks.mean[s], None if tracks.is_reference[s] else sender, own, walls
             )
         for face, order, echo in shown:
-            off = measured - echo
-            off[:, 1] -= velocity_period * np.round(off[:, 1] / velocity_period)
+            off = wrapped(measured - echo, ambiguity)
             allowed = (
                 DEVIATIONS * np.hypot(tracks.std, tracks.std[s]) + RESOLUTION_SHARE * resolution
             )

@@ -16,6 +16,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
+from isac_rt.terminal.filter import Ambiguity, wrapped
 from isac_rt.terminal.ghosts import Walls, suspicion
 from isac_rt.terminal.mirrors import mirror_of
 from isac_rt.terminal.tracker import Track, Tracker
@@ -68,7 +69,7 @@ class Doubts:
             else:
                 shown = sender_images(sender, own, self.walls, reach)
             off = np.column_stack([d.range, d.velocity])[:, None] - shown
-            off[..., 1] -= self._period * np.round(off[..., 1] / self._period)
+            off = wrapped(off, self._ambiguity)
             cells = np.array([w.range_cell(self.passes), w.velocity_cell(self.passes)])
             allowed = BESIDE_CELLS * cells
             starts &= ~(np.abs(off) < allowed).all(axis=-1).any(axis=1)
@@ -87,7 +88,7 @@ class Doubts:
         out: set[int] = set()
         if confirmed:
             tracks = tracker.snapshot(own, reference)
-            said = suspicion(tracks, own, self.walls, cells, self._period)
+            said = suspicion(tracks, own, self.walls, cells, self._ambiguity)
             out = confirmed & set(tracks.ids[said.suspect].tolist())
             if self.places:
                 hidden |= out & set(tracks.ids[said.mirrored < 0].tolist())
@@ -99,8 +100,8 @@ class Doubts:
         tracker.tracks = [t for t in tracker.tracks if t.id not in out]
 
     @property
-    def _period(self) -> float:
-        return 2 * self.waveform.max_velocity(self.passes)
+    def _ambiguity(self) -> Ambiguity:
+        return Ambiguity.of(self.waveform, self.passes)
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:

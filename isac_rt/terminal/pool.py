@@ -21,6 +21,7 @@ from scipy.special import gammaincinv
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     STD_FLOOR,
+    Ambiguity,
     Gaussian,
     birth,
     expected,
@@ -204,7 +205,7 @@ class PooledTracker:
     terminals : names of all that detect
     settings : Tracking
     lives : when bodies begin and end
-    periods : spans of unambiguous velocities at an active and at a passive terminal [m/s]
+    ambiguities : what detections of an active and of a passive terminal leave open
     """
 
     def __init__(
@@ -212,10 +213,10 @@ class PooledTracker:
         terminals: Sequence[str],
         settings: Tracking,
         lives: Lives,
-        periods: tuple[float, float],
+        ambiguities: tuple[Ambiguity, Ambiguity],
     ) -> None:
         self._terminals, self._settings, self._lives = list(terminals), settings, lives
-        self._periods = periods
+        self._ambiguities = ambiguities
         variance = np.tile(_error_variance(), len(self._terminals))
         self._begin = Pool(-np.inf, np.zeros(variance.size), np.diag(variance))
         self._looks: list[tuple[Look, np.ndarray | None]] = []
@@ -382,14 +383,14 @@ class PooledTracker:
             H = np.zeros((4, len(pool.mean)))
             view.errors_into(H, means[i], own, sender)
             S[i] += H @ pool.covariance @ H.T
-        residual = wrapped(z[None] - z_mean[:, None], self._period(view))
+        residual = wrapped(z[None] - z_mean[:, None], self._ambiguity(view))
         d2, log_det = mahalanobis(residual, S[:, None] + R[None])
         freedom = np.isfinite(residual).sum(axis=-1)
         limit = 2 * gammaincinv(freedom / 2, self._settings.gate_probability)
         return np.where(d2 <= limit, d2 + log_det, np.inf)
 
-    def _period(self, view: _View) -> float:
-        return self._periods[0 if view.transmitter is None else 1]
+    def _ambiguity(self, view: _View) -> Ambiguity:
+        return self._ambiguities[0 if view.transmitter is None else 1]
 
     def _update(self, pool: Pool, view: _View, k: int, q: int) -> Pool:
         """Condition all states on one detection of a body: an iterated EKF in Joseph's form."""
@@ -405,7 +406,7 @@ class PooledTracker:
             H[:, at] = jacobian(x[at], own, sender)
             view.errors_into(H, x[at], own, sender)
             H = H[seen]
-            off = wrapped(z - view.measured(x, x[at], own, sender), self._period(view))[seen]
+            off = wrapped(z - view.measured(x, x[at], own, sender), self._ambiguity(view))[seen]
             K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
             new = pool.mean + K @ (off - H @ (pool.mean - x))
             settled = np.all(np.abs(new - x) <= 1e-3 * np.sqrt(np.diag(P)) + 1e-12)
@@ -449,7 +450,12 @@ class PooledTracker:
         known = None if sender is None else Gaussian(sender, np.zeros((SIZE, SIZE)))
         z, look = view.look.z[q], view.look
         made = birth(
-            z, look.std[q], own, known, acceleration_std=self._settings.acceleration_std_mps2
+            z,
+            look.std[q],
+            own,
+            known,
+            acceleration_std=self._settings.acceleration_std_mps2,
+            ambiguity=self._ambiguity(view),
         )
         if made is None:
             return pool

@@ -9,7 +9,7 @@ import numpy as np
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.types import Look
-from isac_rt.terminal.filter import Gaussian, measure, wrapped
+from isac_rt.terminal.filter import Ambiguity, Gaussian, measure, wrapped
 from isac_rt.terminal.self_calibration import FREE, Change, Sight
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.swarm import Pose
@@ -71,7 +71,7 @@ def _nearest(looks: Sequence[Look], expected: np.ndarray, waveform: Waveform) ->
     cells = np.array([w.range_cell(2), w.velocity_cell(2)])
     for i, look in enumerate(looks):
         found = np.array([look.delay, look.delay_rate]) * SPEED_OF_LIGHT / 2
-        apart = wrapped(found - expected, 2 * w.max_velocity(2))
+        apart = wrapped(found - expected, Ambiguity.of(w, 2))
         power = float(np.sum(np.abs(look.modes[0]) ** 2))
         if (np.abs(apart) < NEAR_CELLS * cells).all() and power > most:
             best, most = i, power

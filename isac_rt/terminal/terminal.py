@@ -20,7 +20,6 @@ from scipy.special import gammainccinv
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
-from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
@@ -29,6 +28,7 @@ from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import (
+    Ambiguity,
     Gaussian,
     birth,
     expected,
@@ -128,8 +128,7 @@ class ActiveTerminal:
     ) -> None:
         self._receiver = ActiveReceiver.of(antennas, receivers)
         self.other: Receiver | None = None
-        period = 2 * waveform.max_velocity(2) * unambiguous_share(waveform)
-        self.tracker = Tracker(tracking, period)
+        self.tracker = Tracker(tracking, Ambiguity.of(waveform, 2))
         self._doubts = None
         if tracking.births == "unexplained":
             if walls is None:
@@ -168,7 +167,7 @@ class ActiveTerminal:
         else:
             new = {track.id for track in self.tracker.tracks if not track.confirmed}
             found = self._doubts.births(found, own_pose)
-            crowd = self._standing.look(found, own_pose, time, self.tracker.velocity_period)
+            crowd = self._standing.look(found, own_pose, time, self.tracker.ambiguity.period)
             found = replace(found, starts=found.starts & ~crowd)
             self.tracker.update(found, own_pose)
             self._doubts.remove_ghosts(self.tracker, new, own_pose)
@@ -259,7 +258,7 @@ class PassiveTerminal:
         self.other: Receiver | None = None
         self._groups, self._waveform = groups, waveform
         self._acceleration = tracking.acceleration_std_mps2
-        self._period = 2 * waveform.max_velocity(1)
+        self._ambiguity = Ambiguity.of(waveform, 1)
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
         self._time = -np.inf
         self._level = (transmit_amplitude * antennas.gain * waveform.wavelength / (4 * np.pi)) ** 2
@@ -268,7 +267,7 @@ class PassiveTerminal:
         if tracking.births == "unexplained" and self._surroundings.walls is not None:
             self._doubts = Doubts(self._surroundings.walls, antennas, waveform, passes=1)
         self._standing = Standing.of(antennas, waveform, 1, self._surroundings.walls)
-        self.tracker = Tracker(tracking, self._period)
+        self.tracker = Tracker(tracking, self._ambiguity)
         self.state = TerminalState.ACQUIRING
         self.reference: Track | None = None
         self.slips_repaired = 0
@@ -426,7 +425,8 @@ class PassiveTerminal:
         allowed = self._doubts.births(detections, own, sender.mean[:6])
         crowd = np.zeros(len(allowed), bool)
         if known is None or self._clutter is not None:  # else the city's own echoes are among them
-            crowd = self._standing.look(allowed, own, self._time, self._period, sender.mean[:6])
+            period = self._ambiguity.period
+            crowd = self._standing.look(allowed, own, self._time, period, sender.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
         self._doubts.remove_ghosts(self.tracker, new, own, reference)
@@ -551,7 +551,7 @@ class PassiveTerminal:
         else:
             R = measurement_covariance(std, self.reference.state.mean)
             self.reference.state = update(
-                self.reference.state, z, R, own, velocity_period=self._period
+                self.reference.state, z, R, own, ambiguity=self._ambiguity
             )
             self.reference.snr, self.reference.missed = float(d.snr[q]), 0
             self.reference.detection = q
@@ -575,7 +575,7 @@ class PassiveTerminal:
         if self.reference is None:
             return 0.0
         mean, S = expected(*self.reference.state, own)
-        residual = np.abs(wrapped(z - mean, self._period))[:2]
+        residual = np.abs(wrapped(z - mean, self._ambiguity))[:2]
         allowed = np.array(BELIEVED_CELLS) * self._cells + 4 * np.sqrt(np.diag(S)[:2])
         allowed[0] = min(allowed[0], MOST_CELLS * self._cells[0])
         return float(residual[0] / self._cells[0]) if (residual > allowed).any() else 0.0

@@ -19,6 +19,7 @@ from isac_rt.receive.types import Detections, Prediction
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     STD_FLOOR,
+    Ambiguity,
     Gaussian,
     birth,
     expected,
@@ -186,12 +187,12 @@ class Tracker:
     Parameters
     ----------
     settings : Tracking
-    velocity_period : span of unambiguous velocities [m/s], twice `Waveform.max_velocity`
+    ambiguity : what its detections leave open
     """
 
-    def __init__(self, settings: Tracking, velocity_period: float) -> None:
+    def __init__(self, settings: Tracking, ambiguity: Ambiguity) -> None:
         self.settings = settings
-        self.velocity_period = velocity_period
+        self.ambiguity = ambiguity
         self.tracks: list[Track] = []
         self.time = -np.inf
         self._next_id = 0
@@ -249,9 +250,7 @@ class Tracker:
             if q is not None:
                 R = measurement_covariance(detections.std[q], track.state.mean, transmitter)
                 t = None if transmitter is None else transmitter.mean
-                track.state = update(
-                    track.state, z[q], R, own, t, velocity_period=self.velocity_period
-                )
+                track.state = update(track.state, z[q], R, own, t, ambiguity=self.ambiguity)
                 track.snr, track.detection = float(detections.snr[q]), q
                 track.last = self.time
         self.tracks = [t for t in self.tracks if not self._dead(t)]
@@ -262,6 +261,7 @@ class Tracker:
                 own,
                 transmitter,
                 acceleration_std=self.settings.acceleration_std_mps2,
+                ambiguity=self.ambiguity,
             )
             if state is not None:
                 track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
@@ -299,7 +299,7 @@ class Tracker:
         covariance = np.stack([t.state.covariance for t in self.tracks])
         z_mean, S = expected(mean, covariance, own, transmitter)
         R = np.fmax(std, STD_FLOOR)[:, :, None] ** 2 * np.eye(4)
-        residual = wrapped(z[None] - z_mean[:, None], self.velocity_period)
+        residual = wrapped(z[None] - z_mean[:, None], self.ambiguity)
         d2, log_det = mahalanobis(residual, S[:, None] + R[None])
         freedom = np.isfinite(residual).sum(axis=-1)  # of chi squared
         gate = 2 * gammaincinv(freedom / 2, self.settings.gate_probability)

@@ -21,7 +21,7 @@ from isac_rt.access.messages import (
 )
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.fusion import Key
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.world.swarm import Pose
@@ -203,7 +203,8 @@ def look(frame=0, origin="A->A", count=2, sure=None, snr=None):
 
 
 def sightings(name):
-    tracker = PooledTracker(("A", "B"), Tracking(), Lives(3, 5 * T, 0.36), (30.0, 60.0))
+    folds = Ambiguity(30.0), Ambiguity(60.0)
+    tracker = PooledTracker(("A", "B"), Tracking(), Lives(3, 5 * T, 0.36), folds)
     out = Sightings(name, tracker)
     out.stand(0.0, state(0.0))
     return out

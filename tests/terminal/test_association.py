@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Tracking
-from isac_rt.terminal.filter import Gaussian, mahalanobis
+from isac_rt.terminal.filter import Ambiguity, Gaussian, mahalanobis
 from isac_rt.terminal.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 
@@ -188,7 +188,7 @@ def test_the_association_is_the_likeliest_of_all(bistatic):
         told += 1
         mattered += in_turn(without, confirmed)[0] != expected
         tracker, before = (
-            Tracker(Tracking(gate_probability=GATE), PERIOD),
+            Tracker(Tracking(gate_probability=GATE), Ambiguity(PERIOD)),
             [t.state for t in tracks],
         )
         tracker.tracks = list(tracks)
@@ -217,7 +217,7 @@ def test_the_gate_is_the_quantile_of_what_was_measured(freedom):
     S = (H @ P @ H.T + np.diag(std**2)).astype(float)[some, some]
     one = 1 / np.sqrt(np.linalg.inv(S)[0, 0])
     for share, taken in ((0.99, True), (1.01, False)):
-        tracker = Tracker(Tracking(gate_probability=GATE), PERIOD)
+        tracker = Tracker(Tracking(gate_probability=GATE), Ambiguity(PERIOD))
         tracker.tracks = [Track(0, Gaussian(np.append(FAR, np.zeros(3)), P), 1.0)]
         z = np.array(mean, float)
         z[0] += share * np.sqrt(gate(freedom)) * one
@@ -259,7 +259,7 @@ def test_the_life_of_a_track_over_all_patterns(hits, window, misses):
     settings = Tracking(confirm_hits=hits, confirm_window=window, drop_misses=misses)
     seen, still = one_detection()
     for pattern in product([True, False], repeat=6):
-        tracker, held = Tracker(settings, PERIOD), [True]
+        tracker, held = Tracker(settings, Ambiguity(PERIOD)), [True]
         tracker.predict(0.0)
         tracker.update(seen, still)
         for k, hit in enumerate(pattern, 1):
@@ -291,7 +291,7 @@ def test_numbers_snr_and_references():
     none, and a number is used once. Planted bugs: the SNR of another detection or of the first one
     for ever; references tracked as reflectors."""
     seen, still = one_detection()
-    tracker = Tracker(Tracking(), PERIOD)
+    tracker = Tracker(Tracking(), Ambiguity(PERIOD))
     z = np.column_stack([seen.range, seen.velocity, seen.direction])
     others = np.concatenate([z + np.array([7.0, 0, 0, 0]), z, z - np.array([9.0, 0, 0, 0])])
     for k in range(3):

@@ -8,14 +8,18 @@ import pytest
 from oracles import slopes, what_is_measured
 from scipy.optimize import least_squares
 
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.terminal.filter import (
+    Ambiguity,
     Gaussian,
     birth,
     expected,
+    measure,
     measurement_covariance,
     predict,
     singer,
     update,
+    wrapped,
 )
 from isac_rt.world.swarm import Pose, attitude
 
@@ -29,7 +33,7 @@ STILL = Pose.at_rest((3.1, -2.7, 31.3), (0.5, 1.2, -0.15))
 BODY = np.array([14.7, 38.9, 27.1, -3.7, 6.1, 1.3, 0.7, -1.1, 0.3])
 SENDER = np.array([-21.3, 33.7, 40.9, 8.3, -2.1, 0.4, 0.2, 0.5, -0.4])
 STD = np.array([0.031, 0.083, 0.0047, 0.0061])
-PERIOD = 30.017
+PERIOD, SHIFT = 30.017, 0.217
 
 
 def drawn(rng, mean, deviations):
@@ -102,9 +106,10 @@ def test_the_same_time_again_changes_nothing():
 def test_an_update_is_the_maximum_of_the_posterior(sender, missing):
     """A body known to metres and a range known to 3 cm, where the measurement bends by 2 of its
     deviations: the state at the least sum of squares of prior and measurement together, the
-    covariance by information at that place, folded velocity included. A hundredth of a deviation:
-    where the iteration stops. Planted bugs: one step only; the innovation at the new state taken
-    for that at the old one; components that are missing kept."""
+    covariance by information at that place, a folded velocity and the range that goes with it
+    included. A hundredth of a deviation: where the iteration stops. Planted bugs: one step
+    only; the innovation at the new state taken for that at the old one; components that are
+    missing kept."""
     rng = np.random.default_rng(5)
     g = drawn(rng, BODY, [2.1, 1.7, 1.3, 4.0, 3.0, 5.0, 2.0, 2.0, 2.0])
     truth = g.mean + np.linalg.cholesky(g.covariance) @ rng.normal(size=9)
@@ -120,9 +125,11 @@ def test_an_update_is_the_maximum_of_the_posterior(sender, missing):
     H = slopes(lambda s: what_is_measured(s, OWN, sender), x).astype(float)[rows]
     R = np.diag(STD[rows] ** 2)
     P = np.linalg.inv(np.linalg.inv(g.covariance) + H.T @ np.linalg.inv(R) @ H)
-    given = z - np.array([0, 2 * PERIOD, 0, 0])
+    given = z.copy()
+    if 1 not in missing:
+        given[:2] += 2 * SHIFT, -2 * PERIOD
     given[list(missing)] = np.nan
-    found = update(g, given, np.diag(STD**2), OWN, sender, velocity_period=PERIOD)
+    found = update(g, given, np.diag(STD**2), OWN, sender, ambiguity=Ambiguity(PERIOD, SHIFT))
     scale = np.sqrt(np.diag(P))
     assert (found.mean - x) / scale == pytest.approx(np.zeros(9), abs=0.01)
     assert found.covariance / np.outer(scale, scale) == pytest.approx(
@@ -203,3 +210,40 @@ def test_the_velocity_of_a_birth_is_what_its_rate_says():
         assert g.covariance[6:, 6:] == pytest.approx(1.7**2 * np.eye(3))
     moving = birth(z, STD, OWN, acceleration_std=1.7)
     assert e @ (moving.mean[3:6] - OWN.velocity) == pytest.approx(-6.1, abs=0.02)
+
+
+@pytest.mark.parametrize(("passes", "periods"), [(1, 1), (1, -2), (2, 1)])
+def test_a_folded_velocity_shifts_the_range(passes, periods):
+    """Two paths are alike to a frame if their beats at mid-frame are equal and their phases from
+    slot to slot differ by whole turns. A path whose velocity is read a period too high has its beat
+    with a range that is 0.43 m (one pass) or 0.22 m too short: to 0.1 mm, for the carrier moves
+    with the delay. Planted bugs: the shift's sign; the period of one pass for two."""
+    w = Waveform(num_samples=1024, num_chirps=120)
+    given = Ambiguity.of(w, passes)
+    metres = SPEED_OF_LIGHT / passes
+    tau, rate = 61.3 / metres, -31.7 / metres
+    other = np.array([tau, rate]) + np.array([-given.shift, given.period]) * periods / metres
+    turns = w.effective_carrier * (other[1] - rate) * w.slot_duration
+    assert turns == pytest.approx(periods, abs=1e-9)
+    cells = w.beat_cells(*other, 0.0) - w.beat_cells(tau, rate, 0.0)
+    assert cells * w.range_cell(1) == pytest.approx(0.0, abs=1e-4)
+    off = wrapped((other - [tau, rate]) * metres, given)
+    assert off == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_a_birth_reads_a_velocity_nearest_to_standing_still():
+    """A body that comes nearer, beyond half the period at a passive terminal: read a period too
+    fast and 0.2 m too short, it is born where it is and with its rate; without the ambiguity 10
+    cm off, and flying away. Planted bugs: nearest to the receiver's own velocity; the range
+    kept."""
+    z = np.asarray(what_is_measured(BODY, OWN, SENDER), float)
+    given = Ambiguity(abs(z[1]) * 1.9, SHIFT)
+    folded = z + np.sign(-z[1]) * np.array([-given.shift, given.period, 0, 0])
+    sender = Gaussian(SENDER, 1e-8 * np.eye(9))
+    true = birth(z, STD, OWN, sender, acceleration_std=1.0)
+    found = birth(folded, STD, OWN, sender, acceleration_std=1.0, ambiguity=given)
+    assert found.mean == pytest.approx(true.mean, abs=1e-6)
+    assert found.covariance == pytest.approx(true.covariance, abs=1e-6)
+    blind = birth(folded, STD, OWN, sender, acceleration_std=1.0)
+    assert np.linalg.norm((blind.mean - true.mean)[:3]) > 0.1
+    assert measure(blind.mean, OWN, SENDER)[1] * z[1] < 0

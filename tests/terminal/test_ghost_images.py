@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.ghosts import Walls, echoes, reflections, suspicion
 from isac_rt.terminal.tracker import Track, track_set
 from isac_rt.world.city.mesh import CityMesh
@@ -219,7 +219,7 @@ def asked(tracks, walls=None, reference=None):
         OWN,
         walls or corner(north=(13.0, 30.0)),
         RESOLUTION,
-        PERIOD,
+        Ambiguity(PERIOD),
     )
 
 

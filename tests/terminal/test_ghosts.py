@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from isac_rt.studies.paper.ghosts import explained_tracks, run, verdicts, whole_tracks
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.ghosts import Walls, echoes, reflections, suspicion
 from isac_rt.terminal.tracker import Track, track_set
 from isac_rt.world.city.mesh import CityMesh
@@ -131,11 +131,11 @@ def test_ghosts_are_suspected_and_bodies_are_not():
         track(6, half, half_velocity),
         track(8, beside, beside_velocity),
     ]
-    found = suspicion(track_set(tracks, OWN), OWN, Walls(wall()), RESOLUTION, PERIOD)
+    found = suspicion(track_set(tracks, OWN), OWN, Walls(wall()), RESOLUTION, Ambiguity(PERIOD))
     assert found.suspect.tolist() == [False, True, True, False]
     assert found.order.tolist() == [0, 2, 1, 0] and found.source.tolist() == [-1, 3, 3, -1]
     assert (found.behind >= 0).tolist() == [False, True, False, False]
-    alone = suspicion(track_set(tracks[2:], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD)
+    alone = suspicion(track_set(tracks[2:], OWN), OWN, Walls(wall()), RESOLUTION, Ambiguity(PERIOD))
     assert not alone.suspect.any()
 
 
@@ -146,7 +146,7 @@ def test_a_place_just_behind_a_wall_is_in_doubt_as_far_as_it_is_unsure():
     unsure = replace(behind, state=Gaussian(behind.state.mean, np.diag([0.09] * 3 + [1e-2] * 3)))
     for one, expected in ((behind, True), (unsure, False)):
         assert suspicion(
-            track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, PERIOD
+            track_set([one], OWN), OWN, Walls(wall()), RESOLUTION, Ambiguity(PERIOD)
         ).suspect.tolist() == [expected]
 
 
@@ -244,7 +244,7 @@ def test_a_passive_terminal_suspects_its_ghosts():
     ]
     everyone = track_set(tracks, OWN, track(1, SENDER[:3], SENDER[3:]))
     one_pass = RESOLUTION * [2, 2, 3, 3]
-    found = suspicion(everyone, OWN, Walls(wall()), one_pass, 2 * PERIOD)
+    found = suspicion(everyone, OWN, Walls(wall()), one_pass, Ambiguity(2 * PERIOD))
     assert found.suspect.tolist() == [False, False, True, True, True, False]
     assert found.source.tolist() == [-1, -1, 3, 3, 1, -1] and found.order.tolist() == [
         0,
@@ -265,7 +265,7 @@ def test_a_place_that_the_sender_cannot_see_is_suspect_at_a_passive_terminal():
         OWN,
         Walls(wall()),
         RESOLUTION,
-        PERIOD,
+        Ambiguity(PERIOD),
     )
     assert (found.behind >= 0).tolist() == [False, True]
 

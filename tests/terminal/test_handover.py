@@ -276,6 +276,7 @@ def test_how_far_off_a_reference_may_be(off, spread, believed, periods):
     P[:3, :3] += (spread[0] * CELL) ** 2 * np.outer(e, e)
     P[3:6, 3:6] += (spread[1] * BIN) ** 2 * np.outer(e, e)
     z = sight() + np.array([off[0] * CELL, (off[1] + periods * W.num_chirps) * BIN, 0, 0])
+    z[0] -= periods * W.num_chirps * BIN * MIDDLE / W.slope  # the same beat
     pt, _ = passive([heard(z)], Gaussian(SENDER.copy(), P))
     pt.step(EMPTY, OWN, 0.0, True)
     assert pt.reference is not None and pt.state is TerminalState.TRACKING
@@ -446,13 +447,14 @@ def test_a_slip_is_the_least_move_that_fits_the_alphabet():
 
 def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     """What is expected of the mesh reaches the receiver; the Doppler of an echo tells velocities
-    apart modulo half a wavelength a slot, and a PT's modulo a whole one. Planted bugs: clutter
-    dropped; the period of one pass; half a period."""
+    apart modulo half a wavelength a slot, and a PT's modulo a whole one; the range is read with
+    the velocity. Planted bugs: clutter dropped; the period of one pass; half a period."""
     period = 299_792_458.0 / MIDDLE / (2 * W.slot_duration)
     clutter = ExpectedClutter(*(np.zeros(0),) * 3, *(np.zeros((0, 3)),) * 2)
     at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
     z = np.asarray(what_is_measured(BODY, OWN), float)
-    told = Told([heard(None, [z + np.array([0, whole * period, 0, 0])]) for whole in (0, -1, 2)])
+    fold = np.array([-MIDDLE / W.slope, 1, 0, 0]) * period  # the same beat
+    told = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
     vars(at)["receive"] = told  # in place of the method
     state = Gaussian(BODY.copy(), known(0.02, 0.2).covariance)
     at.tracker.tracks = [Track(at.tracker.new_id(), state, 20.0)]
@@ -464,8 +466,8 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     assert [h[2] for h in told.handed] == [False, True, False]
     assert len(tracks) == 1 and tracks.age[0] == 3 and tracks.confirmed[0]
     pt, _ = passive()
-    assert pt.tracker.velocity_period == pytest.approx(2 * period)
-    assert at.tracker.velocity_period == pytest.approx(period)
+    assert pt.tracker.ambiguity.period == pytest.approx(2 * period)
+    assert at.tracker.ambiguity.period == pytest.approx(period)
 
 
 def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():

@@ -9,6 +9,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Tracking
+from isac_rt.terminal.filter import Ambiguity
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import Doubts, own_images, sender_images
 from isac_rt.terminal.tracker import Tracker
@@ -138,7 +139,7 @@ def test_what_may_not_start_a_track_carries_one_on():
     carried on. Without further ones it ends when 0.2 s have passed, at the third frame of 0.07 s.
     Planted bugs: births of all; frames counted instead of the time."""
     settings = Tracking(confirm_hits=1, confirm_window=1, drop_after_s=0.2, drop_misses=90)
-    tracker, rest = Tracker(settings, 60.0), Pose(*np.zeros((3, 3)), np.eye(3))
+    tracker, rest = Tracker(settings, Ambiguity(60.0)), Pose(*np.zeros((3, 3)), np.eye(3))
     for k in range(6):
         tracker.predict(0.07 * k)
         both = detections([20.0 + 0.07 * k, 33.0], [1.0, 2.0], [0.1, -0.3])

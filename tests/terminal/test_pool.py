@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.filter import measure
+from isac_rt.terminal.filter import Ambiguity, measure
 from isac_rt.terminal.fusion import ATTITUDE_STD, POSE_STD, Key, Name
 from isac_rt.terminal.pool import ERRORS, Lives, Look, Pool, PooledTracker, _View
 from isac_rt.world.swarm import Pose
@@ -86,7 +86,8 @@ NONE = {"A": np.zeros(ERRORS), "B": np.zeros(ERRORS)}
 
 
 def tracker(terminals=("A", "B")):
-    return PooledTracker(terminals, SETTINGS, Lives(3, 5 * T, 0.36), (30.0, 60.0))
+    folds = Ambiguity(30.0), Ambiguity(60.0)
+    return PooledTracker(terminals, SETTINGS, Lives(3, 5 * T, 0.36), folds)
 
 
 def test_bodies_and_errors_lie_where_their_covariances_say():

@@ -14,6 +14,7 @@ from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     BIRTH_SPEED_STD,
     STD_FLOOR,
+    Ambiguity,
     Gaussian,
     birth,
     bistatic_distance,
@@ -284,10 +285,10 @@ def test_velocity_is_taken_modulo_its_period():
     z = measure(BODY, OWN)
     folded = z - np.array([0.0, PERIOD, 0.0, 0.0])
     R = np.diag(STD**2)
-    assert update(g, folded, R, OWN, velocity_period=PERIOD).mean == pytest.approx(
+    assert update(g, folded, R, OWN, ambiguity=Ambiguity(PERIOD)).mean == pytest.approx(
         update(g, z, R, OWN).mean, abs=1e-9
     )
-    assert wrapped(np.array([1.0, 0.6 * PERIOD, 0.1, 0.2]), PERIOD)[1] == pytest.approx(
+    assert wrapped(np.array([1.0, 0.6 * PERIOD, 0.1, 0.2]), Ambiguity(PERIOD))[1] == pytest.approx(
         -0.4 * PERIOD
     )
 
@@ -329,7 +330,7 @@ def test_crossing_targets_keep_their_tracks():
     first, second = BODY.copy(), BODY.copy()
     second[:3] += [2.0, 4.0, 0.4]
     second[3:] = [-6.9, -1.0, 0.6]
-    tracker, settings = Tracker(Tracking(), PERIOD), Tracking()
+    tracker, settings = Tracker(Tracking(), Ambiguity(PERIOD)), Tracking()
     assert settings.confirm_hits == 3
     owner: dict[int, int] = {}
     nearest = np.inf
@@ -353,7 +354,7 @@ def test_a_swarm_that_turns_keeps_its_tracks(interval):
     start, turn = rng.normal((5, 70, 30), (12, 9, 5), (3, 3)), 3.0 / speed  # [m], [rad/s]
     own, tracker, ids = (
         Pose.at_rest(OWN.position, (0.1, 1.2, -0.1)),
-        Tracker(Tracking(), 60.0),
+        Tracker(Tracking(), Ambiguity(60.0)),
         set(),
     )
     for k in range(int(5 / interval)):
@@ -373,7 +374,7 @@ def test_birth_confirmation_and_death():
     """Confirmed at the third hit, dropped after eight misses, a new id afterwards; a single false
     alarm lives until it can no longer reach 3 of 5. Planted bug: misses not reset by a hit."""
     settings = Tracking()
-    tracker = Tracker(settings, PERIOD)
+    tracker = Tracker(settings, Ambiguity(PERIOD))
     hidden = {6, 7, 8} | set(range(12, 20))
     seen = {
         k: (tracks.ids.tolist(), tracks.confirmed.tolist())
@@ -383,14 +384,14 @@ def test_birth_confirmation_and_death():
     assert seen[8] == ([0], [True]) and seen[18] == ([0], [True])
     assert seen[19] == ([], [])
     assert seen[20] == ([1], [False]) and seen[22] == ([1], [True])
-    alone = Tracker(settings, PERIOD)
+    alone = Tracker(settings, Ambiguity(PERIOD))
     lives = [len(tracks) for _, _, tracks in fly(alone, 6, [BODY], 0.02, 2, set(range(1, 6)))]
     assert lives == [1, 1, 1, 0, 0, 0]
 
 
 def test_prediction_lists_reference_then_confirmed_reflectors():
     """Weights are powers over the strongest's; tentative tracks are left out."""
-    tracker = Tracker(Tracking(), 2 * PERIOD)
+    tracker = Tracker(Tracking(), Ambiguity(2 * PERIOD))
     at = Gaussian(AT, np.eye(6) * 1e-4)
     reference_id = tracker.new_id()
     other = BODY + np.array([7.0, 9.0, 1.0, 1.0, -2.0, 0.0])
@@ -412,7 +413,7 @@ def test_prediction_lists_reference_then_confirmed_reflectors():
 def test_a_bistatic_track_finds_the_reflector():
     """Fifty frames with a moving AT and receiver: position within three of its own deviations, and
     these below 0.5 m."""
-    rng, tracker = np.random.default_rng(4), Tracker(Tracking(), 2 * PERIOD)
+    rng, tracker = np.random.default_rng(4), Tracker(Tracking(), Ambiguity(2 * PERIOD))
     for k in range(50):
         t = 0.0078 * k
         move = [np.concatenate([s[:3] + t * s[3:], s[3:]]) for s in (BODY, AT)]
@@ -430,7 +431,7 @@ def test_a_bistatic_track_finds_the_reflector():
 def test_ids_are_deterministic():
     runs = []
     for _ in range(2):
-        tracker = Tracker(Tracking(), PERIOD)
+        tracker = Tracker(Tracking(), Ambiguity(PERIOD))
         runs.append(
             [
                 tracks.ids.tolist()
@@ -444,7 +445,7 @@ def test_ids_are_deterministic():
 def test_a_track_says_which_detection_updated_it():
     """Rows of the frame's detections, whatever their order; -1 while it coasts. Planted bugs: the
     row kept while coasting, the row among the detections that no confirmed track took."""
-    tracker = Tracker(Tracking(), PERIOD)
+    tracker = Tracker(Tracking(), Ambiguity(PERIOD))
     far = BODY + np.array([17.0, 9.0, 1.0, 1.0, -2.0, 0.0])
     expected_rows = ([0, 1], [1, 0], [0, 1], [1, 0], [-1, 0], [-1, -1])
     for k, rows in enumerate(expected_rows):

@@ -15,7 +15,14 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.simulation.setup import swarm_of
 from isac_rt.studies.paper.flight import errors, scenario
 from isac_rt.studies.paper.outcome import Sentences, Verdict, blank, proportion, style
-from isac_rt.terminal.filter import birth, measure, measurement_covariance, predict, update
+from isac_rt.terminal.filter import (
+    Ambiguity,
+    birth,
+    measure,
+    measurement_covariance,
+    predict,
+    update,
+)
 
 Pairs = dict[str, tuple[np.ndarray, np.ndarray]]
 """Absolute errors before and after the filter, by quantity."""
@@ -92,7 +99,7 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                         z,
                         measurement_covariance(std, state.mean),
                         own,
-                        velocity_period=2 * w.max_velocity(passes),
+                        ambiguity=Ambiguity.of(w, passes),
                     )
                 last, count = time, count + 1
                 if state is None or count <= SETTLED:
