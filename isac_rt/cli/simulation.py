@@ -277,9 +277,15 @@ def _say_plan(found: dict[str, Any], frames: int) -> None:
         "reach [m]": found["reach_m"],
     }
     said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
-    total = sum(found["seconds_per_frame"].values()) * frames
-    stages = ", ".join(found["seconds_per_frame"])
-    say(f"preset {found['preset']}; {said}; about {total:.0f} s for {frames} frames of {stages}")
+    say(f"preset {found['preset']}; {said}")
+    once, whole = found["seconds_once"], found["seconds_of_run"]
+    first = sum(once.values()) - once["setup"]
+    stages = ", ".join(f"{stage} {whole[stage]:.3g}" for stage in found["seconds_per_frame"])
+    say(
+        f"processor time of the run: about {sum(whole.values()):.3g} s: {once['setup']:.3g} s of "
+        f"set-up, and for {frames} frames {stages}, of which {first:.3g} s in the first one, for "
+        "what is loaded"
+    )
 
 
 def paths(

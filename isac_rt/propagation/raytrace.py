@@ -30,7 +30,7 @@ import copy
 import logging
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -61,6 +61,7 @@ from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.scenario.environment import Clutter, Propagation
+from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scenes
 from isac_rt.world.swarm import Pose, Swarm
@@ -71,9 +72,20 @@ if TYPE_CHECKING:
 MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
 fewer rays get less room."""
+MOST_RAYS_KEPT = 20_000
+"""Rays of a diffuse solution that is kept for later runs, at most: with more, a run of a hundred
+frames would fill the store."""
 
 
 _LOG = logging.getLogger(__name__)
+
+
+class _Hits(NamedTuple):
+    """Diffuse paths of a link: what comes of a hit (K,), its face (K,) and its point (K, 3)."""
+
+    amplitude: np.ndarray
+    face: np.ndarray
+    point: np.ndarray
 
 
 class RayTracer:
@@ -336,7 +348,7 @@ class RayTracer:
         state: LinkState,
         local: dict[str, Pose],
         legs: dict[Link, LegSet],
-        hits: dict,
+        hits: dict[Link, _Hits],
         bodies: Bodies,
     ) -> PathSet:
         link, antennas = state.link, self._free.antennas
@@ -412,16 +424,36 @@ class RayTracer:
             faces=np.concatenate(chain, axis=1),
         )
 
-    def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict:
-        """Hit points and scattered amplitudes of every link, from one solve; points on the float64
-        mesh, in a fixed order."""
+    @cached_property
+    def _city_content(self) -> str:
+        """Digest of all of the city that Sionna's solutions depend on."""
+        return checksum(*pack([self._city.plain(), self._scenes.carrier_frequency, mi.variant()]))
+
+    def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict[Link, _Hits]:
+        """Hit points and scattered amplitudes of every link, from one solve or from one that an
+        earlier run kept; points on the float64 mesh, in a fixed order."""
         sources, sinks = (
-            list(dict.fromkeys(tx for tx, _ in links)),
-            self._terminals,
-        )  # as many each frame: a new number compiles anew
+            {name: local[name].position for name in names}
+            for names in (dict.fromkeys(tx for tx, _ in links), self._terminals)
+        )  # as many sinks each frame: a new number compiles anew
+
+        def found() -> list[_Hits]:
+            return self._diffuse_solution(sources, sinks, links)
+
+        rays = self._clutter.rays
+        if rays > MOST_RAYS_KEPT:
+            return dict(zip(links, found(), strict=True))
+        where = [[*sources], [*sources.values()], [*sinks], [*sinks.values()], links]
+        hits = kept("diffuse", [self._city_content, rays, where], found)
+        return {link: _Hits(*of_link) for link, of_link in zip(links, hits, strict=True)}
+
+    def _diffuse_solution(
+        self, sources: dict[str, np.ndarray], sinks: dict[str, np.ndarray], links: list[Link]
+    ) -> list[_Hits]:
+        """Sionna's diffuse paths of some links between places by name."""
         found = self._solve(
-            {name: local[name].position for name in sources},
-            {name: local[name].position for name in sinks},
+            sources,
+            sinks,
             max_depth=1,
             samples_per_src=self._clutter.rays,
             los=False,
@@ -429,13 +461,13 @@ class RayTracer:
             diffuse_reflection=True,
         )
         amplitude, valid, faces, points = self._read(found, 1)
-        out = {}
+        out = []
         for tx, rx in links:
-            i, j = sinks.index(rx), sources.index(tx)
+            i, j = [*sinks].index(rx), [*sources].index(tx)
             which = np.flatnonzero(valid[i, j] & (faces[i, j, :, 0] >= 0))
             face, point = faces[i, j, which, 0], points[i, j, which, 0]
             order = np.lexsort(point.T)
-            out[Link(tx, rx)] = np.abs(amplitude[i, j, which])[order], face[order], point[order]
+            out.append(_Hits(np.abs(amplitude[i, j, which])[order], face[order], point[order]))
         return out
 
     def _scattered(

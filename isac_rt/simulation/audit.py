@@ -116,16 +116,25 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
 
 
 def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
-    """The plan of a run: decisions, one item per line, and the seconds of each stage per frame.
+    """The plan of a run: decisions, one item per line, and the processor seconds of each stage.
 
     Traces a few frames of the run, and those that follow, and makes their samples; with `receive`
     receivers work on them too, the passive ones on the run's first frames.
+
+    Returns
+    -------
+    plan : ``seconds_per_frame`` are those of a frame by stage, ``seconds_once`` those of set-up and
+        what each stage takes beyond that when it is first used, ``seconds_of_run`` both for all
+        frames; what a machine does slowly or quickly is in them as it was while the plan was made
     """
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
     trace: list[float] = []
     light, late, short_lived = 0.0, 0.0, 0
+    begin = time.process_time()
+    setup.frame(frames[0])
+    first = time.process_time() - begin
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, found = setup.find(frame)
@@ -139,8 +148,13 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
             late = max(late, _late(setup, paths, last.noise_power(link)))
             short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
     _LOG.info("making the samples of %d frames", len(frames))
-    stages = stage_seconds(setup, frames, receive)
+    stages, beyond = stage_seconds(setup, frames, receive)
     tracing = float(np.mean(trace))
+    seconds = {
+        "trace": tracing,
+        **{stage: sum(of.get(stage, 0.0) for of in stages.values()) for stage in beyond},
+    }
+    once = {"setup": setup.seconds.processor, "trace": max(first - tracing, 0.0), **beyond}
     items = [_tracing_item(setup, frames, tracing)]
     items += _scene_items(setup)
     for link, of_link in uses.items():
@@ -148,12 +162,7 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     items += _standing_items(setup, light, late, short_lived / len(frames))
     items += [] if all(e.ideal for e in setup.front_ends.values()) else _hardware_items(last)
     items += _self_calibration_items(setup, last)
-    seconds = {
-        "trace": tracing,
-        "synthesis": sum(s["synthesis"] for s in stages.values()),
-    }
-    if receive:
-        seconds["receive"] = sum(s.get("receive", 0.0) for s in stages.values())
+    count = plan.timetable.frames
     return {
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
@@ -162,6 +171,10 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
         "seconds_per_frame": seconds,
+        "seconds_once": once,
+        "seconds_of_run": {
+            stage: spent + count * seconds.get(stage, 0.0) for stage, spent in once.items()
+        },
     }
 
 

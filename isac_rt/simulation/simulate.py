@@ -363,43 +363,66 @@ def summarise(
 
 def stage_seconds(
     setup: Setup, frames: Sequence[int], receive: bool
-) -> dict[Link, dict[str, float]]:
-    """Processor seconds of synthesis and, if asked for, reception by link, for one frame of the run
-    on average, as some of its frames show them.
+) -> tuple[dict[Link, dict[str, float]], dict[str, float]]:
+    """Processor seconds of synthesis and, if asked for, reception and scoring, as some frames of
+    the run show them.
 
     Passive terminals read what they have acquired: their reception is that of the first frames of
-    the run, one after the other.
+    the run, one after the other. Sets of receivers that are compared count too.
+
+    Returns
+    -------
+    per_frame : by link and stage, for one frame of the run on average
+    once : by stage what the first frame takes beyond that: machine code and tables are loaded
     """
     timetable = setup.timetable
     acquired = timetable.modulation.acquisition_frames + 2
     early = range(min(acquired, MOST_EARLY, timetable.frames) if receive else 0)
     observers = {link: _fresh(setup, link) for link in timetable.all_links}
+    first: dict[tuple[Link, str], float] = {}
     spent: dict[tuple[Link, str], list[float]] = {}
-    # the first once more: what is compiled on first use is not a frame's cost
     for i, number in enumerate([frames[0], *dict.fromkeys([*early, *frames])]):
         frame = setup.frame(number)
         for link in timetable.links(number):
-            stopwatch = Stopwatch()
-            with stopwatch.stage("synthesis"):
-                cube = frame.heard(link)
-            if receive and (link.own or number in early):
-                observer = _fresh(setup, link) if link.own or not i else observers[link]
-                with stopwatch.stage("receive"):
-                    observer.hear(frame, cube, False)
-                spent.setdefault((link, "receive"), []).append(stopwatch.spent["receive"].processor)
-            spent.setdefault((link, "synthesis"), []).append(stopwatch.spent["synthesis"].processor)
-        if not i:
-            spent.clear()
-    out: dict[Link, dict[str, float]] = {}
-    for (link, stage), seconds in spent.items():
+            fresh, heard = link.own or not i, receive and (link.own or number in early)
+            by = (_fresh(setup, link) if fresh else observers[link]) if heard else []
+            for stage, seconds in _stages_of(frame, link, by).items():
+                if not i:
+                    first[link, stage] = seconds
+                else:
+                    spent.setdefault((link, stage), []).append(seconds)
+    per_frame: dict[Link, dict[str, float]] = {}
+    once: dict[str, float] = {}
+    for (link, stage), each in spent.items():
         share = np.mean([timetable.holds(link, frame) for frame in range(timetable.frames)])
-        out.setdefault(link, {})[stage] = float(share * np.mean(seconds))
-    return out
+        per_frame.setdefault(link, {})[stage] = float(share * np.mean(each))
+        beyond = max(first.get((link, stage), 0.0) - float(np.mean(each)), 0.0)
+        once[stage] = once.get(stage, 0.0) + beyond
+    return per_frame, once
 
 
-def _fresh(setup: Setup, link: Link) -> _Observer:
-    """A link's standard receiver before its first frame."""
-    return _Observer(setup, link, standard_terminal(setup, link), setup.scenario.receivers)
+def _stages_of(frame: Frame, link: Link, observers: Sequence[_Observer]) -> dict[str, float]:
+    """Processor seconds of a link's frame by stage, heard by some observers."""
+    stopwatch = Stopwatch()
+    with stopwatch.stage("synthesis"):
+        cube = frame.heard(link)
+    for observer in observers:
+        with stopwatch.stage("receive"):
+            heard = observer.hear(frame, cube, False)
+        with stopwatch.stage("track"):
+            observer.record(frame, heard)
+    stages = ["synthesis", "receive", "track"] if observers else ["synthesis"]
+    return {stage: stopwatch.spent[stage].processor for stage in stages}
+
+
+def _fresh(setup: Setup, link: Link) -> list[_Observer]:
+    """A link's receivers before their first frame, the scenario's own and those compared."""
+    own, *compared = (setup.scenario, *setup.scenario.compare.values())
+    made = [
+        _Observer(setup, link, standard_terminal(setup, link, one), one.receivers)
+        for one in compared
+    ]
+    return [_Observer(setup, link, standard_terminal(setup, link), own.receivers), *made]
 
 
 @dataclass

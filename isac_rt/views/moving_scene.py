@@ -152,6 +152,7 @@ class _Moving:
             *(f"tracks of {observer}" for observer in dataset.observer.values),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
         ]
+        self._paths = {int(kept): self._paths_of(int(kept)) for kept in self._kept}
 
     def at(self, frame: int) -> list[Trace]:
         """The traces in a frame."""
@@ -176,19 +177,17 @@ class _Moving:
             }
             for o in range(d.sizes["observer"])
         ]
-        traces = [uavs, *tracks, *self._paths(frame)]
+        nearest = self._kept[np.argmin(np.abs(self._kept - frame))] if self._kept.size else -1
+        traces = [uavs, *tracks, *self._paths.get(int(nearest), [])]
         return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
 
     def _of(self, rows: str, frame: int, observer: int) -> np.ndarray:
         mine = self._d[f"{rows}_observer"].values == observer
         return np.asarray(mine & (self._d[f"{rows}_frame"].values == frame))
 
-    def _paths(self, frame: int) -> list[Trace]:
-        """Paths of the nearest frame that has any."""
-        if not self._kept.size:
-            return []
-        nearest = self._kept[np.argmin(np.abs(self._kept - frame))]
-        kind, here = self._d.path_kind.values, self._d.path_frame.values == nearest
+    def _paths_of(self, kept: int) -> list[Trace]:
+        """The paths of a frame whose ledger is kept, by kind."""
+        kind, here = self._d.path_kind.values, self._d.path_frame.values == kept
         return [
             _line(
                 lines_of(list(path_lines(self._d, np.flatnonzero(here & (kind == k)), MOST_LINES))),

@@ -60,16 +60,23 @@ def test_the_truth_of_a_flight_in_free_space_stays_within_the_bounds():
 
 
 def test_the_plan_on_the_command_line(capsys):
-    """Table and JSON of the same plan. Planted bug: the items printed without their links."""
+    """Table and JSON of the same plan; what is spent once counts once. Planted bugs: the items
+    printed without their links; the first frame's loading times the frames."""
     scene = str(SCENES / "paper_swarm.yaml")
     assert main(["plan", scene, "--json", "--set", "frames=4"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert {"preset", "items", "seconds_per_frame", "pilot_frames"} <= set(found)
+    assert found["seconds_once"]["setup"] > 0 and set(found["seconds_per_frame"]) < set(
+        found["seconds_once"]
+    )
+    for stage, seconds in found["seconds_of_run"].items():
+        per_frame = found["seconds_per_frame"].get(stage, 0.0)
+        assert seconds == pytest.approx(found["seconds_once"][stage] + 4 * per_frame), stage
     assert main(["plan", scene, "--set", "frames=4"]) == 0
     text = capsys.readouterr().out
     for item in found["items"]:
         assert item["modelled"].split(",")[0][2:] in text
-    assert "AT to PT1" in text
+    assert "AT to PT1" in text and "s of set-up, and for 4 frames trace" in text
 
 
 def town(seed: int) -> Scenario:

@@ -20,6 +20,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from isac_rt.studies import scene_file
+
 PARTS = ("import", "set-up", "first frame", "other frames", "saving", "figures", "report")
 LONGEST_S = 3000
 SAN_FRANCISCO = (
@@ -41,7 +43,7 @@ SCENES: dict[str, tuple[str, int, int, tuple[str, ...]]] = {
 def tables(quick: bool) -> list[dict[str, Any]]:
     """One dict for each scene: `scene`, `frames`, `peak_memory_mib`, `paths_per_frame`, `processor`
     and `wall` [s] by part and ``total``, `stages`, the processor seconds of the frames, and what
-    `isac-rt plan --receivers` says of one frame's, `predicted`."""
+    `isac-rt plan --receivers` says of them and of the set-up, `predicted`."""
     return [measured(name, quick) for name in SCENES]
 
 
@@ -54,19 +56,30 @@ def measured(name: str, quick: bool) -> dict[str, Any]:
     """
     file, frames, few, changes = SCENES[name]
     number = few if quick else frames
+    told = [*changes, f"frames={number}"]
     for _ in range(1 if quick else 2):
-        job = [file, [*changes, f"frames={number}"], time.time()]
-        done = subprocess.run(
-            [sys.executable, "-m", "isac_rt.studies.bench.command", json.dumps(job)],
-            capture_output=True,
-            text=True,
-            timeout=LONGEST_S,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )
-        if done.returncode:
-            said = done.stderr.strip().splitlines() or ["nothing"]
-            raise RuntimeError(f"{file} ended with {done.returncode} and said: {said[-1]}")
-    return {"scene": name, "frames": number, **json.loads(done.stdout.splitlines()[-1])}
+        job = json.dumps([file, told, time.time()])
+        found = _answer(file, "isac_rt.studies.bench.command", job)
+    overrides = [word for change in told for word in ("--set", change)]
+    asked = ["plan", str(scene_file(file)), "--receivers", "--json", *overrides]
+    predicted = _answer(file, "isac_rt.cli.cli", *asked)["seconds_of_run"]
+    return {"scene": name, "frames": number, **found, "predicted": predicted}
+
+
+def _answer(file: str, module: str, *arguments: str) -> dict[str, Any]:
+    """What a module of this package says as JSON of a scene, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", module, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or ["nothing"]
+        raise RuntimeError(f"{file} ended with {done.returncode} and said: {said[-1]}")
+    answer: dict[str, Any] = json.loads(done.stdout[done.stdout.index("{") :])
+    return answer
 
 
 class _Parts:
@@ -91,7 +104,6 @@ def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
     """Do what the command does and say where its time went."""
     parts = _Parts(begun)
     import isac_rt as irt
-    from isac_rt.studies import scene_file
 
     scenario = irt.load(scene_file(file), changes)
     from isac_rt.simulation import simulate
@@ -117,15 +129,11 @@ def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
         write_report(results, folder, pictures, setup.city)
     parts.mark("report")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    from isac_rt.simulation.audit import make_plan
-
-    predicted = make_plan(irt.prepare(scenario), receive=True)["seconds_per_frame"]
-    stages = ("trace", "synthesis", "receive", "track", "other")
+    stages = ("setup", "trace", "synthesis", "receive", "track", "other")
     return {
         "processor": parts.processor,
         "wall": parts.wall,
         "stages": {stage: results.summary["timing_s"][stage] for stage in stages},
-        "predicted": predicted,
         "peak_memory_mib": peak / 1024,
         "paths_per_frame": sum(results.summary["paths"].values()) / scenario.frames,
     }
@@ -145,11 +153,11 @@ def markdown(found: list[dict[str, Any]]) -> list[str]:
         cells = [f"{one['processor'][part]:.2f} ({one['wall'][part]:.2f})" for one in found]
         lines.append(f"| {part} [s] | {' | '.join(cells)} |")
     for stage in found[0]["stages"]:
-        cells = [f"{one['stages'][stage] / one['frames']:.3f}" for one in found]
-        lines.append(f"| a frame's {stage} [s] | {' | '.join(cells)} |")
+        cells = [f"{one['stages'][stage]:.2f}" for one in found]
         if stage in found[0]["predicted"]:
-            cells = [f"{one['predicted'][stage]:.3f}" for one in found]
-            lines.append(f"| a frame's {stage} by the plan [s] | {' | '.join(cells)} |")
+            said = [f"{one['predicted'][stage]:.2f}" for one in found]
+            cells = [f"{was} ({plan})" for was, plan in zip(cells, said, strict=True)]
+        lines.append(f"| {stage}, all frames (by the plan) [s] | {' | '.join(cells)} |")
     for key, title in (("peak_memory_mib", "peak memory [MiB]"), ("paths_per_frame", "paths")):
         cells = [f"{one[key]:,.0f}" for one in found]
         lines.append(f"| {title} | {' | '.join(cells)} |")
