@@ -135,17 +135,17 @@ class Waveform:
         """T- [s], from one chirp of a group to its next."""
         return self._times.slot
 
-    @property
+    @cached_property
     def frame_duration(self) -> float:
         """P T- [s]."""
         return self.num_chirps * self.slot_duration
 
-    @property
+    @cached_property
     def slope(self) -> float:
         """alpha = B / T~ [Hz/s]."""
         return self.sweep.slope if self.sweep is not None else self.bandwidth / self.chirp_duration
 
-    @property
+    @cached_property
     def sample_interval(self) -> float:
         """T_s [s]."""
         return 1.0 / self.sampling_rate
@@ -174,13 +174,13 @@ class Waveform:
         """c / f_c [m], the unit of the array spacing."""
         return SPEED_OF_LIGHT / self.carrier_frequency
 
-    @property
+    @cached_property
     def effective_carrier(self) -> float:
         """Frequency at the middle of the sampled window [Hz]: what Doppler and steering scale
         with."""
         return self.carrier_frequency + self.slope * (self.window_start + self.sampled_duration / 2)
 
-    @property
+    @cached_property
     def delay_step(self) -> float:
         """1 / (alpha T) [s]: the delay of one range cell and of one data symbol step."""
         return 1.0 / (self.slope * self.sampled_duration)

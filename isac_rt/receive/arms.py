@@ -73,10 +73,11 @@ def both_arms(antennas: Antennas) -> Channels:
 
 
 def element_delays(
-    positions: np.ndarray, direction: np.ndarray, radius: float
+    positions: np.ndarray, direction: np.ndarray, radius: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Delay of elements (E, 3) against the centroid for spherical waves from directions (..., 2)
-    [s], (..., E), and its derivative with respect to u_x, u_z (2, ..., E)."""
+    [s], (..., E), and its derivative with respect to u_x, u_z (2, ..., E); `radius` [m] one for all
+    or (..., 1)."""
     place = positions[:, [0, 2]]
     along = direction @ place.T
     axes = place.T.reshape(2, *(1,) * (along.ndim - 1), -1)

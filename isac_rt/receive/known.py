@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import overload
 
 import numpy as np
 
@@ -121,6 +122,10 @@ class Known:
         """Reported range of one cell [m]."""
         return self.waveform.range_cell(self.passes)
 
-    def radius(self, delay: float) -> float:
+    @overload
+    def radius(self, delay: float) -> float: ...
+    @overload
+    def radius(self, delay: np.ndarray) -> np.ndarray: ...
+    def radius(self, delay: float | np.ndarray) -> float | np.ndarray:
         """Radius of the wavefront of a path [m], one cell at least."""
-        return max(delay * SPEED_OF_LIGHT / self.passes, self.range_cell)
+        return np.maximum(delay * SPEED_OF_LIGHT / self.passes, self.range_cell)

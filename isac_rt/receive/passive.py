@@ -12,9 +12,9 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.chain import Refiner, passive_detector_of, reader_of, refiner_of
 from isac_rt.receive.estimate import Estimate
-from isac_rt.receive.joint.fit import JointPath
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import separate
+from isac_rt.receive.joint.tones import JointPath
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
@@ -49,6 +49,9 @@ known, the whole row is the prediction's."""
 MOST_WRONG = 1.0
 """Transitions of a frame that may be expected wrong where its samples are fitted all the same: a
 chain that turns in its middle looks like several paths."""
+
+SAME_PHASE = 1e-3
+"""Phases that are decided once more are those before, if they differ by no more: rounding."""
 
 
 @dataclass(frozen=True)
@@ -114,13 +117,19 @@ class PassiveReceiver:
             return Reception.undecoded(w, no_detections(), picture)
         known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         moments = Moments(cube.samples, known)
-        found, detections, reference = self._sense_data(cube, moments, prediction, clutter)
+        spectra = clean_spectrum(cube, known)
+        found, detections, reference = self._sense_data(spectra, moments, prediction, clutter)
         phases = None
         if self.refiner is not None and reference is not None:
             phases = self._phases(moments, detections)
         if phases is not None:
-            moments = moments.read_by(replace(known, phases=phases))
-            found, detections, reference = self._sense_data(cube, moments, prediction, clutter)
+            turn = phases.conj() * known.phases
+            if np.abs(turn - 1).max() > SAME_PHASE:
+                spectra *= turn.astype(np.complex64)[:, None, None]
+                moments = moments.read_by(replace(known, phases=phases))
+                found, detections, reference = self._sense_data(
+                    spectra, moments, prediction, clutter
+                )
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -198,14 +207,13 @@ class PassiveReceiver:
 
     def _sense_data(
         self,
-        cube: IFCube,
+        spectra: np.ndarray,
         moments: Moments,
         prediction: Prediction,
         clutter: ExpectedClutter | None,
     ) -> tuple[Sensed, Detections, Estimate | None]:
         """What a frame shows once its symbols are taken out, with the reference put first."""
         known = moments.known
-        spectra = clean_spectrum(cube, known)
         found = self.detector.sense(spectra, known, clutter)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
         found = replace(found, looks=self._look(spectra, known, detections, reference))

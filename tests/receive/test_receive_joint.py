@@ -15,25 +15,23 @@ from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import (
-    Fit,
-    JointPath,
-    _Descent,
-    _Tone,
-    energy,
-    fit,
-    places,
-    rate_bin,
-    residual_channels,
-    units,
-)
+from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
-from isac_rt.receive.joint.moments import Apart, Moments, cross_sums, exchange
+from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import (
     _beams,
     _earlier_reference,
     _hidden,
     refine_jointly,
+)
+from isac_rt.receive.joint.tones import (
+    JointPath,
+    Tones,
+    Weights,
+    cross_sums,
+    own_sums,
+    rate_bin,
+    units,
 )
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.types import Detections
@@ -58,36 +56,51 @@ def in_cells(w: Waveform, passes: int) -> np.ndarray:
     return np.array([w.range_cell(passes), w.velocity_cell(passes), 1.0, 1.0])
 
 
-def test_sums_of_a_tone():
-    """Against sums written out, on both sides of where the series takes over, at receivers with
-    ramps, turns and wobbles of their own; and what two tones of given amplitudes put into each
-    other's sums. Planted bugs: the sign of the second moment; the ramp of one receiver at all; the
-    wobble turned the other way; not conjugated on the way back."""
-    rng = np.random.default_rng(2)
-    for size in (24, 101):
+def tones_of(rng: np.random.Generator, frequency: np.ndarray, size: int) -> Tones:
+    """Tones at frequencies (K, M, P), for three receivers, with phases and wobbles drawn."""
+    shape = frequency.shape
+    slope, interval = 2.0 / size, 0.7
+    carrier = 1e3 + 0.06 * rng.uniform(-1, 1, shape[1:]) + rng.uniform(-1, 1, (len(shape), 1, 1))
+    delay = np.array([[0.0, 2e-2, -3e-2], [1e-2, -2e-2, 0.0], [0.0, 0.0, 1e-2]])
+    middle = carrier.mean(axis=(1, 2))
+    cycles = rng.uniform(-2, 2, shape)
+    return Tones(cycles, frequency, carrier, middle, delay, slope, interval, float(size))
+
+
+@pytest.mark.parametrize("reach", [0.0, 1e-4, 0.3, 3.0])
+def test_sums_of_tones(reach: float):
+    """Of T' T* n^q g over samples and chirps, against the sums written out, for tones whose
+    frequencies stay apart by as much as they do, or by up to `reach` cells more from chirp to
+    chirp, with receivers of other delays, where the series takes over too, and of a tone with
+    itself. Planted bugs: the sign of the second moment; the ramp of one receiver at all; the wobble
+    turned the other way; a Chebyshev node too few (3 cells)."""
+    rng, places = np.random.default_rng(2), 3
+    for size, distance in ((24, 0.0), (101, 0.011), (101, -1.7), (24, 0.5)):
+        base = rng.uniform(0, 0.4, (2, 8))
+        apart = (distance + reach * rng.uniform(-1, 1, (2, 2, 8))) / size
+        tones = tones_of(rng, np.concatenate([base[None], base + apart]), size)
+        factors = rng.standard_normal((2, 2, 8, 2)) @ [1, 1j]
+        place = rng.permuted(np.arange(16) % places).reshape(2, 8)
+        weights = Weights(factors, place, places)
         n = np.arange(size) - (size - 1) / 2
-        x = np.array(
-            [0.0, 3e-5, -0.0099 / size, 0.011 / size, 0.5 / size, -1.7 / size, 0.21, -0.44]
-        )
-        x, cycles, wobble = x.reshape(2, 4), rng.uniform(-2, 2, (2, 4)), rng.uniform(-1, 1, (2, 4))
-        ramp, delay = np.array([0.0, 0.3 / size, -2e-3]), np.array([0.0, 2e-3, -3e-3])
-        turn = np.exp(2j * np.pi * rng.uniform(0, 1, 3))
-        apart = Apart(x, cycles, ramp, turn, delay, wobble, float(size))
-        angle = cycles[..., None] + delay * wobble[..., None]
-        angle = angle[..., None] + (x[..., None] + ramp)[..., None] * n
-        tone = np.exp(2j * np.pi * angle) * turn[:, None]
-        sums = np.empty((3, 2, 4, 3), complex)
-        cross_sums(apart, sums)
-        series = 2e-6  # of the largest: what the two terms leave, and the wobble's third
-        for k in range(3):
-            assert np.abs(sums[k] - tone @ n**k).max() < series * size ** (k + 1)
-        own, other = rng.standard_normal((2, 2, 4, 2)) @ [1, 1j]
-        left, back = np.zeros((2, 2, 2, 4, 3), complex)
-        exchange(apart, own, other, left, back)
-        for k in range(2):
-            limit = 4 * series * size ** (k + 1)
-            assert np.abs(left[k] + other[..., None] * (tone @ n**k)).max() < limit
-            assert np.abs(back[k] + own[..., None] * (tone.conj() @ n**k)).max() < limit
+        late = tones.delay[:, None, None]
+        angle = tones.cycles[..., None] + late * tones.carrier[..., None]
+        angle = angle - tones.slope * late**2 / 2
+        ramped = tones.frequency[..., None] + late * tones.slope * tones.interval
+        signals = np.exp(2j * np.pi * (angle[..., None] + ramped[..., None] * n))
+        pairs = np.array([[0, 1], [2, 0]])
+        sums = cross_sums(tones, pairs, weights)
+        # of the largest: what the series' two terms and the wobble's three leave
+        limit = 4e-6 * np.abs(factors).sum()
+        for (k, j), mine in zip(pairs, sums, strict=True):
+            both = signals[j] * signals[k].conj()
+            for q in range(3):
+                each = factors[..., None] * (both @ n**q)
+                exact = np.stack([each[:, place == a].sum(axis=1) for a in range(places)], axis=1)
+                assert np.abs(mine[q] - exact).max() < limit * size ** (q + 1)
+        real = weights._replace(factors=factors.real.astype(complex))
+        own, itself = own_sums(size, real), cross_sums(tones, np.array([[1, 1]]), real)[0]
+        assert itself == pytest.approx(np.repeat(own, 3, axis=3), abs=1e-9 * size**3)
 
 
 def test_elements_hear_a_spherical_wave():
@@ -230,7 +243,8 @@ def test_a_path_against_its_own_template_has_no_slope():
     clean = samples(w, schedule, payload, wide, np.array(NEAR), 2)
     sent = known(w, schedule, payload, wide)
     path = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
-    zeroth, first = _Tone.of(sent, path).seen(Moments(clean.astype(np.complex64), sent))
+    moments = Moments(clean.astype(np.complex64), sent)
+    zeroth, first = moments.of(Tones.of(sent, [path])[0], Weights.by_chirp(sent))[0, :, 0]
     assert np.abs(zeroth) == pytest.approx(np.abs(zeroth).mean(), rel=1e-3)
     assert np.abs(first).max() < 1e-3 * np.abs(zeroth).mean() * w.num_samples
 
@@ -592,19 +606,27 @@ def test_moments_are_the_sums_over_the_samples(size: int):
     sent = known(w, schedule, payload, FEW)
     moments = Moments(samples_, sent)
     n, cycles = np.arange(size) - (size - 1) / 2, rng.uniform(-3, 3, schedule.shape)
-    ramp = rng.uniform(-1, 1, 4) * 1e-2
-    apart = rng.uniform(-1, 1, (*schedule.shape, 4))
+    chirp, delay = (4e-3, 0.3, float(size)), rng.uniform(-1, 1, (1, 4))
+    carrier = 5.0 + 3e-3 * rng.uniform(-1, 1, schedule.shape)
+    weights = Weights.by_chirp(sent)
     for low, high in ((0.1, 0.2), (-0.02, 0.02), (0.97, 1.02)):
         frequency = rng.uniform(low, high, schedule.shape)
-        sums = moments.of(cycles, frequency, ramp, apart)
+        one = (x[None] for x in (cycles, frequency, carrier))
+        tones = Tones(*one, carrier.mean(keepdims=True)[0], delay, *chirp)
+        sums = moments.of(tones, weights)[0, :, 0].reshape(2, *schedule.shape, 4)
+        apart = delay * carrier[..., None] - chirp[0] * delay**2 / 2
         angle = (cycles[..., None] + apart)[..., None]
-        angle = angle + (frequency[..., None] + ramp)[..., None] * n
+        angle = angle + (frequency[..., None] + delay * chirp[0] * chirp[1])[..., None] * n
         tone = np.exp(-2j * np.pi * angle) * payload.phases.conj()[..., None, None]
         turned = samples_.transpose(0, 2, 1, 3) * tone
         assert np.abs(sums[0] - turned.sum(axis=-1)).max() < 5e-6 * 2 * size
         assert np.abs(sums[1] - turned @ n).max() < 5e-5 * 2 * size**2
+        by_antenna = moments.of(tones, Weights.by_antenna(sent, np.stack([cycles, cycles**2])))
+        each = sums[:, None] * np.stack([cycles, cycles**2])[..., None]
+        mine = np.stack([each[:, :, a].sum(axis=2) for a in sent.sent_by], axis=2)
+        assert by_antenna[0] == pytest.approx(mine, abs=1e-9 * size**2)
     silent = replace(sent, phases=np.ones_like(payload.phases))
-    again = moments.read_by(silent).of(cycles, frequency, ramp, apart)
+    again = moments.read_by(silent).of(tones, weights)[0, :, 0].reshape(sums.shape)
     assert again == pytest.approx(sums * payload.phases[..., None], rel=1e-9)  # rounding
     assert moments.noise == pytest.approx(2.0, rel=0.1)  # the median of 24 chirps
 

@@ -7,8 +7,8 @@ No window, no cells: the samples of the frame are compared with the sum of the p
     tau_D + tau_k + tau_dot_k t + e_k,
 
 e_k the delays of the elements, spherical at the path's range. Gauss-Newton needs of the samples
-only, for each path, chirp and receiver, the sums of s T* and of n s T* over the chirp; what the
-paths leave in each other's sums is known in closed form (a tone's transform and its derivatives).
+only, for each path, transmit antenna and receiver, the sums of s T* times 1, n, t and n t; what the
+paths leave in each other's sums is known in closed form (`isac_rt.receive.joint.tones`).
 In white noise the estimate of an isolated path reaches the Cramer-Rao bound; paths within one cell
 are told apart by their directions and velocities.
 
@@ -20,54 +20,33 @@ the time grows with the paths that touch (`isac_rt.receive.joint.interaction`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.arms import element_delays
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.joint.interaction import CLOSE, TANGENTS, Places, clusters, ignored, shared
-from isac_rt.receive.joint.moments import Apart, Moments, cross_sums, exchange
+from isac_rt.receive.joint.moments import Moments
+from isac_rt.receive.joint.tones import (
+    PARAMETERS,
+    JointPath,
+    Tones,
+    Weights,
+    cross_sums,
+    own_sums,
+    powers_of_time,
+    rate_bin,
+    units,
+)
 from isac_rt.receive.known import Known
 
-PARAMETERS = 4  # delay, delay rate, u_x, u_z
 LARGEST_STEP = np.array([0.3, 0.3, 0.03, 0.03])
 """Of one iteration: cells, Doppler bins, direction cosines."""
 SETTLED = 0.05
 """A step under this share of the standard deviation ends the iteration."""
 AWAKE = 0.05
 """Of its deviations a settled path may be moved by what other paths' later steps leave."""
-
-
-@dataclass(frozen=True)
-class JointPath:
-    """One path of the joint model.
-
-    Attributes
-    ----------
-    delay, delay_rate : of the whole path at mid-frame [s, 1]
-    direction : (2,) direction cosines u_x, u_z, of arrival at a PT, of both ways at the AT
-    amplitude : (1,) complex of an echo; (L_tx,) at a PT, where the directions of departure are free
-    std : (4,) standard deviations of delay, delay_rate, u_x, u_z by the curvature of the likelihood
-    """
-
-    delay: float
-    delay_rate: float
-    direction: np.ndarray
-    amplitude: np.ndarray
-    std: np.ndarray
-
-
-def rate_bin(waveform: Waveform) -> float:
-    """Delay rate of one Doppler bin."""
-    return 1 / (waveform.frame_duration * waveform.effective_carrier)
-
-
-def units(known: Known) -> np.ndarray:
-    """(4,) steps of the scaled parameters: a cell of delay, a bin of delay rate, and 1 and 1."""
-    return np.array([known.waveform.delay_step, rate_bin(known.waveform), 1.0, 1.0])
 
 
 def amplitude_index(known: Known) -> np.ndarray:
@@ -82,105 +61,6 @@ class Fit(NamedTuple):
     left: float
 
 
-@dataclass(frozen=True)
-class _Tone:
-    """A path's signal of unit amplitude.
-
-    Attributes
-    ----------
-    cycles, frequency, carrier : (M, P) phase [cycles] and frequency [cycles per sample] at
-        mid-chirp, and cycles per second of delay, for a receiver at the centroid
-    delay : (L_rx,) of the receivers
-    levers : (4, L_tx, L_rx) change of the delay by each scaled parameter, by the rate at 1 s
-    """
-
-    known: Known
-    cycles: np.ndarray
-    frequency: np.ndarray
-    carrier: np.ndarray
-    delay: np.ndarray
-    levers: np.ndarray
-
-    @classmethod
-    def of(cls, known: Known, path: JointPath) -> _Tone:
-        """The tone of a path."""
-        w, a, schedule = known.waveform, known.antennas, known.schedule
-        radius = known.radius(path.delay)
-        e_rx, de_rx = element_delays(a.rx_positions, path.direction, radius)
-        e_tx, de_tx = element_delays(a.tx_positions, path.direction, radius)
-        if known.passes == 1:
-            e_tx, de_tx = np.zeros_like(e_tx), np.zeros_like(de_tx)
-        u = w.window_start + (w.num_samples - 1) / 2 * w.sample_interval
-        tau = known.delay_symbols * w.delay_step + path.delay
-        tau = tau + path.delay_rate * known.sampled_times + e_tx[schedule]
-        g = w.carrier(tau, u)
-        frequency = (path.delay_rate * g + w.slope * tau) * w.sample_interval
-        levers = np.ones((PARAMETERS, a.num_tx, a.num_rx))
-        levers[2:] = de_rx[:, None, :] + de_tx[:, :, None]
-        levers *= units(known)[:, None, None]
-        return cls(known, w.phase(tau, u), frequency, g, e_rx, levers)
-
-    @cached_property
-    def middle(self) -> float:
-        """Mean of the carrier."""
-        return float(self.carrier.mean())
-
-    @cached_property
-    def ramp(self) -> np.ndarray:
-        """(L_rx,) further frequency at each receiver [cycles per sample]."""
-        return self.delay * self.known.waveform.slope * self.known.waveform.sample_interval
-
-    def seen(self, moments: Moments) -> np.ndarray:
-        """(2, M, P, L_rx) sums of s T* and n s T* over each chirp, n from its middle."""
-        late = self.delay
-        apart = late * self.carrier[..., None] - self.known.waveform.slope * late**2 / 2
-        return moments.of(self.cycles, self.frequency, self.ramp, apart)
-
-    def before(self, other: _Tone) -> Apart:
-        """What another tone has before this one."""
-        turn = other.delay * other.middle - self.delay * self.middle
-        turn -= self.known.waveform.slope * (other.delay**2 - self.delay**2) / 2
-        return Apart(
-            other.frequency - self.frequency,
-            other.cycles - self.cycles,
-            other.ramp - self.ramp,
-            np.exp(2j * np.pi * turn),
-            other.delay - self.delay,
-            self.carrier - self.middle,
-            float(self.known.waveform.num_samples),
-        )
-
-    def cross(self, other: _Tone) -> np.ndarray:
-        """(3, M, P, L_rx) sums of 1, n and n^2 times another tone and this one's conjugate."""
-        out = np.empty((3, *self.cycles.shape, self.delay.size), complex)
-        cross_sums(self.before(other), out)
-        return out
-
-    def itself(self) -> np.ndarray:
-        """`cross` of the tone with itself."""
-        size = self.known.waveform.num_samples
-        out = np.zeros((3, *self.cycles.shape, self.delay.size))
-        out[0], out[2] = size, size * (size**2 - 1) / 12
-        return out
-
-    def slopes(self, amplitude: np.ndarray) -> np.ndarray:
-        """(S, 4, L_tx, L_rx) derivatives of the signal over the unit tone, as factors of 1, t, n
-        and n t, by the scaled parameters and the real and imaginary parts of the amplitudes."""
-        w, count, num_tx = self.known.waveform, amplitude.size, self.levers.shape[1]
-        out = np.zeros((PARAMETERS + 2 * count, 4, *self.levers.shape[1:]), complex)
-        turn = 2j * np.pi * np.broadcast_to(amplitude, num_tx)[:, None] * self.levers
-        carrier, slope = self.middle, w.slope * w.sample_interval
-        for i in range(PARAMETERS):
-            at = 1 if i == 1 else 0  # the delay rate moves the delay by t
-            out[i, at], out[i, at + 2] = turn[i] * carrier, turn[i] * slope
-        out[1, 2] = turn[1] * carrier * w.sample_interval
-        for i in range(count):
-            mine = np.ones((num_tx, 1)) if count == 1 else np.arange(num_tx)[:, None] == i
-            out[PARAMETERS + 2 * i, 0] = mine
-            out[PARAMETERS + 2 * i + 1, 0] = 1j * mine
-        return out
-
-
 def places(known: Known, paths: Sequence[JointPath]) -> Places:
     """Where paths lie among the cells of a frame."""
     delay, rate = (np.array([getattr(p, n) for p in paths]) for n in ("delay", "delay_rate"))
@@ -192,8 +72,9 @@ def places(known: Known, paths: Sequence[JointPath]) -> Places:
 def match_chirps(moments: Moments, path: JointPath) -> np.ndarray:
     """(M, P) the chirps against a path's signal, summed over their samples and the receivers in
     phase."""
-    sums = _Tone.of(moments.known, path).seen(moments)[0].sum(axis=-1)
-    return sums * path.amplitude[amplitude_index(moments.known)].conj()
+    known = moments.known
+    sums = moments.of(Tones.of(known, [path])[0], Weights.by_chirp(known))[0, 0, 0].sum(axis=-1)
+    return sums.reshape(known.schedule.shape) * path.amplitude[amplitude_index(known)].conj()
 
 
 def fit(
@@ -237,27 +118,27 @@ class _Descent:
     ) -> None:
         known, self.free = moments.known, len(paths)
         self.moments, self.known, self.energy = moments, known, energy
-        self.index = amplitude_index(known)
-        self.count = int(self.index.max()) + 1 if known.passes == 1 else 1
+        self.count = known.antennas.num_tx if known.passes == 1 else 1
         self.paths = [*paths, *fixed]
-        self.tones = [_Tone.of(known, p) for p in self.paths]
-        self.seen = [tone.seen(moments) for tone in self.tones[: self.free]]
+        self.weights = powers_of_time(known, 3)
+        self.own = own_sums(float(known.waveform.num_samples), self.weights)
+        self.tones, self.levers = Tones.of(known, self.paths)
         where = places(known, self.paths)
         self.share = shared(known, where, where)[: self.free]
         np.fill_diagonal(self.share, 0)
         self.group = clusters(self.share[:, : self.free])
         # samples that count for each amplitude
-        self.samples = self._by_antenna(np.full(self.seen[0].shape[1:], self._length)).real
-        sums = [self._by_antenna(z[0]) for z in self.seen]
-        sums += [p.amplitude * self.samples for p in fixed]
+        self.samples = self._by_amplitude(np.repeat(self.own[0, 0], known.antennas.num_rx, axis=1))
+        self.seen = moments.of(self.tones.select(slice(self.free)), self._fewer)
+        sums = np.array([p.amplitude * self.samples for p in fixed]).reshape(-1, self.count)
+        sums = np.concatenate([self._by_amplitude(self.seen[:, 0, 0]), sums])
         self.power = (np.abs(sums) ** 2 / self.samples).sum(axis=1)
         self.felt = self._felt(moments.noise)
         self.size = PARAMETERS + 2 * self.count
         self.explained = np.zeros(self.free)
         self.deviation = np.full((self.free, self.size), np.inf)
-        self.stirred = np.zeros(self.free)
+        self.stirred, self.stale = np.zeros(self.free), np.zeros(self.free, bool)
         self.last, self.reach = np.zeros((self.free, PARAMETERS)), np.ones(self.free)
-        self._unused = np.empty_like(self.seen[0])
 
     def _felt(self, noise: float) -> np.ndarray:
         """(free, K) bool, which other paths count in the sums of each free one."""
@@ -267,32 +148,37 @@ class _Descent:
         return out
 
     @property
-    def _length(self) -> float:
-        return float(self.known.waveform.num_samples)
+    def _fewer(self) -> Weights:
+        """Of chirps by 1 and t alone."""
+        return self.weights._replace(factors=self.weights.factors[:2])
 
-    def _by_antenna(self, sums: np.ndarray) -> np.ndarray:
-        """Sums (M, P, L_rx) added up for each amplitude of a path."""
-        chirps = sums.sum(axis=-1)
-        return np.array([chirps[self.index == i].sum() for i in range(self.count)])
+    def _by_amplitude(self, sums: np.ndarray) -> np.ndarray:
+        """Sums (..., L_tx, L_rx) added up for each amplitude of a path."""
+        each = sums.sum(axis=-1)
+        return each if self.count > 1 else each.sum(axis=-1, keepdims=True)
 
-    def _amplitude(self, k: int) -> np.ndarray:
-        """(M, P, 1) amplitude of a path in each chirp."""
-        return self.paths[k].amplitude[self.index][..., None]
+    def _amplitudes(self) -> np.ndarray:
+        """(K, L_tx) amplitudes of all paths."""
+        num_tx = self.known.antennas.num_tx
+        return np.array([np.broadcast_to(p.amplitude, num_tx) for p in self.paths])
 
     def amplitudes(self) -> None:
         """Give the free paths the amplitudes of least squares where they are."""
-        seen = [z[0] for z in self.seen]
+        of, at = np.nonzero(self.felt)
+        kept = (at < of) | (at >= self.free)
+        of, at = of[kept], at[kept]
+        alone = self.weights._replace(factors=self.weights.factors[:1])
+        sums = cross_sums(self.tones, np.column_stack([of, at]), alone, 1)[:, 0, 0]
         gram = np.zeros((self.count, self.free, self.free), complex)
-        for k in range(self.free):
-            gram[:, k, k] = self._by_antenna(self.tones[k].itself()[0])
-            for j in np.flatnonzero(self.felt[k]).tolist():
-                if j >= self.free:
-                    seen[k] = seen[k] - self._amplitude(j) * self.tones[k].cross(self.tones[j])[0]
-                elif j < k:
-                    shared_sum = self._by_antenna(self.tones[k].cross(self.tones[j])[0])
-                    gram[:, k, j], gram[:, j, k] = shared_sum, shared_sum.conj()
-        right = np.array([self._by_antenna(z) for z in seen]).T
-        found = [np.linalg.lstsq(g, r, rcond=1e-9)[0] for g, r in zip(gram, right, strict=True)]
+        gram[:, np.arange(self.free), np.arange(self.free)] = self.samples[:, None]
+        right = self._by_amplitude(self.seen[:, 0, 0])
+        by_amplitude = self._by_amplitude(sums)
+        for k, j, both in zip(of.tolist(), at.tolist(), by_amplitude, strict=True):
+            if j >= self.free:
+                right[k] -= self.paths[j].amplitude * both
+            else:
+                gram[:, k, j], gram[:, j, k] = both, both.conj()
+        found = [np.linalg.lstsq(g, r, rcond=1e-9)[0] for g, r in zip(gram, right.T, strict=True)]
         for k, amplitude in enumerate(np.array(found).T):
             self.paths[k] = replace(self.paths[k], amplitude=amplitude)
 
@@ -311,10 +197,7 @@ class _Descent:
             self.deviation[mine] = np.sqrt(variance)
             moved[mine] = (np.abs(steps) / np.maximum(self.deviation[mine], 1e-300)).max(axis=1)
             share = self._within_reach(mine, steps[:, :PARAMETERS] / LARGEST_STEP)
-            for k, one in zip(mine, share * steps, strict=True):
-                self.paths[k] = _moved(self.tones[k], self.paths[k], one)
-                self.tones[k] = _Tone.of(self.known, self.paths[k])
-                self.seen[k] = self.tones[k].seen(self.moments)
+            self._move(mine, share * steps)
         self.stirred[active] = 0
         self.stirred += TANGENTS * (self.share[:, : self.free] * self.felt[:, : self.free]) @ moved
         return (moved > SETTLED) | (self.stirred > AWAKE)
@@ -339,59 +222,97 @@ class _Descent:
     def _equations(self, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Gram matrix of the scaled parameters, path by path; filled for the active
         paths, and the matrix within clusters."""
-        size, total = self.size, self.size * self.free
-        gradient, gram = np.zeros(total), np.zeros((total, total))
-        left = {k: self.seen[k].copy() for k in active.tolist()}
-        slopes = {k: self.tones[k].slopes(self.paths[k].amplitude) for k in left}
-        for k in left:
-            for j in (np.flatnonzero(self.felt[k, self.free :]) + self.free).tolist():
-                self._exchange(k, j, left)
-        seen = {k: left[k][0].copy() for k in left}
-        for k, j in self._pairs(left):
-            if self.group[j] != self.group[k]:
-                self._exchange(k, j, left)
-                continue
-            sums = self.tones[k].cross(self.tones[j]) if j != k else self.tones[k].itself()
-            left[k] -= self._amplitude(j) * sums[:2]
-            if j != k:
-                left[j] -= self._amplitude(k) * sums[:2].conj()
-            own, other = (slice(i * size, (i + 1) * size) for i in (k, j))
-            gram[own, other] = self._block(slopes[k], slopes[j], sums)
-            gram[other, own] = gram[own, other].T
-        for k, sums in left.items():
-            parts = _by_channel(self.known, sums, 2).reshape(4, *slopes[k].shape[2:])
-            own = slice(k * size, (k + 1) * size)
-            gradient[own] = np.einsum("sbrt,brt->s", slopes[k].conj(), parts).real
-            twice = self._by_antenna(seen[k] + sums[0])
-            self.explained[k] = float((self.paths[k].amplitude.conj() * twice).real.sum())
+        self._refresh()
+        total = self.size * self.free
+        gram, amplitude = np.zeros((total, total)), self._amplitudes()
+        left, slopes = self.seen.copy(), self._slopes(amplitude)
+        near, far = self._pairs(active)
+        self._take_out(left, far, cross_sums(self.tones, far, self._fewer, 2), amplitude)
+        seen = left[:, 0, 0].copy()
+        sums = cross_sums(self.tones, near, self.weights)
+        self._take_out(left, near, sums, amplitude)
+        left[active] -= amplitude[active, None, None, :, None] * self.own[:2, :2]
+        itself = np.broadcast_to(self.own, (active.size, *sums.shape[1:])).astype(complex)
+        _blocks(np.column_stack([active, active]), slopes, itself, gram)
+        _blocks(near, slopes, sums, gram)
+        parts = left.reshape(self.free, 4, *left.shape[3:])
+        gradient = np.einsum("ksbrt,kbrt->ks", slopes.conj(), parts, optimize=True).real.ravel()
+        twice = self._by_amplitude(seen + left[:, 0, 0])
+        for k in active:
+            self.explained[k] = float((self.paths[k].amplitude.conj() @ twice[k]).real)
         return gradient, gram
 
-    def _exchange(self, k: int, j: int, left: dict[int, np.ndarray]) -> None:
-        """Take two paths out of each other's sums, in place."""
-        own, other = (self.paths[i].amplitude[self.index] for i in (k, j))
-        beside = left.get(j, self._unused)
-        exchange(self.tones[k].before(self.tones[j]), own, other, left[k], beside)
+    def _take_out(
+        self, left: np.ndarray, pairs: np.ndarray, sums: np.ndarray, amplitude: np.ndarray
+    ) -> None:
+        """Take paths out of each other's sums, in place."""
+        for (k, j), both in zip(pairs.tolist(), sums[:, :2, :2], strict=True):
+            left[k] -= amplitude[j, :, None] * both
+            if j < self.free:
+                left[j] -= amplitude[k, :, None] * both.conj()
 
-    def _pairs(self, active: dict[int, np.ndarray]) -> Iterator[tuple[int, int]]:
-        """Active paths with each free one that they feel, and with themselves; each pair once."""
-        for k in active:
-            yield k, k
-            for j in np.flatnonzero(self.felt[k, : self.free]).tolist():
-                if j < k or j not in active:
-                    yield k, j
+    def _pairs(self, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Active paths with each one that they feel, (Q, 2), each pair of free ones once: those of
+        a cluster, and the others."""
+        of, at = np.nonzero(self.felt)
+        acts = np.isin(np.arange(len(self.paths)), active)
+        kept = acts[of] & ((at < of) | ~acts[at])
+        of, at = of[kept], at[kept]
+        group = np.append(self.group, np.full(len(self.paths) - self.free, -1))
+        same, pairs = group[of] == group[at], np.column_stack([of, at])
+        return pairs[same], pairs[~same]
 
-    def _block(self, own: np.ndarray, other: np.ndarray, sums: np.ndarray) -> np.ndarray:
-        """(S, S) products of two paths' derivatives over all samples."""
-        powers = _by_channel(self.known, sums, 3)  # of n and of t
-        mixed = np.empty((4, 4, *powers.shape[2:]), complex)
-        for a in range(4):
-            for b in range(4):
-                mixed[a, b] = powers[a // 2 + b // 2, a % 2 + b % 2]
-        channels = own.shape[2] * own.shape[3]
-        left, middle, right = (
-            np.moveaxis(x.reshape(*x.shape[:2], channels), -1, 0) for x in (own, mixed, other)
-        )
-        return (left.conj() @ middle @ right.transpose(0, 2, 1)).sum(axis=0).real
+    def _slopes(self, amplitude: np.ndarray) -> np.ndarray:
+        """(free, S, 4, L_tx, L_rx) derivatives of the signals over the unit tones, as factors of
+        1, t, n and n t, by the scaled parameters and both parts of the amplitudes."""
+        tones, free, num_tx = self.tones, self.free, amplitude.shape[1]
+        shape = free, self.size, 4, num_tx, self.known.antennas.num_rx
+        out = np.zeros(shape, complex)
+        turn = 2j * np.pi * amplitude[:free, None, :, None] * self.levers[:free]
+        carrier = tones.middle[:free, None, None, None]
+        for i in range(PARAMETERS):
+            at = 1 if i == 1 else 0  # the delay rate moves the delay by t
+            out[:, i, at] = turn[:, i] * carrier[:, 0]
+            out[:, i, at + 2] = turn[:, i] * (tones.slope * tones.interval)
+        out[:, 1, 2] = turn[:, 1] * carrier[:, 0] * tones.interval
+        for i in range(self.count):
+            mine = np.ones((num_tx, 1)) if self.count == 1 else np.arange(num_tx)[:, None] == i
+            out[:, PARAMETERS + 2 * i, 0] = mine
+            out[:, PARAMETERS + 2 * i + 1, 0] = 1j * mine
+        return out
+
+    def _move(self, mine: np.ndarray, steps: np.ndarray) -> None:
+        """Let some paths take their steps. The phase turns by 128 cycles per cell of delay: the
+        amplitude follows that turn, and not its tangent."""
+        sent, late = self.own[0, 0, :, 0], self.own[0, 1, :, 0] / self.own[0, 0, :, 0]
+        levers = self.levers[mine].mean(axis=3)
+        levers[:, 1] *= late
+        if self.count == 1:
+            levers = (levers @ sent / sent.sum())[..., None]
+        change, pairs = steps[:, :PARAMETERS], steps[:, PARAMETERS:].reshape(len(mine), -1, 2)
+        angle = 2 * np.pi * self.tones.middle[mine, None] * (change[:, None] @ levers)[:, 0]
+        more = pairs @ np.array([1, 1j])
+        place = change * units(self.known)
+        for i, k in enumerate(mine.tolist()):
+            path, move = self.paths[k], place[i]
+            amplitude = path.amplitude * (1 + 1j * angle[i]) + more[i]
+            self.paths[k] = replace(
+                path,
+                delay=path.delay + float(move[0]),
+                delay_rate=path.delay_rate + float(move[1]),
+                direction=path.direction + move[2:],
+                amplitude=amplitude * np.exp(-1j * angle[i]),
+            )
+        self.stale[mine] = True
+
+    def _refresh(self) -> None:
+        """Read the samples where paths have moved."""
+        moved = np.flatnonzero(self.stale)
+        if moved.size:
+            tones, self.levers[moved] = Tones.of(self.known, [self.paths[k] for k in moved])
+            self.seen[moved] = self.moments.of(tones, self._fewer)
+            self.tones.put(moved, tones)
+        self.stale[:] = False
 
     def fit(self) -> Fit:
         """The free paths with their deviations."""
@@ -403,27 +324,48 @@ class _Descent:
         return Fit(paths, self.noise * self.moments.size)
 
 
-def _by_channel(known: Known, sums: np.ndarray, powers: int) -> np.ndarray:
-    """(K, powers, L_tx, L_rx): sums (K, M, P, L_rx) times 1, t, t^2 .. added over the chirps of
-    each transmit antenna."""
-    times = known.sampled_times.ravel() ** np.arange(powers)[:, None]
-    sent = np.array([mine.ravel() for mine in known.sent_by], float)
-    weights = (times[:, None] * sent).reshape(-1, times.shape[1]).astype(sums.dtype)
-    total = weights @ sums.reshape(len(sums), times.shape[1], -1)
-    return total.reshape(len(sums), powers, len(sent), -1)
+@jit(fast=True)
+def _blocks(pairs, slopes, sums, gram):
+    """Put the products of two paths' derivatives over all samples into the Gram matrix, for each
+    pair and turned round."""
+    size, num_tx, num_rx = slopes.shape[1], slopes.shape[3], slopes.shape[4]
+    half, block = np.empty(4, np.complex128), np.empty((size, size))
+    for s in range(len(pairs)):
+        k, j = pairs[s]
+        block[:] = 0.0
+        for tx in range(num_tx):
+            for rx in range(num_rx):
+                own, other = slopes[k, :, :, tx, rx], slopes[j, :, :, tx, rx]
+                both = sums[s, :, :, tx, rx]
+                for i in range(size):
+                    if i >= PARAMETERS and own[i, 0] == 0:
+                        continue  # another antenna's amplitude
+                    half[:] = 0
+                    for a in range(4):
+                        for b in range(4):
+                            powers = both[a // 2 + b // 2, a % 2 + b % 2]
+                            half[b] += own[i, a].conjugate() * powers
+                    for n in range(size):
+                        total = 0.0
+                        for b in range(4):
+                            total += (half[b] * other[n, b]).real
+                        block[i, n] += total
+        for i in range(size):
+            for n in range(size):
+                gram[k * size + i, j * size + n] = block[i, n]
+                gram[j * size + n, k * size + i] = block[i, n]
 
 
 def energy(known: Known, paths: Sequence[JointPath]) -> float:
     """Energy of the sum of a few paths over the samples of a frame."""
-    index, total = amplitude_index(known), 0.0
-    tones = [_Tone.of(known, p) for p in paths]
-    waves = [p.amplitude[index][..., None] for p in paths]
-    for k, at in enumerate(tones):
-        for j in range(k + 1):
-            sums = at.cross(tones[j])[0] if j < k else at.itself()[0]
-            both = float((waves[k].conj() * waves[j] * sums).sum().real)
-            total += both if j == k else 2 * both
-    return total
+    tones, weights = Tones.of(known, paths)[0], powers_of_time(known, 1)
+    num_tx = known.antennas.num_tx
+    wave = np.array([np.broadcast_to(p.amplitude, num_tx) for p in paths])
+    of, at = np.tril_indices(len(paths), -1)
+    both = cross_sums(tones, np.column_stack([of, at]), weights, 1)[:, 0, 0].sum(axis=-1)
+    own = own_sums(float(known.waveform.num_samples), weights, 1)[0, 0, :, 0]
+    alone = (np.abs(wave) ** 2 @ own).sum() * known.antennas.num_rx
+    return float(alone + 2 * (wave[of].conj() * wave[at] * both).sum().real)
 
 
 def residual_channels(
@@ -443,47 +385,20 @@ def residual_channels(
         the root of their samples
     counts : samples per amplitude of a path
     """
-    known = moments.known
-    w, num_tx, index = known.waveform, known.antennas.num_tx, amplitude_index(known)
+    known, num = moments.known, len(found.paths)
+    w, num_tx = known.waveform, known.antennas.num_tx
     # a bin is one turn per frame
     turns = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
+    weights = Weights.by_antenna(known, turns)
     sent = np.array([mine.sum() for mine in known.sent_by]) * w.num_samples
     counts = (sent if known.passes == 1 else np.array([sent.sum()])) * known.antennas.num_rx
     power = np.array([(np.abs(p.amplitude) ** 2 * counts).sum() for p in found.paths])
     share = shared(known, places(known, found.paths), places(known, beside))
-    felt = ~ignored(share, power / moments.noise)
-    tones = [_Tone.of(known, p) for p in found.paths]
-    for place, mine in zip(beside, felt, strict=True):
-        at = _Tone.of(known, place)
-        left = at.seen(moments)[0]
-        for j in np.flatnonzero(mine):
-            left -= found.paths[j].amplitude[index][..., None] * at.cross(tones[j])[0]
-        channels = np.empty((len(offsets), num_tx, left.shape[-1]), complex)
-        for tx, chirps in enumerate(known.sent_by):
-            turned = np.where(chirps, turns, 0.0)
-            channels[:, tx] = np.tensordot(turned, left, 2) / np.sqrt(sent[tx])
-        yield channels, counts
-
-
-def _moved(tone: _Tone, path: JointPath, step: np.ndarray) -> JointPath:
-    """A path after a step. The phase turns by 128 cycles per cell of delay: the amplitude follows
-    that turn, and not its tangent."""
-    known, count = tone.known, path.amplitude.size
-    change = step[:PARAMETERS]
-    sent = np.array([mine.sum() for mine in known.sent_by], float)
-    late = np.array([known.sampled_times[mine].sum() for mine in known.sent_by]) / sent
-    levers = tone.levers.mean(axis=2)
-    levers[1] *= late
-    if count == 1:
-        levers = (levers @ sent / sent.sum())[:, None]
-    turn = 2j * np.pi * tone.middle * levers.T
-    pairs = step[PARAMETERS:].reshape(-1, 2)
-    amplitude = path.amplitude * (1 + turn @ change) + pairs[:, 0] + 1j * pairs[:, 1]
-    move = change * units(known)
-    return replace(
-        path,
-        delay=path.delay + float(move[0]),
-        delay_rate=path.delay_rate + float(move[1]),
-        direction=path.direction + move[2:],
-        amplitude=amplitude * np.exp(-1j * (turn @ change).imag),
-    )
+    at, of = np.nonzero(~ignored(share, power / moments.noise))
+    tones = Tones.of(known, [*found.paths, *beside])[0]
+    left = moments.of(tones.select(slice(num, None)), weights)[:, 0]
+    sums = cross_sums(tones, np.column_stack([num + at, of]), weights, 1)[:, 0]
+    for i, j, both in zip(at, of, sums, strict=True):
+        left[i] -= np.broadcast_to(found.paths[j].amplitude, num_tx)[:, None] * both
+    for channels in left:
+        yield channels / np.sqrt(sent)[:, None], counts

@@ -74,11 +74,8 @@ def _waves(known: Known, places: Places) -> np.ndarray:
     """(K, 3, L_rx) the receivers' phases, and these times either coordinate of the receivers, each
     of unit norm."""
     a, turn = known.antennas, -2j * np.pi * known.waveform.effective_carrier
-    delays = [
-        element_delays(a.rx_positions, u, known.radius(d))[0]
-        for u, d in zip(places.direction, places.delay, strict=True)
-    ]
-    wave = np.exp(turn * np.array(delays).reshape(-1, a.num_rx))
+    radius = known.radius(places.delay)[:, None]
+    wave = np.exp(turn * element_delays(a.rx_positions, places.direction, radius)[0])
     levers = np.stack([np.ones(a.num_rx), *(a.rx_positions[:, [0, 2]].T)])
     levers -= levers.mean(axis=1, keepdims=True) * (np.arange(3) > 0)[:, None]
     levers /= np.maximum(np.linalg.norm(levers, axis=1, keepdims=True), 1e-30)

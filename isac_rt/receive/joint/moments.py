@@ -1,5 +1,5 @@
-"""Sums of a frame's samples against tones, and of tones against each other: the samples are
-transformed once, and every tone reads its sums from the transform.
+"""Sums of a frame's samples against tones: the samples are transformed once, and every tone reads
+its sums from the transform.
 
 The sums over a chirp are
 
@@ -19,7 +19,6 @@ References
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -27,6 +26,7 @@ from numpy.polynomial import Chebyshev
 from scipy.special import i0
 
 from isac_rt.kernels.jit import jit
+from isac_rt.receive.joint.tones import Tones, Weights
 from isac_rt.receive.known import Known
 
 OVERSAMPLING, TAPS = 1.5, 8
@@ -85,24 +85,15 @@ class Moments:
         gain = np.log(2) * float((window**2).sum())
         return max(float(np.median(np.abs(spectrum) ** 2)) / gain, 1e-30)
 
-    def of(
-        self, cycles: np.ndarray, frequency: np.ndarray, ramp: np.ndarray, apart: np.ndarray
-    ) -> np.ndarray:
-        """Sums of s T* and n s T* over each chirp, n from its middle, (2, M, P, L_rx).
-
-        Parameters
-        ----------
-        cycles, frequency : (M, P) of the tones T at mid-chirp [cycles, cycles per sample], but for
-            the data's phases
-        ramp : (L_rx,) further frequency at each receiver
-        apart : (M, P, L_rx) further phase there [cycles]
-        """
-        length = self._samples.shape[-1]
-        num_groups, num_rx, num_chirps, _ = self._samples.shape
-        out = np.empty((2, num_groups, num_chirps, num_rx), np.complex128)
-        late = length // 2 - (length - 1) / 2
-        _interpolate(self.spectrum, (cycles, frequency, ramp, apart), late, _kernel(), out)
-        out *= self.known.phases.conj()[..., None]
+    def of(self, tones: Tones, weights: Weights) -> np.ndarray:
+        """(K, 2, I, A, L_rx) sums of s n^q g_i T* of each tone, but for the data's phases, which
+        are taken out, n from the chirp's middle."""
+        shape = len(tones.cycles), 2, len(weights.factors), weights.places, tones.delay.shape[1]
+        out, size = np.zeros(shape, complex), self._samples.shape[-1]
+        late = size // 2 - (size - 1) / 2
+        factors = weights.factors * self.known.phases.conj()
+        turned = weights._replace(factors=factors)
+        _interpolate(self.spectrum, tones, turned, late, _kernel(), out)
         return out
 
 
@@ -133,134 +124,66 @@ def _kernel() -> np.ndarray:
 
 
 @jit(fast=True)
-def _interpolate(spectrum, tone, late, kernel, out):
-    """`Moments.of` but for the data; `late` is the place of sample N // 2 from the middle."""
-    cycles, frequency, ramp, apart = tone
+def _interpolate(spectrum, tones, weights, late, kernel, out):
+    """`Moments.of`; `late` is the place of sample N // 2 from the middle.
+
+    Receivers have frequencies of their own, a fraction of a grid point apart: their taps are
+    weighted on a common stretch of the grid.
+    """
+    factors, place, _ = weights
     num_groups, num_chirps, size, num_rx = spectrum.shape
     steps, _, taps = kernel.shape
-    for m in range(num_groups):
-        for p in range(num_chirps):
-            for rx in range(num_rx):
-                f = frequency[m, p] + ramp[rx]
-                whole = np.floor(f * size)
-                part = (f * size - whole) * steps
-                step = min(int(part), steps - 1)
-                x = (part - step - 0.5) / steps
-                at = (int(whole) - taps // 2 + 1) % size
-                table = kernel[step]
-                re0 = im0 = re1 = im1 = 0.0
-                for j in range(taps):
-                    k0, k1, k2, k3 = table[0, j], table[1, j], table[2, j], table[3, j]
-                    weight = k0 + x * (k1 + x / 2 * k2)
-                    change = k1 + x * (k2 + x / 2 * k3)
-                    s = spectrum[m, p, at, rx]
-                    re0 += weight * s.real
-                    im0 += weight * s.imag
-                    re1 += change * s.real
-                    im1 += change * s.imag
+    ramp, turn = np.empty(num_rx), np.empty(num_rx, np.complex128)
+    re, im = np.empty((2, num_rx)), np.empty((2, num_rx))
+    for k in range(len(out)):
+        for rx in range(num_rx):
+            own = tones.delay[k, rx]
+            ramp[rx] = own * tones.slope * tones.interval
+            turns = own * tones.middle[k] - tones.slope * own * own / 2 + ramp[rx] * late
+            angle = 2 * np.pi * (turns - np.floor(turns))
+            turn[rx] = complex(np.cos(angle), -np.sin(angle))
+        low = ramp.min()
+        span = taps + 1 + int(np.ceil((ramp.max() - low) * size))
+        weight, change = np.empty((span, num_rx)), np.empty((span, num_rx))
+        for m in range(num_groups):
+            for p in range(num_chirps):
+                f = tones.frequency[k, m, p]
+                first = np.floor((f + low) * size)
+                weight[:], change[:], re[:], im[:] = 0.0, 0.0, 0.0, 0.0
+                for rx in range(num_rx):
+                    at = (f + ramp[rx]) * size
+                    whole = np.floor(at)
+                    part = (at - whole) * steps
+                    step = min(int(part), steps - 1)
+                    x, table = (part - step - 0.5) / steps, kernel[step]
+                    begin = int(whole - first)
+                    for i in range(taps):
+                        k1, k2 = table[1, i], table[2, i]
+                        weight[begin + i, rx] = table[0, i] + x * (k1 + x / 2 * k2)
+                        change[begin + i, rx] = k1 + x * (k2 + x / 2 * table[3, i])
+                at = (int(first) - taps // 2 + 1) % size
+                for i in range(span):
+                    line = spectrum[m, p, at]
+                    for rx in range(num_rx):
+                        s = line[rx]
+                        re[0, rx] += weight[i, rx] * s.real
+                        im[0, rx] += weight[i, rx] * s.imag
+                        re[1, rx] += change[i, rx] * s.real
+                        im[1, rx] += change[i, rx] * s.imag
                     at += 1
                     if at == size:
                         at = 0
-                turns = cycles[m, p] + apart[m, p, rx] + f * late
+                turns = tones.cycles[k, m, p] + f * late
                 angle = 2 * np.pi * (turns - np.floor(turns))
                 back = complex(np.cos(angle), -np.sin(angle))
-                total = complex(re0, im0) * back
-                out[0, m, p, rx] = total
-                slope = size / (2 * np.pi) * complex(-im1, re1) * back
-                out[1, m, p, rx] = slope + late * total
-
-
-class Apart(NamedTuple):
-    """What a tone T' has before another one T.
-
-    Attributes
-    ----------
-    frequency, cycles : (M, P) at mid-chirp [cycles per sample, cycles]
-    ramp : (L_rx,) further frequency at each receiver
-    turn : (L_rx,) complex, further turn there
-    delay, wobble : (L_rx,) and (M, P), of which the product is what is left of that turn, under a
-        hundredth of a cycle [cycles]
-    size : samples of a chirp
-    """
-
-    frequency: np.ndarray
-    cycles: np.ndarray
-    ramp: np.ndarray
-    turn: np.ndarray
-    delay: np.ndarray
-    wobble: np.ndarray
-    size: float
-
-
-@jit(fast=True)
-def cross_sums(apart, out):
-    """Sums of 1, n and n^2 times T' T* over each chirp, out (3, M, P, L_rx)."""
-    ends = _ends(apart)
-    for m in range(out.shape[1]):
-        for p in range(out.shape[2]):
-            start = _start(apart, m, p)
-            for rx in range(out.shape[3]):
-                sum0, sum1, sum2, turn = _sums(apart, ends, start, rx)
-                out[0, m, p, rx] = sum0 * turn
-                out[1, m, p, rx] = 1j * sum1 * turn
-                out[2, m, p, rx] = sum2 * turn
-
-
-@jit(fast=True)
-def exchange(apart, own, other, left, left_other):
-    """Take what T' of amplitudes `other` (M, P) puts into the sums `left` (2, M, P, L_rx) of T out
-    of them, and what T of amplitudes `own` puts into `left_other`, in place."""
-    ends = _ends(apart)
-    for m in range(left.shape[1]):
-        for p in range(left.shape[2]):
-            start = _start(apart, m, p)
-            a, b = other[m, p], own[m, p]
-            for rx in range(left.shape[3]):
-                sum0, sum1, _, turn = _sums(apart, ends, start, rx)
-                there, back = a * turn, b * turn.conjugate()
-                left[0, m, p, rx] -= sum0 * there
-                left[1, m, p, rx] -= 1j * sum1 * there
-                left_other[0, m, p, rx] -= sum0 * back
-                left_other[1, m, p, rx] += 1j * sum1 * back
-
-
-@jit(inline=True)
-def _ends(apart):
-    """Sines and cosines of the receivers' ramps at a chirp's ends, and over a sample."""
-    wide, narrow = np.pi * apart.size * apart.ramp, np.pi * apart.ramp
-    return np.sin(wide), np.cos(wide), np.sin(narrow), np.cos(narrow)
-
-
-@jit(inline=True)
-def _start(apart, m, p):
-    """Frequency of a chirp, its sines and cosines, its turn, and how much it wobbles."""
-    x, cycles = apart.frequency[m, p], apart.cycles[m, p]
-    angle = 2 * np.pi * (cycles - np.floor(cycles))
-    wide, narrow = np.pi * apart.size * x, np.pi * x
-    turn = complex(np.cos(angle), np.sin(angle))
-    edge = np.sin(wide), np.cos(wide), np.sin(narrow), np.cos(narrow)
-    return x, edge, turn, 2 * np.pi * apart.wobble[m, p]
-
-
-@jit(inline=True)
-def _sums(apart, ends, start, rx):
-    """Sums of exp(j 2 pi x n) times 1, -j n and n^2 over a chirp, and the turn before them."""
-    size, (x0, (e, f, g, h), common, wobble) = apart.size, start
-    x = x0 + apart.ramp[rx]
-    a, b, c, d = ends[0][rx], ends[1][rx], ends[2][rx], ends[3][rx]
-    second = size * (size * size - 1) / 12
-    if abs(x) < 1e-2 / size:  # the closed forms lose digits there
-        y = 2 * np.pi * x
-        fourth = second * (3 * size * size - 7) / 20
-        sum0 = size - second * y * y / 2
-        sum1 = second * y - fourth * y * y * y / 6
-        sum2 = second - fourth * y * y / 2
-    else:
-        s, k, t, u = e * b + f * a, f * b - e * a, g * d + h * c, h * d - g * c
-        under = 1 / t
-        edge = (size * k * t - s * u) * under * under / 2
-        sum0 = s * under
-        sum1 = -edge
-        sum2 = u * under * edge - (1 - size * size) * s * under / 4
-    z = wobble * apart.delay[rx]
-    return sum0, sum1, sum2, common * apart.turn[rx] * complex(1 - z * z / 2, z)
+                wobble = 2 * np.pi * (tones.carrier[k, m, p] - tones.middle[k])
+                a = place[m, p]
+                for rx in range(num_rx):
+                    z = wobble * tones.delay[k, rx]
+                    one = back * turn[rx] * complex(1 - z * z / 2, -z * (1 - z * z / 6))
+                    total = complex(re[0, rx], im[0, rx]) * one
+                    slope = size / (2 * np.pi) * complex(-im[1, rx], re[1, rx]) * one
+                    slope += late * total
+                    for i in range(len(factors)):
+                        out[k, 0, i, a, rx] += factors[i, m, p] * total
+                        out[k, 1, i, a, rx] += factors[i, m, p] * slope

@@ -16,18 +16,10 @@ from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import (
-    Fit,
-    JointPath,
-    energy,
-    fit,
-    places,
-    rate_bin,
-    residual_channels,
-    units,
-)
+from isac_rt.receive.joint.fit import Fit, energy, fit, places, residual_channels
 from isac_rt.receive.joint.interaction import clusters, shared
 from isac_rt.receive.joint.moments import Moments
+from isac_rt.receive.joint.tones import JointPath, rate_bin, units
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Detections
 

@@ -15,8 +15,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import gammainccinv
 
-from isac_rt.receive.joint.fit import JointPath, fit, match_chirps, rate_bin
+from isac_rt.receive.joint.fit import fit, match_chirps
 from isac_rt.receive.joint.moments import Moments
+from isac_rt.receive.joint.tones import JointPath, rate_bin
 from isac_rt.receive.known import Known
 
 FARTHEST = 1.5
