@@ -2,8 +2,8 @@
 
 An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
 message is made of what its sender knows after a frame and leaves with the next; it takes as many
-frames as its bits need and is lost with any of them. Nobody waits for an answer, and nothing is
-said twice unless it has changed.
+frames as its bits need and is lost with any of them, until the frame is read late. Nobody waits for
+an answer, and nothing is said twice unless it has changed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, advance
 from isac_rt.terminal.pool import Look, PooledTracker
+from isac_rt.terminal.retrospect import BATCH
 
 HEADER_BITS = 64
 """Sender, time, length and checksum of a message."""
@@ -131,33 +132,51 @@ class Channel:
 
     def __init__(self) -> None:
         self.message: Message | None = None
-        self._left, self._whole = 0, True
+        self._left = 0
+        self._missed: set[int] = set()
+        self._waiting: list[tuple[Message, set[int]]] = []
 
     def send(self, message: Message) -> None:
         """Put a message on its way; its first frame is the next."""
-        self.message, self._left, self._whole = message, message.bits, True
+        self.message, self._left, self._missed = message, message.bits, set()
 
-    def carry(self, capacity: int, read: bool) -> tuple[Message, bool] | None:
+    def carry(self, frame: int, capacity: int, read: bool) -> tuple[Message, bool] | None:
         """Let a frame pass that holds `capacity` bits for it and was `read` or not: the message if
         this was its last frame, and whether it arrived."""
         if self.message is None or capacity <= 0:
             return None
         self._left -= capacity
-        self._whole &= read
+        if not read:
+            self._missed.add(frame)
         if self._left > 0:
             return None
         message, self.message = self.message, None
-        return message, self._whole
+        self._waiting = [(m, f) for m, f in self._waiting if min(f) > frame - BATCH]
+        if self._missed:
+            self._waiting.append((message, self._missed))
+        return message, not self._missed
+
+    def late(self, frame: int) -> list[Message]:
+        """Messages, whole only now that a frame was read which had passed unread."""
+        self._missed.discard(frame)
+        for _, missed in self._waiting:
+            missed.discard(frame)
+        whole = [message for message, missed in self._waiting if not missed]
+        self._waiting = [(message, missed) for message, missed in self._waiting if missed]
+        return whole
 
     def memory(self) -> list[Any]:
         """What is on its way as plain numbers and arrays, for `restore`."""
         message = None if self.message is None else self.message.memory()
-        return [message, self._left, self._whole]
+        waiting = [[m.memory(), sorted(missed)] for m, missed in self._waiting]
+        return [message, self._left, sorted(self._missed), waiting]
 
     def restore(self, memory: Sequence[Any]) -> None:
         """Go on from a `memory`."""
-        message, self._left, self._whole = memory
+        message, self._left, missed, waiting = memory
         self.message = None if message is None else Message.of_memory(message)
+        self._missed = set(missed)
+        self._waiting = [(Message.of_memory(m), set(f)) for m, f in waiting]
 
 
 @dataclass

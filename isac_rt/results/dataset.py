@@ -372,6 +372,9 @@ PICTURES: dict[str, Column] = {
     "age": Column(float, "s", "mean age of the tracks heard from others", "age", missing=np.nan),
     "messages": _number("messages that ended in the frame", "messages", np.int32),
     "lost": _number("those of them that were lost", "lost", np.int32),
+    "late": _number(
+        "earlier messages, lost until then, that came with a frame read late", "late", np.int32
+    ),
     "bits": _number("bits of these messages", "bits", np.int64),
     "room": _number("bits that the ways to the terminal had for messages", "room", np.int64),
     "left_out": _number(

@@ -177,6 +177,7 @@ class PictureRecord:
         for a terminal that is not recognised
     reports, age : what was heard from others and counts, and its mean age [s]
     messages, lost : that reached the terminal in this frame, and those of them that were lost
+    late : earlier ones, lost until then, that came with a frame that was read late
     bits, room : of these messages, and that the ways to the terminal had in this frame
     left_out : tracks or detections that these messages had no room for
     origin, number : (B,) name: index of the link and number of its track
@@ -197,6 +198,7 @@ class PictureRecord:
     age: float
     messages: int
     lost: int
+    late: int
     bits: int
     room: int
     left_out: int

@@ -33,12 +33,14 @@ class Traffic:
     Attributes
     ----------
     messages, lost : how many, and how many of them were lost
+    late : how many earlier ones, lost until then, came with a frame that was read late
     bits, room : of these messages, and that the ways to the terminal had in the frame
     left_out : tracks or detections that they had no room for
     """
 
     messages: int = 0
     lost: int = 0
+    late: int = 0
     bits: int = 0
     room: int = 0
     left_out: int = 0
@@ -226,7 +228,8 @@ def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str,
         "reports_per_frame": float(heard / len(rows)),
         "age_s": float(np.nansum(ages * reports) / heard) if heard else None,
         "messages": int(sum(row["messages"] for row in rows)),
-        "messages_lost": int(sum(row["lost"] for row in rows)),
+        "messages_lost": int(sum(row["lost"] - row["late"] for row in rows)),
+        "messages_late": int(sum(row["late"] for row in rows)),
         "bits": int(sum(row["bits"] for row in rows)),
         "bits_room": int(sum(row["room"] for row in rows)),
         "left_out": int(sum(row["left_out"] for row in rows)),

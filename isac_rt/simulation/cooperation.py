@@ -3,7 +3,7 @@ and send the next."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from isac_rt.access.messages import CODE_RATE, CORRECTED, Channel, Notes, Sighti
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.metrics import SymbolCount
+from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
@@ -51,7 +52,11 @@ class Cooperation:
         return PooledTracker([*names], s.tracking, Lives.of(s.tracking, period), ambiguities)
 
     def step(
-        self, frame: int, heard: Mapping[Link, Heard], symbols: Mapping[Link, SymbolCount]
+        self,
+        frame: int,
+        heard: Mapping[Link, Heard],
+        symbols: Mapping[Link, SymbolCount],
+        late: Mapping[Link, Sequence[LateRecord]],
     ) -> dict[str, View]:
         """The pictures after a frame, by terminal, and under `SWARM` what all of them know
         together, as if links took no time and lost nothing.
@@ -60,10 +65,12 @@ class Cooperation:
         ----------
         heard : what the links' receivers made of the frame
         symbols : what was sent to them and became of it; their checksums say as much
+        late : earlier frames that they read only now
         """
         timetable = self._setup.timetable
         time = max(timetable.epoch(frame, tx) for tx in timetable.with_role("active", frame))
         traffic = self._carry(frame, heard, symbols)
+        self._carry_late(late, traffic)
         poses = {n: self._setup.believed(p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
             notes.stand(time, of_itself(poses[name]))
@@ -144,19 +151,30 @@ class Cooperation:
         for way, capacity in self._ways(frame).items():
             channel = self._channels.setdefault(way, Channel())
             if way in heard:
-                count = symbols[way]
-                read = heard[way].reception.decoded
-                read = read and count.bit_errors <= CORRECTED * count.bits_total
+                read = heard[way].reception.decoded and _corrected(symbols[way])
             else:
                 read = heard[Link(way.rx, way.tx)].state == TerminalState.TRACKING
             came[way.rx] += Traffic(room=capacity)
-            done = channel.carry(capacity, read)
+            done = channel.carry(frame, capacity, read)
             if done is not None:
                 message, arrived = done
-                came[way.rx] += Traffic(1, not arrived, message.bits, left_out=message.left_out)
+                came[way.rx] += Traffic(
+                    1, not arrived, bits=message.bits, left_out=message.left_out
+                )
                 if arrived:
                     self._notes[way.rx].hear(message)
         return came
+
+    def _carry_late(
+        self, late: Mapping[Link, Sequence[LateRecord]], came: dict[str, Traffic]
+    ) -> None:
+        """What comes with frames that were read late, to be added to what `came`."""
+        for way, records in late.items():
+            for one in records:
+                if way in self._channels and _corrected(one.symbols):
+                    for message in self._channels[way].late(one.frame):
+                        came[way.rx] += Traffic(late=1)
+                        self._notes[way.rx].hear(message)
 
     def _send(self, frame: int) -> None:
         """Put new messages on the channels that are free; channels between terminals that have no
@@ -186,6 +204,11 @@ class Cooperation:
         for tx, rx, kept in memory["channels"]:
             channel = self._channels[Link(tx, rx)] = Channel()
             channel.restore(kept)
+
+
+def _corrected(count: SymbolCount) -> bool:
+    """Whether the code of a frame that was read makes up for its errors."""
+    return count.bit_errors <= CORRECTED * count.bits_total
 
 
 def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_std: float) -> Look:

@@ -22,7 +22,7 @@ from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
-from isac_rt.results.records import FrameRecord, ObserverRecord, PictureRecord
+from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.results.swarm import SwarmScorer
 from isac_rt.scenario.receivers import Receivers, ReceiverSet
@@ -208,10 +208,11 @@ class _Swarm:
         frame: Frame,
         heard: Mapping[Link, Heard],
         records: Mapping[Link, ObserverRecord],
+        late: Mapping[Link, Sequence[LateRecord]],
     ) -> dict[str, PictureRecord]:
         """The pictures after a frame, held against the truth."""
         views = self._cooperation.step(
-            frame.number, heard, {link: o.symbols for link, o in records.items()}
+            frame.number, heard, {link: o.symbols for link, o in records.items()}, late
         )
         poses = {name: self._swarm.poses(view.time) for name, view in views.items()}
         return self._scorer.record(frame.number, views, records, poses)
@@ -251,7 +252,10 @@ class _Listeners:
         """Hold a frame against the truth."""
         timetable = self.recorder.timetable
         records = {link: self.observers[link].record(frame, h) for link, h in heard.items()}
-        pictures = self.swarm.step(frame, heard, records) if self.swarm else {}
+        late = {
+            link: self.observers[link].scorer.late(frame.number, h) for link, h in heard.items()
+        }
+        pictures = self.swarm.step(frame, heard, records, late) if self.swarm else {}
         self.recorder.add(
             FrameRecord(
                 frame=frame.number,
@@ -265,9 +269,9 @@ class _Listeners:
                 pictures=pictures,
             )
         )
-        for link, h in heard.items():
-            for late in self.observers[link].scorer.late(frame.number, h):
-                self.recorder.amend(link, late)
+        for link, frames in late.items():
+            for one in frames:
+                self.recorder.amend(link, one)
 
     def blocks(self) -> dict[str, Any]:
         """`terminals`, `links` and `swarm` of the summary."""

@@ -6,8 +6,9 @@ Its surfaces are cut as finely as the scenario's field, its points are its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import mitsuba as mi
 import numpy as np
@@ -16,7 +17,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.field import ClutterField, Seen
-from isac_rt.propagation.clutter.two_bounces import TwoBounces
+from isac_rt.propagation.clutter.two_bounces import SeenByMirror, TwoBounces
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
@@ -85,17 +86,15 @@ class MeshExpectation:
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
         error = self._errors(wrong)
         state = LinkState(Link(name, name), time, local, local)
-        once = self._field.seen(state)
-        parts = [self._expected(once, once.departure, once.arrival, error, amplitude, state)]
-        by_mirrors = [] if self._two_bounces is None else self._two_bounces.seen(state)
-        for part in by_mirrors:
-            n, s = part.mirror.normal, part.seen
-            met = s.departure if part.before else s.arrival
-            turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
-            there, back = (turned, s.arrival) if part.before else (s.departure, turned)
-            moved = 2 * error[part.mirror.faces[0]] * (met @ n)
-            parts.append(self._expected(s, there, back, error, amplitude, state, moved))
-        return ExpectedClutter.joined(parts)
+        mirrored = [] if self._two_bounces is None else self._two_bounces.seen(state)
+        return ExpectedClutter.joined(
+            [
+                self._expected(
+                    part, error, amplitude * state.elements(self._antennas, part.seen), local
+                )
+                for part in _ways(self._field.seen(state), mirrored, error)
+            ]
+        )
 
     def _believed(self, pose: Pose, wrong: Mistakes) -> Pose:
         """A pose in the axes of the city's mesh, with the velocity that the terminal believes."""
@@ -118,7 +117,7 @@ class MeshExpectation:
         own: Pose,
         mistakes: Mistakes | None = None,
     ) -> ExpectedClutter:
-        """What a passive terminal hears of the mesh by one bounce.
+        """What a passive terminal hears of the mesh, by one bounce and by way of mirrors.
 
         Parameters
         ----------
@@ -137,50 +136,53 @@ class MeshExpectation:
         amplitude = amplitude * 10 ** (wrong.level_db / 20)
         place, velocity = sender[:3] - self._city.origin, sender[3:]
         start = replace(end, position=place, velocity=velocity, acceleration=np.zeros(3))
-        seen = self._field.from_places(LinkState(link, 0.0, start, end))
-        heard = self._antennas.element_gain(end.to_body(seen.arrival))
-        power = (amplitude * seen.magnitude) ** 2 * self._antennas.gain * heard
-        some = power > 0
-        face = self._field.cells.face[seen.index]
-        slopes = (self._city.normals[face] * (seen.departure + seen.arrival)).sum(axis=1)
-        length = seen.length + self._errors(wrong)[face] * slopes
-        return ExpectedClutter(
-            length[some] / SPEED_OF_LIGHT,
-            seen.rate[some] / SPEED_OF_LIGHT,
-            power[some],
-            end.to_body(seen.departure)[some],
-            end.to_body(seen.arrival)[some],
-        )
+        state, error = LinkState(link, 0.0, start, end), self._errors(wrong)
+        mirrored = [] if self._two_bounces is None else self._two_bounces.from_places(state)
+        parts = []
+        for part in _ways(self._field.from_places(state), mirrored, error):
+            heard = self._antennas.element_gain(end.to_body(part.seen.arrival))
+            gain = np.sqrt(self._antennas.gain * heard)
+            parts.append(self._expected(part, error, amplitude * gain, end))
+        return ExpectedClutter.joined(parts)
 
     def _expected(
-        self,
-        seen: Seen,
-        there: np.ndarray,
-        back: np.ndarray,
-        error: np.ndarray,
-        amplitude: float,
-        state: LinkState,
-        moved: np.ndarray | float = 0.0,
+        self, part: _Way, error: np.ndarray, amplitude: np.ndarray, axes: Pose
     ) -> ExpectedClutter:
-        """Clutter from `there` and `back`, unit vectors (K, 3) along which both ways meet the
-        scatterers, on faces that are each in error, and ways made longer by `moved` as a mirror is
-        in error [m]."""
-        elements = state.elements(self._antennas, seen)
-        face = self._field.cells.face[seen.index]
-        length = (
-            seen.length
-            + moved
-            + error[face] * (self._city.normals[face] * (there + back)).sum(axis=1)
-        )
-        power = (amplitude * seen.magnitude * elements) ** 2
+        """Clutter of amplitudes (K,) where antennas were isotropic, on faces that are each in
+        error; directions in the body's axes of a pose."""
+        seen, face = part.seen, self._field.cells.face[part.seen.index]
+        slopes = (self._city.normals[face] * (part.there + part.back)).sum(axis=1)
+        length = seen.length + part.moved + error[face] * slopes
+        power = (amplitude * seen.magnitude) ** 2
         some = power > 0
         return ExpectedClutter(
             length[some] / SPEED_OF_LIGHT,
             seen.rate[some] / SPEED_OF_LIGHT,
             power[some],
-            state.start.to_body(seen.departure)[some],
-            state.start.to_body(seen.arrival)[some],
+            axes.to_body(seen.departure)[some],
+            axes.to_body(seen.arrival)[some],
         )
+
+
+class _Way(NamedTuple):
+    """What K scatterers do, along which unit vectors (K, 3) both ways meet them, and by how much
+    the ways are longer than thought as a mirror is in error [m]."""
+
+    seen: Seen
+    there: np.ndarray
+    back: np.ndarray
+    moved: np.ndarray | float = 0.0
+
+
+def _ways(once: Seen, mirrored: Sequence[SeenByMirror], error: np.ndarray) -> Iterator[_Way]:
+    """Ways of one bounce and by way of mirrors, whose faces are in error along their normals."""
+    yield _Way(once, once.departure, once.arrival)
+    for part in mirrored:
+        n, s = part.mirror.normal, part.seen
+        met = s.departure if part.before else s.arrival
+        turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
+        there, back = (turned, s.arrival) if part.before else (s.departure, turned)
+        yield _Way(s, there, back, 2 * error[part.mirror.faces[0]] * (met @ n))
 
 
 class ClutterExpectation(Protocol):

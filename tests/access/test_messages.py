@@ -56,9 +56,9 @@ def test_a_message_takes_as_many_frames_as_its_bits_need(capacity, frames):
     channel = Channel()
     channel.send(message(3))
     for _ in range(frames - 1):
-        assert channel.carry(capacity, True) is None
-        assert channel.carry(0, False) is None
-    done = channel.carry(capacity, True)
+        assert channel.carry(0, capacity, True) is None
+        assert channel.carry(1, 0, False) is None
+    done = channel.carry(2, capacity, True)
     assert done is not None and done[1]
     assert channel.message is None
 
@@ -67,9 +67,30 @@ def test_a_message_is_lost_with_any_of_its_frames():
     for lost in range(3):
         channel = Channel()
         channel.send(message(3))
-        outcome = [channel.carry(500, frame != lost) for frame in range(3)]
+        outcome = [channel.carry(frame, 500, frame != lost) for frame in range(3)]
         assert outcome[:2] == [None, None]
         assert outcome[2] is not None and not outcome[2][1]
+
+
+def test_a_message_comes_late_with_the_last_of_its_frames_that_is_read():
+    """Two of three frames pass unread and are read afterwards, the one while the message is still
+    on its way; nothing comes twice, and after eight frames nothing waits any more. Planted bugs:
+    whole with the first frame that is read; forgotten while on its way; kept for good."""
+    channel = Channel()
+    channel.send(message(3))
+    assert channel.carry(4, 500, False) is None
+    assert channel.carry(5, 500, False) is None
+    assert channel.late(4) == []
+    done = channel.carry(6, 500, True)
+    assert done is not None and not done[1]
+    assert channel.late(7) == [] and channel.late(5) == [done[0]] and channel.late(5) == []
+    channel.send(message(1))
+    assert channel.carry(8, 700, False) is not None
+    for frame in (15, 16):
+        channel.send(message(2))
+        assert channel.carry(frame, 2000, True)[1]
+        waits = channel.memory()[3]
+        assert [missed for _, missed in waits] == ([[8]] if frame == 15 else [])
 
 
 def test_tracks_take_turns_where_a_frame_cannot_hold_all():
@@ -162,7 +183,7 @@ def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
     b.look(T, 1.5)
     channel = Channel()
     channel.send(a.compose("B", 1300))
-    channel.carry(400, False)
+    channel.carry(0, 400, False)
     kept = unpack(*pack([a.memory(), b.memory(), channel.memory()]))
     again, other, way = Notes("A"), Notes("B"), Channel()
     for one, memory in zip((again, other, way), kept, strict=True):
@@ -179,9 +200,12 @@ def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
             for n in (one, two)
         ]
         assert pictures[0] == pictures[1]
-    outcomes = [[ch.carry(500, True) for _ in range(2)] for ch in (channel, way)]
+    outcomes = [[ch.carry(1 + i, 500, True) for i in range(2)] for ch in (channel, way)]
     assert [o is None for o in outcomes[0]] == [o is None for o in outcomes[1]] == [True, False]
     assert outcomes[1][1][1] is False
+    waiting = Channel()
+    waiting.restore(unpack(*pack([way.memory()]))[0])
+    assert [m.bits for m in waiting.late(0)] == [outcomes[1][1][0].bits]
 
 
 def look(frame=0, origin="A->A", count=2, sure=None, snr=None):

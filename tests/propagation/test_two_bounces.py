@@ -590,3 +590,70 @@ def test_what_a_terminal_expects_of_mirrors():
             assert np.abs(found[rows] - pose.to_body(truth)).max() < 1e-9
         begin = rows.stop
     assert begin == len(right)
+
+
+def test_what_a_passive_terminal_expects_of_mirrors():
+    """From where its transmitter is tracked to be, off both planned flights: the lengths of the
+    ways over image points, directions, and the total power within 0.2 dB of the field's own with
+    elements that send as on boresight. Planted bugs: the mirrors of one end alone; the own motion
+    for the transmitter's; the element's gain towards the arrival left out."""
+    tree = {
+        "frames": 40,
+        "swarm": {
+            "A": {"role": "active", "position_m": [0.3, -1.1, 0.9]},
+            "P": {"role": "passive", "position_m": [2.1, -3.4, 1.7], "boresight": [0, 1, 0]},
+        },
+        "receiver_preset": "plain",
+        "city": {"source": "canyon"},
+        "array": {"element_pattern": "cosine", "element_gain_dbi": 10 * float(np.log10(4))},
+        "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
+        "clutter": {"model": "field", "cell_area_per_metre_m": 0.02, "mirrors": 2},
+    }
+    s = scenario.Scenario.model_validate(tree)
+    w = waveform_of(s.radio, s.array)
+    antennas = antennas_of(s.array, w)
+    city = joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
+    swarm, link = swarm_of(s), Link("A", "P")
+    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
+    own = swarm.poses(0.0)["P"]
+    sender = np.array([0.7, -1.3, 1.1, 3.1, -2.3, 0.7])
+    start = replace(own, position=sender[:3], velocity=sender[3:])
+    found = copy.between(link, 0.6, sender, own)
+    state = LinkState(link, 0.0, start, own)
+    straight = copy._field.from_places(state)
+    once = int((own.to_body(straight.arrival)[:, 1] > 0).sum())  # nothing is heard from behind
+    begin, lags = once, 1e-5
+    for part in copy._two_bounces.from_places(state):
+        ahead = own.to_body(part.seen.arrival)[:, 1] > 0
+        place, m = copy._field.cells.points[part.seen.index[ahead]], part.mirror
+
+        def imaged(point, m=m):
+            return point - 2 * (point @ m.normal - m.offset) * m.normal
+
+        ways = []
+        for t in (-lags, 0.0, lags):
+            ends = [sender[:3] + t * sender[3:], own.position + t * own.velocity]
+            ends[0 if part.before else 1] = imaged(ends[0 if part.before else 1])
+            ways.append(sum(np.linalg.norm(place - end, axis=1) for end in ends))
+        rows = slice(begin, begin + len(place))
+        assert np.abs(C * found.delay[rows] - ways[1]).max() < 1e-9
+        assert np.abs(C * found.delay_rate[rows] - (ways[2] - ways[0]) / (2 * lags)).max() < 1e-4
+        target = (
+            place if part.before else place - 2 * (place @ m.normal - m.offset)[:, None] * m.normal
+        )
+        towards = target - own.position
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        assert np.abs(found.arrival[rows] - own.to_body(towards)).max() < 1e-9
+        begin = rows.stop
+    assert begin == len(found)
+    truth = propagation_in(city, s).two_bounces.seen(state)
+    assert {part.before for part in truth} == {True, False}
+    ours = sum(
+        (
+            antennas.gain
+            * antennas.element_gain(own.to_body(part.seen.arrival))
+            * (0.6 * part.seen.magnitude) ** 2
+        ).sum()
+        for part in truth
+    )
+    assert abs(10 * np.log10(found.power[once:].sum() / ours)) < 0.2

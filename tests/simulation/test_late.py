@@ -35,6 +35,7 @@ def scenario(acquisition="blind"):
             "modulation.acquisition_frames=1",
             "modulation.pilot_every_frames=null",
             f"receivers={{link_acquisition: {acquisition}, symbol_decision: beams}}",
+            "cooperation=tracks",
             "compare={pilots: {receivers: {link_acquisition: pilots}}}",
         ],
         frames=14,
@@ -79,6 +80,20 @@ def test_late_frames_are_amended(whole):
     assert pilots["PT1"]["latency_frames"]["read"] == 13
     row = next(r for r in per_terminal(whole.summary).rows if r[0] == "AT to PT2")
     assert list(row[-3:]) == [str(seen.sum()), str((late > 0).sum()), str(late.max())]
+
+
+def test_messages_on_late_frames_come_late(whole):
+    """What the AT tells PT2 takes two frames; the message that ends after the first frame that PT2
+    reads comes with the one that is read late, those before are lost. Planted bugs: late frames not
+    carried; counted as lost for good."""
+    d = whole.dataset.sel(picture="PT2")
+    lost, late = d.picture_lost.values, d.picture_late.values
+    waits = whole.dataset.latency_frames.sel(observer="PT2").values
+    first = int(np.flatnonzero(waits >= 0)[0])
+    assert late.sum() >= 1 and not late[: first + 1].any()
+    told = whole.summary["swarm"]["terminals"]["PT2"]
+    assert told["messages_late"] == late.sum()
+    assert told["messages_lost"] == lost[: first + 1].sum() == lost.sum() - late.sum()
 
 
 def test_a_run_stopped_before_a_frame_is_read_goes_on(whole, tmp_path):

@@ -42,6 +42,11 @@ KNOTS_KEPT = 16
 """Knots per terminal whose tests are remembered; a frame needs six."""
 
 
+_Sight = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
+"""How far (N,) scatterers are in sight of an end, and of each of its mirrors which show in it and
+how far."""
+
+
 @dataclass(frozen=True)
 class SeenByMirror:
     """What K scatterers do between two terminals by way of one mirror.
@@ -102,23 +107,40 @@ class TwoBounces:
     def seen(self, state: LinkState, bodies: Bodies | None = None) -> list[SeenByMirror]:
         """What is in sight of both ends, once for each mirror and order; poses in local
         coordinates."""
-        (tx, rx), out = state.link, []
-        for before, name, pose, other, far in (
-            (True, tx, state.start, rx, state.end),
-            (False, rx, state.end, tx, state.start),
+        sight, time = self._field.sight, state.epoch
+        ends = zip(state.link, (state.start, state.end), strict=True)
+        tx, rx = (
+            (sight.share(name, pose, time), self._share(name, pose, time)) for name, pose in ends
+        )
+        out = self._between(state, tx, rx)
+        if bodies is not None:
+            for found in out:
+                self._shade(found, state, bodies)
+        return out
+
+    def from_places(self, state: LinkState) -> list[SeenByMirror]:
+        """The same by rays alone, wherever the ends are."""
+        places = np.array([state.start.position, state.end.position])
+        tx, rx = (
+            (straight.astype(np.float32), [(i, np.ones(i.size)) for i in self._test(name, place)])
+            for straight, name, place in zip(
+                self._field.sight.from_places(places), state.link, places, strict=True
+            )
+        )
+        return self._between(state, tx, rx)
+
+    def _between(self, state: LinkState, tx: _Sight, rx: _Sight) -> list[SeenByMirror]:
+        """Ways by the mirrors of the one end, then by those of the other."""
+        out = []
+        for before, name, shown_in, straight in (
+            (True, state.link.tx, tx[1], rx[0]),
+            (False, state.link.rx, rx[1], tx[0]),
         ):
-            if not self.mirrors[name]:
-                continue
-            straight = self._field.sight.share(other, far, state.epoch)
-            shown_in = self._share(name, pose, state.epoch)
             for mirror, (index, share) in zip(self.mirrors[name], shown_in, strict=True):
                 share = share * straight[index]
                 lit = share > 0
                 if lit.any():
-                    found = self._by_way_of(mirror, index[lit], share[lit], state, before)
-                    if bodies is not None:
-                        self._shade(found, state, bodies)
-                    out.append(found)
+                    out.append(self._by_way_of(mirror, index[lit], share[lit], state, before))
         return out
 
     def paths(
@@ -178,11 +200,13 @@ class TwoBounces:
         return self._shown[name, knot]
 
     def _test(self, name: str, place: np.ndarray) -> list[np.ndarray]:
-        cells = self._field.cells
+        cells, mirrors = self._field.cells, self.mirrors[name]
+        if not mirrors:
+            return []
         return shown(
             self._field.sight.shadows,
             place,
-            self.mirrors[name],
+            mirrors,
             cells.points,
             self._city.normals[cells.face],
         )
