@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, advance
+from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, Told, advance
 from isac_rt.terminal.pool import Look, PooledTracker
 from isac_rt.terminal.retrospect import BATCH
 
@@ -27,9 +27,10 @@ TERMINAL_BITS = 16 + 3 * 24 + 3 * 16
 second."""
 NUMBER_BITS = 16
 """One of the numbers of the tracks that a terminal keeps."""
-REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8
+REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8 + 8
 """A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
-deviations and correlations. What these bits round off is not modelled: a centimetre and less."""
+deviations and correlations, and how far the clock moves it; what the errors of the pose do follows
+from the terminal's own place. What these bits round off is not modelled: a centimetre and less."""
 LOOK_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
 """Of one frame of a link: which, when, the receiver's position, velocity and attitude, how well its
 clock is known."""
@@ -200,16 +201,16 @@ class Notes:
     told: dict[str, dict[Key, float]] = field(default_factory=dict)
     picture: Picture = field(default_factory=Picture)
 
-    def see(self, origin: str, time: float, tracks: Mapping[int, Gaussian]) -> None:
+    def see(self, origin: str, time: float, tracks: Mapping[int, Told]) -> None:
         """Take down the tracks of one of its own links after a frame, by their numbers; tracks that
         were there before have begun before."""
         mine = [key for key in self.reports if key.origin == origin]
         before = {key: self.reports.pop(key)[0] for key in mine}
-        for number, state in tracks.items():
+        for number, (state, lever) in tracks.items():
             key = Key(origin, number)
             since = before[key].since if key in before else time
             name = before[key].name if key in before else Name(since, *key)
-            self.reports[key] = Report(key, since, name, time, state), ""
+            self.reports[key] = Report(key, since, name, time, state, lever), ""
         self.kept[origin] = Kept(time, tuple(tracks))
 
     def stand(self, time: float, state: Gaussian) -> None:

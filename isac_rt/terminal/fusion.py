@@ -1,15 +1,18 @@
 """One picture from the tracks of several terminals: which of them are one body, what they say of it
 together, and its name in the whole swarm.
 
-What terminals have in common is not known: they follow the same manoeuvres, rest on one
-transmitter's pose, and may hear their own words again. Covariance intersection is consistent
-whatever it is.
+A terminal is wrong about its own pose and clock, and so about all its tracks alike. These errors
+are states beside the bodies: what two terminals see, and what they say of themselves, tells them,
+and that helps all other bodies. What else tracks have in common is not known: they follow the same
+manoeuvres, and may rest on one transmitter's pose. Covariance intersection is consistent whatever
+it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,13 +29,24 @@ SIZE = 6
 POSE_STD = (0.05, 0.05)
 """Deviations of a terminal's own position and velocity on each axis, as satellites and inertial
 sensors give them [m, m/s]. They are part of what it says of itself and of others."""
-ATTITUDE_STD = np.radians(0.1)
+DATUM_STD = (0.05, 0.05)
+"""And of what all terminals are wrong alike, for they hear the same satellites [m, m/s]: nothing
+that they tell each other shows it, and all bodies of a picture have it."""
+ATTITUDE_STD = np.radians(0.3)
 """Deviation of a terminal's attitude about each axis [rad]: across the line of sight, times the
-range, it adds to what it says of others."""
+range, it adds to what it says of others. Small inertial sensors with two antennas hold it."""
+ERRORS = 10
+"""Errors of a terminal: of its position, velocity and attitude, and of its ranges by its clock."""
+OWN_NOISE = 1e-3
+"""What is left of a terminal's word of itself without the errors of its pose: rounding [m, m/s]."""
 JOIN_PROBABILITY = 0.99
 SPLIT_PROBABILITY = 1 - 1e-6
 """Two tracks are joined within the first gate and parted beyond the second, so that noise does not
 join and part them in turns."""
+
+LEAST_APART = 0.5
+"""UAVs keep farther from each other than this [m]: two tracks of one terminal within it, and within
+their errors, are one; beyond twice this they are parted."""
 
 
 class Key(NamedTuple):
@@ -61,7 +75,8 @@ class Report:
     since : when it was confirmed [s]
     name : by which it knows the body
     time : that the state is of [s]
-    state : position and velocity (6,), (6, 6)
+    state : position and velocity (6,), (6, 6), without the errors of who tells
+    lever : (6, `ERRORS`) what these errors, one deviation each, do to it; by default nothing
     """
 
     key: Key
@@ -69,26 +84,36 @@ class Report:
     name: Name
     time: float
     state: Gaussian
+    lever: np.ndarray = field(default_factory=lambda: np.zeros((SIZE, ERRORS)))
 
     @property
     def own_name(self) -> Name:
         """The name that the track alone would give."""
         return Name(self.since, *self.key)
 
+    @property
+    def whole(self) -> Gaussian:
+        """The state with the errors of who tells."""
+        return Gaussian(self.state.mean, self.state.covariance + self.lever @ self.lever.T)
+
     def at(self, time: float, acceleration_std: float) -> Report:
         """The same at another time [s]."""
-        state = advance(self.state, time - self.time, acceleration_std)
-        return replace(self, time=time, state=state)
+        interval = time - self.time
+        state = advance(self.state, interval, acceleration_std)
+        lever = self.lever.copy()
+        lever[:3] += interval * lever[3:]
+        return replace(self, time=time, state=state, lever=lever)
 
     def memory(self) -> list[Any]:
         """As plain numbers and arrays, for `of_memory`."""
-        return [list(self.key), self.since, list(self.name), self.time, list(self.state)]
+        head = [list(self.key), self.since, list(self.name), self.time]
+        return [*head, list(self.state), self.lever]
 
     @classmethod
     def of_memory(cls, memory: Sequence[Any]) -> Report:
         """The report that gave a `memory`."""
-        key, since, name, time, state = memory
-        return cls(Key(*key), since, Name(*name), time, Gaussian(*state))
+        key, since, name, time, state, lever = memory
+        return cls(Key(*key), since, Name(*name), time, Gaussian(*state), lever)
 
 
 @dataclass(frozen=True)
@@ -121,26 +146,50 @@ def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussi
     return Gaussian(F[:SIZE, :SIZE] @ state.mean, (F @ P @ F.T + Q)[:SIZE, :SIZE])
 
 
-def in_world(tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0) -> Gaussian:
-    """A track in world axes as it is told to others.
+class Told(NamedTuple):
+    """A track as it is told to others, in world axes: `Report.state` and `Report.lever`."""
 
-    Beside the track's own covariance it holds the errors of the terminal's pose (`POSE_STD`,
-    `ATTITUDE_STD`), and `clock_std` [m], the speed of light times the deviation of what is left
-    of its clock's offset, on every axis. The turn of the velocity by the attitude's error is left
-    out: it is a thousandth of it.
-    """
+    state: Gaussian
+    lever: np.ndarray
+
+
+def in_world(tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0) -> Told:
+    """A track as it is told to others: its own covariance, and apart from it what the errors of the
+    terminal do to it: of its position and velocity (`POSE_STD`), of its attitude (`ATTITUDE_STD`),
+    which turns place and motion about the terminal, and of its clock (`clock_std`, the speed of
+    light times the deviation of what is left of its offset [m])."""
+    offset, motion = np.split(tracks.mean[row], 2)
+    lever = np.zeros((SIZE, ERRORS))
+    lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
+    lever[:3, 6:9], lever[3:, 6:9] = -ATTITUDE_STD * cross(offset), -ATTITUDE_STD * cross(motion)
+    lever[:3, 9] = clock_std * _by_clock(tracks, row)
+    mean = tracks.mean[row] + np.concatenate([own.position, own.velocity])
+    return Told(Gaussian(mean, tracks.covariance[row]), lever)
+
+
+def _by_clock(tracks: TrackSet, row: int) -> np.ndarray:
+    """How far a body moves for each metre that a terminal's clock adds to its ranges (3,): along
+    its direction, by its path length and its reference's, which are both too long."""
     offset = tracks.mean[row, :3]
-    across = offset @ offset * np.eye(3) - np.outer(offset, offset)
-    P = tracks.covariance[row].copy()
-    P[:3, :3] += (POSE_STD[0] ** 2 + clock_std**2) * np.eye(3) + ATTITUDE_STD**2 * across
-    P[3:, 3:] += POSE_STD[1] ** 2 * np.eye(3)
-    return Gaussian(tracks.mean[row] + np.concatenate([own.position, own.velocity]), P)
+    rho = float(np.linalg.norm(offset))
+    if tracks.is_reference[row] or not tracks.is_reference.any():
+        return offset / rho
+    baseline = tracks.mean[tracks.is_reference][0, :3]
+    d, u = float(np.linalg.norm(baseline)), offset / rho
+    length, ahead = rho + float(np.linalg.norm(offset - baseline)), float(baseline @ u)
+    # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
+    return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
 
 
 def of_itself(own: Pose) -> Gaussian:
     """What a terminal says of its own position and velocity."""
     variance = np.repeat(np.square(POSE_STD), 3)
     return Gaussian(np.concatenate([own.position, own.velocity]), np.diag(variance))
+
+
+def in_datum(state: Gaussian) -> Gaussian:
+    """A body (6,) with what all terminals are wrong alike."""
+    return Gaussian(state.mean, state.covariance + np.diag(np.repeat(np.square(DATUM_STD), 3)))
 
 
 def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
@@ -168,6 +217,11 @@ def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
     >>> fused.mean.round(6).tolist(), fused.covariance.round(6).tolist()
     ([0.9, 1.8], [[1.8, 0.0], [0.0, 1.8]])
     """
+    return _intersection(a, b)[0]
+
+
+def _intersection(a: Gaussian, b: Gaussian) -> tuple[Gaussian, float]:
+    """And the weight w of the first."""
     A, B = np.linalg.inv(a.covariance), np.linalg.inv(b.covariance)
     values, V = eigh((A + A.T) / 2, (B + B.T) / 2)
     lengths = np.sum(V**2, axis=0)
@@ -182,16 +236,79 @@ def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
     else:
         w = float(brentq(slope, 0.0, 1.0))
     P = (V / (w * values + 1 - w)) @ V.T
-    return Gaussian(P @ (w * A @ a.mean + (1 - w) * B @ b.mean), P)
+    return Gaussian(P @ (w * A @ a.mean + (1 - w) * B @ b.mean), P), w
 
 
 def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
     """Covariance intersection of one or more, one after the other, the surest first."""
-    ordered = sorted(states, key=lambda g: float(np.trace(g.covariance)))
-    fused = ordered[0]
-    for other in ordered[1:]:
-        fused = intersection(fused, other)
-    return fused
+    return _intersected(states)[0]
+
+
+def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
+    """And the weight of each in it."""
+    order = sorted(range(len(states)), key=lambda k: float(np.trace(states[k].covariance)))
+    fused, weights = states[order[0]], np.ones(len(states))
+    for at, k in enumerate(order[1:], 1):
+        fused, w = _intersection(fused, states[k])
+        weights[order[:at]] *= w
+        weights[k] = 1 - w
+    return fused, weights
+
+
+def together(
+    bodies: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Gaussian]]
+) -> list[Gaussian]:
+    r"""Bodies from their tracks, jointly with the errors of the terminals that tell of them.
+
+    A track says :math:`y = b + L_y e + n` with the errors e of its terminal, one deviation each and
+    independent of all else, and with its own error n. Of the n of one body the correlation is not
+    known: each has the weight w of covariance intersection, which is consistent whatever it is. The
+    information of all, of the errors' own and of what terminals say of themselves is added up:
+
+    .. math:: \sum_y w_y A_y^T P_y^{-1} A_y + E + \sum_t B_t^T Q_t^{-1} B_t,\quad A_y = [I, L_y]
+
+    Parameters
+    ----------
+    bodies : by body the reports of its tracks, all of one instant
+    itself : by number of a body the terminal that it is, and what that one says of itself
+    """
+    owners = {name for name, _ in itself.values()}
+    owners |= {_teller(report.key) for reports in bodies for report in reports}
+    links = dict.fromkeys(report.key.origin for reports in bodies for report in reports)
+    first = SIZE * len(bodies)
+    pose = {name: first + (ERRORS - 1) * k for k, name in enumerate(sorted(owners))}
+    clock = {o: first + (ERRORS - 1) * len(pose) + k for k, o in enumerate(links)}
+    size = first + (ERRORS - 1) * len(pose) + len(clock)
+    information, vector = np.zeros((size, size)), np.zeros(size)
+    information[range(first, size), range(first, size)] = 1.0
+
+    def add(k: int, at: list[int], lever: np.ndarray, said: Gaussian, weight: float) -> None:
+        rows = [*range(SIZE * k, SIZE * k + SIZE), *at]
+        A = np.hstack([np.eye(SIZE), lever])
+        gain = weight * np.linalg.solve(said.covariance, A).T
+        information[np.ix_(rows, rows)] += gain @ A
+        vector[rows] += gain @ said.mean
+
+    for k, reports in enumerate(bodies):
+        _, weights = _intersected([report.whole for report in reports])
+        for report, w in zip(reports, weights, strict=True):
+            at = pose[_teller(report.key)]
+            rows = [*range(at, at + ERRORS - 1), clock[report.key.origin]]
+            add(k, rows, report.lever, report.state, w)
+    for k, (name, said) in itself.items():
+        deviations = np.repeat(POSE_STD, 3)
+        rest = said.covariance - np.diag(deviations**2) + OWN_NOISE**2 * np.eye(SIZE)
+        rows = [*range(pose[name], pose[name] + SIZE)]
+        add(k, rows, np.diag(deviations), Gaussian(said.mean, rest), 1.0)
+    P = np.linalg.inv(information)
+    mean, P = P @ vector, (P + P.T) / 2
+    each = [slice(SIZE * k, SIZE * k + SIZE) for k in range(len(bodies))]
+    return [Gaussian(mean[rows], P[rows, rows]) for rows in each]
+
+
+def _teller(key: Key) -> str:
+    """The terminal that tells of a track."""
+    return key.origin.rpartition("->")[2]
 
 
 def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray, np.ndarray]:
@@ -207,6 +324,12 @@ def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray,
     residual = means[0][:, None] - means[1][None]
     S = covariances[0][:, None] + covariances[1][None]
     return normalised(residual, S)
+
+
+def cross(e: np.ndarray) -> np.ndarray:
+    """(3, 3) matrix of the cross product with e from the left."""
+    x, y, z = e
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def gate(probability: float) -> float:
@@ -249,17 +372,24 @@ class Picture:
         known : what terminals say of themselves, likewise
         """
         by_key = {report.key: report for report in reports}
-        self._keep(by_key)
-        self._join(by_key)
+        whole = {key: report.whole for key, report in by_key.items()}
+        self._keep(whole, by_key)
+        self._join(whole)
+        self._unite(whole)
         self._call(by_key)
-        states = [intersection_of([by_key[k].state for k in b.members]) for b in self._bodies]
-        whose = recognise(states, known or {})
+        known = known or {}
+        states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
+        whose = recognise(states, known)
+        itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
+        if self._bodies:
+            members = [[by_key[k] for k in b.members] for b in self._bodies]
+            states = together(members, itself)
         return [
-            Fused(body.name, state, tuple(body.members), terminal)
+            Fused(body.name, in_datum(state), tuple(body.members), terminal)
             for body, state, terminal in zip(self._bodies, states, whose, strict=True)
         ]
 
-    def _keep(self, by_key: Mapping[Key, Report]) -> None:
+    def _keep(self, whole: Mapping[Key, Gaussian], by_key: Mapping[Key, Report]) -> None:
         """Bodies of the tracks that are still there: those that have left their body, and new
         ones, stand alone."""
         kept, alone = [], dict.fromkeys(by_key)
@@ -267,31 +397,52 @@ class Picture:
             members = [key for key in body.members if key in by_key]
             if not members:
                 continue
-            surest = min(members, key=lambda k: float(np.trace(by_key[k].state.covariance)))
-            d2, _ = distances([by_key[surest].state], [by_key[k].state for k in members])
+            members.sort(key=lambda k: float(np.trace(whole[k].covariance)))
+            d2, _ = distances([whole[members[0]]], [whole[k] for k in members])
+            surest = {k.origin: k for k in reversed(members)}
+            gaps = [_gap(whole[k], whole[surest[k.origin]]) for k in members]
             body.members = [
-                k for k, d in zip(members, d2[0], strict=True) if d <= gate(SPLIT_PROBABILITY)
+                k
+                for k, d, gap in zip(members, d2[0], gaps, strict=True)
+                if d <= gate(SPLIT_PROBABILITY) and gap <= 2 * LEAST_APART
             ]
             kept.append(body)
             for key in body.members:
                 del alone[key]
         self._bodies = kept + [_Body(by_key[key].name, [key]) for key in alone]
 
-    def _join(self, by_key: Mapping[Key, Report]) -> None:
+    def _join(self, whole: Mapping[Key, Gaussian]) -> None:
         """Tracks that stand alone join bodies that their terminal has no track of, origin by
         origin: as many as the gate allows, of the greatest likelihood."""
-        for origin in dict.fromkeys(key.origin for key in sorted(by_key)):
+        for origin in dict.fromkeys(key.origin for key in sorted(whole)):
             single = [b for b in self._bodies if len(b.members) == 1 and origin in b.origins()]
             others = [b for b in self._bodies if origin not in b.origins()]
             d2, log_det = distances(
-                [intersection_of([by_key[k].state for k in b.members]) for b in others],
-                [by_key[b.members[0]].state for b in single],
+                [intersection_of([whole[k] for k in b.members]) for b in others],
+                [whole[b.members[0]] for b in single],
             )
             cost = np.where(d2 <= gate(JOIN_PROBABILITY), d2 + log_det, np.inf)
             for i, j in assign(cost):
                 others[i].members += single[j].members
                 others[i].name = min(others[i].name, single[j].name)
                 self._bodies.remove(single[j])
+
+    def _unite(self, whole: Mapping[Key, Gaussian]) -> None:
+        """Bodies of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
+        states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
+        d2, _ = distances(states, states)
+        gone: set[int] = set()
+        for i, body in enumerate(self._bodies):
+            for j in range(i):
+                if {i, j} & gone or d2[i, j] > gate(JOIN_PROBABILITY):
+                    continue
+                pairs = product(body.members, self._bodies[j].members)
+                gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
+                if gaps and max(gaps) < LEAST_APART:
+                    self._bodies[j].members += body.members
+                    self._bodies[j].name = min(body.name, self._bodies[j].name)
+                    gone.add(i)
+        self._bodies = [b for i, b in enumerate(self._bodies) if i not in gone]
 
     def _call(self, by_key: Mapping[Key, Report]) -> None:
         """Names: the earliest that any member is known by; two bodies never have the same. The one
@@ -306,6 +457,11 @@ class Picture:
             if body.name in holder:  # by a body that lacks the track; it takes its own in its turn
                 waiting.append(holder[body.name])
             holder[body.name] = body
+
+
+def _gap(a: Gaussian, b: Gaussian) -> float:
+    """Distance of two places [m]."""
+    return float(np.linalg.norm(a.mean[:3] - b.mean[:3]))
 
 
 def recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:

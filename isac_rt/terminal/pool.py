@@ -34,21 +34,23 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.terminal.fusion import (
     ATTITUDE_STD,
+    ERRORS,
     JOIN_PROBABILITY,
     POSE_STD,
     SIZE,
     Fused,
     Key,
     Name,
+    cross,
     gate,
+    in_datum,
     recognise,
 )
 from isac_rt.terminal.tracker import ROUNDING, assign
 from isac_rt.world.swarm import Pose
 
-ERRORS, BODY = 10, 9
-"""States of a terminal: errors of its position, velocity and attitude, and of its ranges by its
-clock [m, m/s, rad, m]; those of a body."""
+BODY = 9
+"""States of a body; those of a terminal are its errors [m, m/s, rad, m]."""
 ERROR_TIME = 10.0
 """Correlation time of a terminal's errors [s]: satellites and inertial sensors drift in seconds to
 minutes. A clock's error stays, and grows as looks state."""
@@ -299,7 +301,7 @@ class PooledTracker:
         return [
             Fused(
                 pool.bodies[k].name,
-                state,
+                in_datum(state),
                 tuple(Key(origin, number) for origin, (number, _) in pool.bodies[k].fed.items()),
                 terminal,
             )
@@ -564,7 +566,7 @@ class _View:
         H[:, at : at + SIZE] += jacobian(body, own)[:, :SIZE]
         away = body[:3] - own.position
         e = away / np.linalg.norm(away)
-        H[2:, at + 6 : at + 9] = -(own.rotation.T @ _cross(e))[[0, 2]]
+        H[2:, at + 6 : at + 9] = -(own.rotation.T @ cross(e))[[0, 2]]
         H[0, at + ERRORS - 1] = 1.0
         if sender is not None:
             other = self._at(tx)
@@ -575,12 +577,6 @@ def _error_variance() -> np.ndarray:
     """(`ERRORS`,) variances of a terminal's errors but for its clock's, which looks state."""
     deviations = [*[POSE_STD[0]] * 3, *[POSE_STD[1]] * 3, *[ATTITUDE_STD] * 3, 0.0]
     return np.square(deviations)
-
-
-def _cross(e: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of the cross product with e from the left."""
-    x, y, z = e
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _apart(a: Body, b: Body) -> bool:

@@ -94,7 +94,7 @@ def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
 def test_who_hears_what_and_when(talked):
     """Three detections confirm a track, so frame 2 is the first after which there is something to
     tell; it leaves with frame 3 and is in the other's picture from there on, a frame old. The AT
-    follows the PT and the target: 64 + 136 + 2 x 16 bits and 416 for each track. A frame holds
+    follows the PT and the target: 64 + 136 + 2 x 16 bits and 424 for each track. A frame holds
     3 (60 x 7 + 57 x 3) = 1773 bits, half of them for messages: one track, so that the two take
     turns, and their mean age is a frame and a half. The feedback has 1000 bits a frame and one
     track to tell. Planted bugs: a message that arrives with the frame it is made after; a code
@@ -120,7 +120,7 @@ def test_the_target_is_one_body_of_two_tracks_and_the_terminals_are_none(talked)
 
 
 def test_a_slow_feedback_makes_the_picture_old():
-    """1 kbit/s is 20 bits a frame: a message of a track and a terminal, 632 bits and more, takes
+    """1 kbit/s is 20 bits a frame: a message of a track and a terminal, 640 bits and more, takes
     over 31 frames, so that the AT hears nothing in nine, while the PT hears as before."""
     swarm = simulate.run(scenario(access=Access(feedback_rate_bps=1e3))).summary["swarm"]
     assert swarm["terminals"]["AT"]["messages"] == 0
