@@ -9,12 +9,13 @@ from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter, Reception
+from isac_rt.receive.types import ExpectedClutter, Gates, Reception
 from isac_rt.scenario.receivers import Receivers
 
 
@@ -41,8 +42,9 @@ class ActiveReceiver:
         clutter: ExpectedClutter | None = None,
         *,
         maps: bool = False,
+        sought: Gates | None = None,
     ) -> Reception:
-        """See `receive_active`."""
+        """See `receive_active`; `sought` is where UAVs are expected."""
         known = Known.of(cube, payload, self.antennas, 2)
         if isinstance(cube, IFCube):
             spectra = clean_spectrum(cube, known)
@@ -51,7 +53,10 @@ class ActiveReceiver:
         if self.clutter_filter is not None:
             self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
         spectra, known = known.decoded(spectra)
-        found = self.detector.sense(spectra, known, clutter)
+        detector = self.detector
+        if isinstance(detector, AngleDoppler):
+            detector = replace(detector, sought=sought)
+        found = detector.sense(spectra, known, clutter)
         detections = found.detections
         if self.refiner is not None and isinstance(cube, IFCube):
             detections = self.refiner(Moments(cube.samples, known), detections)[0]

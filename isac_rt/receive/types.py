@@ -305,6 +305,20 @@ class Reception:
 
 
 @dataclass(frozen=True)
+class Gates:
+    """Where K UAVs are expected, by their tracks or by what they say of themselves.
+
+    Attributes
+    ----------
+    mean : (K, 4) range, velocity and direction cosines as in `Detections`
+    std : (K, 4) standard deviations
+    """
+
+    mean: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True)
 class ExpectedClutter:
     """K independent scatterers of known mean power, as one receiver expects them at the middle of a
     frame.

@@ -13,6 +13,7 @@ COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
     "clutter_channels": ("clutter_detector", ("sample_matrix",)),
     "update_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
+    "gate_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "clutter_run_cells": ("clutter_filter", ("runs",)),
     "cluster_cells": ("velocity_method", ("auto", "omp", "latin_union", "conventional")),
 }
@@ -58,6 +59,11 @@ class Receivers(Node):
     """Probability that noise alone is taken in one cell for a detection that may carry on a track,
     for `clutter_detector: angle_doppler`; those by `false_alarm_rate`, which is at most as high,
     may start one too. null, the default: the same rate."""
+    gate_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
+    """Probability that noise alone is taken for a UAV where one is expected, by its track or, with
+    `cooperation`, by what a terminal says of its place: in all cells and directions of its gate
+    together, for `clutter_detector: angle_doppler`. Such detections carry tracks on and start none.
+    null, the default: no cell has a threshold of its own."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
     """Cells in range and in Doppler on each side of a cell that are left out when its background is
     measured, so that a target does not raise its own threshold. The default covers the main lobe of
@@ -234,6 +240,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "clutter_detector": "cfar",
         "false_alarm_rate": 1e-6,
         "update_false_alarm_rate": None,
+        "gate_false_alarm_rate": None,
     },
     "tracking": {"drop_after_s": None, "births": "all", "mirrors": "ignore"},
 }
@@ -257,6 +264,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "passive_detector": "beams",
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
+            "gate_false_alarm_rate": 1e-3,
         },
         "tracking": {"drop_after_s": 0.36, "births": "unexplained", "mirrors": "ignore"},
     },

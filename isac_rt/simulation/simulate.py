@@ -150,7 +150,9 @@ class _Observer:
         """Where the other end of the link, or at an active terminal those of all links, say that
         they are, as far as the receiver asks."""
         s = self.setup
-        if self.receivers.self_calibration != "positions":
+        gates = self.link.own and self.receivers.gate_false_alarm_rate is not None
+        gates = gates and s.scenario.cooperation != "none"
+        if not gates and self.receivers.self_calibration != "positions":
             return []
         tx, rx = self.link
         names = s.timetable.with_role("passive", frame) if self.link.own else [tx]

@@ -25,7 +25,7 @@ from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Gates
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import (
     Ambiguity,
@@ -35,6 +35,7 @@ from isac_rt.terminal.filter import (
     measure,
     measurement_covariance,
     predict,
+    reported,
     update,
     wrapped,
 )
@@ -138,6 +139,7 @@ class ActiveTerminal:
         self.calibration = calibration_of(receivers, waveform, antennas, 2)
         self._standing = Standing.of(antennas, waveform, 2, walls)
         self._correction: Correction | None = None
+        self._gates: Gates | None = None
 
     def step(
         self,
@@ -156,11 +158,12 @@ class ActiveTerminal:
             cube = self.calibration.correct(cube, time)
         if clutter is not None and self._correction is not None:
             clutter = self._correction.apply(clutter)
+        self.tracker.predict(time)
+        self._gates = self._sought(own_pose, mates)
         reception = self.receive(cube, payload, clutter, maps)
         if reception.correction is not None:
             before = self._correction or Correction(0.0, np.zeros(3))
             self._correction = before.then(reception.correction)
-        self.tracker.predict(time)
         found = in_plane(reception.detections)
         if self._doubts is None:
             self.tracker.update(found, own_pose)
@@ -174,7 +177,8 @@ class ActiveTerminal:
             self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
-            seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
+            where = mates if self._receiver.settings.self_calibration == "positions" else ()
+            seen = echoes(reception.looks, self.calibration.waveform, own_pose, where, tracks)
             change = self.calibration.learn_all(seen, reception.neighbours)
             for track in self.tracker.tracks:
                 track.state = seen_after(track.state, own_pose, change, 2)
@@ -191,7 +195,16 @@ class ActiveTerminal:
         `other`, which is given the same."""
         if self.other is not None:
             return self.other.receive(cube, payload, clutter, maps)
-        return self._receiver.receive(cube, payload, clutter, maps=maps)
+        return self._receiver.receive(cube, payload, clutter, maps=maps, sought=self._gates)
+
+    def _sought(self, own: Pose, mates: Sequence[Pose]) -> Gates | None:
+        """Where the frame's tracks and other terminals are expected; None: that is not asked for."""
+        if self._receiver.settings.gate_false_alarm_rate is None:
+            return None
+        told = [of_itself(mate) for mate in mates]
+        # the error of the own pose is as large as what a mate states of its own
+        told = [Gaussian(np.pad(m, (0, 3)), np.pad(2 * P, (0, 3))) for m, P in told]
+        return Gates(*reported([t.state for t in self.tracker.tracks] + told, own))
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""

@@ -233,7 +233,7 @@ def test_expected_count_is_that_of_a_fine_scan():
     above = np.concatenate(
         [(np.abs(part @ fine.conj().T) ** 2).max(axis=1) / 16 > 7 for part in np.array_split(x, 20)]
     )
-    p = float(expected_count(np.array(7.0), beams))
+    p = float(expected_count(7.0, beams.lengths, beams.area))
     assert above.mean() == pytest.approx(p, abs=5 * np.sqrt(p / draws) + 0.05 * p)
 
 

@@ -17,7 +17,9 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)
@@ -190,3 +192,21 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
         assert sorted(found.files) == sorted(expected)
         for name, value in expected.items():
             assert np.array_equal(found[name], value, equal_nan=value.dtype.kind == "f"), name
+
+
+def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
+    """A mate 20 m ahead that recedes at 3 m/s, and the track of an echo, straight ahead too, one
+    frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none where it is not asked for.
+    Planted bug: gates of the frame before."""
+    rule = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-3)
+    at = ActiveTerminal(W, ANTENNAS, rule, Tracking())
+    own = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+    mate = replace(own, position=np.array([0.0, 20.0, 0.0]), velocity=np.array([0.0, 3.0, 0.0]))
+    body = Gaussian(np.array([0.0, 30.0, 0, 0, -4.0, 0, 0, 0, 0]), 0.01 * np.eye(9))
+    at.tracker.tracks, at.tracker.time = [Track(0, body, 10.0)], 0.0
+    at.tracker.predict(0.5)
+    sought = at._sought(own, [mate])
+    np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(sought.std[1, :2], 0.05 * np.sqrt(2))
+    plain = ActiveTerminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())
+    assert plain._sought(own, [mate]) is None

@@ -88,12 +88,20 @@ def scanned(
     return sides, area
 
 
-def expected_count(t: np.ndarray, beams: Beams) -> np.ndarray:
-    """Mean Euler characteristic of {T > t}; at least that of one beam."""
+def scanned_within(
+    channels: Channels, wavenumber: float, width: np.ndarray
+) -> tuple[tuple[float, ...], float]:
+    """`scanned` of directions within a box, so wide (2,) in both cosines."""
+    sides, area = scanned(channels, wavenumber, 0.5)
+    return (sides[0] * width[0], sides[1] * width[1]), area * width[0] * width[1]
+
+
+def expected_count(t: np.ndarray | float, lengths: tuple[float, ...], area: float) -> np.ndarray:
+    """Mean Euler characteristic of {T > t} over directions of such lengths and area (`scanned`); at
+    least that of one beam."""
     t = np.asarray(t, float)
-    more = sum(beams.lengths) * np.sqrt(np.maximum(t, 0) / np.pi) + beams.area * np.maximum(
-        2 * t - 1, 0
-    ) / (2 * np.pi)
+    more = sum(lengths) * np.sqrt(np.maximum(t, 0) / np.pi)
+    more = more + area * np.maximum(2 * t - 1, 0) / (2 * np.pi)
     return np.exp(-t) * (1 + more)
 
 
@@ -109,11 +117,10 @@ def scan_threshold(beams: tuple[Beams, ...], false_alarm_rate: float) -> float:
 def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
     """`scan_threshold` of scans of such lengths and areas (`scanned`)."""
     grid = np.arange(0, 200, 0.01)
-    nothing = np.zeros((0, 3)), np.zeros((0, 0))
     density = np.zeros_like(grid)
     density[0] = 1.0
     for lengths, area in sizes:
-        below = np.exp(-expected_count(grid, Beams(*nothing, lengths, area)))
+        below = np.exp(-expected_count(grid, lengths, area))
         one = np.diff(np.maximum.accumulate(below), prepend=0.0)
         size = 2 * grid.size
         density = np.fft.irfft(np.fft.rfft(density, size) * np.fft.rfft(one, size), size)[

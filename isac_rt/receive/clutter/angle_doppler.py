@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -17,10 +18,11 @@ from isac_rt.receive.clutter.coherent import (
     search_white,
     searches,
 )
+from isac_rt.receive.clutter.gates import gates_of, seek
 from isac_rt.receive.clutter.detectors import ClutterDetector, Judged
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter, Gates
 
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
@@ -30,8 +32,17 @@ PRUNED = 0.9
 misses a tenth of a peak at most."""
 
 
+@dataclass(frozen=True)
 class AngleDoppler(ClutterDetector):
-    """All channels of every cell coherently, whitened where clutter is expected."""
+    """All channels of every cell coherently, whitened where clutter is expected.
+
+    Attributes
+    ----------
+    sought : where UAVs are expected, with a threshold of their own
+        (`isac_rt.receive.clutter.gates`); None: nowhere
+    """
+
+    sought: Gates | None = None
 
     def judge(
         self, frames: Sequence[np.ndarray], known: Known, clutter: ExpectedClutter | None = None
@@ -63,14 +74,28 @@ class AngleDoppler(ClutterDetector):
             cosines[found.cell] = found.cosines
 
         note(plain, limits[0])
-        cluttered = np.fft.ifftshift(expected, axes=1).ravel()[plain.cell] > LEAST * noise
-        cell = plain.cell[cluttered & (plain.peak > PRUNED * limits[1][0])]
-        R = Bucketed.of(clutter, known, arms, noise, self.taper).covariances(
-            *np.divmod(cell, power.shape[1])
-        )
-        x = maps[arms.channels.tx, arms.channels.rx].reshape(len(arms.channels), -1)[:, cell]
-        x = np.ascontiguousarray(x.T) / np.float32(np.sqrt(noise))
-        note(search_white(x, R, cell, arms, PRUNED * limits[1][0]), limits[1])
+        filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST * noise
+        cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
+        bucketed = Bucketed.of(clutter, known, arms, noise, self.taper)
+
+        def heard(cell: np.ndarray, search: Search) -> np.ndarray:
+            c = search.channels
+            x = maps.reshape(*maps.shape[:2], -1)[c.tx[:, None], c.rx[:, None], cell]
+            return np.ascontiguousarray(x.T) / np.float32(np.sqrt(noise))
+
+        R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
+        note(search_white(heard(cell, arms), R, cell, arms, PRUNED * limits[1][0]), limits[1])
+        sought = () if self.sought is None else gates_of(self.sought, known, len(power))
+        for gate in sought:
+            if (gate.holds(cosines[gate.cell]) & (ratio[gate.cell] > 1)).any():
+                continue
+            quiet = not filled[gate.cell].any()
+            search = everything if quiet else arms
+            R = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
+            found = seek(gate, heard(gate.cell, search), R, search)
+            limit = gate.threshold(search, self.settings.gate_false_alarm_rate)
+            if found.peak[0] > limit:
+                ratio[found.cell], cosines[found.cell] = found.peak / limit, found.cosines
         rows, bins = power.shape
         shown = [
             np.fft.fftshift(a.reshape(rows, bins, *a.shape[1:]), axes=1)
