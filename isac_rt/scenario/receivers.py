@@ -159,6 +159,12 @@ class Receivers(Node):
         return self.update_false_alarm_rate or self.false_alarm_rate, self.false_alarm_rate
 
     @property
+    def gate_rate(self) -> float:
+        """Of a detection in the gate of an expected UAV; that of any other cell where the gate has
+        none of its own."""
+        return self.gate_false_alarm_rate or self.false_alarm_rates[0]
+
+    @property
     def needs_mesh(self) -> bool:
         """Whether the detector predicts clutter from a city's mesh."""
         return self.clutter_detector in ("map", "angle_doppler")

@@ -198,7 +198,7 @@ class ActiveTerminal:
         return self._receiver.receive(cube, payload, clutter, maps=maps, sought=self._gates)
 
     def _sought(self, own: Pose, mates: Sequence[Pose]) -> Gates | None:
-        """Where the frame's tracks and other terminals are expected; None: that is not asked for."""
+        """Where tracks and other terminals are expected; None: that is not asked for."""
         if self._receiver.settings.gate_false_alarm_rate is None:
             return None
         told = [of_itself(mate) for mate in mates]

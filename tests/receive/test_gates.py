@@ -76,9 +76,7 @@ def test_a_weak_echo_is_found_where_it_is_expected_and_nowhere_else():
     for (row, column), (x, z) in zip(places, towards, strict=True):
         wave = c.steering(np.array([[x, 0.0, z]]), SENT)[0]
         maps[c.tx, c.rx, row, column] = np.sqrt(0.01 * 11 / len(c)) * wave
-    settings = Receivers(
-        clutter_detector="angle_doppler", gate_false_alarm_rate=1e-2
-    )
+    settings = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-2)
     sought = np.array([at(*p, u) for p, u in zip(places[:3], towards[:3], strict=True)])
     gates = Gates(sought, np.tile([0.02, 0.05, 0.01, 0.01], (3, 1)))
     (without,) = AngleDoppler(settings).judge([maps], SENT, NOTHING)
@@ -90,7 +88,8 @@ def test_a_weak_echo_is_found_where_it_is_expected_and_nowhere_else():
     assert [d <= 1 for d in near] == [True] * 3 + [False] * 3
     assert not (judged.sure > 1).any()
     for (row, column), u in zip(places[:3], towards[:3], strict=True):
-        seen = judged.cosines[row - 1 : row + 2, column + half - 1 : column + half + 2].reshape(-1, 2)
+        near_it = np.s_[row - 1 : row + 2, column + half - 1 : column + half + 2]
+        seen = judged.cosines[near_it].reshape(-1, 2)
         assert np.nanmin(np.abs(seen - u).max(axis=1)) < 0.1
 
 

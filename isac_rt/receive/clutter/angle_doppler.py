@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,8 @@ from isac_rt.receive.clutter.coherent import (
     search_white,
     searches,
 )
-from isac_rt.receive.clutter.gates import gates_of, seek
 from isac_rt.receive.clutter.detectors import ClutterDetector, Judged
+from isac_rt.receive.clutter.gates import Gate, gates_of, seek
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate
 from isac_rt.receive.types import ExpectedClutter, Gates
@@ -85,15 +85,12 @@ class AngleDoppler(ClutterDetector):
 
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
         note(search_white(heard(cell, arms), R, cell, arms, PRUNED * limits[1][0]), limits[1])
-        sought = () if self.sought is None else gates_of(self.sought, known, len(power))
-        for gate in sought:
-            if (gate.holds(cosines[gate.cell]) & (ratio[gate.cell] > 1)).any():
-                continue
+        for gate in self._gates(known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
             search = everything if quiet else arms
-            R = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
-            found = seek(gate, heard(gate.cell, search), R, search)
-            limit = gate.threshold(search, self.settings.gate_false_alarm_rate)
+            whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
+            found = seek(gate, heard(gate.cell, search), whiten, search)
+            limit = gate.threshold(search, self.settings.gate_rate)
             if found.peak[0] > limit:
                 ratio[found.cell], cosines[found.cell] = found.peak / limit, found.cosines
         rows, bins = power.shape
@@ -103,6 +100,14 @@ class AngleDoppler(ClutterDetector):
         ]
         held_up = self._unexplained(power / (noise + expected), shown[0])
         return Judged(shown[0] / held_up, shown[1] / held_up, noise + expected, shown[2])
+
+    def _gates(
+        self, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
+    ) -> Iterator[Gate]:
+        """Where UAVs are sought in which nothing was found yet."""
+        for gate in () if self.sought is None else gates_of(self.sought, known, rows):
+            if not (gate.holds(cosines[gate.cell]) & (ratio[gate.cell] > 1)).any():
+                yield gate
 
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""

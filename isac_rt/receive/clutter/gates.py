@@ -71,7 +71,8 @@ def gates_of(expected: Gates, known: Known, rows: int) -> Iterator[Gate]:
             continue
         cell = row[:, None] * w.num_chirps + column.astype(np.int64) % w.num_chirps
         half = DEVIATIONS * std[2:] + STEP / 2
-        lines = [u + h * np.linspace(-1, 1, 1 + 2 * int(np.ceil(h / STEP))) for u, h in zip(at[2:], half, strict=True)]
+        steps = [np.linspace(-h, h, 1 + 2 * int(np.ceil(h / STEP))) for h in half]
+        lines = [u + step for u, step in zip(at[2:], steps, strict=True)]
         u = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
         yield Gate(cell.ravel(), u[(u**2).sum(axis=1) <= 1], at[2:], half)
 
