@@ -60,6 +60,19 @@ def tracked_states(dataset: xr.Dataset) -> np.ndarray:
     return np.asarray(dataset.track_state.values + np.concatenate(of, axis=1))
 
 
+def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray:
+    """(B, 3) where the picture of a terminal, or of the swarm, has bodies that are no terminals
+    [m]; none where terminals do not cooperate."""
+    if "picture" not in dataset.variables:
+        return np.zeros((0, 3))
+    mine = (
+        (dataset.fused_frame.values == frame)
+        & (dataset.fused_picture.values == list(dataset.picture.values).index(picture))
+        & (dataset.fused_terminal.values < 0)
+    )
+    return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
+
+
 class Column(NamedTuple):
     """How an array of the dataset is made: from which attribute (or by which function) of an
     `ObserverRecord` or a `PathSet`, over which dimensions beside frame and observer (or beside a

@@ -12,7 +12,7 @@ from matplotlib.animation import FuncAnimation, writers
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from isac_rt.frame.antennas import unit_vector
+from isac_rt.results.dataset import fused_positions, tracked_states
 from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
 from isac_rt.results.swarm import SWARM
@@ -26,42 +26,13 @@ _LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
 
 
 def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
-    """(K, 3) where a terminal's confirmed tracks lie in the world [m], as it sees them: its own
-    pose, a range and a direction.
-
-    Of a passive terminal the line of sight alone: the other ranges are path lengths.
-    """
-    name = str(dataset.receiver.values[observer])
-    own, monostatic = (
-        list(dataset.uav.values).index(name),
-        str(dataset.transmitter.values[observer]) == name,
-    )
+    """(K, 3) where a terminal's confirmed tracks lie in the world [m], as it sees them."""
     mine = (
         (dataset.track_frame.values == frame)
         & (dataset.track_observer.values == observer)
         & dataset.track_confirmed.values
     )
-    if not monostatic:
-        sender = list(dataset.uav.values).index(str(dataset.transmitter.values[observer]))
-        mine &= dataset.track_uav.values == sender
-    u = np.column_stack([dataset.track_u_x.values[mine], dataset.track_u_z.values[mine]])
-    rotation = dataset.uav_attitude.values[frame, own]
-    return dataset.uav_position.values[frame, own] + dataset.track_range.values[mine, None] * (
-        unit_vector(u) @ rotation.T
-    )
-
-
-def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray:
-    """(B, 3) where the picture of a terminal, or of the swarm, has bodies that are no terminals
-    [m]; none where terminals do not cooperate."""
-    if "picture" not in dataset.variables:
-        return np.zeros((0, 3))
-    mine = (
-        (dataset.fused_frame.values == frame)
-        & (dataset.fused_picture.values == list(dataset.picture.values).index(picture))
-        & (dataset.fused_terminal.values < 0)
-    )
-    return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
+    return tracked_states(dataset)[mine, :3]
 
 
 def animate(

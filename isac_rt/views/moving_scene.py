@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from isac_rt.results.dataset import tracked_states
+from isac_rt.results.dataset import fused_positions, tracked_states
+from isac_rt.results.swarm import SWARM
 from isac_rt.views.export import path_lines
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
@@ -139,7 +140,8 @@ def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> d
 
 
 class _Moving:
-    """The traces that change from frame to frame: UAVs, tracks of each observer, paths by kind."""
+    """The traces that change from frame to frame: UAVs, tracks of each observer, what terminals
+    that cooperate know together, paths by kind."""
 
     def __init__(self, dataset: xr.Dataset) -> None:
         self._d, self._states = dataset, tracked_states(dataset)[:, :3]
@@ -147,9 +149,12 @@ class _Moving:
         kinds = dataset.kind.values
         self._kinds = [int(k) for k in shown if kinds[k] not in ("diffuse", "leakage")]
         self._kept = np.unique(dataset.path_frame.values)
+        together = "picture" in dataset.variables
+        self._pictures = [str(name) for name in dataset.picture.values] if together else []
         self.names = [
             "UAVs",
             *(f"tracks of {observer}" for observer in dataset.observer.values),
+            *(f"picture of {'the ' * (name == SWARM)}{name}" for name in self._pictures),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
         ]
         self._paths = {int(kept): self._paths_of(int(kept)) for kept in self._kept}
@@ -177,9 +182,20 @@ class _Moving:
             }
             for o in range(d.sizes["observer"])
         ]
+        pictures = [
+            {**mark, "marker": self._mark(name), **points_of(fused_positions(d, frame, name))}
+            for name in self._pictures
+        ]
         nearest = self._kept[np.argmin(np.abs(self._kept - frame))] if self._kept.size else -1
-        traces = [uavs, *tracks, *self._paths.get(int(nearest), [])]
+        traces = [uavs, *tracks, *pictures, *self._paths.get(int(nearest), [])]
         return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
+
+    def _mark(self, name: str) -> dict[str, Any]:
+        """How the bodies of a picture are drawn."""
+        if name == SWARM:
+            return {"size": 9, "symbol": "diamond-open", "color": "black"}
+        uav = self._d.uav.values.tolist().index(name)
+        return {"size": 6, "symbol": "square-open", "color": colour_of(uav)}
 
     def _of(self, rows: str, frame: int, observer: int) -> np.ndarray:
         mine = self._d[f"{rows}_observer"].values == observer

@@ -11,6 +11,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive import Reception
 from isac_rt.receive.types import Detections
+from isac_rt.results.dataset import fused_positions
 from isac_rt.results.provenance import run_content
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM
@@ -21,8 +22,10 @@ from isac_rt.simulation.cooperation import look_of
 from isac_rt.simulation.resume import Resume
 from isac_rt.terminal.filter import Gaussian, measure
 from isac_rt.terminal.tracker import Track, track_set
-from isac_rt.views.animate import animate, fused_positions
+from isac_rt.views.animate import animate
+from isac_rt.views.moving_scene import moving_scene
 from isac_rt.views.report import swarm_table
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
 
@@ -162,9 +165,15 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     assert table.rows[2][-3] == str(told["left_out"]) and told["left_out"] > 0
     assert told["bits"] < told["bits_room"] == 886 * 7
     d = talked.dataset
+    corners, faces = np.eye(3), np.array([[0, 1, 2]])
+    roof = CityMesh("roof", corners, faces, np.zeros(1, np.int16), (), np.zeros(3))
+    scene = moving_scene(d, roof)
     for name in ("AT", "PT", SWARM):
         (found,) = fused_positions(d, 8, name)
         assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
+        bodies = {trace["name"]: trace for trace in scene["frames"][8]["data"]}
+        shown = bodies["picture of the swarm" if name == SWARM else f"picture of {name}"]
+        assert [shown[a] for a in "xyz"] == np.round(found, 2)[:, None].tolist()
     alone = d.drop_vars([name for name in d.variables if name == "picture"])
     assert fused_positions(alone, 8, SWARM).shape == (0, 3)
     figure, moving = animate(talked, 0)

@@ -29,14 +29,14 @@ def results() -> Results:
 
 def test_tracks_lie_where_the_uavs_are(results):
     """The active terminal's track of P and P's reference, placed in the world, within 0.2 m of the
-    truth (0.4 mrad of the cosines at 20 m, a tenth of a range cell). Planted bug: the attitude not
-    applied."""
+    truth (0.4 mrad of the cosines at 20 m, a tenth of a range cell). Planted bug: the terminal's
+    own place left out."""
     d = results.dataset
     for observer, other in ((0, 1), (1, 0)):
         found = tracked_positions(d, 3, observer)
         near = np.linalg.norm(found - d.uav_position.values[3, other], axis=1)
         assert len(found) == 0 or near.min() < 0.2
-    assert len(tracked_positions(d, 3, 1)) == 1
+    assert len(tracked_positions(d, 3, 1)) >= 1
 
 
 def test_a_moving_picture_has_a_picture_per_map(results, tmp_path):
