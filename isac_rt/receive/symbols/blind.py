@@ -349,10 +349,17 @@ def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.nda
     coarse = coarse * FASTEST / cell  # within a frame
     nearest = np.abs(rates[:, None] - coarse).argmin(axis=1)
     total = np.zeros((rates.size, bends.size), np.complex128)
+    within = np.zeros(coarse.size)
     for one in seen:
         inside = np.exp(2j * np.pi * (one.cell - coarse[:, None] * one.time)).sum(axis=1)
         moved = rates[:, None] * one.middle + bends * (one.middle**2 / 2)
         total += inside[nearest, None] * np.exp(-2j * np.pi * moved)
+        within += np.abs(inside) ** 2
+    gaps = np.diff([one.middle for one in seen if one.cell.size])
+    if gaps.size:  # whole cells from frame to frame turn nothing but the frames' own rates
+        own = _own_rate(seen, float(coarse[within.argmax()]))
+        middle = sum(one.middle * one.cell.size for one in seen) / count
+        total[np.abs(rates[:, None] + bends * middle - own) > 0.5 / gaps.min()] = 0
     i, j = np.unravel_index(np.abs(total).argmax(), total.shape)
     state = np.array([np.angle(total[i, j]) / (2 * np.pi), rates[i], bends[j]])
     time = np.concatenate([one.middle + one.time for one in seen])
@@ -372,10 +379,24 @@ def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.nda
     if comb < LEAST_COMB or near.sum() < LEAST_CHIRPS:
         return None
     own = np.concatenate([one.time for one in seen])[near]
-    gaps = np.diff([one.middle for one in seen if one.cell.size])
     if gaps.size and ALIAS_STDS * np.sqrt(spread / (own @ own)) > 0.5 / gaps.min():
         return None
     return state, covariance
+
+
+def _own_rate(seen: Sequence[_Seen], rate: float) -> float:
+    """Rate [cells/s] at which cells move within frames, whatever they do from one to the next."""
+    time = np.concatenate([one.time for one in seen])
+    for _ in range(4):
+        parts = []
+        for one in seen:
+            off = one.cell - rate * one.time
+            off = off - np.angle(np.exp(2j * np.pi * off).sum()) / (2 * np.pi)
+            parts.append(off - np.round(off))
+        off = np.concatenate(parts)
+        near = np.abs(off) < FRACTION
+        rate += float(time[near] @ off[near] / max(time[near] @ time[near], 1e-300))
+    return rate
 
 
 def _whole_cells(seen: Sequence[_Seen], state: np.ndarray, symbols: int) -> int | None:
