@@ -18,7 +18,7 @@ from isac_rt.cli.arguments import (
     check_frame,
     check_names,
 )
-from isac_rt.cli.console import err, out, say, say_table, with_progress, working
+from isac_rt.cli.console import Report, err, out, say, say_table, with_progress, working
 from isac_rt.cli.interruption import ending_soon_after_interrupt
 
 if TYPE_CHECKING:
@@ -98,13 +98,19 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     _say_budget(budget)
     if resume.begun:
         err().print(f"going on after the frames in {resume.file}", soft_wrap=True)
-    results = with_progress(
-        lambda report: simulate.run(
-            loaded, setup=setup, progress=report, snapshots=snapshots, resume=resume
-        ),
-        "frames",
-        loaded.frames,
-    )
+
+    def simulated(report: Report) -> Results:
+        def progress(done: int, total: int) -> None:
+            report(done, total)
+            if done < total:  # what draws is loaded while receivers are at work
+                import isac_rt.views.figures
+                import isac_rt.views.report  # noqa: F401
+
+        return simulate.run(
+            loaded, setup=setup, progress=progress, snapshots=snapshots, resume=resume
+        )
+
+    results = with_progress(simulated, "frames", loaded.frames)
     if check_budget:
         from isac_rt.simulation.audit import check
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathSet
@@ -24,6 +23,9 @@ from isac_rt.results.records import (
     ObserverRecord,
     PictureRecord,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Row = dict[str, Any]
 """A frame, or an observer in it, as numbers, arrays and further rows by name."""
@@ -558,6 +560,8 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
     rows : of `row_of`
     states : names of the terminals' state codes
     """
+    import xarray as xr  # as dear as a frame, and not needed before the last
+
     w, labels = timetable.waveform, list(timetable.labels.values())
     uavs, roles = list(timetable.first_roles), list(timetable.first_roles.values())
     out: dict[str, xr.Variable] = {}

@@ -12,18 +12,17 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5netcdf
-import h5py
-import xarray as xr
 from pydantic import BaseModel
-from xarray.backends import H5NetCDFStore
 
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError, shortly
 from isac_rt.scenario.file import to_yaml
 from isac_rt.storage import BAD_DATA, read_whole, write_whole
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FILE = "results.nc"
 
@@ -51,6 +50,9 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
 
     It is made in memory: on a full disk the library that makes it may end the process.
     """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
     encoding = {
         name: {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
         for name, v in dataset.variables.items()
@@ -70,6 +72,9 @@ def read_dataset(file: Path) -> xr.Dataset:
     ------
     OSError, MemoryError or one of `BAD_DATA`  If it is none, or bent.
     """
+    import h5py
+    import xarray as xr
+
     if not file.is_file():
         raise OSError(f"{file} is no file" if file.exists() else f"there is no {file}")
     with h5py.File(file) as whole:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
@@ -18,6 +17,9 @@ from isac_rt.results.records import KINDS, FrameRecord, LateRecord
 from isac_rt.results.sensing import Sensing, latencies, summary_block
 from isac_rt.results.swarm import summary_of
 from isac_rt.scenario.tree import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STAGES = ("setup", "trace", "synthesis", "receive", "track")
 TIMINGS = (*STAGES, "other", "total", "wall")

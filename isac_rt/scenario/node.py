@@ -53,9 +53,7 @@ def _holds_bool(value: Any) -> bool:
 class Node(BaseModel):
     """One mapping of the tree."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod

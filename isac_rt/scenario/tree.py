@@ -7,8 +7,11 @@ Files are read and written by `isac_rt.scenario.file`.
 
 from __future__ import annotations
 
+import ast
+import inspect
 import itertools
 import math
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -616,7 +619,39 @@ def json_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **Scenario.model_json_schema(),
     }
-    for node in (tree, *tree["$defs"].values()):
-        for entry in (node, *node.get("properties", {}).values()):
-            entry["description"] = " ".join(entry["description"].split())
+    every = [*_descendants(Node)]
+    nodes = {node.__name__: node for node in every}  # two of one name go by their modules too
+    nodes |= {f"{node.__module__}.{node.__name__}".replace(".", "__"): node for node in every}
+    for name, entry in {"Scenario": tree, **tree["$defs"]}.items():
+        entry["description"] = " ".join(entry["description"].split())
+        said = _docstrings(nodes[name])
+        for key, own in entry.get("properties", {}).items():
+            own["description"] = " ".join(said[key].split())
+            entry["properties"][key] = dict(sorted(own.items()))
     return tree
+
+
+def _descendants(node: type[Node]) -> Iterator[type[Node]]:
+    for kind in node.__subclasses__():
+        yield kind
+        yield from _descendants(kind)
+
+
+def _docstrings(node: type[Node]) -> dict[str, str]:
+    """What stands under each field of a node and of those that it extends.
+
+    The source is read here, for the schema alone: pydantic's `use_attribute_docstrings` does it for
+    each model at every import.
+    """
+    found: dict[str, str] = {}
+    for kind in (kind for kind in reversed(node.__mro__) if issubclass(kind, Node)):
+        parsed = ast.walk(ast.parse(textwrap.dedent(inspect.getsource(kind))))
+        definition = next(part for part in parsed if isinstance(part, ast.ClassDef))
+        for two in itertools.pairwise(definition.body):
+            match two:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=field)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    found[field] = text
+    return found

@@ -465,8 +465,9 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     )
     _ = setup.calibration  # a file that is none is refused here
     setup = _connected(setup)
+    setup = replace(setup, seconds=Seconds.of_process() - begin)
     warn_of_unseen(setup.coverage)
-    return replace(setup, seconds=Seconds.of_process() - begin)
+    return setup
 
 
 def _maker(

@@ -328,6 +328,21 @@ def test_help_loads_nothing_heavy():
     assert done.stderr.strip() == "[]" and "doctor" in done.stdout
 
 
+def test_a_run_begins_without_what_writes_and_draws_its_results():
+    """They take as long to load as a frame to make. Planted bug: `import xarray as xr` at the top
+    of results/dataset.py."""
+    heavy = ("xarray", "pandas", "h5py", "matplotlib", "sionna")
+    code = (
+        "import sys; from isac_rt.cli import simulation; import isac_rt.scenario.file, "
+        "isac_rt.results.files, isac_rt.simulation.resume, isac_rt.simulation.simulate; "
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
 @pytest.mark.parametrize("stuck", ["time.sleep(60)", "native()"])
 def test_interrupt_ends_within_two_seconds(stuck, scenario_file, tmp_path):
     """Also inside a native call that Python cannot interrupt, with a partial file on disk. Seen

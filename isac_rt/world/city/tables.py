@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import shapely
 
 from isac_rt.world.city.buildings import Feature
@@ -129,6 +128,8 @@ def _features(table: Any, name: str) -> list[Feature]:
 
 def _plain(value: Any) -> Any:
     """A cell as JSON would hold it."""
+    import pandas as pd  # most cities are read without
+
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray | list):  # GeoParquet's, of which no tag is one
