@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,9 +102,8 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     def simulated(report: Report) -> Results:
         def progress(done: int, total: int) -> None:
             report(done, total)
-            if done < total:  # what draws is loaded while receivers are at work
-                import isac_rt.views.figures
-                import isac_rt.views.report  # noqa: F401
+            if done < total:  # while receivers are at work
+                _drawing()
 
         return simulate.run(
             loaded, setup=setup, progress=progress, snapshots=snapshots, resume=resume
@@ -118,13 +117,19 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
             results.summary["fidelity"]["checked"] = check(setup)
     save(results, folder)
     with working("figures and report"):
-        from isac_rt.views.figures import make_figures
-        from isac_rt.views.report import write_report
-
+        make_figures, write_report = _drawing()
         pictures = make_figures(results, folder, setup.city)
         write_report(results, folder, pictures, setup.city)
     resume.remove()
     _say_summary(results)
+
+
+def _drawing() -> tuple[Callable[..., list[Path]], Callable[..., Path]]:
+    """What draws the figures and what writes the report, loaded at the first call."""
+    from isac_rt.views.figures import make_figures
+    from isac_rt.views.report import write_report
+
+    return make_figures, write_report
 
 
 def _say_city(notes: Sequence[str]) -> None:
