@@ -72,7 +72,7 @@ class CfarRule:
 
     def factors(self, rows: int) -> np.ndarray:
         """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
-        return np.array([_factor(self, *count) for count in self.side_rows(rows).tolist()])
+        return _factors(self, rows)
 
     def detect(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells above the threshold, and the background of every cell.
@@ -155,6 +155,14 @@ def _factor(rule: CfarRule, before: int, behind: int) -> float:
     across = independent_cells(2 * (rule.guard[1] + rule.training[1]) + 1)
     sides = (independent_cells(rows) * across for rows in (before, behind))
     return greatest_of_factor(rule.rate, float(rule.looks), *sides)
+
+
+@lru_cache(maxsize=64)
+def _factors(rule: CfarRule, rows: int) -> np.ndarray:
+    """`CfarRule.factors`."""
+    out = np.array([_factor(rule, *count) for count in rule.side_rows(rows).tolist()])
+    out.setflags(write=False)
+    return out
 
 
 @lru_cache(maxsize=256)

@@ -126,9 +126,9 @@ def pursue(
         rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
         if not rows.size:
             break
-        _find(left, power, level, (rows, bins), found, taken, known, noise)
+        changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
         if len(found) < settings.max_detections:
-            power = power_map(left, known)
+            _map_again(power, left, changed, known)
     return [f.estimate for f in found], np.array([f.snr for f in found]), whole
 
 
@@ -138,7 +138,8 @@ def take_strong(
     """Paths `STRONG_DB` over the noise and more, their SNR, the spectra without them, and the map
     (rows, P) with them; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
-    power = whole = power_map(left, known)
+    power = power_map(left, known)
+    whole = power.copy()
     noise = max(float(np.median(power)), 1e-30)
     taken, level = np.zeros(power.shape), np.full(power.shape, noise)
     found: list[_Path] = []
@@ -149,8 +150,8 @@ def take_strong(
         rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
         if not rows.size:
             break
-        _find(left, power, level, (rows, bins), found, taken, known, noise)
-        power = power_map(left, known)
+        changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
+        _map_again(power, left, changed, known)
     return [f.estimate for f in found], np.array([f.snr for f in found]), left, whole
 
 
@@ -163,10 +164,10 @@ def _find(
     taken: np.ndarray,
     known: Known,
     noise: float,
-) -> None:
+) -> np.ndarray:
     """Estimate the paths at some peaks of the map of what is `left`, take them out, and estimate
-    again what they touch; in place."""
-    new = []
+    again what they touch; in place. (rows,) bool, which rows that changes."""
+    new, changed = [], np.zeros(left.shape[2], bool)
     for row, column in zip(cells[0].tolist(), cells[1].tolist(), strict=True):
         peak = float(power[row, column])
         local = LocalSpectra(left, known, row)
@@ -174,8 +175,15 @@ def _find(
         new.append(_Path(estimate, peak, peak / float(level[row, column])))
         _take_out(left, new[-1], known, noise)
         _mark(taken, row, column, peak)
+        changed[slice(*new[-1].rows)] = True
     found += new
-    _fit_again(left, found, len(new), known, noise)
+    _fit_again(left, found, len(new), known, noise, changed)
+    return changed
+
+
+def _map_again(power: np.ndarray, left: np.ndarray, changed: np.ndarray, known: Known) -> None:
+    """Make the rows of the map anew in which something was taken out, in place."""
+    power[changed] = power_map(np.ascontiguousarray(left[:, :, changed]), known)
 
 
 def sidelobe_floor(known: Known) -> float:
@@ -197,10 +205,16 @@ def _mark(taken: np.ndarray, row: int, column: int, peak: float) -> None:
 
 
 def _fit_again(
-    spectra: np.ndarray, found: list[_Path], count: int, known: Known, noise: float
+    spectra: np.ndarray,
+    found: list[_Path],
+    count: int,
+    known: Known,
+    noise: float,
+    changed: np.ndarray,
 ) -> None:
     """Estimate the last `count` paths and those that they touch once more, each with the others
-    taken out; in place. A path that nothing touches stays as it is."""
+    taken out; in place, and mark the rows that are `changed`. A path that nothing touches stays as
+    it is."""
     w = known.waveform
     power = np.array([f.power for f in found])
     rate = 1 / (w.frame_duration * w.effective_carrier)
@@ -224,11 +238,13 @@ def _fit_again(
         for k in near:
             path, before = found[k], found[k].estimate
             _add(spectra, path, known, 1.0)
+            changed[slice(*path.rows)] = True
             row = min(max(round(float(place[0, k])), 0), spectra.shape[2] - 1)
             local = LocalSpectra(spectra, known, row)
             path.estimate = refine(local, before.delay, before.delay_rate, CLOSE)
             if cycle == 0:
                 _take_out(spectra, path, known, noise)
+                changed[slice(*path.rows)] = True
             else:  # where it comes from it does not change any more
                 _add(spectra, path, known, -1.0)
             move = np.array(

@@ -32,15 +32,16 @@ def test_errors_of_the_synthesis_are_as_stated():
 
 @pytest.mark.slow
 def test_rows_of_the_reception():
-    """Both receivers find all four paths to a hundredth of a cell, and need less than three cubes
-    of memory."""
+    """Both receivers find all four paths to a hundredth of a cell, by joint refinement and by
+    pursuit too, and need less than three cubes of memory, a joint fit's transform one and a half
+    more."""
     rows = reception.rows(quick=True)
-    assert len(rows) == 2
+    assert len(rows) == 6
     for row in rows:
         assert set(REQUIRED) <= set(row)
         assert row["kind"] == "reception"
         assert row["error"] < 0.01
-        assert row["memory_cubes"] < 3
+        assert row["memory_cubes"] < (5 if "joint" in row["method"] else 3)
 
 
 @pytest.mark.slow

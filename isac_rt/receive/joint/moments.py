@@ -93,7 +93,7 @@ class Moments:
         late = size // 2 - (size - 1) / 2
         factors = weights.factors * self.known.phases.conj()
         turned = weights._replace(factors=factors)
-        _interpolate(self.spectrum, tones, turned, late, _kernel(), out)
+        _interpolate(self.spectrum.view(np.float32), tones, turned, late, _kernel(), out)
         return out
 
 
@@ -107,10 +107,10 @@ def _weights(length: int, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _kernel() -> np.ndarray:
-    """(STEPS, 4, TAPS) the kernel and its three derivatives at the taps about a frequency, in the
-    middle of each step from one grid point to the next."""
+    """(STEPS, 4, TAPS) float32, the kernel and its three derivatives at the taps about a frequency,
+    in the middle of each step from one grid point to the next."""
     place = (np.arange(STEPS) + 0.5) / STEPS
-    out = np.empty((STEPS, 4, TAPS))
+    out = np.empty((STEPS, 4, TAPS), np.float32)
     for j in range(TAPS):
 
         def kernel(part: np.ndarray, j: int = j) -> np.ndarray:
@@ -125,51 +125,57 @@ def _kernel() -> np.ndarray:
 
 @jit(fast=True)
 def _interpolate(spectrum, tones, weights, late, kernel, out):
-    """`Moments.of`; `late` is the place of sample N // 2 from the middle.
+    """`Moments.of`; `late` is the place of sample N // 2 from the middle, the spectrum real and
+    imaginary parts side by side.
 
     Receivers have frequencies of their own, a fraction of a grid point apart: their taps are
     weighted on a common stretch of the grid.
     """
     factors, place, _ = weights
-    num_groups, num_chirps, size, num_rx = spectrum.shape
-    steps, _, taps = kernel.shape
-    ramp, turn = np.empty(num_rx), np.empty(num_rx, np.complex128)
-    re, im = np.empty((2, num_rx)), np.empty((2, num_rx))
-    for k in range(len(out)):
+    num_groups, num_chirps, size, width = spectrum.shape
+    (steps, _, taps), num_rx = kernel.shape, width // 2
+    count = len(out)
+    ramp, turn = np.empty((count, num_rx)), np.empty((count, num_rx), np.complex128)
+    low, span = np.empty(count), np.empty(count, np.int64)
+    for k in range(count):
         for rx in range(num_rx):
             own = tones.delay[k, rx]
-            ramp[rx] = own * tones.slope * tones.interval
-            turns = own * tones.middle[k] - tones.slope * own * own / 2 + ramp[rx] * late
+            ramp[k, rx] = own * tones.slope * tones.interval
+            turns = own * tones.middle[k] - tones.slope * own * own / 2 + ramp[k, rx] * late
             angle = 2 * np.pi * (turns - np.floor(turns))
-            turn[rx] = complex(np.cos(angle), -np.sin(angle))
-        low = ramp.min()
-        span = taps + 1 + int(np.ceil((ramp.max() - low) * size))
-        weight, change = np.empty((span, num_rx)), np.empty((span, num_rx))
-        for m in range(num_groups):
-            for p in range(num_chirps):
+            turn[k, rx] = complex(np.cos(angle), -np.sin(angle))
+        low[k] = ramp[k].min()
+        span[k] = taps + 1 + int(np.ceil((ramp[k].max() - low[k]) * size))
+    zeroth, slant = np.empty(width, np.float32), np.empty(width, np.float32)
+    weight, change = np.empty((2, span.max(), width), np.float32)
+    tap = np.empty((2, taps), np.float32)
+    for m in range(num_groups):
+        for p in range(num_chirps):
+            for k in range(count):  # tones of like frequencies find each other's part of the grid
                 f = tones.frequency[k, m, p]
-                first = np.floor((f + low) * size)
-                weight[:], change[:], re[:], im[:] = 0.0, 0.0, 0.0, 0.0
+                first = np.floor((f + low[k]) * size)
+                weight[:], change[:], zeroth[:], slant[:] = 0.0, 0.0, 0.0, 0.0
                 for rx in range(num_rx):
-                    at = (f + ramp[rx]) * size
+                    at = (f + ramp[k, rx]) * size
                     whole = np.floor(at)
                     part = (at - whole) * steps
                     step = min(int(part), steps - 1)
-                    x, table = (part - step - 0.5) / steps, kernel[step]
-                    begin = int(whole - first)
+                    x, table = np.float32((part - step - 0.5) / steps), kernel[step]
+                    half = x / np.float32(2)
                     for i in range(taps):
                         k1, k2 = table[1, i], table[2, i]
-                        weight[begin + i, rx] = table[0, i] + x * (k1 + x / 2 * k2)
-                        change[begin + i, rx] = k1 + x * (k2 + x / 2 * table[3, i])
+                        tap[0, i] = table[0, i] + x * (k1 + half * k2)
+                        tap[1, i] = k1 + x * (k2 + half * table[3, i])
+                    begin = int(whole - first)
+                    for i in range(taps):
+                        weight[begin + i, 2 * rx] = weight[begin + i, 2 * rx + 1] = tap[0, i]
+                        change[begin + i, 2 * rx] = change[begin + i, 2 * rx + 1] = tap[1, i]
                 at = (int(first) - taps // 2 + 1) % size
-                for i in range(span):
-                    line = spectrum[m, p, at]
-                    for rx in range(num_rx):
-                        s = line[rx]
-                        re[0, rx] += weight[i, rx] * s.real
-                        im[0, rx] += weight[i, rx] * s.imag
-                        re[1, rx] += change[i, rx] * s.real
-                        im[1, rx] += change[i, rx] * s.imag
+                for i in range(span[k]):
+                    line, own_weight, own_change = spectrum[m, p, at], weight[i], change[i]
+                    for c in range(width):
+                        zeroth[c] += own_weight[c] * line[c]
+                        slant[c] += own_change[c] * line[c]
                     at += 1
                     if at == size:
                         at = 0
@@ -180,9 +186,9 @@ def _interpolate(spectrum, tones, weights, late, kernel, out):
                 a = place[m, p]
                 for rx in range(num_rx):
                     z = wobble * tones.delay[k, rx]
-                    one = back * turn[rx] * complex(1 - z * z / 2, -z * (1 - z * z / 6))
-                    total = complex(re[0, rx], im[0, rx]) * one
-                    slope = size / (2 * np.pi) * complex(-im[1, rx], re[1, rx]) * one
+                    one = back * turn[k, rx] * complex(1 - z * z / 2, -z * (1 - z * z / 6))
+                    total = complex(zeroth[2 * rx], zeroth[2 * rx + 1]) * one
+                    slope = size / (2 * np.pi) * complex(-slant[2 * rx + 1], slant[2 * rx]) * one
                     slope += late * total
                     for i in range(len(factors)):
                         out[k, 0, i, a, rx] += factors[i, m, p] * total

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.fft import fft
@@ -26,7 +27,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.passive import receive_passive
-from isac_rt.receive.types import Detections, Prediction
+from isac_rt.receive.types import Detections, Prediction, Reception
 from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Direct
@@ -36,6 +37,12 @@ from isac_rt.world.swarm import Pose
 SIZES = (1, 4, 8)
 QUICK_SIZES = (4,)
 _DPSK = 8
+SETTINGS = {
+    "": Receivers(),
+    ", refinement joint": Receivers(refinement="joint"),
+    ", velocity_method pursuit": Receivers(velocity_method="pursuit"),
+}
+"""Receivers by what is added to a row's name."""
 
 
 def _frame(count: int) -> tuple[IFCube, Payload, Antennas, Prediction]:
@@ -104,19 +111,19 @@ def _jobs(
     cube: IFCube, payload: Payload, antennas: Antennas, prediction: Prediction
 ) -> list[tuple[str, int, Callable[[], Detections]]]:
     """Name, passes of the way and work of each reception."""
-    settings = Receivers()
-    return [
-        (
-            "active terminal (DCA-SPE)",
-            2,
-            lambda: receive_active(cube, payload, antennas, settings).detections,
-        ),
-        (
-            "passive terminal (J-SPEDD)",
-            1,
-            lambda: receive_passive(cube, antennas, settings, _DPSK, prediction, True).detections,
-        ),
-    ]
+    out: list[tuple[str, int, Callable[[], Detections]]] = []
+    for named, settings in SETTINGS.items():
+        active = partial(receive_active, cube, payload, antennas, settings)
+        passive = partial(receive_passive, cube, antennas, settings, _DPSK, prediction, True)
+        out += [
+            (f"active terminal (DCA-SPE){named}", 2, partial(_found, active)),
+            (f"passive terminal (J-SPEDD){named}", 1, partial(_found, passive)),
+        ]
+    return out
+
+
+def _found(receive: Callable[[], Reception]) -> Detections:
+    return receive().detections
 
 
 def _transform_seconds(cube: IFCube, repeats: int) -> tuple[float, float]:
