@@ -40,6 +40,7 @@ from isac_rt.results.records import Use
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.simulation.plan import (
+    COUNTS_DB,
     MATTERS_DB,
     decisions,
     extent,
@@ -265,17 +266,24 @@ def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
     it be expected (`isac_rt.simulation.plan`)."""
     tracer = tracer_of(setup)
     assert tracer is not None
-    alone = 0
+    alone, weak, strong = 0, 0, 0
     for frame in frames:
         poses, found = setup.find(frame)
         when, links = setup.timetable.epoch(frame), list(found)
         halves = [tracer.by_half(k).trace(poses, when, links).paths for k in (0, 1)]
         for link in links:
             level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
-            here = [half[link] for half in halves]
-            here = [paths.select(paths.power > level * 10 ** (MATTERS_DB / 10)) for paths in here]
-            alone += sum(int((~present(here[k], here[1 - k])).sum()) for k in (0, 1))
-    return alone / len(frames)
+            first, second = (_over(half[link], level, COUNTS_DB) for half in halves)
+            more = second.select(~present(second, first))
+            alone += len(more) + int((~present(first, second)).sum())
+            weak += len(first) + len(more)
+            strong += sum(len(_over(paths, level, MATTERS_DB)) for paths in (first, more))
+    return strong * alone / (len(frames) * weak) if weak else 0.0
+
+
+def _over(paths: PathSet, level: float, decibels: float) -> PathSet:
+    """The paths over a level by so much."""
+    return paths.select(paths.power > level * 10 ** (decibels / 10))
 
 
 def _tracing_item(setup: Setup, frames: Sequence[int], seconds: float) -> Item:

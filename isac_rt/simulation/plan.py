@@ -14,11 +14,12 @@ Left out. Paths the IF filter stops in every group, chirp and symbol are left ou
 Ghosts and paths of the city so weak that all that are left out of one range cell together stay
 ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
 whatever the phases, on average. Chains of walls that no ray met are missed
-(`isac_rt.propagation.legs.chains`); those that are met are placed without error. As many paths over
-`MATTERS_DB` are taken to be missed as only one half of the knots finds, the even or the odd ones:
-the second half of the rays adds half of that number, and what all further rays would add is taken
-for twice as much as that. Chances of being met are spread over decades, so that rules for equal
-chances (capture and recapture) state a tenth of the truth and less.
+(`isac_rt.propagation.legs.chains`); those that are met are placed without error. The share of
+paths that is missed is taken for the share that only one half of the knots finds, the even or the
+odd ones: the second half of the rays adds half of that number, and what all further rays would add
+is taken for twice as much as that. Chances of being met are spread over decades, so that rules for
+equal chances (capture and recapture) state a tenth of the truth and less. All paths over
+`COUNTS_DB` show the share: those over `MATTERS_DB`, which count, are too few to.
 
 What is not modelled whatever the budget: directions that turn within a frame (`turning_bound`, no
 part of ``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, chirps that
@@ -55,6 +56,8 @@ FASTEST_UNTRACED_M = 4.0
 """Flight between knots under the preset fastest."""
 MATTERS_DB = -10.0
 """Paths over this count as missed [dB over the noise of a cell]."""
+COUNTS_DB = -40.0
+"""Paths over this show what share is missed [dB over the noise of a cell]."""
 FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
