@@ -29,6 +29,12 @@ CREASE = np.deg2rad(20.0)
 """Faces that meet at more than this have an edge drawn between them [rad]."""
 ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 _AXES = "xyz"
+_SHOWN = frozenset(
+    "uav role uav_position observer track_observer track_frame track_confirmed picture fused_frame "
+    "fused_picture fused_terminal fused_x fused_y fused_z".split()
+)
+"""What changes from frame to frame, beside paths. A look-up by name takes as long as the dataset has
+variables."""
 
 
 def layout(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
@@ -144,7 +150,8 @@ class _Moving:
     that cooperate know together, paths by kind."""
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        self._d, self._states = dataset, tracked_states(dataset)[:, :3]
+        self._d = dataset[[str(name) for name in dataset.variables if name in _SHOWN]]
+        self._states = tracked_states(dataset)[:, :3]
         shown = np.unique(dataset.path_kind.values)
         kinds = dataset.kind.values
         self._kinds = [int(k) for k in shown if kinds[k] not in ("diffuse", "leakage")]
@@ -157,7 +164,7 @@ class _Moving:
             *(f"picture of {'the ' * (name == SWARM)}{name}" for name in self._pictures),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
         ]
-        self._paths = {int(kept): self._paths_of(int(kept)) for kept in self._kept}
+        self._paths = {int(kept): self._paths_of(dataset, int(kept)) for kept in self._kept}
 
     def at(self, frame: int) -> list[Trace]:
         """The traces in a frame."""
@@ -201,13 +208,13 @@ class _Moving:
         mine = self._d[f"{rows}_observer"].values == observer
         return np.asarray(mine & (self._d[f"{rows}_frame"].values == frame))
 
-    def _paths_of(self, kept: int) -> list[Trace]:
+    def _paths_of(self, dataset: xr.Dataset, kept: int) -> list[Trace]:
         """The paths of a frame whose ledger is kept, by kind."""
-        kind, here = self._d.path_kind.values, self._d.path_frame.values == kept
+        kind, here = dataset.path_kind.values, dataset.path_frame.values == kept
         return [
             _line(
-                lines_of(list(path_lines(self._d, np.flatnonzero(here & (kind == k)), MOST_LINES))),
-                KIND_COLOURS[self._d.kind.values[k]],
+                lines_of(list(path_lines(dataset, np.flatnonzero(here & (kind == k)), MOST_LINES))),
+                KIND_COLOURS[dataset.kind.values[k]],
                 2,
                 "",
             )
