@@ -33,8 +33,8 @@ _SHOWN = frozenset(
     "uav role uav_position observer track_observer track_frame track_confirmed picture fused_frame "
     "fused_picture fused_terminal fused_x fused_y fused_z".split()
 )
-"""What changes from frame to frame, beside paths. A look-up by name takes as long as the dataset has
-variables."""
+"""What changes from frame to frame, beside paths. A look-up by name takes the longer the more
+variables a dataset has."""
 
 
 def layout(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
