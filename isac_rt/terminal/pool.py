@@ -50,7 +50,9 @@ from isac_rt.terminal.tracker import ROUNDING, assign
 from isac_rt.world.swarm import Pose
 
 BODY = 9
-"""States of a body; those of a terminal are its errors [m, m/s, rad, m]."""
+"""States of a body."""
+POSE = ERRORS - 1
+"""Those of a terminal are the errors of its pose [m, m/s, rad]; each link has one of its clocks."""
 ERROR_TIME = 10.0
 """Correlation time of a terminal's errors [s]: satellites and inertial sensors drift in seconds to
 minutes. A clock's error stays, and grows as looks state."""
@@ -153,8 +155,9 @@ class Body:
 
 @dataclass(frozen=True)
 class Pool:
-    """All states at a time: `ERRORS` of each terminal, then `BODY` of each body; `clocks` is the
-    variance of ranges by a terminal's clock that looks have stated [m^2]."""
+    """All states at a time: `POSE` of each terminal, one of the clocks of each link that states
+    that they may be off, then `BODY` of each body; `clocks` is the variance of ranges by a link's
+    clocks that its looks have stated [m^2]."""
 
     time: float
     mean: np.ndarray
@@ -318,7 +321,7 @@ class PooledTracker:
         return tuple(fed.get(Key(look.origin, int(n))) for n in look.numbers)
 
     def _first(self, pool: Pool, k: int) -> int:
-        return ERRORS * len(self._terminals) + BODY * k
+        return POSE * len(self._terminals) + len(pool.clocks) + BODY * k
 
     def _marginal(self, pool: Pool, k: int) -> tuple[np.ndarray, np.ndarray]:
         at = slice(self._first(pool, k), self._first(pool, k) + BODY)
@@ -330,11 +333,12 @@ class PooledTracker:
         if not np.isfinite(interval) or interval <= 0:
             return replace(pool, time=time) if interval else pool
         F, Q = singer(interval, self._settings.acceleration_std_mps2)
-        kept = np.append(np.full(ERRORS - 1, np.exp(-interval / ERROR_TIME)), 1.0)
-        count, terminals = len(pool.bodies), len(self._terminals)
-        drift = _error_variance() * (1 - kept**2)
-        step = block_diag(np.diag(np.tile(kept, terminals)), *[F] * count)
-        noise = block_diag(np.diag(np.tile(drift, terminals)), *[Q] * count)
+        kept = np.exp(-interval / ERROR_TIME)
+        count, terminals, clocks = len(pool.bodies), len(self._terminals), len(pool.clocks)
+        drift = np.tile(_error_variance() * (1 - kept**2), terminals)
+        stays = np.append(np.full(POSE * terminals, kept), np.ones(clocks))
+        step = block_diag(np.diag(stays), *[F] * count)
+        noise = block_diag(np.diag(np.append(drift, np.zeros(clocks))), *[Q] * count)
         P = step @ pool.covariance @ step.T + noise
         return replace(pool, time=time, mean=step @ pool.mean, covariance=(P + P.T) / 2)
 
@@ -350,9 +354,15 @@ class PooledTracker:
     def _step(self, pool: Pool, look: Look, transmitter: np.ndarray | None) -> Pool:
         """One look: prediction, association, updates, births, and what is one body."""
         pool = self._alive(self._predicted(pool, look.time))
-        view = _View(look, transmitter, self._terminals)
-        if look.clock_std:
-            pool = view.with_clock(pool)
+        pool = self._with_clock(pool, look)
+        clocks = [*pool.clocks]
+        clock = self._first(pool, 0) - len(clocks)
+        view = _View(
+            look,
+            transmitter,
+            self._terminals,
+            clock + clocks.index(look.origin) if look.origin in clocks else None,
+        )
         free = list(range(len(look)))
         for confirmed in (True, False):
             rows = [k for k, body in enumerate(pool.bodies) if body.confirmed is confirmed]
@@ -365,6 +375,23 @@ class PooledTracker:
             if not self._strays(pool, look, q):
                 pool = self._born(pool, view, q)
         return _named_apart(self._merged(_kept(pool, look)))
+
+    def _with_clock(self, pool: Pool, look: Look) -> Pool:
+        """With the deviation of its clocks that the look states: what it has grown by counts as
+        noise since the last one."""
+        stated, at = look.clock_std**2, self._first(pool, 0)
+        if not stated and look.origin not in pool.clocks:
+            return pool
+        mean, P = pool.mean, pool.covariance.copy()
+        if look.origin in pool.clocks:
+            at += [*pool.clocks].index(look.origin) - len(pool.clocks)
+        else:
+            mean = np.insert(mean, at, 0.0)
+            P = np.insert(np.insert(P, at, 0.0, axis=0), at, 0.0, axis=1)
+        before = pool.clocks.get(look.origin, 0.0)
+        P[at, at] += max(stated - before, 0.0)
+        clocks = {**pool.clocks, look.origin: max(stated, before)}
+        return replace(pool, mean=mean, covariance=P, clocks=clocks)
 
     def _costs(
         self, pool: Pool, view: _View, rows: Sequence[int], free: Sequence[int]
@@ -507,25 +534,16 @@ class PooledTracker:
 
 @dataclass(frozen=True)
 class _View:
-    """A look with what says where its ends are."""
+    """A look with what says where its ends are, and which state its clocks have; None: they are
+    right."""
 
     look: Look
     transmitter: np.ndarray | None
     terminals: list[str]
+    clock_state: int | None = None
 
     def _at(self, name: str) -> int:
-        return ERRORS * self.terminals.index(name)
-
-    def with_clock(self, pool: Pool) -> Pool:
-        """With the deviation of the clock that the look states: what it has grown by counts as
-        noise since the last one."""
-        rx, stated = self.look.ends[1], self.look.clock_std**2
-        grown = stated - pool.clocks.get(rx, 0.0)
-        if grown <= 0:
-            return pool
-        at, P = self._at(rx) + ERRORS - 1, pool.covariance.copy()
-        P[at, at] += grown
-        return replace(pool, covariance=P, clocks={**pool.clocks, rx: stated})
+        return POSE * self.terminals.index(name)
 
     def corrected(self, x: np.ndarray) -> tuple[Pose, np.ndarray | None]:
         """The receiver's pose and the transmitter's state (6,) without the errors that are known of
@@ -545,8 +563,8 @@ class _View:
         return pose, self.transmitter - x[other : other + SIZE]
 
     def clock(self, x: np.ndarray) -> float:
-        """What the receiver's clock adds to its ranges [m]."""
-        return float(x[self._at(self.look.ends[1]) + ERRORS - 1])
+        """What the link's clocks add to its ranges [m]."""
+        return 0.0 if self.clock_state is None else float(x[self.clock_state])
 
     def measured(
         self, x: np.ndarray, body: np.ndarray, own: Pose, sender: np.ndarray | None
@@ -567,15 +585,16 @@ class _View:
         away = body[:3] - own.position
         e = away / np.linalg.norm(away)
         H[2:, at + 6 : at + 9] = -(own.rotation.T @ cross(e))[[0, 2]]
-        H[0, at + ERRORS - 1] = 1.0
+        if self.clock_state is not None:
+            H[0, self.clock_state] = 1.0
         if sender is not None:
             other = self._at(tx)
             H[:, other : other + SIZE] -= transmitter_jacobian(body, sender)[:, :SIZE]
 
 
 def _error_variance() -> np.ndarray:
-    """(`ERRORS`,) variances of a terminal's errors but for its clock's, which looks state."""
-    deviations = [*[POSE_STD[0]] * 3, *[POSE_STD[1]] * 3, *[ATTITUDE_STD] * 3, 0.0]
+    """(`POSE`,) variances of the errors of a terminal's pose."""
+    deviations = [*[POSE_STD[0]] * 3, *[POSE_STD[1]] * 3, *[ATTITUDE_STD] * 3]
     return np.square(deviations)
 
 

@@ -15,7 +15,7 @@ from isac_rt.scenario.receivers import Tracking
 from isac_rt.storage import pack, unpack
 from isac_rt.terminal.filter import Ambiguity, measure
 from isac_rt.terminal.fusion import ATTITUDE_STD, POSE_STD, Key, Name
-from isac_rt.terminal.pool import ERRORS, Lives, Look, Pool, PooledTracker, _View
+from isac_rt.terminal.pool import ERRORS, POSE, Lives, Look, Pool, PooledTracker, _View
 from isac_rt.world.swarm import Pose
 
 T = 0.05
@@ -82,6 +82,8 @@ def drawn(rng):
     }
 
 
+FIRST = 2 * POSE + 1
+"""States before the bodies': of both terminals, and of the clocks of the link from A to B."""
 NONE = {"A": np.zeros(ERRORS), "B": np.zeros(ERRORS)}
 
 
@@ -91,8 +93,8 @@ def tracker(terminals=("A", "B")):
 
 
 def test_bodies_and_errors_lie_where_their_covariances_say():
-    """Thirty draws of all errors: the squared errors of both bodies' states and of all twenty
-    states of the terminals but A's clock, in their joint covariance, are chi squared within what
+    """Thirty draws of all errors: the squared errors of both bodies' states and of all nineteen
+    states of the terminals and of B's clock, in their joint covariance, are chi squared within what
     30 draws may be off at 1e-4. Planted bugs: the sign of the errors in births; errors of the
     transmitter left out; the attitude's cross product the other way round."""
     rng, total, freedom = np.random.default_rng(7), 0.0, 0
@@ -104,12 +106,12 @@ def test_bodies_and_errors_lie_where_their_covariances_say():
         found = pool.latest
         assert len(found.bodies) == 2
         order = np.argsort([b.fed["A->A"][0] for b in found.bodies])
-        truth = np.concatenate([errors["A"], errors["B"]])
-        kept = [k for k in range(2 * ERRORS) if k != ERRORS - 1]
+        truth = np.concatenate([errors["A"][:POSE], errors["B"]])  # B's clock comes last
+        kept = [*range(FIRST)]
         for i, body in zip(order, bodies_at(T * 5), strict=True):
             truth = np.append(truth, body)
-            kept += [2 * ERRORS + 9 * int(i) + k for k in range(6)]
-        e = found.mean[kept] - truth[[k for k in range(2 * ERRORS) if k != 9] + [*range(20, 32)]]
+            kept += [FIRST + 9 * int(i) + k for k in range(6)]
+        e = found.mean[kept] - truth
         total += e @ np.linalg.solve(found.covariance[np.ix_(kept, kept)], e)
         freedom += len(kept)
     low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], freedom) / freedom
@@ -124,10 +126,33 @@ def test_the_clock_of_a_passive_terminal_is_found_by_what_both_see():
     for frame in range(8):
         for rx in "AB":
             pool.add(*look_at(rx, frame, errors, rng))
-    at = 2 * ERRORS - 1
+    at = FIRST - 1
     std = np.sqrt(pool.latest.covariance[at, at])
     assert std < CLOCK_STD / 2
     assert abs(pool.latest.mean[at] - 0.3) < 4 * std
+
+
+def test_each_link_of_a_terminal_has_clocks_of_its_own():
+    """B hears A with paths 0.3 m too long and C, beside A, with paths 0.2 m too short: both are
+    found within four deviations that are half of what was stated. As one state they would be a
+    mean. Planted bugs: one clock for a receiver; a new clock in the place of the first one's."""
+    errors, rng = {**NONE, "B": np.append(np.zeros(9), 0.3)}, np.random.default_rng(3)
+    pool = tracker(("A", "B", "C"))
+    for frame in range(8):
+        pool.add(*look_at("A", frame, errors, rng))
+        look, sender = look_at("B", frame, errors, rng)
+        pool.add(look, sender)
+        z = look.z - np.array([0.5, 0, 0, 0])
+        pool.add(replace(look, origin="C->B", z=z), sender)
+    memory = pool.memory()
+    again = tracker(("A", "B", "C"))
+    again.restore(memory)
+    for found in (pool.latest, again.latest):
+        assert [*found.clocks] == ["A->B", "C->B"]
+        for k, late in ((3 * POSE, 0.3), (3 * POSE + 1, -0.2)):
+            std = np.sqrt(found.covariance[k, k])
+            assert std < CLOCK_STD / 2
+            assert abs(found.mean[k] - late) < 4 * std
 
 
 def test_errors_that_nobody_sees_stay_as_uncertain_as_they_were():
@@ -136,7 +161,7 @@ def test_errors_that_nobody_sees_stay_as_uncertain_as_they_were():
     pool = tracker()
     look, _ = look_at("A", 0, NONE, np.random.default_rng(1), which=())
     pool.add(look, None)
-    later = np.diag(pool._predicted(pool.latest, 5.0).covariance)[: ERRORS - 1]
+    later = np.diag(pool._predicted(pool.latest, 5.0).covariance)[:POSE]
     assert later == pytest.approx(
         np.square([*[POSE_STD[0]] * 3, *[POSE_STD[1]] * 3, *[ATTITUDE_STD] * 3])
     )
@@ -147,7 +172,7 @@ def test_a_clock_that_nobody_sees_is_as_uncertain_as_was_stated_last():
     was said, however long ago. Planted bugs: a clock's error is forgotten as a pose's is; only the
     first statement counts."""
     pool, rng = tracker(), np.random.default_rng(1)
-    at = 2 * ERRORS - 1
+    at = FIRST - 1
     for frame, stated, expected in ((0, 0.2, 0.2), (100, 0.5, 0.5), (101, 0.4, 0.5)):
         look, sender = look_at("B", frame, NONE, rng, which=())
         pool.add(replace(look, clock_std=stated), sender)
@@ -162,15 +187,16 @@ def test_derivatives_by_differences(rx):
     a thousandth of their size apart."""
     rng = np.random.default_rng(5)
     look, sender = look_at(rx, 3, drawn(rng), rng)
-    view, body = _View(look, sender, ["A", "B"]), bodies_at(T * 3)[0] + 0.1
+    clock = None if rx == "A" else FIRST - 1
+    view, body = _View(look, sender, ["A", "B"], clock), bodies_at(T * 3)[0] + 0.1
 
     def measured(x):
         return view.measured(x, body, *view.corrected(x))
 
-    x = np.concatenate([[0.02, -0.03, 0.01, 0.04, 0.02, -0.05, 1e-3, 5e-4, -8e-4, 0.01]] * 2)
-    H = np.zeros((4, 2 * ERRORS))
+    x = np.array([*[0.02, -0.03, 0.01, 0.04, 0.02, -0.05, 1e-3, 5e-4, -8e-4] * 2, 0.01])
+    H = np.zeros((4, FIRST))
     view.errors_into(H, body, *view.corrected(x))
-    for k in range(2 * ERRORS):
+    for k in range(FIRST):
         step = np.zeros_like(x)
         step[k] = 1e-6
         slope = (measured(x + step) - measured(x - step)) / 2e-6
@@ -278,9 +304,9 @@ def test_two_bodies_in_one_place_become_one():
         for frame in range(6):
             one.add(*look_at(rx, frame, NONE, rng))
         alone[rx] = one.latest
-    count = 2 * ERRORS
-    states = [alone[rx].mean[count:] for rx in "AB"]
-    blocks = [alone[rx].covariance[count:, count:] for rx in "AB"]
+    count = 2 * POSE
+    states = [alone[rx].mean[-18:] for rx in "AB"]  # of two bodies
+    blocks = [alone[rx].covariance[-18:, -18:] for rx in "AB"]
     both = Pool(
         T * 5,
         np.concatenate([np.zeros(count), *states]),
