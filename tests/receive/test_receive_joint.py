@@ -478,11 +478,15 @@ def test_a_second_path_in_the_cell_no_longer_pulls_the_range():
     assert off["local"] > 0.05 and off["joint"] < 0.01
 
 
-@pytest.mark.parametrize(("cells", "modulated"), [(0.6, False), (1.3, False), (1.3, True)])
+@pytest.mark.parametrize(
+    ("cells", "modulated"), [(0.6, False), (1.3, False), (1.3, True), (1.6, False)]
+)
 def test_a_reflection_beside_the_line_of_sight_no_longer_pulls_it(cells: float, modulated: bool):
     """A reflection 0.3 dB weaker from a direction 0.4 away, as the ground makes: as one wave the
     reference is tenths of a cell off, told apart within 5 deviations, with the reflection beside
-    it. Planted bug: probes at the path's own delay only (1.3 cells off nothing fits)."""
+    it, by `separate_reference` and by `refinement: joint` alike. Planted bugs: probes at the path's
+    own delay only (1.3 cells off nothing fits); what was found no farther than 1.5 cells from the
+    line of sight (1.6 cells)."""
     w, schedule, payload = frame(waveform=LONGER)
     cell, bin_ = w.range_cell(1), w.velocity_cell(1)
     ground = [LOS[0] + cells * cell, LOS[1] + 0.5 * bin_, 0.31, -0.62, 0.9, 0.97, -0.17, 0.02]
@@ -491,20 +495,22 @@ def test_a_reflection_beside_the_line_of_sight_no_longer_pulls_it(cells: float, 
     cube = noisy(w, schedule, clean, 10.0, 5)
     expected = predicted(np.array(LOS), w) if modulated else None
 
-    def reference(separated: bool):
-        settings = Receivers(separate_reference=separated, symbol_decision="beams")
+    def reference(separated: bool, refinement: str):
+        settings = Receivers(
+            separate_reference=separated, symbol_decision="beams", refinement=refinement
+        )
         return receive_passive(cube, FEW, settings, 8, expected, modulated)
 
-    pulled = reference(False).detections
+    pulled = reference(False, "local").detections
     assert abs(pulled.range[pulled.is_reference][0] - LOS[0]) > 0.1 * cell
-    r = reference(True)
-    d, own = r.detections, r.detections.is_reference
-    assert abs(d.range[own][0] - LOS[0]) < 5 * d.std[own][0, 0] < 0.02 * cell
-    assert abs(d.velocity[own][0] - LOS[1]) < 5 * d.std[own][0, 1]
-    assert r.reference_power == pytest.approx(LOS[5] ** 2, rel=0.05)
-    other = np.abs(d.range - ground[0]).argmin()
-    assert abs(d.range[other] - ground[0]) < 5 * d.std[other, 0]
-    assert np.abs(d.direction[other] - ground[2:4]).max() < 5 * d.std[other, 2:].max()
+    for r in (reference(True, "local"), reference(False, "joint")):
+        d, own = r.detections, r.detections.is_reference
+        assert abs(d.range[own][0] - LOS[0]) < 5 * d.std[own][0, 0] < 0.02 * cell
+        assert abs(d.velocity[own][0] - LOS[1]) < 5 * d.std[own][0, 1]
+        assert r.reference_power == pytest.approx(LOS[5] ** 2, rel=0.05)
+        other = np.abs(d.range - ground[0]).argmin()
+        assert abs(d.range[other] - ground[0]) < 5 * d.std[other, 0]
+        assert np.abs(d.direction[other] - ground[2:4]).max() < 5 * d.std[other, 2:].max()
 
 
 def test_two_echoes_in_one_cell_at_the_active_terminal():

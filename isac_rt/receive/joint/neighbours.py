@@ -9,6 +9,7 @@ with those close to it; the others stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +39,7 @@ WEAKEST_DB = 25.0
 (acceleration, near field)."""
 DIRECTIONS, DOPPLER_OFFSETS = 31, np.arange(-2.0, 2.01, 0.5)
 FARTHEST = np.array([1.5, 3.0])
-"""Cells and bins that a path found beside another one may move away from it in the fit."""
+"""Cells and bins that a path may move in the fit away from where it was found."""
 PROBED_CELLS = (-1.5, -0.75, 0.75, 1.5)
 """Where a neighbour in the main lobe of Hann's window is sought besides, off the path in delay."""
 LINE_OF_SIGHT_DB = 10.0
@@ -60,21 +61,28 @@ def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections
     near = [_near(known, p, s) for p, s in zip(found.paths, start, strict=True)]
     group = _clusters(known, start)
     settled = ~np.isin(group, group[~np.array(near)])
-    found, parent = _with_hidden(moments, found, settled)
+    probed = {0} if d.is_reference[order[0]] else set()
+    found, parent = _with_hidden(moments, found, settled, probed)
     settled = np.append(settled, np.ones(len(parent), bool))
     return _merged(known, d, order, found.paths, parent, settled)
 
 
-def _with_hidden(moments: Moments, found: Fit, settled: np.ndarray) -> tuple[Fit, list[int]]:
+def _with_hidden(
+    moments: Moments, found: Fit, settled: np.ndarray, probed: Set[int]
+) -> tuple[Fit, list[int]]:
     """A fit with the paths that are found beside its strongest settled ones behind, and beside
-    which path each was. Only what is close to a new path is fitted again."""
+    which path each was; beside those `probed` they are sought off in delay too. Only what is close
+    to a new path is fitted again."""
     parent = list(range(len(found.paths)))
     power = np.array([float((np.abs(p.amplitude) ** 2).mean()) for p in found.paths])
     searched = np.flatnonzero(settled)[np.argsort(-power[settled], kind="stable")][:MAX_SEARCHED]
     stale, spent = set(searched.tolist()), 0
     best: dict[int, tuple[float, int, JointPath]] = {}
     while spent < MAX_HIDDEN:
-        best |= {k: b for k in stale if (b := _hidden(moments, found, [k])) is not None}
+        for k in stale:
+            delays = PROBED_CELLS if k in probed else ()
+            if (one := _hidden(moments, found, [k], delays)) is not None:
+                best[k] = one
         stale = set()
         if not best:
             break
@@ -111,7 +119,7 @@ def _joined(
         energy=found.left + energy(known, members),
     )
     at = int(np.searchsorted(mine, beside))
-    if trial.left > found.left or not _credible(known, trial.paths, members, at):
+    if trial.left > found.left or not _credible(known, trial.paths, [*members, other], at):
         return None
     paths = [*found.paths, trial.paths[-1]]
     for k, path in zip(mine, trial.paths, strict=False):
@@ -149,7 +157,7 @@ def separate(moments: Moments, reference: Detections) -> tuple[Detections, np.nd
     if found is None:
         return None
     trial = fit(moments, [*one.paths, found[2]], iterations=MOST_STEPS)
-    if trial.left > one.left or not _credible(known, trial.paths, one.paths, 0):
+    if trial.left > one.left or not _credible(known, trial.paths, [*one.paths, found[2]], 0):
         return None
     return _merged(known, reference, np.zeros(1, int), trial.paths, [0], np.ones(2, bool))
 
@@ -175,10 +183,9 @@ def _near(known: Known, path: JointPath, start: JointPath) -> bool:
 
 
 def _credible(known: Known, paths: list[JointPath], before: list[JointPath], beside: int) -> bool:
-    """Whether a fit stayed near what was `before`, and the new path, the last, is within
-    `WEAKEST_DB` of the one `beside` which it was found and not on top of it."""
-    near = [*before, before[beside]]
-    if not all(_near(known, p, n) for p, n in zip(paths, near, strict=True)):
+    """Whether a fit stayed near what was `before`, and the new path, the last, near where it was
+    found, within `WEAKEST_DB` of the one `beside` which that was and not on top of it."""
+    if not all(_near(known, p, n) for p, n in zip(paths, before, strict=True)):
         return False
     power = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     return power[beside] * 10 ** (-WEAKEST_DB / 10) < power[-1] < power[beside] * 10
