@@ -96,7 +96,8 @@ class BeamSearch(BySchedule):
             found, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
         )
         first = describe(strong, snr, known)
-        first = replace(first, starts=np.zeros(len(strong), bool))
+        if clutter is not None:  # a city's walls are as strong, and no mesh explains all of them
+            first = replace(first, starts=np.zeros(len(strong), bool))
         starts = (sure[rows, bins] > 1) & ~_remainders(detections, first, known)
         detections = replace(detections, starts=starts)
         return Sensed([*strong, *found], Detections.joined([first, detections]), power, level)
