@@ -133,15 +133,15 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     uses: dict[Link, list[Use]] = {}
     trace: list[float] = []
     light, late, short_lived = 0.0, 0.0, 0
-    begin = time.process_time()
+    begin = time.thread_time()
     setup.frame(frames[0])
-    first = time.process_time() - begin
+    first = time.thread_time() - begin
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, found = setup.find(frame)
-        trace += _seconds_after(setup, frame)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
         last = setup.frame_of(frame, poses, found)
+        trace += _seconds_after(setup, frame)
         for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
             paths = found[link].select(found[link].power > 0)
@@ -251,13 +251,13 @@ def _synthesis_seconds(frame: Frame, link: Link, ends: Ends) -> float:
 
 
 def _seconds_after(setup: Setup, frame: int) -> list[float]:
-    """Processor seconds that tracing the frames after a traced one takes; of the last, itself
-    again."""
+    """Processor seconds, by the clock of `Stopwatch`, that tracing the frames after a made one
+    takes; of the last, itself again."""
     out = []
     for number in range(frame + 1, frame + 1 + FOLLOWED):
-        begin = time.process_time()
+        begin = time.thread_time()
         setup.frame(min(number, setup.timetable.frames - 1))
-        out.append(time.process_time() - begin)
+        out.append(time.thread_time() - begin)
     return out
 
 
