@@ -21,7 +21,7 @@ theta_l (1 - theta_l^2/10 + jq kappa) with x. The narrowband model has theta_l =
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +46,22 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
+from isac_rt.signal.covered import (
+    EXTRA,
+    Batches,
+    Covered,
+    Desk,
+    Sheet,
+    add_covered,
+    batches,
+    covered_paths,
+    desk,
+    line_turn,
+    no_paths,
+    part_slots,
+    plain_batches,
+    slow,
+)
 from isac_rt.signal.direct import numbers, passed
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
@@ -63,9 +79,9 @@ class Setting:
     wideband : delays of the receive elements applied to the whole chirp (to second order), not to
         its middle alone
     cubic : the third order in x too, of a wideband setting
-    faint : grid points per path that noise covers, to which the division by the kernel's response
-        is fitted then; these paths have delays of the elements to first order and their quadratic
-        phase at the middle alone. 0: no path is treated so
+    faint : grid points per line between which paths that noise covers are shared
+        (`isac_rt.signal.covered`), to which the division by the kernel's response is fitted then.
+        0: no path is treated so
     """
 
     oversampling: float
@@ -87,13 +103,13 @@ ACCURATE = Setting(1.5, 8, True, True)
 of the speed."""
 ACCURATE_ERROR = 5e-6
 COVERING = Setting(1.5, 12, True, faint=4)
-"""Error below `GRIDDED_ERROR`; of paths that noise covers below 2e-3 and 7e-5 v, v in m/s."""
+"""Error below `GRIDDED_ERROR`; of paths that noise covers below 2.5e-3 + 1.5e-4 v +
+2e-5 v^2, v in m/s."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
 # several chirps
 _MANY = 4000
 _TOGETHER = 6
 _MARGIN = LANES  # rows beyond the grid
-_EXTRA = 2  # degree of the weights' polynomials above the width
 _STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
 _DOPPLER = 4 / 1024  # cycles per sample, more than motion and elements move a frequency
 _FIELDS = 3  # float64 of a path before its transmit elements' delays
@@ -154,7 +170,7 @@ def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -
 
 def _basis(num_samples: int, grid: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Places in a cell (R,) and the tones of the grid points about each, (R, N + 1, width)."""
-    half, degree = num_samples // 2, width + _EXTRA
+    half, degree = num_samples // 2, width + EXTRA
     nodes = np.cos(np.pi * (np.arange(2 * degree) + 0.5) / (2 * degree)) / 2
     steps = np.arange(width) - (width - 1) / 2
     x = np.arange(-half, half + 1)
@@ -220,23 +236,21 @@ class _View(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path and
-    of one that noise covers, the orders of the wideband term, `weights`, the `plan` of the
-    transform, and the chirps for which the paths are read once."""
+    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path, the
+    orders of the wideband term, `weights`, the `plan` of the transform, and in which order chirps
+    are made."""
 
     half: float
     centre: float
     taps: tuple[int, ...]
-    few: tuple[int, ...]
     wideband: bool
     cubic: bool
     poly: np.ndarray
-    few_poly: np.ndarray
     deconvolution: np.ndarray
     radices: np.ndarray
     twiddles: np.ndarray
     rows: np.ndarray
-    together: int
+    order: Batches
 
 
 class _Blocks(NamedTuple):
@@ -251,8 +265,7 @@ class _Blocks(NamedTuple):
     factor : float32, of each block 16 real and 16 imaginary parts; where elements differ, of each
         transmit element one after the other
     life : float64, of each block 16 begins and 16 ends
-    blocks : (B, 5) link, offset, number of paths, whether any of them is born or dies in the frame,
-        whether noise covers them
+    blocks : (B, 4) link, offset, number of paths, whether any of them is born or dies in the frame
     bounds : (B, 2) least and greatest delay in the frame, without data
     """
 
@@ -262,6 +275,22 @@ class _Blocks(NamedTuple):
     life: np.ndarray
     blocks: np.ndarray
     bounds: np.ndarray
+
+
+class _Faint(NamedTuple):
+    """Paths that noise covers, how they are spread, and the memory of their sums."""
+
+    paths: Covered
+    sheet: Sheet
+    desk: Desk
+
+
+class _Heard(NamedTuple):
+    """What is heard: blocks of paths, the `_steering` of these, and what noise covers."""
+
+    blocks: _Blocks
+    steer: np.ndarray
+    faint: _Faint
 
 
 class _Room(NamedTuple):
@@ -336,7 +365,7 @@ def _weigh(work, scratch, poly, taps, wideband, cubic):
     """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as
     they are."""
     r, c, s, q = load(work, 0), load(work, 16), load(work, 32), load(work, 48)
-    width, degree = len(taps), len(taps) + _EXTRA
+    width, degree = len(taps), len(taps) + EXTRA
     set_size = (degree + 1) * width
     for j in range(width):
         v0, v1, v2 = splat(poly[j]), splat(poly[set_size + j]), splat(poly[2 * set_size + j])
@@ -373,39 +402,6 @@ def _spread(grid, base, places, scratch, count, taps, steer, k):
             store(grid, at + 16, load(grid, at + 16) + c * ai + s * ar)
             at += ROW
         k += 32
-
-
-@jit(fast=True)
-def _weigh_faint(work, scratch, poly, taps):
-    """Weights of 1 and j x on the grid points of 16 paths that noise covers."""
-    r, width, degree = load(work, 0), len(taps), len(taps) + _EXTRA
-    set_size = (degree + 1) * width
-    for j in range(width):
-        v0, v1 = splat(poly[j]), splat(poly[set_size + j])
-        for d in range(1, degree + 1):
-            v0 = v0 * r + splat(poly[d * width + j])
-            v1 = v1 * r + splat(poly[set_size + d * width + j])
-        store(scratch, _STEP * j, v0)
-        store(scratch, _STEP * j + 16, v1)
-
-
-@jit(fast=True)
-def _spread_faint(grid, base, places, scratch, count, taps, steer, k, work):
-    """Add `count` of 16 paths that noise covers: strengths of 1 and j x, the element's own delay at
-    the middle of the chirp to first order."""
-    for i in range(count):
-        at = base + int(places[i]) * ROW
-        ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
-        c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
-        pr, pi = c * ar - s * ai, c * ai + s * ar
-        er, ei = pr + late * pi, pi - late * pr
-        br, bi = theta * er, theta * ei
-        for tap in range(len(taps)):
-            u, v = splat(scratch[i + _STEP * tap]), splat(scratch[i + _STEP * tap + 16])
-            store(grid, at, load(grid, at) + u * er + v * br)
-            store(grid, at + 16, load(grid, at + 16) + u * ei + v * bi)
-            at += ROW
-        k += 48
 
 
 @jit(inline=True)
@@ -528,34 +524,35 @@ def _in_band(work, places, count, limit):
 
 
 @jit(fast=True)
-def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fresh):
-    """Synthesise all chirps for up to 16 receive elements: spread, transform, emit, one chirp after
-    the other."""
+def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room, fresh):
+    """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, emit,
+    one batch of chirps after the other."""
     grid, work, scratch, tile = room
+    b, steer, faint = heard
     groups, num_rx, num_chirps, num_samples = shape
     size, width, cells = g.rows.shape[0], len(g.taps), band.turn.shape[0]
     low, centre, channels = width // 2 - 1, np.float32(g.centre), min(16, num_rx - first_channel)
     top, skirt, per_delay = w.rate / w.slope, w.transition / w.slope, w.slope * w.step
     cut = top + skirt
     stride, places = (size + _MARGIN) * ROW, np.zeros(32)
-    inner = (width - len(g.few)) // 2 * ROW
-    for start in range(0, groups * num_chirps, g.together):
-        count = min(g.together, groups * num_chirps - start)
+    for batch in range(g.order.parts.shape[0]):
+        start, count, segment = g.order.parts[batch]
+        chirps = g.order.chirp[start : start + count]
         grid[:] = np.float32(0)
         for i in range(b.blocks.shape[0]):
             q, used = b.blocks[i, 0], b.blocks[i, 2]
             for c in range(count):
-                m, p = (start + c) // num_chirps, (start + c) % num_chirps
+                m, p = chirps[c] // num_chirps, chirps[c] % num_chirps
                 source = m - b.blocks[i, 1]
                 if source < 0 or source >= groups or t.send[q, source, p] == 0:
                     continue
                 view = _View(
-                    views.shift[start + c],
-                    views.origin[start + c],
-                    views.share[start + c],
-                    views.below[start + c],
-                    views.limit[start + c],
-                    views.turn[start + c],
+                    views.shift[chirps[c]],
+                    views.origin[chirps[c]],
+                    views.share[chirps[c]],
+                    views.below[chirps[c]],
+                    views.limit[chirps[c]],
+                    views.turn[chirps[c]],
                 )
                 time = w.first + view.origin * w.step + p * w.slot + m * w.spacing
                 delay = t.symbol_delay[q, source, p]
@@ -572,10 +569,6 @@ def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fre
                     _gate(work, b, i, w, time, delay)
                 last = _in_band(work, places, used, view.limit) if cells else used
                 to, k = c * stride, i * 16 * 48
-                if len(g.few) and b.blocks[i, 4]:
-                    _weigh_faint(work, scratch, g.few_poly, g.few)
-                    _spread_faint(grid, to + inner, places, scratch, last, g.few, steer, k, work)
-                    continue
                 _weigh(work, scratch, g.poly, g.taps, g.wideband, g.cubic)
                 if g.cubic:
                     _spread_cubic(grid, to, places, scratch, last, g.taps, steer, k, work, centre)
@@ -585,8 +578,10 @@ def _chirps(out, shape, first_channel, w, views, g, b, steer, t, band, room, fre
                     )
                 else:
                     _spread(grid, to, places, scratch, last, g.taps, steer, i * 16 * 32)
+        if faint.paths.groups.shape[0]:
+            add_covered(grid, faint.paths, segment, chirps, t, w, faint.sheet, faint.desk)
         for c in range(count):
-            m, p = (start + c) // num_chirps, (start + c) % num_chirps
+            m, p = chirps[c] // num_chirps, chirps[c] % num_chirps
             table = grid[c * stride : (c + 1) * stride]
             _fold(table, size, low, width)
             transform(table, low * ROW, size, g.radices, g.twiddles)
@@ -643,12 +638,12 @@ def _steering(
     return out
 
 
-def _blocks(waveform: Waveform, t: Tones, faint: np.ndarray) -> _Blocks:
+def _blocks(waveform: Waveform, t: Tones, path: np.ndarray, offset: np.ndarray) -> _Blocks:
+    """Of the listed paths and their offsets."""
     w = waveform
-    path, offset = sources(w, t)
-    order = np.lexsort((t.delay[path], faint[path], offset, t.link[path]))
+    order = np.lexsort((t.delay[path], offset, t.link[path]))
     path, offset = path[order], offset[order]
-    kind = (t.link[path] * (2 * w.num_groups) + offset) * 2 + faint[path]
+    kind = t.link[path] * (2 * w.num_groups) + offset
     segment = np.cumsum(np.r_[True, np.diff(kind) != 0]) - 1 if path.size else path
     _, starts, counts = np.unique(segment, return_index=True, return_counts=True)
     full = -(-counts // LANES)
@@ -666,7 +661,7 @@ def _blocks(waveform: Waveform, t: Tones, faint: np.ndarray) -> _Blocks:
     bounds = np.stack([(delay - motion).min(axis=1), (delay + motion).max(axis=1)], axis=1)
     mortal = ((t.begin[k] > -reach) | (t.end[k] < reach)).any(axis=1)
     used = np.minimum(last - first + 1, LANES)
-    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], used, mortal, faint[k[:, 0]]], axis=1)
+    blocks = np.stack([t.link[k[:, 0]], lag[:, 0], used, mortal], axis=1)
     if t.tx_gain.size:
         by_antenna = t.factor[k][:, None] * np.moveaxis(t.tx_gain[k], 2, 1)
         factor = np.stack([by_antenna.real, by_antenna.imag], axis=2).astype(np.float32)
@@ -784,30 +779,67 @@ def _synthesise(
     """Run the kernel over all elements; False, and nothing done, where no path can be heard and
     there is no band."""
     w, t, setting, faint = job
-    if faint is None or not setting.faint:
-        faint = np.zeros(t.size, bool)
-    b = _blocks(w, t, faint)
-    if b.path.size == 0 and band.turn.size == 0:
+    path, offset = sources(w, t)
+    apart = np.zeros(path.size, bool)
+    if faint is not None and setting.faint:
+        reach = w.frame_duration / 2
+        apart = (faint & (t.begin <= -reach) & (t.end >= reach))[path]
+    if path.size == 0 and band.turn.size == 0:
         return False
     num_samples = len(band.window) or w.num_samples
     kernel = weights(num_samples, setting.oversampling, setting.width, setting.faint)
+    b = _blocks(w, t, path[~apart], offset[~apart])
+    weak, order = (path[apart], offset[apart]), plain_batches(views.share.size, 1)
+    if b.path.size > _MANY:
+        order = plain_batches(views.share.size, _TOGETHER)
+    if apart.any():
+        slots = part_slots(w, t.rate[weak[0]], kernel.grid)
+        order = batches(t.antenna[0], slots)
     g = _Grid(
         float(w.num_samples // 2),
         mean_square(num_samples),
         (0,) * setting.width,
-        (0,) * setting.faint,
         setting.wideband,
         setting.wideband and setting.cubic,
         kernel.polynomials.ravel(),
-        kernel.faint.ravel(),
         kernel.deconvolution,
         *plan(kernel.grid),
-        _TOGETHER if b.path.size > _MANY else 1,
+        order,
     )
-    grids = aligned(g.together * (kernel.grid + _MARGIN) * ROW)
+    stride = (kernel.grid + _MARGIN) * ROW
+    sheet = Sheet(
+        kernel.grid,
+        line_turn(kernel.grid, g.half) ** 2 * g.centre / 2,
+        stride,
+        (setting.width - setting.faint) // 2 * ROW,
+        (0,) * (setting.faint or COVERING.faint),
+        kernel.faint.ravel(),
+    )
+    grids = aligned(int(order.parts[:, 1].max()) * stride)
     room = _Room(grids, aligned(80), aligned(_STEP * setting.width), aligned(512))
-    flat = out.reshape(-1).view(np.float32)
+    flat, rx, shared = out.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     for first in range(0, shape[1], LANES):
-        steer = _steering(w, (t.rx_delay, t.rx_gain), b.path, first, setting.wideband)
-        _chirps(flat, shape, first, numbers(w), views, g, b, steer, t, band, room, fresh)
+        steer = _steering(w, rx, b.path, first, setting.wideband)
+        paths = no_paths(t.tx_delay.shape[1])
+        if apart.any():
+            steering = partial(_slow_steering, w, rx, first, kernel.grid)
+            paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
+        weakest = _Faint(paths, sheet, desk(paths, setting.faint))
+        heard = _Heard(b, steer, weakest)
+        _chirps(flat, shape, first, shared, views, g, heard, t, band, room, fresh)
     return True
+
+
+def _slow_steering(
+    waveform: Waveform,
+    rx: tuple[np.ndarray, np.ndarray],
+    first: int,
+    size: int,
+    path: np.ndarray,
+    late: np.ndarray,
+) -> np.ndarray:
+    """`_steering`, wideband, for `Covered`: with what the paths' own delays, in half chirps, do to
+    the frequency that the elements see."""
+    out = _steering(waveform, rx, path, first, True)
+    slow(out, late, line_turn(size, waveform.num_samples // 2))
+    return out

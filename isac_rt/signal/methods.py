@@ -101,8 +101,7 @@ class Auto:
     and of those whose error, integrated coherently over the cube, could exceed the noise of a cell
     (power error^2 size > noise_power), the `max_direct` strongest. Some settings have a faster way
     with a larger error for paths that noise covers: all of a range-Doppler cell together keep it
-    under `covered` times the noise, integrated coherently over the cube. The error of a path lies
-    in its own cell and those beside it.
+    under `covered` times the noise, integrated coherently over the cube.
 
     Attributes
     ----------

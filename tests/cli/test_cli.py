@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
@@ -34,6 +35,20 @@ def scenario_file(tmp_path):
     file = tmp_path / "fake.yaml"
     file.write_text(to_yaml(fake_scenario()))
     return file
+
+
+def test_garbage_is_looked_for_less_often(capsys):
+    """Twenty thousand objects that nothing refers to but themselves are made before it is."""
+    usual = gc.get_threshold()
+    try:
+        assert main(["--version"]) == 0
+        before = gc.get_stats()[0]["collections"]
+        for _ in range(15_000):
+            itself: list = []
+            itself.append(itself)
+        assert gc.get_stats()[0]["collections"] <= before + 1
+    finally:
+        gc.set_threshold(*usual)
 
 
 @pytest.fixture

@@ -106,7 +106,7 @@ def test_noise_covers_what_a_cell_holds_together():
     cell, power = np.arange(count), np.full(count, 1e-9)
     cell[100:140], power[500], sight = 7, 1e-6, np.arange(count) == 600
     speed = np.full(count, 3.0)
-    error = 2e-3 + 7e-5 * 3.0
+    error = 2.5e-3 + 1.5e-4 * 3.0 + 2e-5 * 9.0
     noise = 20 * 1e-9 * error**2 * size / 0.01  # twenty of the paths keep 20 dB under it
     choice = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cell)
     expected = (cell != 7) & (power < 1e-7) & ~sight

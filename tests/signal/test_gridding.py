@@ -18,6 +18,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.signal.covered import TOGETHER, batches
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
 from isac_rt.signal.gridded import (
@@ -225,15 +226,46 @@ def test_error_of_the_full_model(setting, bound):
     assert relative(gridded(w, tones, replace(setting, wideband=False)), truth) > 1e-2
 
 
-@pytest.mark.parametrize("speed", [0.0, 15.0, 60.0])
+@pytest.mark.parametrize("speed", [0.0, 8.0, 15.0])
 def test_error_of_paths_that_noise_covers(speed):
-    """The stated bounds of both classes, which lie within three times of the truth. Planted bug:
-    `br` and `bi` of zero."""
-    w, tones = scene(40, np.random.default_rng(23), speed=speed, num_chirps=3)
-    truth, bound = exact(w, tones), 2e-3 + 7e-5 * speed
-    covered = relative(gridded(w, tones, COVERING, np.ones(40, bool)), truth)
+    """The stated bounds of both classes, which lie within three times of the truth; over twelve
+    slots, for which the paths are read once. Planted bugs: `late` of zero; shares of the batch's
+    middle in all its chirps."""
+    w, tones = scene(14, np.random.default_rng(23), speed=speed, num_chirps=12)
+    tones = tones._replace(rate=np.sign(tones.rate) * 2 * speed / SPEED_OF_LIGHT)
+    truth, bound = exact(w, tones), 2.5e-3 + 1.5e-4 * speed + 2e-5 * speed**2
+    covered = relative(gridded(w, tones, COVERING, np.ones(14, bool)), truth)
     assert bound / 3 < covered < bound
     assert relative(gridded(w, tones, COVERING), truth) < GRIDDED_ERROR
+
+
+def test_covered_paths_of_two_senders_and_of_the_group_before():
+    """Chirps that are made together are sent by other elements of the second sender, and of the
+    group before, whose late paths are heard. Planted bugs: one element for all chirps of a batch;
+    the data of the receiver's own group."""
+    w, t = scene(24, np.random.default_rng(26), num_chirps=9, view=30.0)
+    late = np.arange(24) % 3 == 2
+    both = {name: np.repeat(getattr(t, name), 2, axis=0) for name in ("send", "symbol_delay")}
+    antenna = np.concatenate([t.antenna, t.antenna[:, :, ::-1]])
+    both["symbol_delay"][1] = both["symbol_delay"][1, :, ::-1]
+    delay = t.delay * 0.4 + late * w.group_spacing
+    tones = t._replace(link=np.arange(24) % 2, delay=delay, antenna=antenna, **both)
+    truth = exact(w, tones)
+    assert relative(gridded(w, tones, COVERING, np.ones(24, bool)), truth) < 5e-3
+    assert relative(truth, exact(w, tones.select(~late))) > 0.1  # they are heard
+
+
+def test_every_chirp_is_made_once_with_others_of_its_element():
+    """Of a schedule of 3 groups and 50 slots. Planted bug: batches that end with a part's first
+    element."""
+    antenna = np.random.default_rng(27).integers(0, 3, (3, 50))
+    chirp, parts = batches(antenna, 24)
+    assert sorted(chirp.tolist()) == list(range(150))
+    assert parts[:, 1].sum() == 150 and parts[:, 1].max() <= TOGETHER
+    for first, count, part in parts:
+        some = chirp[first : first + count]
+        assert len(set(antenna.ravel()[some])) == 1
+        assert set(some % 50 // 24) == {part}
 
 
 def test_covered_paths_share_the_grid_with_the_others():
