@@ -124,7 +124,7 @@ def test_a_covered_cube_differs_by_less_than_its_noise():
     links = job.paths(100)
     w, shape = job.waveform, (3, 15, 3, 1024)
     truth = job.samples(links, Exact())
-    noise = float(np.mean(np.abs(truth) ** 2)) / 100 * np.prod(shape) * 3e-3
+    noise = float(np.mean(np.abs(truth) ** 2)) / 100 * np.prod(shape) * 3e-2
     auto = Auto(noise, covered=0.01, decide_for=20_000)
     error = job.samples(links, auto) - truth
     cells = np.abs(np.fft.fft(error * hann(np.arange(1024), 1024), axis=-1)) ** 2
