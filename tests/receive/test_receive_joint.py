@@ -22,6 +22,7 @@ from isac_rt.receive.joint.neighbours import (
     _beams,
     _earlier_reference,
     _hidden,
+    _widened,
     refine_jointly,
 )
 from isac_rt.receive.joint.tones import (
@@ -511,6 +512,25 @@ def test_a_reflection_beside_the_line_of_sight_no_longer_pulls_it(cells: float, 
         other = np.abs(d.range - ground[0]).argmin()
         assert abs(d.range[other] - ground[0]) < 5 * d.std[other, 0]
         assert np.abs(d.direction[other] - ground[2:4]).max() < 5 * d.std[other, 2:].max()
+
+
+@pytest.mark.parametrize(("snr_db", "widened"), [(30.0, True), (-10.0, False)])
+def test_deviations_grow_with_what_is_not_explained(snr_db: float, widened: bool):
+    """An echo at every other receiver 1 dB stronger than at the rest, as no path is: by hand 0.0033
+    of its power stays in the channels, of which each gathers all its chirps. At 30 dB that is
+    far over the noise and the deviations grow by its root, at -10 dB it is under it and they stay
+    those of the curvature. Planted bugs: never widened; always."""
+    w, schedule, payload = frame(waveform=SHORT)
+    clean = samples(w, schedule, payload, FEW, np.array(NEAR), 2)
+    uneven = 10 ** (np.arange(FEW.num_rx) % 2 / 20)
+    cube = noisy(w, schedule, clean * uneven[:, None, None], 10 ** (snr_db / 10), 5)
+    moments = Moments(cube.samples, known(w, schedule, payload, FEW))
+    path = JointPath(2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4))
+    found = fit(moments, [path])
+    ratio = _widened(moments, found)[0].std / found.paths[0].std
+    each = schedule.size / FEW.num_tx * w.num_samples
+    by_hand = np.var(uneven) * each * moments.size / found.left
+    assert ratio == pytest.approx(np.sqrt(by_hand) if widened else 1.0, rel=0.1)
 
 
 def test_two_echoes_in_one_cell_at_the_active_terminal():

@@ -40,6 +40,10 @@ WEAKEST_DB = 25.0
 DIRECTIONS, DOPPLER_OFFSETS = 31, np.arange(-2.0, 2.01, 0.5)
 FARTHEST = np.array([1.5, 3.0])
 """Cells and bins that a path may move in the fit away from where it was found."""
+MISFIT, MISFIT_OFFSETS = 2.5, np.array([-0.5, 0.0, 0.5])
+"""Power of a channel over the noise, where a path was taken out or so many bins beside it, from
+which on the fit does not explain the samples; of 12 channels and more noise shows it once in ten
+thousand."""
 PROBED_CELLS = (-1.5, -0.75, 0.75, 1.5)
 """Where a neighbour in the main lobe of Hann's window is sought besides, off the path in delay."""
 LINE_OF_SIGHT_DB = 10.0
@@ -64,7 +68,18 @@ def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections
     probed = {0} if d.is_reference[order[0]] else set()
     found, parent = _with_hidden(moments, found, settled, probed)
     settled = np.append(settled, np.ones(len(parent), bool))
-    return _merged(known, d, order, found.paths, parent, settled)
+    return _merged(known, d, order, _widened(moments, found), parent, settled)
+
+
+def _widened(moments: Moments, found: Fit) -> list[JointPath]:
+    """The paths of a fit, with deviations as much larger as the channels hold more than noise where
+    a path was taken out: what no path explains may have moved it so far."""
+    noise, out = found.left / moments.size, []
+    left = residual_channels(moments, found, found.paths, MISFIT_OFFSETS)
+    for path, (channels, _) in zip(found.paths, left, strict=True):
+        most = float((np.abs(channels) ** 2).mean(axis=(1, 2)).max()) / noise
+        out.append(replace(path, std=path.std * np.sqrt(most)) if most > MISFIT else path)
+    return out
 
 
 def _with_hidden(
