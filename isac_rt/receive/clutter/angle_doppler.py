@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.clutter.adaptive import scanned, threshold_of
 from isac_rt.receive.clutter.coherent import (
@@ -76,21 +77,26 @@ class AngleDoppler(ClutterDetector):
         note(plain, limits[0])
         filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST * noise
         cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
-        bucketed = Bucketed.of(clutter, known, arms, noise, self.taper)
+        bucketed = Bucketed.of(clutter, known, everything, noise, self.taper)
 
         def heard(cell: np.ndarray, search: Search) -> np.ndarray:
             c = search.channels
             x = maps.reshape(*maps.shape[:2], -1)[c.tx[:, None], c.rx[:, None], cell]
             return np.ascontiguousarray(x.T) / np.float32(np.sqrt(noise))
 
+        R = bucketed.among(arms_of(known)).covariances(*np.divmod(cell, power.shape[1]))
+        found = search_white(heard(cell, arms), R, cell, arms, PRUNED * limits[1][0])
+        note(found, limits[1])
+        # the few that remain with all channels: fewer directions look alike
+        cell = cell[found.peak > PRUNED * limits[1][0]]
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
-        note(search_white(heard(cell, arms), R, cell, arms, PRUNED * limits[1][0]), limits[1])
+        note(search_white(heard(cell, everything), R, cell, everything, 0.0), limits[0])
+        inverses = dict(zip(cell.tolist(), np.linalg.inv(R), strict=True))
         for gate in self._gates(known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
-            search = everything if quiet else arms
             whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
-            found = seek(gate, heard(gate.cell, search), whiten, search)
-            limit = gate.threshold(search, self.settings.gate_rate)
+            found = seek(gate, heard(gate.cell, everything), whiten, everything)
+            limit = gate.threshold(everything, self.settings.gate_rate)
             if found.peak[0] > limit:
                 ratio[found.cell], cosines[found.cell] = found.peak / limit, found.cosines
         rows, bins = power.shape
@@ -99,7 +105,12 @@ class AngleDoppler(ClutterDetector):
             for a in (ratio, sure, cosines)
         ]
         held_up = self._unexplained(power / (noise + expected), shown[0])
-        return Judged(shown[0] / held_up, shown[1] / held_up, noise + expected, shown[2])
+        half = bins // 2
+        whiteners = {
+            (c // bins, (c % bins + half) % bins): inverse for c, inverse in inverses.items()
+        }
+        passed = shown[0] / held_up, shown[1] / held_up
+        return Judged(*passed, noise + expected, shown[2], whiteners)
 
     def _gates(
         self, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
@@ -121,3 +132,11 @@ class AngleDoppler(ClutterDetector):
         target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
         rule = CfarRule.of(self.settings, 1)
         return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
+
+
+def arms_of(known: Known) -> np.ndarray:
+    """Numbers of the channels of both arms among all."""
+    c, every = both_arms(known.antennas), all_channels(known.antennas)
+    pairs = zip(every.tx.tolist(), every.rx.tolist(), strict=True)
+    number = {pair: i for i, pair in enumerate(pairs)}
+    return np.array([number[pair] for pair in zip(c.tx.tolist(), c.rx.tolist(), strict=True)])

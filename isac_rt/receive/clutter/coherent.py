@@ -20,7 +20,7 @@ and G_l along Z,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -423,6 +423,11 @@ class Bucketed:
             search.spread(taper.cosine),
             w.num_chirps,
         )
+
+    def among(self, some: np.ndarray) -> Bucketed:
+        """The same of some of the channels."""
+        steer = np.ascontiguousarray(self.steer[:, some])
+        return replace(self, steer=steer, shape=self.shape[np.ix_(some, some)])
 
     def covariances(self, rows: np.ndarray, bins: np.ndarray) -> np.ndarray:
         """(S, L, L) complex64 of noise and clutter in cells, Doppler in FFT order, in units of the

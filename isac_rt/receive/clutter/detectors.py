@@ -9,12 +9,12 @@ them. A new detector is a subclass of `ClutterDetector` in a file of its own, an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isac_rt.receive.arms import Channels, arm, both_arms
+from isac_rt.receive.arms import Channels, all_channels, arm, both_arms
 from isac_rt.receive.cfar import first_row, strongest_peaks, without_sidelobes
 from isac_rt.receive.clutter.adaptive import Beams, Scan, beams_of, scan_threshold
 from isac_rt.receive.clutter.correction import fit
@@ -47,12 +47,15 @@ class Judged:
     level : (rows, P) power of a channel that counts as background
     cosines : (rows, P, 2) direction in which a filter found most, NaN where the detector does not
         look at directions
+    whiteners : of cells (row, bin) in which all channels were whitened R^-1 (L, L), R in units of
+        the noise
     """
 
     ratio: np.ndarray
     sure: np.ndarray
     level: np.ndarray
     cosines: np.ndarray
+    whiteners: Mapping[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def everywhere(cls, ratio: np.ndarray, level: np.ndarray) -> Judged:
@@ -111,7 +114,8 @@ class ClutterDetector:
         found, towards = [], judged.cosines[rows, bins]
         for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
             if np.isfinite(cosines).all():
-                beam = BeamSpectra(spectra, known, row, beam_weights(known, cosines))
+                weights = beam_weights(known, cosines, judged.whiteners.get((row, column)))
+                beam = BeamSpectra(spectra, known, row, weights)
                 found.append(self.estimator.at(beam, ratio, row, column))
             else:
                 local = LocalSpectra(spectra, known, row)
@@ -122,7 +126,8 @@ class ClutterDetector:
         direction = detections.direction.copy()
         for i, cosines in enumerate(towards):
             if np.isfinite(cosines).all():
-                direction[i] = cosines if on_grid else near_beam(found[i], known, cosines)
+                white = judged.whiteners.get((int(rows[i]), int(bins[i])))
+                direction[i] = cosines if on_grid else near_beam(found[i], known, cosines, white)
         starts = judged.sure[rows, bins] > 1
         if first:
             starts &= ~in_skirt(rows, bins, power, first)
@@ -183,26 +188,38 @@ class BeamSpectra(LocalSpectra):
         return np.abs((self._beam * heard).sum(axis=(1, 2))) ** 2
 
 
-def beam_weights(known: Known, cosines: np.ndarray) -> np.ndarray:
-    """(L_tx, L_rx) weights of the virtual L towards (u_x, u_z), zero off the L."""
-    channels = both_arms(known.antennas)
+def beam_weights(
+    known: Known, cosines: np.ndarray, whitener: np.ndarray | None = None
+) -> np.ndarray:
+    """(L_tx, L_rx) weights towards (u_x, u_z): of the virtual L, zero off it, or of all channels
+    against the clutter by R^-1 (L, L)."""
+    channels = both_arms(known.antennas) if whitener is None else all_channels(known.antennas)
     out = np.zeros((known.antennas.num_tx, known.antennas.num_rx), complex)
     towards = np.array([[cosines[0], 0.0, cosines[1]]])
-    out[channels.tx, channels.rx] = channels.steering(towards, known)[0]
+    steering = channels.steering(towards, known)[0]
+    out[channels.tx, channels.rx] = steering if whitener is None else whitener @ steering
     return out
 
 
-def near_beam(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
-    """(u_x, u_z) of the most power of the virtual L near the filter's beam."""
-    channels = both_arms(known.antennas)
+def near_beam(
+    estimate: Estimate, known: Known, cosines: np.ndarray, whitener: np.ndarray | None = None
+) -> np.ndarray:
+    """(u_x, u_z) near the filter's beam of the most power of the virtual L, or of the largest
+    likelihood of all channels with R^-1 (L, L)."""
+    channels = both_arms(known.antennas) if whitener is None else all_channels(known.antennas)
     values = estimate.channels[channels.tx, channels.rx]
+    if whitener is not None:
+        values = whitener @ values
     best = np.array(cosines, float)
     for step in FINE:
         i, j = np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij")
         tried = np.stack(
             [best[0] + step * i.ravel(), np.zeros(25), best[1] + step * j.ravel()], axis=1
         )
-        power = np.abs(channels.steering(tried, known).conj() @ values) ** 2
+        a = channels.steering(tried, known)
+        power = np.abs(a.conj() @ values) ** 2
+        if whitener is not None:
+            power /= ((a.conj() @ whitener) * a).sum(axis=1).real
         best = tried[power.argmax()][[0, 2]]
     period = 2 * np.pi / (known.wavenumber * known.antennas.spacing)
     best = best - period * np.round(best / period)
