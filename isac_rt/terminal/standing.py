@@ -130,11 +130,16 @@ class Standing:
 
     def holds(self, track: Track) -> bool:
         """Whether a track stands still, as far as is known of it, within a crowd."""
-        velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
-        d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
-        return bool(
-            d2 < STANDS and self.crowded(track.state.mean[None, :3], np.array([track.snr]))[0]
+        return rests(track) and bool(
+            self.crowded(track.state.mean[None, :3], np.array([track.snr]))[0]
         )
+
+
+def rests(track: Track) -> bool:
+    """Whether a track stands still, as far as is known of it."""
+    velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
+    d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
+    return bool(d2 < STANDS)
 
 
 def _spots(places: np.ndarray) -> int:

@@ -45,7 +45,7 @@ from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
 from isac_rt.terminal.retrospect import COAST_CELLS, Late, Retrospect
 from isac_rt.terminal.self_calibration import calibration_of
 from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
-from isac_rt.terminal.standing import Standing
+from isac_rt.terminal.standing import Standing, rests
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane
 from isac_rt.world.swarm import Pose
 
@@ -198,13 +198,15 @@ class ActiveTerminal:
         return self._receiver.receive(cube, payload, clutter, maps=maps, sought=self._gates)
 
     def _sought(self, own: Pose, mates: Sequence[Pose]) -> Gates | None:
-        """Where tracks and other terminals are expected; None: that is not asked for."""
+        """Where tracks that move and other terminals are expected; None: that is not asked for.
+        What stands still may be a wall that the mesh lacks, whose clutter nothing whitens."""
         if self._receiver.settings.gate_false_alarm_rate is None:
             return None
         told = [of_itself(mate) for mate in mates]
         # the error of the own pose is as large as what a mate states of its own
         told = [Gaussian(np.pad(m, (0, 3)), np.pad(2 * P, (0, 3))) for m, P in told]
-        return Gates(*reported([t.state for t in self.tracker.tracks] + told, own))
+        moving = [t.state for t in self.tracker.tracks if not rests(t)]
+        return Gates(*reported(moving + told, own))
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""

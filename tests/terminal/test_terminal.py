@@ -196,14 +196,17 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
 
 def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     """A mate 20 m ahead that recedes at 3 m/s, and the track of an echo, straight ahead too, one
-    frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none where it is not asked for.
+    frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none of what stands still, nor where
+    it is not asked for.
     Planted bug: gates of the frame before."""
     rule = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-3)
     at = ActiveTerminal(W, ANTENNAS, rule, Tracking())
     own = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
     mate = replace(own, position=np.array([0.0, 20.0, 0.0]), velocity=np.array([0.0, 3.0, 0.0]))
     body = Gaussian(np.array([0.0, 30.0, 0, 0, -4.0, 0, 0, 0, 0]), 0.01 * np.eye(9))
-    at.tracker.tracks, at.tracker.time = [Track(0, body, 10.0)], 0.0
+    still = Gaussian(np.array([0.0, 15.0, 0, 0, 0.1, 0, 0, 0, 0]), 0.01 * np.eye(9))
+    at.tracker.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
+    at.tracker.time = 0.0
     at.tracker.predict(0.5)
     sought = at._sought(own, [mate])
     np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
