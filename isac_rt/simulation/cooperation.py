@@ -17,11 +17,19 @@ from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.terminal.filter import Ambiguity
-from isac_rt.terminal.fusion import Fused, Picture, in_world, of_itself
+from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.fusion import Fused, Picture, advance, in_world, of_itself
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
 from isac_rt.terminal.tracker import in_plane
 from isac_rt.world.swarm import Pose
+
+
+REMEMBERED = 3
+"""Frames of which it is remembered what terminals knew: some are still being heard when the next
+begins."""
+Body = tuple[str, Gaussian]
+"""The terminal that it is, "" if it is none, and its position and velocity (6,)."""
 
 
 class Cooperation:
@@ -41,6 +49,8 @@ class Cooperation:
         self._channels: dict[Link, Channel] = {}
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
+        self._known: dict[int, tuple[float, dict[str, list[Body]]]] = {}
+        """By frame: its time, and by terminal the bodies that it knew of then."""
 
     def _pool(self) -> PooledTracker:
         """A tracker of all terminals' detections."""
@@ -86,8 +96,30 @@ class Cooperation:
             for name, notes in self._notes.items()
         }
         together = self._together(time, poses)
+        self._known = {k: v for k, v in self._known.items() if k > frame - REMEMBERED}
+        self._known[frame] = time, {n: self._bodies(n, views[n], time) for n in self._notes}
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
+
+    def _bodies(self, name: str, view: View, time: float) -> list[Body]:
+        """What a terminal knows of: other terminals by what they say of themselves, and the bodies
+        of its picture."""
+        said = self._notes[name].terminals
+        mates = [
+            (other, advance(s.state, time - s.time, self._acceleration))
+            for other, s in said.items()
+        ]
+        return mates + [(body.terminal or "", body.state) for body in view.bodies]
+
+    def told(self, link: Link, frame: int, time: float) -> list[Gaussian]:
+        """The bodies that a link's receiver knew of after a frame, at a time [s], but the link's
+        ends; none where the frame is not remembered."""
+        then, known = self._known.get(frame, (time, {}))
+        return [
+            advance(state, time - then, self._acceleration)
+            for name, state in known.get(link.rx, [])
+            if name not in link
+        ]
 
     def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
         """What all know together at a time [s]."""
@@ -193,6 +225,10 @@ class Cooperation:
             "notes": {name: notes.memory() for name, notes in self._notes.items()},
             "swarm": self._swarm.memory(),
             "channels": [[*way, channel.memory()] for way, channel in self._channels.items()],
+            "known": [
+                [frame, time, {n: [[who, *g] for who, g in of] for n, of in bodies.items()}]
+                for frame, (time, bodies) in self._known.items()
+            ],
         }
 
     def restore(self, memory: Mapping[str, Any]) -> None:
@@ -204,6 +240,10 @@ class Cooperation:
         for tx, rx, kept in memory["channels"]:
             channel = self._channels[Link(tx, rx)] = Channel()
             channel.restore(kept)
+        self._known = {
+            frame: (time, {n: [(who, Gaussian(*g)) for who, *g in of] for n, of in bodies.items()})
+            for frame, time, bodies in memory["known"]
+        }
 
 
 def _corrected(count: SymbolCount) -> bool:

@@ -32,6 +32,7 @@ from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
+from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.retrospect import Late
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
@@ -114,9 +115,15 @@ class _Observer:
         self.seconds = 0.0
         """Processor time of reception and tracking so far."""
 
-    def hear(self, frame: Frame, cube: IFCube | RangeProfiles, maps: bool) -> Heard:
-        """Reception and tracking of one frame. Runs in a thread of its own; only this observer's
-        state changes."""
+    def hear(
+        self,
+        frame: Frame,
+        cube: IFCube | RangeProfiles,
+        maps: bool,
+        told: Sequence[Gaussian] = (),
+    ) -> Heard:
+        """Reception and tracking of one frame; `told` are the bodies that the receiver knows of
+        from others. Runs in a thread of its own; only this observer's state changes."""
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
@@ -127,13 +134,20 @@ class _Observer:
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
             reception, tracks = self.terminal.step(
-                cube, payload, own, when, clutter=clutter, mates=mates, maps=maps
+                cube, payload, own, when, clutter=clutter, mates=mates, told=told, maps=maps
             )
         else:
             assert isinstance(cube, IFCube)  # profiles are for active terminals only
             modulated = timetable.modulated(frame.number)
             reception, tracks = self.terminal.step(
-                cube, own, when, modulated, mates=mates, sender=self._told(when), maps=maps
+                cube,
+                own,
+                when,
+                modulated,
+                mates=mates,
+                sender=self._told(when),
+                told=told,
+                maps=maps,
             )
             state, late = int(self.terminal.state), self.terminal.late
         self.seconds += time.thread_time() - begun
@@ -219,6 +233,10 @@ class _Swarm:
         poses = {name: self._swarm.poses(view.time) for name, view in views.items()}
         return self._scorer.record(frame.number, views, records, poses)
 
+    def told(self, link: Link, frame: int, time: float) -> list[Gaussian]:
+        """As `Cooperation.told`."""
+        return self._cooperation.told(link, frame, time)
+
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
         return {"talk": self._cooperation.memory(), "scorer": self._scorer.memory()}
@@ -249,6 +267,12 @@ class _Listeners:
             Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
             None if setup.scenario.cooperation == "none" else _Swarm(setup),
         )
+
+    def told(self, link: Link, frame: int) -> list[Gaussian]:
+        """What the link's receiver knows of from others in a frame: what it knew `AHEAD` frames
+        before, so that no frame waits for the one before."""
+        when = self.recorder.timetable.epoch(frame, link.tx)
+        return self.swarm.told(link, frame - AHEAD, when) if self.swarm else []
 
     def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
         """Hold a frame against the truth."""
@@ -511,17 +535,26 @@ class _Run:
                 keep = resume if resume and at_work and resume.due() else None
                 settle(0 if keep or dependent else AHEAD - 1, keep)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
+                sets = (self.own, *self.compared.values())
                 jobs = {
-                    link: pool.submit(self.hear, frame, link, last.get(link))
+                    link: pool.submit(
+                        self.hear, frame, link, [s.told(link, number) for s in sets], last.get(link)
+                    )
                     for link in setup.timetable.links(number)
                 }
                 last |= jobs
                 at_work.append((frame, jobs))
             settle(0)
 
-    def hear(self, frame: Frame, link: Link, before: Future[list[Heard]] | None) -> list[Heard]:
+    def hear(
+        self,
+        frame: Frame,
+        link: Link,
+        told: Sequence[Sequence[Gaussian]],
+        before: Future[list[Heard]] | None,
+    ) -> list[Heard]:
         """What a link's receivers make of a frame, those of the scenario first; all are given the
-        same samples.
+        same samples, and each what it was told.
 
         The frame `before` is one that the pool began earlier, so that waiting for it ends.
         """
@@ -531,9 +564,9 @@ class _Run:
             before.result()
         with self.stopwatch.stage("receive"):
             maps = frame.number in self.snapshots
-            heard = self.own.observers[link].hear(frame, cube, maps)
-            others = self.compared.values()
-            return [heard, *(s.observers[link].hear(frame, cube, False) for s in others)]
+            heard = self.own.observers[link].hear(frame, cube, maps, told[0])
+            others = zip(self.compared.values(), told[1:], strict=True)
+            return [heard, *(s.observers[link].hear(frame, cube, False, k) for s, k in others)]
 
     def collect(self, frame: Frame, jobs: Jobs) -> None:
         """Wait for a frame's receivers, score and record it, take the own receivers' advice."""

@@ -4,10 +4,11 @@ city's mesh, and nothing of the truth.
 A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is
 enough to make it suspect:
 
-- Is it one of the echoes that a nearer track must have over walls? There (straight) and back (over
+- Is it one of the echoes that a nearer body must have over walls? There (straight) and back (over
   a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
   the source's state and the wall's plane. An echo over a wall is always longer than the direct one,
-  and so weaker; being farther stands here for being weaker.
+  and so weaker; being farther stands here for being weaker. The body is another track, or one that
+  the terminal was told of: a UAV that the line of sight masks is heard by its echoes over walls.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
 A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
@@ -21,6 +22,8 @@ from functools import cached_property
 
 import numpy as np
 
+from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.waveform import Waveform
 from isac_rt.terminal.filter import Ambiguity, measure, wrapped
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
@@ -140,6 +143,38 @@ class Walls:
 
 
 @dataclass(frozen=True)
+class Leeway:
+    """What a detection leaves open of a path.
+
+    Attributes
+    ----------
+    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `frame.antennas.resolutions`; of one
+        pass at a passive terminal
+    ambiguity : of range and velocity
+    turn : span of direction cosines that the array tells apart: an image may stand beyond the view
+    """
+
+    resolution: np.ndarray
+    ambiguity: Ambiguity
+    turn: float = np.inf
+
+    @classmethod
+    def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
+        """At an active terminal (2 passes) or a passive one (1)."""
+        cells = resolutions(waveform, antennas, passes)
+        return cls(cells, Ambiguity.of(waveform, passes), 2 * antennas.view_limit)
+
+    def explained(self, off: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """Whether differences (..., 4) of paths' measures may be nothing; their deviations."""
+        off = wrapped(off, self.ambiguity)
+        if np.isfinite(self.turn):
+            off[..., 2:] -= self.turn * np.round(off[..., 2:] / self.turn)
+        allowed = DEVIATIONS * std + RESOLUTION_SHARE * self.resolution
+        hit: np.ndarray = (np.abs(off) <= allowed).all(axis=-1)
+        return hit
+
+
+@dataclass(frozen=True)
 class Suspicion:
     """What the test says of K tracks.
 
@@ -147,7 +182,7 @@ class Suspicion:
     ----------
     mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1:
         none does
-    source : (K,) int64 id of that nearer track, -1: none
+    source : (K,) int64 id of that nearer track, -1: none, or one that the terminal was told of
     order : (K,) int8 bounces: 1 off that wall on one of the two ways, 2 on both, 0: none. At a
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
@@ -166,7 +201,12 @@ class Suspicion:
 
 
 def suspicion(
-    tracks: TrackSet, own: Pose, walls: Walls, resolution: np.ndarray, ambiguity: Ambiguity
+    tracks: TrackSet,
+    own: Pose,
+    walls: Walls,
+    leeway: Leeway,
+    told: TrackSet | None = None,
+    asked: np.ndarray | None = None,
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
@@ -176,9 +216,10 @@ def suspicion(
         reference, which itself is not suspected
     own : its pose
     walls : the mesh
-    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of
-        `frame.antennas.resolutions`; of one pass at a passive terminal
-    ambiguity : what detections leave open
+    leeway : what detections leave open
+    told : likewise, bodies that others say there are; with the same reference. Those that are not
+        known to a resolution would explain anything, and are left out
+    asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
     """
     count = len(tracks)
     out = Suspicion(
@@ -190,39 +231,45 @@ def suspicion(
     measured = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
     sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
     seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
-    for k in np.flatnonzero(~tracks.is_reference):
+    for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
         out.behind[k] = hidden_by(
             own.position + tracks.mean[k, :3],
             tracks.covariance[k, :3, :3],
             seen_from,
             walls,
-            resolution[0],
+            leeway.resolution[0],
         )
-    for s in np.flatnonzero(tracks.confirmed & (out.behind < 0)):
+    sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
+    if told is not None:
+        sure = (told.std < leeway.resolution).all(axis=1)
+        sources += [(told, int(s)) for s in np.flatnonzero(sure & ~told.is_reference)]
+    reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
+    for known, s in sources:
         if sender is None:
-            shown = echoes(tracks.mean[s], own, walls)
+            shown = echoes(known.mean[s], own, walls, reach)
         else:
-            shown = reflections(
-                tracks.mean[s], None if tracks.is_reference[s] else sender, own, walls
-            )
-        for face, order, echo in shown:
-            off = wrapped(measured - echo, ambiguity)
-            allowed = (
-                DEVIATIONS * np.hypot(tracks.std, tracks.std[s]) + RESOLUTION_SHARE * resolution
-            )
-            hit = (
-                (np.abs(off) <= allowed).all(axis=1)
-                & (tracks.range > tracks.range[s])
-                & (out.mirrored < 0)
-                & ~tracks.is_reference
-            )
-            out.mirrored[hit], out.source[hit], out.order[hit] = face, tracks.ids[s], order
+            start = None if known.is_reference[s] else sender
+            shown = reflections(known.mean[s], start, own, walls, reach)
+        if not shown:
+            continue
+        std = np.hypot(tracks.std, known.std[s])
+        may_be = ~tracks.is_reference & (tracks.range > known.range[s])
+        if known is told:  # a track of the body itself is no echo of it
+            direct = np.concatenate([[told.range[s], told.velocity[s]], told.direction[s]])
+            may_be &= ~leeway.explained(measured - direct, std)
+        faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
+        hit = leeway.explained(measured[:, None] - ways, std[:, None]) & may_be[:, None]
+        which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
+        out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
+        out.source[new] = known.ids[s]
     return out
 
 
-def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, np.ndarray]]:
+def echoes(
+    state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf
+) -> list[tuple[int, int, np.ndarray]]:
     """What a body shows of itself over each single wall: (face, order, (4,) range, range rate, u_x,
-    u_z).
+    u_z), images beyond `reach` [m] left out.
 
     `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on
     both ways the echo is the image's. Over it on one way two equal waves arrive, from the body and
@@ -232,7 +279,7 @@ def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, n
     here = np.concatenate([own.position, own.velocity])
     body = state + here
     direct, out = measure(body, own), []
-    for face, image in _images(body, here, walls):
+    for face, image in _images(body, here, walls, reach):
         mirrored = measure(image, own)
         middle = (direct + mirrored) / 2
         out += [
@@ -243,10 +290,15 @@ def echoes(state: np.ndarray, own: Pose, walls: Walls) -> list[tuple[int, int, n
 
 
 def reflections(
-    state: np.ndarray, sender: np.ndarray | None, own: Pose, walls: Walls
+    state: np.ndarray,
+    sender: np.ndarray | None,
+    own: Pose,
+    walls: Walls,
+    reach: float = np.inf,
 ) -> list[tuple[int, int, np.ndarray]]:
     """What a passive terminal hears of a body over walls, one wall on each way at most: (first
-    face, order, (4,) path length, its rate, u_x, u_z).
+    face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either end left
+    out.
 
     `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose.
     With `sender` None the body is the active terminal itself: its line of sight over a wall. The
@@ -254,31 +306,30 @@ def reflections(
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
-    back = [(-1, body), *_images(body, here, walls)]
+    back = [(-1, body), *_images(body, here, walls, reach)]
     if sender is None:
         return [(face, 1, measure(image, own)) for face, image in back[1:]]
     start, out = sender + here, []
-    for first, image in [(-1, body), *_images(body, start, walls)]:
-        distance, rate = _apart(image, start)
-        for last, seen in back:
+    heard = [(face, measure(seen, own)) for face, seen in back]
+    for first, image in [(-1, body), *_images(body, start, walls, reach)]:
+        way = np.array([*_apart(image, start), 0.0, 0.0])
+        for last, seen in heard:
             order = (first >= 0) + (last >= 0)
             if order:
-                out.append(
-                    (
-                        first if first >= 0 else last,
-                        order,
-                        measure(seen, own) + np.array([distance, rate, 0.0, 0.0]),
-                    )
-                )
+                out.append((first if first >= 0 else last, order, seen + way))
     return out
 
 
-def _images(body: np.ndarray, end: np.ndarray, walls: Walls) -> list[tuple[int, np.ndarray]]:
-    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,), world
-    coordinates, with the walls' faces."""
+def _images(
+    body: np.ndarray, end: np.ndarray, walls: Walls, reach: float
+) -> list[tuple[int, np.ndarray]]:
+    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,) within reach [m],
+    world coordinates, with the walls' faces."""
     faces, normals, offsets = walls.mirrors
     behind, before = normals @ body[:3] - offsets, normals @ end[:3] - offsets
-    some = np.flatnonzero(behind * before > 0)  # else the wall stands between the two
+    apart2 = ((body[:3] - end[:3]) ** 2).sum() + 4 * behind * before  # to the image, squared
+    # else the wall stands between the two, or the image is too far
+    some = np.flatnonzero((behind * before > 0) & (apart2 < reach**2))
     n, behind, before = normals[some], behind[some], before[some]
     places = body[:3] - 2 * behind[:, None] * n
     met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]

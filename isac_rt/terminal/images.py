@@ -9,17 +9,19 @@ buildings is not asked for: an image that is not there only forbids births in a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Ambiguity, wrapped
-from isac_rt.terminal.ghosts import Walls, suspicion
+from isac_rt.terminal.filter import Ambiguity, Gaussian, wrapped
+from isac_rt.terminal.ghosts import Leeway, Walls, suspicion
 from isac_rt.terminal.mirrors import mirror_of
-from isac_rt.terminal.tracker import Track, Tracker
+from isac_rt.terminal.tracker import Track, Tracker, track_set
 from isac_rt.world.swarm import Pose
 
 EDGE = 0.3
@@ -30,6 +32,9 @@ BESIDE_CELLS = 1.5
 """Off an image by no more cells of range and of rate than these, a detection is taken for it."""
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
+ECHOED_FRAMES = 3
+"""So many frames in a row a confirmed track fits a nearer body's echo before it ends: the body may
+be known only after its echo was confirmed, and a UAV may cross the place of another one's echo."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is a third as long."""
 
@@ -76,28 +81,47 @@ class Doubts:
         return replace(d, starts=starts)
 
     def remove_ghosts(
-        self, tracker: Tracker, new: set[int], own: Pose, reference: Track | None = None
+        self,
+        tracker: Tracker,
+        new: set[int],
+        own: Pose,
+        reference: Track | None = None,
+        told: Sequence[Gaussian] = (),
     ) -> None:
-        """Take out the tracks, among those `new` to be confirmed, that a wall explains; at a
-        passive terminal with its `reference`. Where mirrors are eyes, those stay that a wall shows
-        and nothing else explains, as long as it does."""
-        cells = resolutions(self.waveform, self.antennas, self.passes)
+        """Take out the tracks, among those `new` to be confirmed, that a wall explains, and of
+        the others those that are a nearer body's echoes over a wall frame after frame; at a passive
+        terminal with its `reference`. Of bodies that were `told` echoes are known as well as of
+        tracks. Where mirrors are eyes, those stay that a wall shows and nothing else explains, as
+        long as it does."""
         old = {t.id for t in tracker.tracks if t.mirror.size}
-        confirmed = {t.id for t in tracker.tracks if t.confirmed} & new
+        confirmed = {t.id for t in tracker.tracks if t.confirmed}
         hidden = set(old)
         out: set[int] = set()
-        if confirmed:
+        if confirmed - old:
             tracks = tracker.snapshot(own, reference)
-            said = suspicion(tracks, own, self.walls, cells, self._ambiguity)
-            out = confirmed & set(tracks.ids[said.suspect].tolist())
+            asked = np.isin(tracks.ids, [*(confirmed & new)]) & ~tracks.is_reference
+            others = track_set([Track.of_body(body) for body in told], own, reference)
+            said = suspicion(tracks, own, self.walls, self._leeway, others, asked)
+            out = confirmed & new & set(tracks.ids[said.suspect].tolist())
+            echoes = set(tracks.ids[said.mirrored >= 0].tolist())
+            for track in tracker.tracks:
+                track.echoed = track.echoed + 1 if track.id in echoes else 0
+                if track.echoed >= ECHOED_FRAMES:
+                    out.add(track.id)
             if self.places:
                 hidden |= out & set(tracks.ids[said.mirrored < 0].tolist())
         for track in tracker.tracks:
             if track.id in hidden:
-                track.mirror = mirror_of(track.state, own, self.walls, cells[0])
+                track.mirror = mirror_of(
+                    track.state, own, self.walls, float(self._leeway.resolution[0])
+                )
         shown = {t.id for t in tracker.tracks if t.mirror.size}
         out = (out | old) - shown
         tracker.tracks = [t for t in tracker.tracks if t.id not in out]
+
+    @cached_property
+    def _leeway(self) -> Leeway:
+        return Leeway.of(self.waveform, self.antennas, self.passes)
 
     @property
     def _ambiguity(self) -> Ambiguity:

@@ -14,7 +14,6 @@ from enum import IntEnum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import gammainccinv
 
 from isac_rt.frame.antennas import Antennas
@@ -150,10 +149,12 @@ class ActiveTerminal:
         *,
         clutter: ExpectedClutter | None = None,
         mates: Sequence[Pose] = (),
+        told: Sequence[Gaussian] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal
-        expects of its mesh there, `mates` where other terminals say that they are."""
+        expects of its mesh there, `mates` where other terminals say that they are, `told` the
+        bodies (6,) that it knows of from them."""
         if self.calibration is not None and isinstance(cube, IFCube):
             cube = self.calibration.correct(cube, time)
         if clutter is not None and self._correction is not None:
@@ -173,7 +174,7 @@ class ActiveTerminal:
             crowd = self._standing.look(found, own_pose, time, self.tracker.ambiguity.period)
             found = replace(found, starts=found.starts & ~crowd)
             self.tracker.update(found, own_pose)
-            self._doubts.remove_ghosts(self.tracker, new, own_pose)
+            self._doubts.remove_ghosts(self.tracker, new, own_pose, told=told)
             self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
@@ -309,11 +310,12 @@ class PassiveTerminal:
         *,
         mates: Sequence[Pose] = (),
         sender: Pose | None = None,
+        told: Sequence[Gaussian] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `modulated` is public, `mates` is
         where the transmitter says that it is, `sender` where its data do, which count once a frame
-        was read."""
+        was read, `told` the bodies (6,) that the terminal knows of from others."""
         if self.calibration is not None:
             cube = self.calibration.correct(cube, time)
         if self.reference is not None:
@@ -351,7 +353,7 @@ class PassiveTerminal:
         sight = self.reference if reception.line_of_sight else self._teller
         seen = reception.line_of_sight or reception.decoded
         if sight is not None and seen and reception.placed:
-            self._track(in_plane(reception.detections), own_pose, sight)
+            self._track(in_plane(reception.detections), own_pose, sight, told)
         tracks = self.tracker.snapshot(own_pose, self.reference)
         self._calibrate(reception, own_pose, mates)
         return reception, tracks
@@ -402,10 +404,7 @@ class PassiveTerminal:
         path than the line of sight."""
         if sender is None or self._retrospect is None or self._retrospect.path is None:
             return None
-        told, spread = of_itself(sender), np.full(3, self._acceleration)
-        mean = np.concatenate([told.mean, np.zeros(3)])
-        covariance = block_diag(told.covariance, np.diag(spread**2))
-        return Track(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=self._time)
+        return Track.of_body(of_itself(sender), self._acceleration, self._time)
 
     def _named(self, kept: Retrospect, own: Pose) -> bool:
         """Whether the path that is read over is as long, and changes as fast, as a way from the
@@ -427,7 +426,9 @@ class PassiveTerminal:
         edge = WELL_INSIDE * self._receiver.antennas.view_limit
         return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
-    def _track(self, detections: Detections, own: Pose, reference: Track) -> None:
+    def _track(
+        self, detections: Detections, own: Pose, reference: Track, told: Sequence[Gaussian]
+    ) -> None:
         """Carry on the reflectors' tracks, and start those that the city does not explain."""
         sender = reference.state
         if self._doubts is None:
@@ -444,7 +445,7 @@ class PassiveTerminal:
             crowd = self._standing.look(allowed, own, self._time, period, sender.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
-        self._doubts.remove_ghosts(self.tracker, new, own, reference)
+        self._doubts.remove_ghosts(self.tracker, new, own, reference, told)
         self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
 
     def _placed(self, sender: Gaussian) -> bool:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
@@ -83,6 +84,7 @@ class Track:
     last : time of the last detection [s]
     mirror : (4,) plane of the wall by which the body is seen, of which the state is the image;
         (0,): it is seen straight
+    echoed : frames in a row that it fits a nearer body's echo over a wall
     """
 
     id: int
@@ -95,6 +97,15 @@ class Track:
     detection: int = -1
     last: float = -np.inf
     mirror: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    echoed: int = 0
+
+    @classmethod
+    def of_body(cls, body: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf) -> Track:
+        """A body that others say there is, with position and velocity (6,): a track that was never
+        born."""
+        mean = np.concatenate([body.mean, np.zeros(3)])
+        covariance = block_diag(body.covariance, acceleration_std**2 * np.eye(3))
+        return cls(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=time)
 
     def memory(self) -> dict[str, Any]:
         """The track as plain numbers and arrays, for `of_memory`."""

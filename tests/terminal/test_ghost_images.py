@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.ghosts import Walls, echoes, reflections, suspicion
+from isac_rt.terminal.ghosts import Leeway, Walls, echoes, reflections, suspicion
 from isac_rt.terminal.tracker import Track, track_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
@@ -218,8 +218,7 @@ def asked(tracks, walls=None, reference=None):
         track_set(tracks, OWN, reference),
         OWN,
         walls or corner(north=(13.0, 30.0)),
-        RESOLUTION,
-        Ambiguity(PERIOD),
+        Leeway(RESOLUTION, Ambiguity(PERIOD)),
     )
 
 

@@ -28,8 +28,7 @@ from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.studies import scene_file
 from isac_rt.studies.paper.outcome import Outcome, Progress, Sentences, Verdict, proportion
-from isac_rt.terminal.filter import Ambiguity
-from isac_rt.terminal.ghosts import Suspicion, Walls, suspicion
+from isac_rt.terminal.ghosts import Leeway, Suspicion, Walls, suspicion
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.swarm import Pose
@@ -65,16 +64,13 @@ class _Watched:
     def watch(self, setup: Setup, passes: int) -> Self:
         """`passes` of the range: 2 at an active terminal, 1 at a passive one."""
         self._walls = Walls(setup.city)
-        self._resolution = resolutions(setup.waveform, setup.antennas, passes)
-        self._ambiguity = Ambiguity.of(setup.waveform, passes)
+        self._leeway = Leeway.of(setup.waveform, setup.antennas, passes)
         self.said: list[tuple[TrackSet, Suspicion]] = []
         return self
 
     def note(self, tracks: TrackSet, own: Pose) -> None:
         """The test's answer for one frame's tracks."""
-        self.said.append(
-            (tracks, suspicion(tracks, own, self._walls, self._resolution, self._ambiguity))
-        )
+        self.said.append((tracks, suspicion(tracks, own, self._walls, self._leeway)))
 
 
 class WatchedActive(_Watched, ActiveTerminal):
