@@ -16,14 +16,12 @@ from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
-from isac_rt.terminal.filter import Ambiguity
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.fusion import Fused, Picture, advance, in_world, of_itself
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
 from isac_rt.terminal.tracker import in_plane
 from isac_rt.world.swarm import Pose
-
 
 REMEMBERED = 3
 """Frames of which it is remembered what terminals knew: some are still being heard when the next

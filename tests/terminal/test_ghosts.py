@@ -161,7 +161,7 @@ def test_bodies_that_others_know_of_explain_echoes():
         leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
         found = suspicion(tracks, OWN, Walls(wall()), leeway, told, nobody)
         assert found.order.tolist() == [expected] and found.source.tolist() == [-1]
-    beside = track(8, BODY[:3] + [0.03, 0.2, 0.05], BODY[3:])
+    beside = track(8, BODY[:3] + np.array([0.03, 0.2, 0.05]), BODY[3:])
     sure = track_set([Track.of_body(Gaussian(body.mean, np.eye(6) * 1e-3))], OWN)
     wide = Leeway(RESOLUTION * 40, Ambiguity(PERIOD))
     assert not suspicion(track_set([beside], OWN), OWN, Walls(wall()), wide, sure, nobody).suspect
