@@ -655,7 +655,11 @@ OF_TESTS = (
     ),
     (
         "test_ghost_images::test_reflections_are_the_images_that_each_end_sees",
-        Bug("terminal/ghosts.py", "*_images(body, start, walls, reach)", "*_images(body, here, walls, reach)"),
+        Bug(
+            "terminal/ghosts.py",
+            "*_images(body, start, walls, reach)",
+            "*_images(body, here, walls, reach)",
+        ),
     ),
     (
         "test_randomness::test_no_two_receptions_share_their_noise",
