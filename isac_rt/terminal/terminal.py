@@ -236,8 +236,8 @@ class Surroundings:
     Attributes
     ----------
     walls : the mesh, against which births are held; None: all are allowed
-    clutter : what the terminal expects of the mesh, from the state (6,) of its transmitter as it is
-        tracked and its own pose, both in world coordinates; None: nothing
+    clutter : what the terminal expects of the mesh, from the state (6,) of its transmitter as its
+        data say, or as it is tracked, and its own pose, both in world coordinates; None: nothing
     """
 
     walls: Walls | None = None
@@ -292,6 +292,8 @@ class PassiveTerminal:
         self._profile: np.ndarray | None = None
         self._clutter: ExpectedClutter | None = None
         self._teller: Track | None = None
+        self._word: Track | None = None
+        self._read = False
         self._retrospect: Retrospect | None = None
         if receivers.link_acquisition == "blind":
             self._retrospect = Retrospect(self._receiver, waveform)
@@ -326,7 +328,12 @@ class PassiveTerminal:
             self.reference.detection = -1
         self._time = time
         self.tracker.predict(time)
-        self._teller = self._told(sender)
+        self._word = self._teller = None
+        if sender is not None:
+            word = Track.of_body(of_itself(sender), self._acceleration, self._time)
+            over_another = self._retrospect is not None and self._retrospect.path is not None
+            self._word = word if self._read or over_another else None
+            self._teller = word if over_another else None
         self._clutter = self._expected_clutter(own_pose)
         reception = self._hear(cube, self._expect(own_pose) if modulated else None, modulated, maps)
         if reception.decoded:
@@ -345,6 +352,8 @@ class PassiveTerminal:
                 anchored=anchored,
                 maps=maps,
             )
+        if modulated:
+            self._read = reception.decoded
         self._follow(reception, own_pose, anchored)
         believed = self.reference is not None and self.reference.missed == 0
         if reception.line_of_sight and (believed or not modulated):
@@ -399,13 +408,6 @@ class PassiveTerminal:
             return out, True
         return out.without_sight(self._named(kept, own)), False
 
-    def _told(self, sender: Pose | None) -> Track | None:
-        """The transmitter where its data say that it is; None unless they are read over another
-        path than the line of sight."""
-        if sender is None or self._retrospect is None or self._retrospect.path is None:
-            return None
-        return Track.of_body(of_itself(sender), self._acceleration, self._time)
-
     def _named(self, kept: Retrospect, own: Pose) -> bool:
         """Whether the path that is read over is as long, and changes as fast, as a way from the
         transmitter over the city's walls or about an edge."""
@@ -434,15 +436,15 @@ class PassiveTerminal:
         if self._doubts is None:
             self.tracker.update(detections, own, sender)
             return
-        known = self._surroundings.clutter
-        if known is not None and not self._placed(sender):
+        known, place = self._surroundings.clutter, (self._word or reference).state
+        if known is not None and not self._placed(place):
             detections = replace(detections, starts=np.zeros(len(detections), bool))
         new = {track.id for track in self.tracker.tracks if not track.confirmed}
-        allowed = self._doubts.births(detections, own, sender.mean[:6])
+        allowed = self._doubts.births(detections, own, place.mean[:6])
         crowd = np.zeros(len(allowed), bool)
         if known is None or self._clutter is not None:  # else the city's own echoes are among them
             period = self._ambiguity.period
-            crowd = self._standing.look(allowed, own, self._time, period, sender.mean[:6])
+            crowd = self._standing.look(allowed, own, self._time, period, place.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
         self._doubts.remove_ghosts(self.tracker, new, own, reference, told)
@@ -455,9 +457,9 @@ class PassiveTerminal:
         return bool(np.sqrt(spread) < MOTION_BINS * self._cells[1])
 
     def _expected_clutter(self, own: Pose) -> ExpectedClutter | None:
-        """What the mesh returns of the transmitter as it is tracked; None where neither is
-        known."""
-        known, sender = self._surroundings.clutter, self._teller or self.reference
+        """What the mesh returns of the transmitter where its data say that it is, else as it is
+        tracked; None where neither is known."""
+        known, sender = self._surroundings.clutter, self._word or self.reference
         if known is None or sender is None or not self._placed(sender.state):
             return None
         clutter = known(sender.state.mean[:6], own)
@@ -474,6 +476,7 @@ class PassiveTerminal:
             "slips_repaired": self.slips_repaired,
             "ends": list(self._ends),
             "profile": self._profile,
+            "read": self._read,
             "standing": self._standing.memory(),
             "calibration": None if self.calibration is None else self.calibration.memory(),
             "retrospect": None if self._retrospect is None else self._retrospect.memory(),
@@ -487,6 +490,7 @@ class PassiveTerminal:
         self.reference = None if reference is None else Track.of_memory(reference)
         self._time, self.state = memory["time"], TerminalState(memory["state"])
         self.slips_repaired, self._profile = memory["slips_repaired"], memory["profile"]
+        self._read = memory["read"]
         self._ends = deque(memory["ends"], maxlen=EVIDENCE_FRAMES)
         if self.calibration is not None:
             self.calibration.restore(memory["calibration"])

@@ -11,7 +11,9 @@ from test_images import ORIGIN, VELOCITY, WALL, city, pose
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.terminal import PassiveTerminal, Surroundings
+from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=48)
@@ -77,3 +79,30 @@ def test_a_path_over_a_wall_is_named(said, named):
     # 0.1 cells of range, and a direction known to 0.01 at 10 m
     off = np.linalg.norm(tracks.mean[tracks.confirmed, :3] + own.position - TARGET - moved, axis=1)
     assert off.min() < 0.5
+
+
+class Asked(Exception):
+    """What the city shows was asked for."""
+
+
+@pytest.mark.parametrize("read", [False, True])
+def test_the_city_is_expected_from_where_the_data_say(read):
+    """Once a data frame was read its word counts, and before it the track, 1 m off and 1.2 m/s.
+    Planted bug: the track asked though the data were read."""
+    asked = []
+
+    def clutter(state, own):
+        asked.append(state)
+        raise Asked
+
+    terminal = PassiveTerminal(
+        W, ANTENNAS, Receivers(), Tracking(), 8, 1.0, surroundings=Surroundings(None, clutter)
+    )
+    told = Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3))
+    off = np.array([1.0, 0.0, 0.0, 0.0, 1.2, 0.0])
+    tracked = Gaussian(np.concatenate([SENDER, VELOCITY]) + off, np.eye(6) * 1e-4)
+    terminal.reference, terminal._time, terminal._read = Track.of_body(tracked), 0.0, read
+    with pytest.raises(Asked):
+        terminal.step(None, OWN, 0.0, True, sender=told)
+    expected = tracked.mean - off * read
+    np.testing.assert_allclose(asked[0], expected, rtol=0, atol=1e-9)
