@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, Told, advance
+from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, Told, advance, its_word
 from isac_rt.terminal.pool import Look, PooledTracker
 from isac_rt.terminal.retrospect import BATCH
 
@@ -243,7 +243,7 @@ class Notes:
         fused = self.picture.update(
             [report.at(time, acceleration_std) for report, _ in self.reports.values()],
             {
-                name: advance(said.state, time - said.time, acceleration_std)
+                name: its_word(said.state).after(time - said.time, acceleration_std)
                 for name, said in self.terminals.items()
             },
         )

@@ -17,7 +17,7 @@ from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.fusion import Fused, Picture, advance, in_world, of_itself
+from isac_rt.terminal.fusion import Fused, Picture, advance, in_world, its_word, of_itself
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
 from isac_rt.terminal.tracker import in_plane
@@ -132,7 +132,8 @@ class Cooperation:
             for report, via in notes.reports.values()
             if not via
         ]
-        return self._swarm.update([r.at(time, self._acceleration) for r in own], known)
+        words = {name: its_word(said) for name, said in known.items()}
+        return self._swarm.update([r.at(time, self._acceleration) for r in own], words)
 
     def _see(self, frame: int, link: Link, heard: Heard) -> None:
         """A terminal takes down what one of its links shows: its confirmed tracks, or what its

@@ -65,6 +65,26 @@ class Name(NamedTuple):
     number: int
 
 
+class Told(NamedTuple):
+    """What a terminal tells of a body, in world axes: its position and velocity (6,), (6, 6)
+    without the errors of who tells, and (6, `ERRORS`) what these errors, one deviation each, do to
+    it."""
+
+    state: Gaussian
+    lever: np.ndarray
+
+    @property
+    def whole(self) -> Gaussian:
+        """The state with the errors of who tells."""
+        return Gaussian(self.state.mean, self.state.covariance + self.lever @ self.lever.T)
+
+    def after(self, interval: float, acceleration_std: float) -> Told:
+        """The same an interval [s] later."""
+        lever = self.lever.copy()
+        lever[:3] += interval * lever[3:]
+        return Told(advance(self.state, interval, acceleration_std), lever)
+
+
 @dataclass(frozen=True)
 class Report:
     """What a terminal says of one of its tracks.
@@ -75,8 +95,7 @@ class Report:
     since : when it was confirmed [s]
     name : by which it knows the body
     time : that the state is of [s]
-    state : position and velocity (6,), (6, 6), without the errors of who tells
-    lever : (6, `ERRORS`) what these errors, one deviation each, do to it; by default nothing
+    state, lever : as in `Told`; by default the errors of who tells do nothing
     """
 
     key: Key
@@ -94,14 +113,11 @@ class Report:
     @property
     def whole(self) -> Gaussian:
         """The state with the errors of who tells."""
-        return Gaussian(self.state.mean, self.state.covariance + self.lever @ self.lever.T)
+        return Told(self.state, self.lever).whole
 
     def at(self, time: float, acceleration_std: float) -> Report:
         """The same at another time [s]."""
-        interval = time - self.time
-        state = advance(self.state, interval, acceleration_std)
-        lever = self.lever.copy()
-        lever[:3] += interval * lever[3:]
+        state, lever = Told(self.state, self.lever).after(time - self.time, acceleration_std)
         return replace(self, time=time, state=state, lever=lever)
 
     def memory(self) -> list[Any]:
@@ -146,13 +162,6 @@ def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussi
     return Gaussian(F[:SIZE, :SIZE] @ state.mean, (F @ P @ F.T + Q)[:SIZE, :SIZE])
 
 
-class Told(NamedTuple):
-    """A track as it is told to others, in world axes: `Report.state` and `Report.lever`."""
-
-    state: Gaussian
-    lever: np.ndarray
-
-
 def in_world(tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0) -> Told:
     """A track as it is told to others: its own covariance, and apart from it what the errors of the
     terminal do to it: of its position and velocity (`POSE_STD`), of its attitude (`ATTITUDE_STD`),
@@ -185,6 +194,13 @@ def of_itself(own: Pose) -> Gaussian:
     """What a terminal says of its own position and velocity."""
     variance = np.repeat(np.square(POSE_STD), 3)
     return Gaussian(np.concatenate([own.position, own.velocity]), np.diag(variance))
+
+
+def its_word(said: Gaussian) -> Told:
+    """The same (`of_itself`) with the errors of its pose apart."""
+    lever = np.zeros((SIZE, ERRORS))
+    lever[range(SIZE), range(SIZE)] = np.repeat(POSE_STD, 3)
+    return Told(Gaussian(said.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
 
 
 def in_datum(state: Gaussian) -> Gaussian:
@@ -256,7 +272,7 @@ def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
 
 
 def together(
-    bodies: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Gaussian]]
+    bodies: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Told]]
 ) -> list[Gaussian]:
     r"""Bodies from their tracks, jointly with the errors of the terminals that tell of them.
 
@@ -276,30 +292,30 @@ def together(
     owners |= {_teller(report.key) for reports in bodies for report in reports}
     links = dict.fromkeys(report.key.origin for reports in bodies for report in reports)
     first = SIZE * len(bodies)
-    pose = {name: first + (ERRORS - 1) * k for k, name in enumerate(sorted(owners))}
-    clock = {o: first + (ERRORS - 1) * len(pose) + k for k, o in enumerate(links)}
-    size = first + (ERRORS - 1) * len(pose) + len(clock)
+    count = ERRORS - 1
+    of_pose = {
+        name: range(first + count * k, first + count * (k + 1))
+        for k, name in enumerate(sorted(owners))
+    }
+    clock = {origin: first + count * len(of_pose) + k for k, origin in enumerate(links)}
+    size = first + count * len(of_pose) + len(clock)
     information, vector = np.zeros((size, size)), np.zeros(size)
     information[range(first, size), range(first, size)] = 1.0
 
-    def add(k: int, at: list[int], lever: np.ndarray, said: Gaussian, weight: float) -> None:
-        rows = [*range(SIZE * k, SIZE * k + SIZE), *at]
-        A = np.hstack([np.eye(SIZE), lever])
-        gain = weight * np.linalg.solve(said.covariance, A).T
+    def add(k: int, errors: list[int], state: Gaussian, lever: np.ndarray, weight: float) -> None:
+        rows = [*range(SIZE * k, SIZE * k + SIZE), *errors]
+        A = np.hstack([np.eye(SIZE), lever[:, : len(errors)]])
+        gain = weight * np.linalg.solve(state.covariance, A).T
         information[np.ix_(rows, rows)] += gain @ A
-        vector[rows] += gain @ said.mean
+        vector[rows] += gain @ state.mean
 
     for k, reports in enumerate(bodies):
         _, weights = _intersected([report.whole for report in reports])
         for report, w in zip(reports, weights, strict=True):
-            at = pose[_teller(report.key)]
-            rows = [*range(at, at + ERRORS - 1), clock[report.key.origin]]
-            add(k, rows, report.lever, report.state, w)
-    for k, (name, said) in itself.items():
-        deviations = np.repeat(POSE_STD, 3)
-        rest = said.covariance - np.diag(deviations**2) + OWN_NOISE**2 * np.eye(SIZE)
-        rows = [*range(pose[name], pose[name] + SIZE)]
-        add(k, rows, np.diag(deviations), Gaussian(said.mean, rest), 1.0)
+            errors = [*of_pose[_teller(report.key)], clock[report.key.origin]]
+            add(k, errors, report.state, report.lever, w)
+    for k, (name, (state, lever)) in itself.items():
+        add(k, [*of_pose[name]], state, lever, 1.0)
     P = np.linalg.inv(information)
     mean, P = P @ vector, (P + P.T) / 2
     each = [slice(SIZE * k, SIZE * k + SIZE) for k in range(len(bodies))]
@@ -362,14 +378,14 @@ class Picture:
         self._bodies = [_Body(Name(*name), [Key(*k) for k in keys]) for name, keys in memory]
 
     def update(
-        self, reports: Iterable[Report], known: Mapping[str, Gaussian] | None = None
+        self, reports: Iterable[Report], known: Mapping[str, Told] | None = None
     ) -> list[Fused]:
         """The bodies of one instant.
 
         Parameters
         ----------
         reports : all of that instant (`Report.at`), one per track
-        known : what terminals say of themselves, likewise
+        known : what terminals say of themselves (`its_word`), likewise
         """
         by_key = {report.key: report for report in reports}
         whole = {key: report.whole for key, report in by_key.items()}
@@ -379,7 +395,7 @@ class Picture:
         self._call(by_key)
         known = known or {}
         states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
-        whose = recognise(states, known)
+        whose = recognise(states, {name: word.whole for name, word in known.items()})
         itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
         if self._bodies:
             members = [[by_key[k] for k in b.members] for b in self._bodies]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from isac_rt.terminal.filter import Gaussian, bistatic_distance, predict
@@ -22,6 +23,7 @@ from isac_rt.terminal.fusion import (
     in_world,
     intersection,
     intersection_of,
+    its_word,
     of_itself,
     together,
 )
@@ -226,7 +228,7 @@ def test_a_terminal_is_known_by_what_it_says_of_itself():
     itself = Gaussian(np.array([30.0, 20, 12, 1, 2, 0]), 0.0025 * np.eye(6))
     echo = told(("A->A", 1), [30.05, 20, 12, 1, 2, 0], [0.04] * 6)
     beside = told(("A->A", 2), [30.6, 20, 12, 1, 2, 0], [0.04] * 6)
-    found = Picture().update([beside, echo], {"P": itself})
+    found = Picture().update([beside, echo], {"P": its_word(itself)})
     assert {f.members[0]: f.terminal for f in found} == {echo.key: "P", beside.key: None}
 
 
@@ -323,7 +325,7 @@ def test_what_one_body_shows_of_a_terminal_helps_the_others():
     mean, other = rng.normal(size=6), rng.normal(size=6)
     one, two = levered(("A->A", 1), mean, P1, rng), levered(("A->A", 2), other, P2, rng)
     itself = of_itself(Pose(mean[:3] + 0.2, mean[3:] - 0.1, np.zeros(3), np.eye(3)))
-    found = together([[one], [two]], {0: ("T", itself)})
+    found = together([[one], [two]], {0: ("T", its_word(itself))})
     L1, L2 = one.lever, two.lever
     S = L1 @ L1.T + P1 + itself.covariance + OWN_NOISE**2 * np.eye(6)
     C = np.eye(ERRORS) - L1.T @ np.linalg.solve(S, L1)
@@ -333,6 +335,38 @@ def test_what_one_body_shows_of_a_terminal_helps_the_others():
     moved = -L2 @ L1.T @ np.linalg.solve(S, mean - itself.mean)
     assert (found[1].mean - other) / spread == pytest.approx(moved / spread, abs=1e-7)
     assert np.linalg.norm(moved) > 0.1
+
+
+@pytest.mark.parametrize("acceleration", [0.1, 3.0])
+def test_a_word_of_some_time_ago_has_the_errors_of_then_carried_on(acceleration):
+    """A sees T, T sees a stranger, and T's word of itself is 0.4 s old: its place is off by 0.4 s
+    of its velocity's error, too, which is that of its track of the stranger. Generalised least
+    squares of the three with the covariance of all their errors. Planted bug: the word's errors as
+    if it were new, the rest of its covariance apart (what is left of it is none at 0.1 m/s^2)."""
+    rng, age = np.random.default_rng(9), 0.4
+    P1, P2 = (0.01 * covariance(rng) for _ in range(2))
+    D = np.diag(np.repeat(POSE_STD, 3))
+    lever = np.hstack([D, np.zeros((6, ERRORS - 6))])
+    of_t, of_stranger = (
+        Report(Key(o, 1), 0.0, Name(0.0, o, 1), 0.0, Gaussian(rng.normal(size=6), P), of)
+        for o, P, of in (("A->A", P1, np.zeros((6, ERRORS))), ("T->T", P2, lever))
+    )
+    itself = Gaussian(0.1 * rng.normal(size=6), D**2)
+    word = its_word(itself).after(age, acceleration)
+    found = together([[of_t], [of_stranger]], {0: ("T", word)})
+
+    carry = np.kron([[1, age], [0, 1]], np.eye(3))
+    rest = advance(Gaussian(np.zeros(6), OWN_NOISE**2 * np.eye(6)), age, acceleration).covariance
+    L = np.vstack([np.zeros((6, 6)), D, carry @ D])
+    N = L @ L.T + block_diag(P1, P2, rest)
+    H = np.kron([[1, 0], [0, 1], [1, 0]], np.eye(6))
+    y = np.concatenate([of_t.state.mean, of_stranger.state.mean, carry @ itself.mean])
+    C = np.linalg.inv(H.T @ np.linalg.solve(N, H))
+    mean, spread = C @ H.T @ np.linalg.solve(N, y), np.sqrt(np.diag(C))
+    for k, rows in enumerate((slice(0, 6), slice(6, 12))):
+        off = (found[k].covariance - C[rows, rows]) / np.outer(spread[rows], spread[rows])
+        assert np.abs(off).max() < 1e-7
+        assert found[k].mean / spread[rows] == pytest.approx(mean[rows] / spread[rows], abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(6))
