@@ -17,7 +17,15 @@ from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.fusion import Fused, Picture, advance, in_world, its_word, of_itself
+from isac_rt.terminal.fusion import (
+    Fused,
+    KnownBody,
+    Picture,
+    advance,
+    in_world,
+    its_word,
+    of_itself,
+)
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
 from isac_rt.terminal.terminal import TerminalState
 from isac_rt.terminal.tracker import in_plane
@@ -26,8 +34,6 @@ from isac_rt.world.swarm import Pose
 REMEMBERED = 3
 """Frames of which it is remembered what terminals knew: some are still being heard when the next
 begins."""
-Body = tuple[str, Gaussian]
-"""The terminal that it is, "" if it is none, and its position and velocity (6,)."""
 
 
 class Cooperation:
@@ -47,7 +53,7 @@ class Cooperation:
         self._channels: dict[Link, Channel] = {}
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
-        self._known: dict[int, tuple[float, dict[str, list[Body]]]] = {}
+        self._known: dict[int, tuple[float, dict[str, list[KnownBody]]]] = {}
         """By frame: its time, and by terminal the bodies that it knew of then."""
 
     def _pool(self) -> PooledTracker:
@@ -99,24 +105,24 @@ class Cooperation:
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
 
-    def _bodies(self, name: str, view: View, time: float) -> list[Body]:
+    def _bodies(self, name: str, view: View, time: float) -> list[KnownBody]:
         """What a terminal knows of: other terminals by what they say of themselves, and the bodies
-        of its picture."""
+        of its picture that are none of these."""
         said = self._notes[name].terminals
         mates = [
-            (other, advance(s.state, time - s.time, self._acceleration))
+            KnownBody(other, advance(s.state, time - s.time, self._acceleration))
             for other, s in said.items()
         ]
-        return mates + [(body.terminal or "", body.state) for body in view.bodies]
+        return mates + [KnownBody("", b.state) for b in view.bodies if b.terminal is None]
 
-    def told(self, link: Link, frame: int, time: float) -> list[Gaussian]:
+    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
         """The bodies that a link's receiver knew of after a frame, at a time [s], but the link's
         ends; none where the frame is not remembered."""
         then, known = self._known.get(frame, (time, {}))
         return [
-            advance(state, time - then, self._acceleration)
-            for name, state in known.get(link.rx, [])
-            if name not in link
+            body._replace(state=advance(body.state, time - then, self._acceleration))
+            for body in known.get(link.rx, [])
+            if body.terminal not in link
         ]
 
     def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
@@ -240,7 +246,10 @@ class Cooperation:
             channel = self._channels[Link(tx, rx)] = Channel()
             channel.restore(kept)
         self._known = {
-            frame: (time, {n: [(who, Gaussian(*g)) for who, *g in of] for n, of in bodies.items()})
+            frame: (
+                time,
+                {n: [KnownBody(who, Gaussian(*g)) for who, *g in of] for n, of in bodies.items()},
+            )
             for frame, time, bodies in memory["known"]
         }
 

@@ -32,7 +32,7 @@ from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.fusion import KnownBody
 from isac_rt.terminal.retrospect import Late
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
@@ -120,7 +120,7 @@ class _Observer:
         frame: Frame,
         cube: IFCube | RangeProfiles,
         maps: bool,
-        told: Sequence[Gaussian] = (),
+        told: Sequence[KnownBody] = (),
     ) -> Heard:
         """Reception and tracking of one frame; `told` are the bodies that the receiver knows of
         from others. Runs in a thread of its own; only this observer's state changes."""
@@ -164,9 +164,7 @@ class _Observer:
         """Where the other end of the link, or at an active terminal those of all links, say that
         they are, as far as the receiver asks."""
         s = self.setup
-        gates = self.link.own and self.receivers.gate_false_alarm_rate is not None
-        gates = gates and s.scenario.cooperation != "none"
-        if not gates and self.receivers.self_calibration != "positions":
+        if self.receivers.self_calibration != "positions":
             return []
         tx, rx = self.link
         names = s.timetable.with_role("passive", frame) if self.link.own else [tx]
@@ -233,7 +231,7 @@ class _Swarm:
         poses = {name: self._swarm.poses(view.time) for name, view in views.items()}
         return self._scorer.record(frame.number, views, records, poses)
 
-    def told(self, link: Link, frame: int, time: float) -> list[Gaussian]:
+    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
         """As `Cooperation.told`."""
         return self._cooperation.told(link, frame, time)
 
@@ -268,7 +266,7 @@ class _Listeners:
             None if setup.scenario.cooperation == "none" else _Swarm(setup),
         )
 
-    def told(self, link: Link, frame: int) -> list[Gaussian]:
+    def told(self, link: Link, frame: int) -> list[KnownBody]:
         """What the link's receiver knows of from others in a frame: what it knew `AHEAD` frames
         before, so that no frame waits for the one before."""
         when = self.recorder.timetable.epoch(frame, link.tx)
@@ -550,7 +548,7 @@ class _Run:
         self,
         frame: Frame,
         link: Link,
-        told: Sequence[Sequence[Gaussian]],
+        told: Sequence[Sequence[KnownBody]],
         before: Future[list[Heard]] | None,
     ) -> list[Heard]:
         """What a link's receivers make of a frame, those of the scenario first; all are given the

@@ -150,6 +150,14 @@ class Fused:
     terminal: str | None = None
 
 
+class KnownBody(NamedTuple):
+    """A body that a terminal knows of from others: its position and velocity (6,), and the terminal
+    of the swarm that it is by its own word, "" if it is none."""
+
+    terminal: str
+    state: Gaussian
+
+
 def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     """Position and velocity (6,) after an interval [s] of Singer's model. The acceleration is not
     told: it is zero with `acceleration_std` [m/s^2] per axis."""

@@ -38,7 +38,7 @@ from isac_rt.terminal.filter import (
     update,
     wrapped,
 )
-from isac_rt.terminal.fusion import of_itself
+from isac_rt.terminal.fusion import KnownBody, of_itself
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
 from isac_rt.terminal.retrospect import COAST_CELLS, Late, Retrospect
@@ -149,18 +149,18 @@ class ActiveTerminal:
         *,
         clutter: ExpectedClutter | None = None,
         mates: Sequence[Pose] = (),
-        told: Sequence[Gaussian] = (),
+        told: Sequence[KnownBody] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `clutter` what the terminal
-        expects of its mesh there, `mates` where other terminals say that they are, `told` the
-        bodies (6,) that it knows of from them."""
+        expects of its mesh there, `mates` where other terminals are by what its calibration is
+        told, `told` the bodies that it knows of from them."""
         if self.calibration is not None and isinstance(cube, IFCube):
             cube = self.calibration.correct(cube, time)
         if clutter is not None and self._correction is not None:
             clutter = self._correction.apply(clutter)
         self.tracker.predict(time)
-        self._gates = self._sought(own_pose, mates)
+        self._gates = self._sought(own_pose, told)
         reception = self.receive(cube, payload, clutter, maps)
         if reception.correction is not None:
             before = self._correction or Correction(0.0, np.zeros(3))
@@ -174,7 +174,7 @@ class ActiveTerminal:
             crowd = self._standing.look(found, own_pose, time, self.tracker.ambiguity.period)
             found = replace(found, starts=found.starts & ~crowd)
             self.tracker.update(found, own_pose)
-            self._doubts.remove_ghosts(self.tracker, new, own_pose, told=told)
+            self._doubts.remove_ghosts(self.tracker, new, own_pose, None, [b.state for b in told])
             self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
@@ -198,16 +198,20 @@ class ActiveTerminal:
             return self.other.receive(cube, payload, clutter, maps)
         return self._receiver.receive(cube, payload, clutter, maps=maps, sought=self._gates)
 
-    def _sought(self, own: Pose, mates: Sequence[Pose]) -> Gates | None:
-        """Where tracks that move and other terminals are expected; None: that is not asked for.
-        What stands still may be a wall that the mesh lacks, whose clutter nothing whitens."""
+    def _sought(self, own: Pose, told: Sequence[KnownBody]) -> Gates | None:
+        """Where tracks that move, and other terminals by their word, are expected; None: that is
+        not asked for. What stands still may be a wall that the mesh lacks, whose clutter nothing
+        whitens."""
         if self._receiver.settings.gate_false_alarm_rate is None:
             return None
-        told = [of_itself(mate) for mate in mates]
-        # the error of the own pose is as large as what a mate states of its own
-        told = [Gaussian(np.pad(m, (0, 3)), np.pad(2 * P, (0, 3))) for m, P in told]
+        error = of_itself(own).covariance
+        mates = [
+            Track.of_body(Gaussian(body.state.mean, body.state.covariance + error)).state
+            for body in told
+            if body.terminal
+        ]
         moving = [t.state for t in self.tracker.tracks if not rests(t)]
-        return Gates(*reported(moving + told, own))
+        return Gates(*reported(moving + mates, own))
 
     def memory(self) -> dict[str, Any]:
         """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
@@ -312,12 +316,12 @@ class PassiveTerminal:
         *,
         mates: Sequence[Pose] = (),
         sender: Pose | None = None,
-        told: Sequence[Gaussian] = (),
+        told: Sequence[KnownBody] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame; `time` is its middle [s], `modulated` is public, `mates` is
         where the transmitter says that it is, `sender` where its data do, which count once a frame
-        was read, `told` the bodies (6,) that the terminal knows of from others."""
+        was read, `told` the bodies that the terminal knows of from others."""
         if self.calibration is not None:
             cube = self.calibration.correct(cube, time)
         if self.reference is not None:
@@ -429,7 +433,7 @@ class PassiveTerminal:
         return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
     def _track(
-        self, detections: Detections, own: Pose, reference: Track, told: Sequence[Gaussian]
+        self, detections: Detections, own: Pose, reference: Track, told: Sequence[KnownBody]
     ) -> None:
         """Carry on the reflectors' tracks, and start those that the city does not explain."""
         sender = reference.state
@@ -447,7 +451,7 @@ class PassiveTerminal:
             crowd = self._standing.look(allowed, own, self._time, period, place.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
-        self._doubts.remove_ghosts(self.tracker, new, own, reference, told)
+        self._doubts.remove_ghosts(self.tracker, new, own, reference, [b.state for b in told])
         self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
 
     def _placed(self, sender: Gaussian) -> bool:

@@ -132,13 +132,18 @@ def test_a_slow_feedback_makes_the_picture_old():
 
 
 def test_a_terminal_that_does_not_decode_hears_nothing():
-    """The PT looks away: it acquires nobody. Its messages, and those to it, are lost."""
+    """The PT looks away: it acquires nobody. Its messages, and those to it, are lost: the AT's
+    receiver never knows where the PT is. Planted bug: terminals' poses as if they were heard."""
     deaf = scenario().swarm["PT"].model_copy(update={"boresight": (0, 1, 0)})
     swarm = {**scenario().swarm, "PT": deaf}
-    told = simulate.run(scenario(swarm=swarm, frames=6)).summary["swarm"]["terminals"]
+    known: dict = {}
+    results = simulate.run(scenario(swarm=swarm, frames=6), terminal=noting(known))
+    heard = results.summary["swarm"]["terminals"]
     for name in ("AT", "PT"):
-        assert told[name]["messages"] == told[name]["messages_lost"] > 0
-        assert told[name]["reports_per_frame"] == 0
+        assert heard[name]["messages"] == heard[name]["messages_lost"] > 0
+        assert heard[name]["reports_per_frame"] == 0
+    assert len(known["AT->AT"]) == 6
+    assert not [b for told in known.values() for bodies in told for b in bodies if b.terminal]
 
 
 @pytest.mark.parametrize("told", ["tracks", "detections"])
@@ -220,7 +225,7 @@ def noting(told):
         step = made.step
 
         def noted(*given, **options):
-            told.setdefault(str(link), []).append([body.mean for body in options["told"]])
+            told.setdefault(str(link), []).append(options["told"])
             return step(*given, **options)
 
         made.step = noted
@@ -231,9 +236,9 @@ def noting(told):
 
 def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tmp_path):
     """Each link's receiver knows the target within 3 cm where it is by then (it flies 6 cm in two
-    frames), and no body within 3 m of the link's own ends. A run that is stopped and taken up
-    tells the same. Planted bugs: states not brought to the frame's time; what is known not taken
-    up."""
+    frames), no body within 3 m of the link's own ends, and other terminals once each. A run that is
+    stopped and taken up tells the same. Planted bugs: states not brought to the frame's time; what
+    is known not taken up; a terminal that a picture knows told of twice."""
     flight = scenario(frames=7)
     whole, resumed = {}, {}
     simulate.run(flight, snapshots=0, terminal=noting(whole))
@@ -241,9 +246,14 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     for link, told in whole.items():
         assert len(told) == flight.frames and not told[0]
         poses = swarm.poses((flight.frames - 1) * flight.frame_interval_s)
-        away = {n: [np.linalg.norm(m[:3] - p.position) for m in told[-1]] for n, p in poses.items()}
+        away = {
+            n: [np.linalg.norm(body.state.mean[:3] - p.position) for body in told[-1]]
+            for n, p in poses.items()
+        }
         assert min(away["U"]) < 0.03
-        assert all(min(away[name]) > 3 for name in link.split("->"))
+        ends = set(link.split("->"))
+        assert all(min(away[name]) > 3 for name in ends)
+        assert [b.terminal for b in told[-1] if b.terminal] == sorted({"AT", "PT"} - ends)
 
     def kept():
         return Resume(tmp_path, run_content(flight, 0), every=0.0)
@@ -254,4 +264,7 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     for link, told in resumed.items():
         assert 0 < len(told) < flight.frames
         for again, before in zip(told[::-1], whole[link][::-1], strict=False):
-            assert np.array_equal(np.array(again), np.array(before))
+            assert [body.terminal for body in again] == [body.terminal for body in before]
+            for one, other in zip(again, before, strict=True):
+                assert np.array_equal(one.state.mean, other.state.mean)
+                assert np.array_equal(one.state.covariance, other.state.covariance)

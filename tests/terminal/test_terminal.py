@@ -18,6 +18,7 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.fusion import KnownBody, of_itself
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
 from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose, attitude
@@ -195,10 +196,10 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
 
 
 def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
-    """A mate 20 m ahead that recedes at 3 m/s, and the track of an echo, straight ahead too, one
-    frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none of what stands still, nor where
-    it is not asked for.
-    Planted bug: gates of the frame before."""
+    """A mate 20 m ahead that recedes at 3 m/s, as it said, and the track of an echo, straight ahead
+    too, one frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none of what stands still
+    or is no terminal, nor where it is not asked for.
+    Planted bugs: gates of the frame before; one of every body that it was told of."""
     rule = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-3)
     at = ActiveTerminal(W, ANTENNAS, rule, Tracking())
     own = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
@@ -208,8 +209,9 @@ def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     at.tracker.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
     at.tracker.time = 0.0
     at.tracker.predict(0.5)
-    sought = at._sought(own, [mate])
+    told = [KnownBody("PT", of_itself(mate)), KnownBody("", of_itself(own))]
+    sought = at._sought(own, told)
     np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(sought.std[1, :2], 0.05 * np.sqrt(2))
     plain = ActiveTerminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())
-    assert plain._sought(own, [mate]) is None
+    assert plain._sought(own, told) is None
