@@ -6,7 +6,8 @@ included. The lines, not the paths, are then spread on the grid. Between which l
 decided a few times in a frame, f for every few chirps, and amplitudes z for every chirp: a path
 costs two sums of products for each receive element. With theta the turn over half a chirp from line
 to line and x the time from the middle of the chirp, what is left out of a path is f (1 - f) theta^2
-(x^2 - 1/3)/2, and the quadratic phase of motion away from the middle of the chirp.
+(x^2 - 1/3)/2, and the quadratic phase of motion away from the middle of the chirp: see
+`covered_error`.
 
 Data delay all paths alike by D: they move the lines over the grid and turn a line of beat F by
 exp(-j 2 pi F D).
@@ -30,6 +31,11 @@ LINES = 8
 """Lines to a step of the grid."""
 TOGETHER = 12
 """Chirps for which the paths are read once."""
+MOVED = 0.5
+"""Lines that paths may move by until the lines beside them are sought anew, where that takes longer
+than a batch of chirps."""
+FLOOR = 2e-3
+"""Error of a path on a line: four weights, to which twelve are fitted besides."""
 EXTRA = 2
 """Degree of the weights' polynomials above the width."""
 _ACROSS = 3  # chirps whose sums stay in registers, with the same shares
@@ -200,11 +206,56 @@ def batches(antenna: np.ndarray, slots: int) -> Batches:
 
 
 def part_slots(waveform: Waveform, rate: np.ndarray, size: int) -> int:
-    """Slots of a part of the frame, in which paths move by about a line: whole batches."""
+    """Slots of a part of the frame, in which paths move by no more than `MOVED`: whole batches, one
+    at least."""
+    moved = float(np.abs(rate).max(initial=0.0)) * waveform.slot_duration * _lines(waveform, size)
+    return TOGETHER * max(int(MOVED / max(moved * TOGETHER, 1e-3)), 1)
+
+
+def _lines(waveform: Waveform, size: int) -> float:
+    """Lines by which a delay of a second moves a path."""
+    return waveform.slope * waveform.sample_interval * size * LINES
+
+
+def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
+    """(K,) bound of the relative RMS error over a frame of paths that noise covers, of what the
+    receiver's filter would let through whole.
+
+    Four parts, added in power: what two lines leave of a path between them or, by its motion and
+    its elements' delays, beyond one of them; shares of the middle of a few chirps; the quadratic
+    phase; and `FLOOR`.
+
+    Parameters
+    ----------
+    size : grid points a turn
+    """
+    w, t, rate = waveform, tones, np.abs(tones.rate)
+    half, lines = w.num_samples / 2, _lines(waveform, size)
+    slots = part_slots(w, rate, size)
+    moved = np.maximum(rate * TOGETHER * w.slot_duration * lines, MOVED) / 2
+    beyond = moved + lines * sum(np.abs(d).max(axis=1) for d in (t.tx_delay, t.rx_delay))
+    # most of f (1 - f), f between the lines, or on one of them and evenly that far to both sides
+    between = np.maximum(0.25, np.sqrt(beyond**2 / 3 + beyond**4 / 5))
+    turn = line_turn(size, half)
+    order, parts = batches(t.antenna[0], slots)
+    stale = rate * _apart(w, order, parts) * lines * turn
+    bend = np.pi * w.slope * rate * (w.sample_interval * half) ** 2 * 2
+    spread = np.sqrt(1 / 5 - 1 / 9)  # of x^2
+    return np.sqrt(
+        (turn**2 / 2 * between * spread) ** 2 + stale**2 / 3 + (bend * spread) ** 2 + FLOOR**2
+    )
+
+
+def _apart(waveform: Waveform, order: np.ndarray, parts: np.ndarray) -> float:
+    """RMS of the time from the middle of the chirps that have the same shares [s]."""
     w = waveform
-    moved = np.abs(rate).max(initial=0.0) * w.slot_duration * w.slope * w.sample_interval * size
-    batches_each = 1 / max(moved * LINES * TOGETHER, 1e-3)
-    return TOGETHER * max(int(np.rint(batches_each)), 1)
+    place = np.concatenate([np.arange(count) for count in parts[:, 1]])
+    few = np.repeat(np.arange(len(parts)), parts[:, 1]) * TOGETHER + place // _ACROSS
+    group, slot = np.divmod(order, w.num_chirps)
+    time = slot * w.slot_duration + group * w.group_spacing
+    _, number, count = np.unique(few, return_inverse=True, return_counts=True)
+    middle = np.bincount(number, time) / count
+    return float(np.sqrt(np.mean((time - middle[number]) ** 2)))
 
 
 def covered_paths(

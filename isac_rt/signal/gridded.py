@@ -103,8 +103,8 @@ ACCURATE = Setting(1.5, 8, True, True)
 of the speed."""
 ACCURATE_ERROR = 5e-6
 COVERING = Setting(1.5, 12, True, faint=4)
-"""Error below `GRIDDED_ERROR`; of paths that noise covers below 2.5e-3 + 1.5e-4 v +
-2e-5 v^2, v in m/s."""
+"""Error below `GRIDDED_ERROR`; of paths that noise covers below
+`isac_rt.signal.covered.covered_error`."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
 # several chirps
 _MANY = 4000
@@ -136,6 +136,13 @@ class Kernel(NamedTuple):
     deconvolution: np.ndarray
 
 
+def grid_size(num_samples: int, oversampling: float, width: int) -> int:
+    """Grid points a turn for chirps of N samples."""
+    return scipy.fft.next_fast_len(
+        max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True
+    )
+
+
 @lru_cache(maxsize=16)
 def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -> Kernel:
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
@@ -147,9 +154,7 @@ def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -
     so many grid points, and what more of them leave is fitted to it.
     """
     first = faint or width
-    grid = scipy.fft.next_fast_len(
-        max(int(np.ceil(oversampling * num_samples)), 4 * width), real=True
-    )
+    grid = grid_size(num_samples, oversampling, width)
     nodes, basis = _basis(num_samples, grid, first)
     steps = np.arange(first) - (first - 1) / 2
     beta = 0.98 * np.pi * (1 - num_samples / grid / 2) * first

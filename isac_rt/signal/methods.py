@@ -10,10 +10,18 @@ import numpy as np
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.vector import cube_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
-from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, read
+from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, Cover, read
+from isac_rt.signal.covered import covered_error
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
-from isac_rt.signal.gridded import DEFAULT, GRIDDED_ERROR, Setting, add_gridded
+from isac_rt.signal.gridded import (
+    COVERING,
+    DEFAULT,
+    GRIDDED_ERROR,
+    Setting,
+    add_gridded,
+    grid_size,
+)
 from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
 
@@ -126,8 +134,8 @@ class Auto:
     def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         shape, speed = _shape(waveform, tones), tones.speed(waveform.frame_duration)
-        cell = resolution_cell(waveform, tones.delay, tones.rate) if self.covered else None
-        choice = self.choose(shape, tones.power, speed, tones.sight, cell)
+        cover = _cover(waveform, tones) if self.covered and tones.size else None
+        choice = self.choose(shape, tones.power, speed, tones.sight, cover)
         return _made(waveform, tones, choice)
 
     def choose(
@@ -136,7 +144,7 @@ class Auto:
         power: np.ndarray,
         speed: np.ndarray,
         sight: np.ndarray,
-        cell: np.ndarray | None = None,
+        cover: Cover | None = None,
     ) -> Choice:
         """How a cube of this shape (M, L_rx, P, N) is made.
 
@@ -144,7 +152,7 @@ class Auto:
         ----------
         power, speed, sight : (K,) of each path: received power [W], c ``|delay rate|`` / 2 [m/s],
             whether it is a line of sight
-        cell : (K,) int, range-Doppler cell in which it is seen; None: noise is taken to cover none
+        cover : which paths noise may cover; None: it is taken to cover none
         """
         model = self.costs or read(SHIPPED)
         scale = 1.0 if self.decide_for is None else self.decide_for / max(power.size, 1)
@@ -157,9 +165,9 @@ class Auto:
             error = candidate.error_at(speed)
             strong = power * error**2 * size > self.noise_power
             faint = none
-            if cell is not None:
+            if cover is not None:
                 limit = self.covered * self.noise_power / size
-                faint = ~sight & candidate.covered(power, speed, cell, limit)
+                faint = ~sight & candidate.covered(power, cover, limit)
             alone = ~faint & ((strong & top) | sight | (error > self.max_error))
             if alone.all():
                 continue
@@ -178,6 +186,13 @@ Method = Exact | Direct | Gridded | Auto | Separable
 def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
     w = waveform
     return w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples
+
+
+def _cover(waveform: Waveform, tones: Tones) -> Cover:
+    """Where paths are seen, and their errors if noise is taken to cover them."""
+    size = grid_size(waveform.num_samples, COVERING.oversampling, COVERING.width)
+    cell = resolution_cell(waveform, tones.delay, tones.rate)
+    return Cover(cell, covered_error(waveform, tones, size))
 
 
 def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:

@@ -20,6 +20,7 @@ from isac_rt.signal.choice import (
     NAMES,
     SHIPPED,
     CostModel,
+    Cover,
     read,
 )
 from isac_rt.signal.gridded import COVERING, DEFAULT
@@ -52,7 +53,7 @@ def test_what_is_predicted_twice_as_dear_is_dearer(size):
     works |= {
         c.name + FAINT: (lambda c=c: job.samples(links, Gridded(c.setting, faint=True)))
         for c in CANDIDATES
-        if c.faint
+        if c.setting.faint
     }
     works[DIRECT] = lambda: job.samples(links, Direct())
     measured = {name: cpu_seconds(work, 3) for name, work in works.items()}
@@ -99,21 +100,22 @@ def test_sights_fast_and_strong_paths_go_direct():
 
 
 def test_noise_covers_what_a_cell_holds_together():
-    """Twelve hundred paths in cells of one, one cell of forty of the same power, one strong path
-    and a line of sight: what is covered is known cell by cell. Planted bug: the cell's sum taken
-    for the path's own."""
+    """Twelve hundred paths in cells of one, one cell of forty of the same power, one strong path,
+    one whose error is large and a line of sight: what is covered is known cell by cell. Planted
+    bugs: the cell's sum taken for the path's own; one error for all paths."""
     count, size = 1200, float(np.prod(SHAPE))
     cell, power = np.arange(count), np.full(count, 1e-9)
     cell[100:140], power[500], sight = 7, 1e-6, np.arange(count) == 600
     speed = np.full(count, 3.0)
-    error = 2.5e-3 + 1.5e-4 * 3.0 + 2e-5 * 9.0
-    noise = 20 * 1e-9 * error**2 * size / 0.01  # twenty of the paths keep 20 dB under it
-    choice = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cell)
-    expected = (cell != 7) & (power < 1e-7) & ~sight
+    error = np.where(np.arange(count) == 700, 0.03, 3e-3)
+    noise = 20 * 1e-9 * 3e-3**2 * size / 0.01  # twenty of the paths keep 20 dB under it
+    cover = Cover(cell, error)
+    choice = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cover)
+    expected = (cell != 7) & (power < 1e-7) & ~sight & (np.arange(count) != 700)
     assert choice.setting == COVERING
     np.testing.assert_array_equal(choice.faint, expected)
     assert np.flatnonzero(choice.alone).tolist() == [600]
-    none = Auto(noise).choose(SHAPE, power, speed, sight, cell)
+    none = Auto(noise).choose(SHAPE, power, speed, sight, cover)
     assert not none.faint.any()
 
 

@@ -44,7 +44,7 @@ def fit(
         links = job.paths(size)
         for c in CANDIDATES:
             jobs[c.name, size] = partial(job.samples, links, Gridded(c.setting))
-            if c.faint is not None:
+            if c.setting.faint:
                 covered = Gridded(c.setting, faint=True)
                 jobs[c.name + FAINT, size] = partial(job.samples, links, covered)
     jobs |= {
