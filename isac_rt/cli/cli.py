@@ -25,9 +25,10 @@ from isac_rt.cli.interruption import Terminated, say_interrupted
 from isac_rt.runtime import UserError, of_machine
 
 DEBUG = "ISAC_RT_DEBUG"
-COLLECT = 20_000, 20, 50
-"""Objects made until garbage is looked for, and how often among young and old ones: what commands
-import stays, and looking through it ten times takes over a second."""
+COLLECT = 20_000
+"""Objects made until garbage is looked for among them: what commands import stays, and looking
+through it after each 700 takes over a second. Older ones are looked through as often as ever: what
+runs leave, figures above all, would pile up in a command of many runs."""
 COMMANDS: dict[Callable[..., None], str] = {
     simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
     simulation.demo: "demo --out first_look",
@@ -90,7 +91,7 @@ def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> No
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    gc.set_threshold(*COLLECT)
+    gc.set_threshold(COLLECT)
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -292,10 +292,11 @@ def _say_plan(found: dict[str, Any], frames: int) -> None:
     once, whole = found["seconds_once"], found["seconds_of_run"]
     first = sum(once.values()) - once["setup"]
     stages = ", ".join(f"{stage} {whole[stage]:.3g}" for stage in found["seconds_per_frame"])
+    heard = "" if "receive" in whole else "receivers (--receivers), "
     say(
-        f"processor time of the run: about {sum(whole.values()):.3g} s: {once['setup']:.3g} s of "
-        f"set-up, and for {frames} frames {stages}, of which {first:.3g} s in the first one, for "
-        "what is loaded"
+        f"processor time of the run without {heard}loading and drawing: about "
+        f"{sum(whole.values()):.3g} s: {once['setup']:.3g} s of set-up, and for {frames} frames "
+        f"{stages}, of which {first:.3g} s in the first one, for what is loaded"
     )
 
 

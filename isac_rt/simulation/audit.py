@@ -126,7 +126,8 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
     -------
     plan : ``seconds_per_frame`` are those of a frame by stage, ``seconds_once`` those of set-up and
         what each stage takes beyond that when it is first used, ``seconds_of_run`` both for all
-        frames; what a machine does slowly or quickly is in them as it was while the plan was made
+        frames, without what loads the program and draws its results; what a machine does slowly or
+        quickly is in them as it was while the plan was made
     """
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)

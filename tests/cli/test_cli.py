@@ -38,10 +38,12 @@ def scenario_file(tmp_path):
 
 
 def test_garbage_is_looked_for_less_often(capsys):
-    """Twenty thousand objects that nothing refers to but themselves are made before it is."""
+    """Twenty thousand objects that nothing refers to but themselves are made before it is; old
+    ones are looked through as often as ever. Planted bugs: no threshold; one of 20 for old ones."""
     usual = gc.get_threshold()
     try:
         assert main(["--version"]) == 0
+        assert gc.get_threshold()[1:] == usual[1:]
         before = gc.get_stats()[0]["collections"]
         for _ in range(15_000):
             itself: list = []

@@ -76,6 +76,7 @@ def test_the_plan_on_the_command_line(capsys):
     text = capsys.readouterr().out
     for item in found["items"]:
         assert item["modelled"].split(",")[0][2:] in text
+    assert "without receivers (--receivers)" in text
     assert "AT to PT1" in text and "s of set-up, and for 4 frames trace" in text
 
 
