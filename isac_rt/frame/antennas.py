@@ -176,6 +176,11 @@ class Antennas:
         apart = apart[apart > SAME_PLACE_M]
         return float(apart.min()) if apart.size else 0.0
 
+    def turn(self, wavelength: float, passes: int) -> float:
+        """Span of direction cosines that the array tells apart; inf: all."""
+        step = self.step(passes)
+        return wavelength / step if step else np.inf
+
     def observes(self, passes: int) -> tuple[bool, bool]:
         """Whether directions along X and along Z can be told at all: the channels of an echo
         (passes = 2), or the receive elements for one pass, do not all stand at one place there."""

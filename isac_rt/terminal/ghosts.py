@@ -151,7 +151,7 @@ class Leeway:
     resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `frame.antennas.resolutions`; of one
         pass at a passive terminal
     ambiguity : of range and velocity
-    turn : span of direction cosines that the array tells apart: an image may stand beyond the view
+    turn : of `Antennas`: an image may stand beyond the view
     """
 
     resolution: np.ndarray
@@ -162,7 +162,8 @@ class Leeway:
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
         """At an active terminal (2 passes) or a passive one (1)."""
         cells = resolutions(waveform, antennas, passes)
-        return cls(cells, Ambiguity.of(waveform, passes), 2 * antennas.view_limit)
+        turn = antennas.turn(waveform.wavelength, passes)
+        return cls(cells, Ambiguity.of(waveform, passes), turn)
 
     def explained(self, off: np.ndarray, std: np.ndarray) -> np.ndarray:
         """Whether differences (..., 4) of paths' measures may be nothing; their deviations."""

@@ -39,8 +39,7 @@ class Standing:
 
     Parameters
     ----------
-    turn : by which direction cosines are ambiguous, the wavelength over the array's spacing: an
-        echo from beyond the view is seen so far beside its direction; inf: by nothing
+    turn : of `Antennas`: an echo from beyond the view is seen so far beside its direction
     walls : the mesh; None: nothing is known of it
     """
 
@@ -56,8 +55,7 @@ class Standing:
         cls, antennas: Antennas, waveform: Waveform, passes: int, walls: Walls | None
     ) -> Standing:
         """For the array of an active terminal (passes = 2) or a passive one."""
-        step = antennas.step(passes)
-        return cls(waveform.wavelength / step if step else np.inf, walls)
+        return cls(antennas.turn(waveform.wavelength, passes), walls)
 
     def memory(self) -> np.ndarray:
         """(n, 5) times, places and signal-to-noise ratios, for `restore`."""

@@ -184,6 +184,22 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
         assert len(tracker.tracks) == left
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+def test_directions_turn_by_what_the_array_tells_apart_whatever_the_view(passes):
+    """Every channel hears two directions one turn apart alike, and two half as far apart not, where
+    the view is narrower than that. Planted bug: the turn from the view."""
+    w = Waveform()
+    antennas = Antennas(
+        tx_x=2, tx_z=2, rx_x=4, rx_z=4, spacing=0.5 * w.wavelength, half_view=np.radians(40)
+    )
+    turn = Leeway.of(w, antennas, passes).turn
+    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    places = (places - places[0]) / w.wavelength
+    for axis in (0, 2):
+        assert np.exp(2j * np.pi * turn * places[:, axis]) == pytest.approx(1, abs=1e-9)
+        assert np.abs(np.exp(1j * np.pi * turn * places[:, axis]) - 1).max() > 1
+
+
 def test_an_image_beyond_the_view_is_heard_from_the_other_side():
     """The wall's echo comes from u_x of 0.59 to an array that tells 1.1 apart: it is detected at
     -0.51. Planted bug: directions are not folded."""
