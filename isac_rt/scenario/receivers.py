@@ -200,8 +200,9 @@ class Tracking(Node):
     """Frames without a detection in a row after which a confirmed track ends. The default bridges
     short shadows."""
     drop_after_s: Positive | None = None
-    """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s].
-    null, the default: only `drop_misses` counts."""
+    """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
+    one that was seen for less long ends after as many frames as it was seen in. null, the default:
+    only `drop_misses` counts."""
     births: Literal["all", "unexplained"] = "all"
     """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
     mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those

@@ -29,8 +29,9 @@ from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
-SMALLEST_WALL = 20.0
-"""Area of a plane's faces together [m^2] below which it is not taken for a mirror."""
+SMALLEST_WALL = 8.0
+"""Area of a plane's faces together [m^2] below which it is not taken for a mirror: bays and gables
+of 10 m^2 showed UAVs over San Francisco."""
 DEVIATIONS = 3.0
 """How many standard deviations a track may be off."""
 MEETING = 1e-9
@@ -38,6 +39,10 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
+ONE_WAY_SHARE = 2.0
+"""The same for the direction of an echo over a wall on one way at an active terminal: its transmit
+antennas see another direction than its receive antennas, so that the halves of the virtual array do
+not join, and the receive antennas' resolution is twice as wide."""
 
 
 @dataclass(frozen=True)
@@ -165,12 +170,17 @@ class Leeway:
         turn = antennas.turn(waveform.wavelength, passes)
         return cls(cells, Ambiguity.of(waveform, passes), turn)
 
-    def explained(self, off: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """Whether differences (..., 4) of paths' measures may be nothing; their deviations."""
+    def explained(
+        self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
+    ) -> np.ndarray:
+        """Whether differences (..., 4) of paths' measures may be nothing, by their deviations and
+        whether they are of an active terminal's echo over a wall on `one_way` (...)."""
         off = wrapped(off, self.ambiguity)
         if np.isfinite(self.turn):
             off[..., 2:] -= self.turn * np.round(off[..., 2:] / self.turn)
-        allowed = DEVIATIONS * std + RESOLUTION_SHARE * self.resolution
+        share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
+        share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
+        allowed = DEVIATIONS * std + share * self.resolution
         hit: np.ndarray = (np.abs(off) <= allowed).all(axis=-1)
         return hit
 
@@ -259,7 +269,8 @@ def suspicion(
             direct = np.concatenate([[told.range[s], told.velocity[s]], told.direction[s]])
             may_be &= ~leeway.explained(measured - direct, std)
         faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
-        hit = leeway.explained(measured[:, None] - ways, std[:, None]) & may_be[:, None]
+        one_way = (orders == 1) & (sender is None)
+        hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]
         which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
         out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
         out.source[new] = known.ids[s]

@@ -325,10 +325,13 @@ class Tracker:
 
     def _dead(self, track: Track) -> bool:
         """A confirmed track dies of `drop_misses` misses in a row, or of `drop_after_s` without a
-        detection; a tentative one as soon as it can no longer be confirmed within its first
+        detection, and where that is set also of as many misses as it had frames before; a tentative
+        one as soon as it can no longer be confirmed within its first
         `confirm_window` frames."""
         s = self.settings
         if track.confirmed:
-            late = s.drop_after_s is not None and self.time - track.last > s.drop_after_s - ROUNDING
+            late = s.drop_after_s is not None and (
+                self.time - track.last > s.drop_after_s - ROUNDING or 2 * track.missed > track.age
+            )
             return late or track.missed >= s.drop_misses
         return sum(track.recent) + s.confirm_window - len(track.recent) < s.confirm_hits

@@ -134,16 +134,18 @@ def test_images_and_aliases_start_no_track():
     assert found.starts.tolist() == [False, False, True, True, False]
 
 
-def test_what_may_not_start_a_track_carries_one_on():
-    """Two detections, of which one may start a track; in the next frame none may, and the track is
-    carried on. Without further ones it ends when 0.2 s have passed, at the third frame of 0.07 s.
-    Planted bugs: births of all; frames counted instead of the time."""
+@pytest.mark.parametrize(("seen", "gone"), [(4, 6), (2, 3)])
+def test_what_may_not_start_a_track_carries_one_on(seen, gone):
+    """Two detections, of which one may start a track; in the next frames none may, and the track is
+    carried on. Without further ones it ends when 0.2 s have passed, at the third frame of 0.07 s;
+    if it was seen in two frames alone, after two of them. Planted bugs: births of all; frames
+    counted instead of the time; young tracks as old ones."""
     settings = Tracking(confirm_hits=1, confirm_window=1, drop_after_s=0.2, drop_misses=90)
     tracker, rest = Tracker(settings, Ambiguity(60.0)), Pose(*np.zeros((3, 3)), np.eye(3))
-    for k in range(6):
+    for k in range(8):
         tracker.predict(0.07 * k)
         both = detections([20.0 + 0.07 * k, 33.0], [1.0, 2.0], [0.1, -0.3])
-        some = both.select(np.arange(2) < (2 if k < 2 else 0))
+        some = both.select(np.arange(2) < (2 if k < seen else 0))
         starts = np.array([k == 0, False])[: len(some)]
         tracker.update(Detections(**{**vars(some), "starts": starts}), rest)
-        assert len(tracker.tracks) == (1 if k < 4 else 0)
+        assert len(tracker.tracks) == (1 if k < gone else 0)

@@ -86,7 +86,7 @@ def test_a_facade_shows_what_the_corner_hides():
         ),
         (
             "the wall is no mirror",
-            [upright([12.4, 16.3], [12.4, 18.3], 6.0), CORNER],
+            [upright([12.4, 16.8], [12.4, 17.9], 6.8), CORNER],
             track(),
         ),
         (
