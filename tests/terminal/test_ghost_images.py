@@ -271,7 +271,7 @@ def test_a_ghost_is_farther_than_its_source():
 
 @pytest.mark.parametrize("component", range(4))
 def test_how_far_off_an_echo_may_be(component):
-    """Three deviations of both tracks together and half a resolution, two in direction, for the wall
+    """Three deviations of both tracks together and half a resolution, two in direction, as the wall
     is on one way alone; a whole period of velocity is no difference. Planted bugs: the source's
     deviation left out; deviations added; no resolution; velocities not folded."""
     source, spread = track(4, BODY, (0.01, 0.04)), (0.02, 0.09)
