@@ -43,10 +43,12 @@ class Cover(NamedTuple):
     ----------
     cell : (K,) int, range-Doppler cell in which each is seen
     error : (K,) relative RMS error that it would have (`isac_rt.signal.covered.covered_error`)
+    dearer : what such a path costs over that of a frame with three groups
     """
 
     cell: np.ndarray
     error: np.ndarray
+    dearer: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -246,6 +246,14 @@ def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
     )
 
 
+def summed_share(waveform: Waveform, tones: Tones, size: int) -> float:
+    """Chirps for which sums are made over those that there are: some of the few that share a sum
+    are missing where an element sends seldom."""
+    slots = part_slots(waveform, tones.rate, size)
+    count = batches(tones.antenna[0], slots).parts[:, 1]
+    return float((-(-count // _ACROSS) * _ACROSS).sum() / count.sum())
+
+
 def _apart(waveform: Waveform, order: np.ndarray, parts: np.ndarray) -> float:
     """RMS of the time from the middle of the chirps that have the same shares [s]."""
     w = waveform
@@ -426,9 +434,9 @@ def _place(desk, count, antenna, w, sheet):
 
 
 @jit(fast=True)
-def _add_lines(grids, desk, count, antenna, sheet, paths, order):
-    """Sum the paths beside each of `count` lines in all chirps of the batch, and spread them. What
-    the last paths leave to the next line stays in `desk.sums`."""
+def _add_lines(grids, desk, count, antenna, sheet, paths, order, used):
+    """Sum the paths beside each of `count` lines in the `used` chirps of the batch, and spread
+    them. What the last paths leave to the next line stays in `desk.sums`."""
     steer, z, sums, zero, width = (
         paths.steer,
         desk.z,
@@ -437,7 +445,7 @@ def _add_lines(grids, desk, count, antenna, sheet, paths, order):
         len(sheet.taps),
     )
     for b in range(count):
-        for half in range(0, TOGETHER, _ACROSS):
+        for half in range(0, used, _ACROSS):
             at, own = _SUMS * half, half // _ACROSS * paths.turn.shape[0]
             ar, ai = load(sums, at + 32), load(sums, at + 48)
             cr, ci = load(sums, at + 96), load(sums, at + 112)
@@ -547,5 +555,6 @@ def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
             while pending or i < stop:
                 count, i, line, pending = _gather(desk, order, below, i, stop, line, pending)
                 _place(desk, count, antenna, w, sheet)
-                _add_lines(grids, desk, count, antenna, sheet, paths, order)
+                used = chirps.shape[0]
+                _add_lines(grids, desk, count, antenna, sheet, paths, order, used)
         begin = stop

@@ -11,7 +11,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.vector import cube_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, Cover, read
-from isac_rt.signal.covered import covered_error
+from isac_rt.signal.covered import covered_error, summed_share
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
 from isac_rt.signal.gridded import (
@@ -171,7 +171,8 @@ class Auto:
             alone = ~faint & ((strong & top) | sight | (error > self.max_error))
             if alone.all():
                 continue
-            several = scale * int((~alone & ~faint).sum()), scale * int(faint.sum())
+            dearer = scale if cover is None else scale * cover.dearer
+            several = scale * int((~alone & ~faint).sum()), dearer * int(faint.sum())
             cost = model.seconds(candidate.name, shape, *several)
             if alone.any():
                 cost += model.seconds(DIRECT, shape, scale * int(alone.sum()))
@@ -192,7 +193,8 @@ def _cover(waveform: Waveform, tones: Tones) -> Cover:
     """Where paths are seen, and their errors if noise is taken to cover them."""
     size = grid_size(waveform.num_samples, COVERING.oversampling, COVERING.width)
     cell = resolution_cell(waveform, tones.delay, tones.rate)
-    return Cover(cell, covered_error(waveform, tones, size))
+    dearer = summed_share(waveform, tones, size)
+    return Cover(cell, covered_error(waveform, tones, size), dearer)
 
 
 def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:

@@ -6,12 +6,13 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from isac_rt.cli.cli import main
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, hann
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.scenario.file import ScenarioError, load, to_yaml
 from isac_rt.signal.choice import (
     CANDIDATES,
@@ -23,6 +24,7 @@ from isac_rt.signal.choice import (
     Cover,
     read,
 )
+from isac_rt.signal.covered import summed_share
 from isac_rt.signal.gridded import COVERING, DEFAULT
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
 from isac_rt.signal.tones import tones_of
@@ -102,7 +104,8 @@ def test_sights_fast_and_strong_paths_go_direct():
 def test_noise_covers_what_a_cell_holds_together():
     """Twelve hundred paths in cells of one, one cell of forty of the same power, one strong path,
     one whose error is large and a line of sight: what is covered is known cell by cell. Planted
-    bugs: the cell's sum taken for the path's own; one error for all paths."""
+    bugs: the cell's sum taken for the path's own; one error for all paths; what they cost here left
+    out."""
     count, size = 1200, float(np.prod(SHAPE))
     cell, power = np.arange(count), np.full(count, 1e-9)
     cell[100:140], power[500], sight = 7, 1e-6, np.arange(count) == 600
@@ -117,6 +120,19 @@ def test_noise_covers_what_a_cell_holds_together():
     assert np.flatnonzero(choice.alone).tolist() == [600]
     none = Auto(noise).choose(SHAPE, power, speed, sight, cover)
     assert not none.faint.any()
+    dear = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cover._replace(dearer=9.0))
+    assert dear.setting == DEFAULT
+
+
+def test_what_covered_paths_cost_where_elements_send_seldom():
+    """Sums are made for three chirps at a time: of four chirps of each element in twelve slots six,
+    of twelve chirps twelve. Planted bug: the chirps' number over the sums'."""
+    slots = 24
+    for groups, num_tx, share in ((1, 3, 1.5), (3, 3, 1.0), (1, 12, 3.0), (2, 3, 9 / 8)):
+        w = Waveform(num_chirps=slots, num_groups=groups, num_tx=num_tx)
+        antenna = (np.arange(slots) + np.arange(groups)[:, None]) % num_tx
+        tones = SimpleNamespace(rate=np.full(4, 1e-7), antenna=antenna[None])
+        assert summed_share(w, tones, 1536) == pytest.approx(share)
 
 
 def test_a_covered_cube_differs_by_less_than_its_noise():
