@@ -22,6 +22,7 @@ from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
     PassiveTerminal,
+    Surroundings,
     TerminalState,
     slip_cells,
 )
@@ -501,3 +502,21 @@ def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():
         more = -np.array([2 * y, 0.6 * x + 1.8 * y]) / c
         assert handed.delay_rate - clutter.delay_rate == pytest.approx(more, abs=1e-20)
         assert np.array_equal(handed.delay, clutter.delay)
+
+
+def test_the_word_of_data_counts_from_the_frame_after_they_were_read_to_one_that_was_not():
+    """A pilot and a data frame that is read are sensed by the track, a pilot and a data frame that
+    is not read by the word, 1 m beside it, and the next one by the track again. Planted bugs: the
+    word counts whether data were read or not; a pilot makes it count no more."""
+    z, asked = sight(), []
+
+    def clutter(state, own):
+        asked.append(state[0] - SENDER[0])
+        return ExpectedClutter(*np.zeros((3, 0)), *np.zeros((2, 0, 3)))
+
+    pt, _ = passive([heard(z), read((), z), *[heard(z)] * 3], known(1e-3, 1e-3))
+    pt._surroundings = Surroundings(None, clutter)
+    word = Pose(SENDER[:3] + [1.0, 0.0, 0.0], SENDER[3:6], np.zeros(3), np.eye(3))
+    for n, modulated in enumerate([False, True, False, True, True]):
+        pt.step(EMPTY, OWN, n * 1e-4, modulated, sender=word)
+    assert asked == pytest.approx([0, 0, 1, 1, 0], abs=0.1)  # the track is known to 1 mm, and moves
