@@ -206,8 +206,8 @@ class Tracking(Node):
     births: Literal["all", "unexplained"] = "all"
     """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
     mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
-    at the edge of the view, nor, at an active one, those that stand still beside each other as a
-    building does that the mesh lacks; and no track is confirmed that lies behind a wall or is a
+    at the edge of the view, nor those that stand still beside each other as a building does that
+    the mesh lacks; and no track is confirmed that lies behind a wall or is a
     wall's image of a nearer one, or of a nearer body that others told of (`cooperation`). One that
     fits such an image in three frames in a row ends."""
     mirrors: Literal["ignore", "place"] = "ignore"

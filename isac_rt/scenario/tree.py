@@ -102,7 +102,7 @@ class Scenario(Node):
     by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and hears.
     `detections`: the detections that their tracks rest on instead; each runs one filter over all of
     them, with the errors of poses and clocks as states. What is sent otherwise does not depend on
-    it."""
+    it; receivers of the preset `city` use what they are told."""
     compare: dict[Name, ReceiverSet] = Field({})
     """Further sets of receivers by name, which hear the same samples. By default none."""
 

@@ -145,7 +145,7 @@ class _Observer:
                 when,
                 modulated,
                 mates=mates,
-                sender=self._told(when),
+                sender=self._sender(when),
                 told=told,
                 maps=maps,
             )
@@ -153,7 +153,7 @@ class _Observer:
         self.seconds += time.thread_time() - begun
         return Heard(reception, tracks, state, late)
 
-    def _told(self, when: float) -> Pose | None:
+    def _sender(self, when: float) -> Pose | None:
         """Where the link's transmitter says with its data that it is; None: it says nothing."""
         s = self.setup
         if s.scenario.cooperation == "none":

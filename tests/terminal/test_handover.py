@@ -516,7 +516,7 @@ def test_the_word_of_data_counts_from_the_frame_after_they_were_read_to_one_that
 
     pt, _ = passive([heard(z), read((), z), *[heard(z)] * 3], known(1e-3, 1e-3))
     pt._surroundings = Surroundings(None, clutter)
-    word = Pose(SENDER[:3] + [1.0, 0.0, 0.0], SENDER[3:6], np.zeros(3), np.eye(3))
+    word = Pose(SENDER[:3] + np.array([1.0, 0, 0]), SENDER[3:6], np.zeros(3), np.eye(3))
     for n, modulated in enumerate([False, True, False, True, True]):
         pt.step(EMPTY, OWN, n * 1e-4, modulated, sender=word)
     assert asked == pytest.approx([0, 0, 1, 1, 0], abs=0.1)  # the track is known to 1 mm, and moves
