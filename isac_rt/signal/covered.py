@@ -315,7 +315,8 @@ def covered_paths(
     drift = w.slope * rate * ts * size
     spacing = 1 / (w.slope * ts * size * LINES)
     first_slots = np.arange(0, w.num_chirps, slots)
-    middle = (first_slots + slots / 2 - w.num_chirps / 2) * w.slot_duration
+    after = np.minimum(first_slots + slots, w.num_chirps)
+    middle = (first_slots + after - w.num_chirps) / 2 * w.slot_duration
     below = np.floor((place + drift * middle[:, None]) * LINES)
     shown = [
         first + np.argsort(below[:, first:last], axis=1, kind="stable")

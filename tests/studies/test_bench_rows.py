@@ -15,6 +15,8 @@ from isac_rt.studies.bench import REQUIRED, datasets, endtoend, hermes, nufft, r
 
 
 def test_errors_of_the_synthesis_are_as_stated():
+    """Each method's by its bound; that of what noise covers is 8.7e-3 at the 15 m/s of the fastest
+    path."""
     found = synthesis.errors()
     assert set(found) == {
         "direct",
@@ -24,7 +26,7 @@ def test_errors_of_the_synthesis_are_as_stated():
     }
     assert found["direct"] < 1e-6
     covered = found.pop("gridded, 1.5 N, width 4, of what noise covers")
-    assert max(found.values()) < 3e-4 < covered < 3.05e-3
+    assert max(found.values()) < 3e-4 < covered < 8.7e-3
     assert found["gridded wideband, 1.5 N, width 6"] < GRIDDED_ERROR
     assert found["gridded narrowband, 1.5 N, width 8"] < 5e-6
     assert found["gridded wideband, cubic, 1.5 N, width 8"] < ACCURATE_ERROR
