@@ -231,13 +231,13 @@ def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
     """
     w, t, rate = waveform, tones, np.abs(tones.rate)
     half, lines = w.num_samples / 2, _lines(waveform, size)
-    slots = part_slots(w, rate, size)
     moved = np.maximum(rate * TOGETHER * w.slot_duration * lines, MOVED) / 2
     beyond = moved + lines * sum(np.abs(d).max(axis=1) for d in (t.tx_delay, t.rx_delay))
     # most of f (1 - f), f between the lines, or on one of them and evenly that far to both sides
     between = np.maximum(0.25, np.sqrt(beyond**2 / 3 + beyond**4 / 5))
     turn = line_turn(size, half)
-    order, parts = batches(t.antenna[0], slots)
+    # parts are as long as the fastest path lets them, and cut fewer of the few when they are long
+    order, parts = batches(t.antenna[0], w.num_chirps)
     stale = rate * _apart(w, order, parts) * lines * turn
     bend = np.pi * w.slope * rate * (w.sample_interval * half) ** 2 * 2
     spread = np.sqrt(1 / 5 - 1 / 9)  # of x^2
@@ -338,7 +338,7 @@ def covered_paths(
 
 
 @jit(fast=True)
-def slow(steer, late, per_line):
+def turn_elements(steer, late, per_line):
     """Turn the elements' phasors (of `Covered.steer`, turns over half a chirp instead of lines) by
     what a path's delay `late`, in half chirps, does to the frequency that they see."""
     for i in range(late.shape[0]):

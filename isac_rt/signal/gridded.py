@@ -60,7 +60,7 @@ from isac_rt.signal.covered import (
     no_paths,
     part_slots,
     plain_batches,
-    slow,
+    turn_elements,
 )
 from isac_rt.signal.direct import numbers, passed
 from isac_rt.signal.noise import WhiteNoise
@@ -827,7 +827,7 @@ def _synthesise(
         steer = _steering(w, rx, b.path, first, setting.wideband)
         paths = no_paths(t.tx_delay.shape[1])
         if apart.any():
-            steering = partial(_slow_steering, w, rx, first, kernel.grid)
+            steering = partial(_turned_steering, w, rx, first, kernel.grid)
             paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
         weakest = _Faint(paths, sheet, desk(paths, setting.faint))
         heard = _Heard(b, steer, weakest)
@@ -835,7 +835,7 @@ def _synthesise(
     return True
 
 
-def _slow_steering(
+def _turned_steering(
     waveform: Waveform,
     rx: tuple[np.ndarray, np.ndarray],
     first: int,
@@ -846,5 +846,5 @@ def _slow_steering(
     """`_steering`, wideband, for `Covered`: with what the paths' own delays, in half chirps, do to
     the frequency that the elements see."""
     out = _steering(waveform, rx, path, first, True)
-    slow(out, late, line_turn(size, waveform.num_samples // 2))
+    turn_elements(out, late, line_turn(size, waveform.num_samples // 2))
     return out
