@@ -93,6 +93,21 @@ def test_a_weak_echo_is_found_where_it_is_expected_and_nowhere_else():
         assert np.nanmin(np.abs(seen - u).max(axis=1)) < 0.1
 
 
+def test_a_strong_echo_from_elsewhere_is_none_of_a_gate():
+    """A wave 33 dB over the noise in the cells of a gate, 0.5 beside it in both cosines: what it
+    leaves there is over the gate's threshold, and all that is found comes from the wave. Planted
+    bug: cells sought that hold something already."""
+    maps, away = 0.1 * noise(np.random.default_rng(11)), (-0.3, 0.3)
+    c = searches(ARRAY, SENT.wavenumber)[0].channels
+    wave = c.steering(np.array([[away[0], 0.0, away[1]]]), SENT)[0]
+    maps[c.tx, c.rx, 50, 4] += np.sqrt(0.01 * 2000 / len(c)) * wave
+    settings = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-2)
+    gates = Gates(np.array([at(50, 4, (0.2, -0.2))]), np.array([[0.02, 0.05, 0.01, 0.01]]))
+    (judged,) = AngleDoppler(settings, sought=gates).judge([maps], SENT, NOTHING)
+    seen = judged.cosines[judged.ratio > 1]
+    assert len(seen) and np.abs(seen - away).max() < 0.1
+
+
 def test_gates_out_of_view_or_too_wide_are_none():
     """By hand: a direction beyond the view, rows beyond the map, and 30 m and
     30 m/s of uncertainty."""

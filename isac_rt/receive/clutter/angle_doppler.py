@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -115,10 +115,12 @@ class AngleDoppler(ClutterDetector):
     def _gates(
         self, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
     ) -> Iterator[Gate]:
-        """Where UAVs are sought in which nothing was found yet."""
+        """Where UAVs are sought in which nothing was found yet, but for cells that hold something
+        from elsewhere: what it leaves in other directions is no noise."""
         for gate in () if self.sought is None else gates_of(self.sought, known, rows):
-            if not (gate.holds(cosines[gate.cell]) & (ratio[gate.cell] > 1)).any():
-                yield gate
+            full = ratio[gate.cell] > 1
+            if not full.all() and not (gate.holds(cosines[gate.cell]) & full).any():
+                yield replace(gate, cell=gate.cell[~full])
 
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""
