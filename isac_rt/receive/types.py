@@ -86,6 +86,11 @@ class Detections:
     def __len__(self) -> int:
         return self.range.shape[0]
 
+    @property
+    def measured(self) -> np.ndarray:
+        """(Q, 4) range, velocity, u_x, u_z."""
+        return np.column_stack([self.range, self.velocity, self.direction])
+
     def select(self, which: np.ndarray) -> Detections:
         """The detections that a mask or an index array chooses."""
         return Detections(**{name: value[which] for name, value in vars(self).items()})

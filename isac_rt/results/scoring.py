@@ -126,8 +126,8 @@ class Scorer:
             reception=reception,
             paths=paths,
             truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
-            detected=_estimates(len(hit), _points(reception.detections), best, self._observed),
-            tracked=_estimates(len(hit), _points(tracks), followed, self._observed),
+            detected=_estimates(len(hit), reception.detections.measured, best, self._observed),
+            tracked=_estimates(len(hit), tracks.measured, followed, self._observed),
             in_view=view.inside,
             shadowed=view.inside & ~view.direct,
             tracks=table,
@@ -238,7 +238,7 @@ class Scorer:
         whether it is within one resolution on all axes."""
         best, hit = {}, np.zeros(len(view.truth), bool)
         for i, truth in view.seen.items():
-            off = np.where(uav == i, self._off(truth, _points(d)), np.inf)
+            off = np.where(uav == i, self._off(truth, d.measured), np.inf)
             if off.size and off.min() <= GATE_RESOLUTIONS:
                 best[i] = int(off.argmin())
                 hit[i] = off.min() <= 1
@@ -257,7 +257,7 @@ class Scorer:
         kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
         follows = np.full(len(tracks), -1)
         for i, truth in view.seen.items():
-            off = self._off(truth, _points(tracks))
+            off = self._off(truth, tracks.measured)
             able = (uav == i) & tracks.confirmed & (off <= GATE_RESOLUTIONS)
             if able.any():
                 rank = np.where(tracks.ids == self._followed.get(i), -1.0, off)
@@ -372,10 +372,6 @@ class _Labels:
     face: np.ndarray
     skirt: np.ndarray
     uav: np.ndarray
-
-
-def _points(of: Detections | TrackSet) -> np.ndarray:
-    return np.column_stack([of.range, of.velocity, of.direction])
 
 
 def _by_uav(values: dict[int, float], count: int) -> np.ndarray:

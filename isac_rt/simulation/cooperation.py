@@ -31,9 +31,9 @@ from isac_rt.terminal.terminal import TerminalState
 from isac_rt.terminal.tracker import in_plane
 from isac_rt.world.swarm import Pose
 
-REMEMBERED = 3
-"""Frames of which it is remembered what terminals knew: some are still being heard when the next
-begins."""
+AHEAD = 2
+"""Frames at work at once: a frame does not wait for the slowest link of the one before, and its
+receivers know what they were told until so many frames before it."""
 
 
 class Cooperation:
@@ -100,7 +100,7 @@ class Cooperation:
             for name, notes in self._notes.items()
         }
         together = self._together(time, poses)
-        self._known = {k: v for k, v in self._known.items() if k > frame - REMEMBERED}
+        self._known = {k: v for k, v in self._known.items() if k > frame - AHEAD}
         self._known[frame] = time, {n: self._bodies(n, views[n], time) for n in self._notes}
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
@@ -280,7 +280,7 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
         own,
         clock_std,
         tracks.ids[mine],
-        np.column_stack([found.range, found.velocity, found.direction])[rows],
+        found.measured[rows],
         found.std[rows],
         found.snr[rows],
         tracks.confirmed[mine],

@@ -27,7 +27,7 @@ from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.results.swarm import SwarmScorer
 from isac_rt.scenario.receivers import Receivers, ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
-from isac_rt.simulation.cooperation import Cooperation
+from isac_rt.simulation.cooperation import AHEAD, Cooperation
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
@@ -51,8 +51,6 @@ Jobs = dict[Link, Future[list[Heard]]]
 
 MOST_EARLY = 8
 """First frames at the most that show what passive terminals take."""
-AHEAD = 2
-"""Frames at work at once: a frame does not wait for the slowest link of the one before."""
 
 
 def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:

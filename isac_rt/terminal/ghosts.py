@@ -239,7 +239,7 @@ def suspicion(
         np.zeros(count, np.int8),
         np.full(count, -1, np.int32),
     )
-    measured = np.column_stack([tracks.range, tracks.velocity, tracks.direction])
+    measured = tracks.measured
     sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
     seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
@@ -266,8 +266,7 @@ def suspicion(
         std = np.hypot(tracks.std, known.std[s])
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
         if known is told:  # a track of the body itself is no echo of it
-            direct = np.concatenate([[told.range[s], told.velocity[s]], told.direction[s]])
-            may_be &= ~leeway.explained(measured - direct, std)
+            may_be &= ~leeway.explained(measured - told.measured[s], std)
         faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
         one_way = (orders == 1) & (sender is None)
         hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]

@@ -18,7 +18,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Ambiguity, Gaussian, wrapped
+from isac_rt.terminal.filter import Gaussian, wrapped
 from isac_rt.terminal.ghosts import Leeway, Walls, suspicion
 from isac_rt.terminal.mirrors import mirror_of
 from isac_rt.terminal.tracker import Track, Tracker, track_set
@@ -74,7 +74,7 @@ class Doubts:
             else:
                 shown = sender_images(sender, own, self.walls, reach)
             off = np.column_stack([d.range, d.velocity])[:, None] - shown
-            off = wrapped(off, self._ambiguity)
+            off = wrapped(off, self._leeway.ambiguity)
             cells = np.array([w.range_cell(self.passes), w.velocity_cell(self.passes)])
             allowed = BESIDE_CELLS * cells
             starts &= ~(np.abs(off) < allowed).all(axis=-1).any(axis=1)
@@ -122,10 +122,6 @@ class Doubts:
     @cached_property
     def _leeway(self) -> Leeway:
         return Leeway.of(self.waveform, self.antennas, self.passes)
-
-    @property
-    def _ambiguity(self) -> Ambiguity:
-        return Ambiguity.of(self.waveform, self.passes)
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:

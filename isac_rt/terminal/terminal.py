@@ -178,8 +178,7 @@ class ActiveTerminal:
             self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
-            where = mates if self._receiver.settings.self_calibration == "positions" else ()
-            seen = echoes(reception.looks, self.calibration.waveform, own_pose, where, tracks)
+            seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
             change = self.calibration.learn_all(seen, reception.neighbours)
             for track in self.tracker.tracks:
                 track.state = seen_after(track.state, own_pose, change, 2)

@@ -159,6 +159,11 @@ class TrackSet:
     def __len__(self) -> int:
         return self.ids.shape[0]
 
+    @property
+    def measured(self) -> np.ndarray:
+        """(K, 4) range, velocity, u_x, u_z."""
+        return np.column_stack([self.range, self.velocity, self.direction])
+
 
 def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None) -> TrackSet:
     """Report tracks relative to `own`; a PT's `reference` comes first and makes the others
@@ -245,7 +250,7 @@ class Tracker:
         Detections that are a PT's reference are passed over. With a transmitter all are taken as
         bistatic.
         """
-        z = np.column_stack([detections.range, detections.velocity, detections.direction])
+        z = detections.measured
         free = [int(q) for q in np.flatnonzero(~detections.is_reference)]
         cost = self._costs(z, detections.std, own, transmitter)
         hit: dict[int, int] = {}
