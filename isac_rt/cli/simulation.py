@@ -139,7 +139,7 @@ def _say_city(notes: Sequence[str]) -> None:
 
 def _say_coverage(seen: Mapping[str, Any]) -> None:
     """What the radar can see, as of `isac_rt.simulation.coverage.Coverage`."""
-    from isac_rt.views.report import coverage_tables
+    from isac_rt.views.tables import coverage_tables
 
     limits, words, outside = coverage_tables(seen)
     say_table(limits.columns, limits.rows)
@@ -197,7 +197,7 @@ _PLAN_WORDS = (
 
 
 def _say_summary(results: Results) -> None:
-    from isac_rt.views.report import gospa_table, number, per_terminal, rmse_table, side_by_side
+    from isac_rt.views.tables import gospa_table, number, per_terminal, rmse_table, side_by_side
 
     left_out = {"Role", "Matched", "Matched, tracked"}
     left_out |= {"Data frames read", "Of these late", "Frames late, at most"}  # a line below

@@ -53,6 +53,21 @@ def test_garbage_is_looked_for_less_often(capsys):
         gc.set_threshold(*usual)
 
 
+def test_the_end_looks_through_nothing():
+    """An object that only refers to itself is looked at when Python ends, and then says so; after
+    a command it is not. Planted bug: no freeze at the exit."""
+    code = (
+        "import gc\ngc.disable()\nclass Garbage:\n    def __del__(self): print('looked through')\n"
+        "one = Garbage(); one.itself = one; del one\n"
+    )
+    command = "from isac_rt.cli.cli import main; main(['--version'])"
+    for after, said in ((code, True), (code + command, False)):
+        done = subprocess.run(
+            [sys.executable, "-c", after], capture_output=True, text=True, cwd=ROOT, check=True
+        )
+        assert ("looked through" in done.stdout) == said
+
+
 @pytest.fixture
 def simulation(monkeypatch):
     """A stand-in for the simulation: it reports progress and hands back made-up results."""
@@ -346,13 +361,14 @@ def test_help_loads_nothing_heavy():
 
 
 def test_a_run_begins_without_what_writes_and_draws_its_results():
-    """They take as long to load as a frame to make. Planted bug: `import xarray as xr` at the top
-    of results/dataset.py."""
+    """They take as long to load as a frame to make, and what is said before the first frame needs
+    none of them. Planted bugs: `import xarray as xr` at the top of results/dataset.py, and of
+    views/tables.py."""
     heavy = ("xarray", "pandas", "h5py", "matplotlib", "sionna")
     code = (
         "import sys; from isac_rt.cli import simulation; import isac_rt.scenario.file, "
-        "isac_rt.results.files, isac_rt.simulation.resume, isac_rt.simulation.simulate; "
-        f"print([m for m in {heavy} if m in sys.modules])"
+        "isac_rt.results.files, isac_rt.simulation.resume, isac_rt.simulation.simulate, "
+        f"isac_rt.views.tables; print([m for m in {heavy} if m in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True

@@ -16,7 +16,8 @@ from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import prepare
-from isac_rt.views.report import city_costs, side_by_side, write_report
+from isac_rt.views.report import write_report
+from isac_rt.views.tables import city_costs, side_by_side
 
 SHORT = ["modulation.acquisition_frames=2", "receivers.active_every_frames=2"]
 SETS = [

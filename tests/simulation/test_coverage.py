@@ -15,7 +15,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.setup import prepare
-from isac_rt.views.report import coverage_tables
+from isac_rt.views.tables import coverage_tables
 
 C = 299792458.0
 CARRIER, BANDWIDTH, RATE, SAMPLES, CHIRPS = 61.3e9, 433e6, 17.9e6, 128, 36

@@ -13,7 +13,7 @@ import isac_rt as irt
 from isac_rt.results.provenance import run_content
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
-from isac_rt.views.report import per_terminal
+from isac_rt.views.tables import per_terminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SHIFT = 1.0

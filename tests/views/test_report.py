@@ -11,14 +11,14 @@ from fake_run import fake_run
 
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.environment import City
-from isac_rt.views.report import (
+from isac_rt.views.report import wall_table
+from isac_rt.views.tables import (
     error_table,
     false_table,
     gospa_table,
     loss_table,
     mirror_table,
     target_table,
-    wall_table,
 )
 from isac_rt.world.city import load_city
 
