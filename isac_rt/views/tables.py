@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 from isac_rt.results.losses import LOSSES
@@ -56,13 +57,16 @@ def _rates(link: Mapping[str, Any], keys: Iterable[str]) -> list[str]:
 
 
 def per_terminal(summary: Mapping[str, Any]) -> Table:
-    """Decoding and detection, one row for each link (and so for each terminal)."""
+    """Decoding and detection, one row for each link (and so for each terminal); what none of them
+    has, a sensor's data say, has no column."""
     rows = [
         (link_words(name), s["role"], *_rates(s, _RATES.values()), *_waits(s.get("latency_frames")))
         for name, s in summary["links"].items()
     ]
     titles = ("Link", "Role", *_RATES, "Data frames read", "Of these late", "Frames late, at most")
-    return Table(titles, rows)
+    columns = zip(*rows, strict=True)
+    kept = [set(column) != {DASH} for column in columns]
+    return Table(tuple(compress(titles, kept)), [tuple(compress(row, kept)) for row in rows])
 
 
 def _waits(latency: Mapping[str, Any] | None) -> list[str]:

@@ -18,6 +18,7 @@ from isac_rt.views.tables import (
     gospa_table,
     loss_table,
     mirror_table,
+    per_terminal,
     target_table,
 )
 from isac_rt.world.city import load_city
@@ -47,6 +48,16 @@ def test_who_saw_what(summary):
     assert bound["Range [m]"] == "0.0027 / 0.0066"
     assert row(table, "AT to AT", "U1")["In view"] == "3"
     assert {r[1] for r in table.rows} == {"AT", "U1"}
+
+
+def test_a_sensor_decodes_nothing(summary):
+    """Without data there are no columns of data, and those of sensing stay. Planted bug: a column
+    goes when one link has nothing in it: the AT's own has no symbols."""
+    assert {"SER delay", "Hit rate"} <= set(per_terminal(summary).columns)
+    name, own = next((n, s) for n, s in summary["links"].items() if s["ser_delay"] is None)
+    alone = per_terminal({"links": {name: own}})
+    assert "SER delay" not in alone.columns and "Bits" not in alone.columns
+    assert row(alone, "AT to AT")["Hit rate"] == row(per_terminal(summary), "AT to AT")["Hit rate"]
 
 
 def test_walls_behind_what_was_seen():
