@@ -50,19 +50,9 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
 
     It is made in memory: on a full disk the library that makes it may end the process.
     """
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
+    from isac_rt.results.netcdf import netcdf
 
-    encoding = {
-        name: {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
-        for name, v in dataset.variables.items()
-        if v.dtype.kind not in "OU" and v.ndim and v.size  # words cannot be filtered
-    }
-    made = io.BytesIO()
-    # not by `to_netcdf`, which loads dask's scheduler to see whether one is at work
-    with h5netcdf.File(made, "w") as whole:
-        dataset.dump_to_store(H5NetCDFStore(whole), encoding=encoding)
-    write_whole(file, made.getvalue())
+    write_whole(file, netcdf(dataset))
 
 
 def read_dataset(file: Path) -> xr.Dataset:
