@@ -20,6 +20,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -349,6 +350,22 @@ def activate() -> Backend:
             "call isac_rt.runtime.activate() before anything else sets a variant"
         )
     return backend
+
+
+@contextmanager
+def tracing_in_one_thread() -> Iterator[None]:
+    """Let the ray tracer, where it is loaded, work in the thread that asks for rays: other threads
+    of its own look for work all the time while there is none."""
+    drjit = sys.modules.get("drjit")
+    if drjit is None:
+        yield
+        return
+    before = drjit.thread_count()
+    drjit.set_thread_count(1)
+    try:
+        yield
+    finally:
+        drjit.set_thread_count(before)
 
 
 # ---- doctor

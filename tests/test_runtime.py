@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -168,3 +169,21 @@ def test_a_foreign_variant_is_refused():
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=PROGRAM.parent.parent
     )
     assert "already set to the variant scalar_rgb" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("ends", [None, KeyError])
+def test_rays_are_traced_in_one_thread_for_a_while(ends):
+    """The number of threads is what it was afterwards, whether or not what was done ended well."""
+    runtime.activate()
+    import drjit
+
+    before = drjit.thread_count()
+    drjit.set_thread_count(3)
+    try:
+        with pytest.raises(KeyError) if ends else nullcontext(), runtime.tracing_in_one_thread():
+            assert drjit.thread_count() == 1
+            if ends:
+                raise ends
+        assert drjit.thread_count() == 3
+    finally:
+        drjit.set_thread_count(before)

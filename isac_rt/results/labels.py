@@ -96,9 +96,11 @@ class Places(NamedTuple):
         """Those of some rows."""
         return self._replace(range=self.range[rows], velocity=self.velocity[rows])
 
-    def apart(self, range: float, velocity: float) -> tuple[np.ndarray, np.ndarray]:
+    def apart(
+        self, range: float | np.ndarray, velocity: float | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Distances from a place in range and Doppler cells, velocities modulo the unambiguous
-        span."""
+        span; from places (Q, 1) as (Q, K)."""
         off = velocity - self.velocity
         off -= self.span * np.round(off / self.span)
         return np.abs(range - self.range) / self.cells[0], np.abs(off) / self.cells[1]
@@ -155,6 +157,8 @@ def explain(
     ranges = places.range[field_rows]
     beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
     count = len(detections)
+    apart = places.select(others).apart(detections.range[:, None], detections.velocity[:, None])
+    shares = reach(apart[0]) * np.minimum(reach(apart[1]) + UNION_FLOOR, 1.0)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
     )
@@ -167,7 +171,7 @@ def explain(
         rows, bins = places.select(some).apart(at, detections.velocity[q])
         near = (rows <= 1) & (bins <= 1)
         here = np.where(field, 0.0, own)
-        here[~field] *= reach(rows[~field]) * np.minimum(reach(bins[~field]) + UNION_FLOOR, 1.0)
+        here[~field] *= shares[q]
         clutter = np.where(near & field, own, 0.0)
         best = -1
         if aim is not None:

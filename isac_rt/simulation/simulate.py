@@ -25,6 +25,7 @@ from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.results.swarm import SwarmScorer
+from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.scenario.receivers import Receivers, ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.cooperation import AHEAD, Cooperation
@@ -522,6 +523,7 @@ class _Run:
 
         with (
             threadpool_limits(limits=1),
+            tracing_in_one_thread(),
             ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
         ):
             _LOG.info("tracing and receiving the first frame")

@@ -32,6 +32,7 @@ sensors give them [m, m/s]. They are part of what it says of itself and of other
 DATUM_STD = (0.05, 0.05)
 """And of what all terminals are wrong alike, for they hear the same satellites [m, m/s]: nothing
 that they tell each other shows it, and all bodies of a picture have it."""
+_DATUM = np.diag(np.repeat(np.square(DATUM_STD), 3))
 ATTITUDE_STD = np.radians(0.3)
 """Deviation of a terminal's attitude about each axis [rad]: across the line of sight, times the
 range, it adds to what it says of others. Small inertial sensors with two antennas hold it."""
@@ -213,7 +214,7 @@ def its_word(said: Gaussian) -> Told:
 
 def in_datum(state: Gaussian) -> Gaussian:
     """A body (6,) with what all terminals are wrong alike."""
-    return Gaussian(state.mean, state.covariance + np.diag(np.repeat(np.square(DATUM_STD), 3)))
+    return Gaussian(state.mean, state.covariance + _DATUM)
 
 
 def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
@@ -265,11 +266,13 @@ def _intersection(a: Gaussian, b: Gaussian) -> tuple[Gaussian, float]:
 
 def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
     """Covariance intersection of one or more, one after the other, the surest first."""
-    return _intersected(states)[0]
+    return states[0] if len(states) == 1 else _intersected(states)[0]
 
 
 def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
     """And the weight of each in it."""
+    if len(states) == 1:
+        return states[0], np.ones(1)
     order = sorted(range(len(states)), key=lambda k: float(np.trace(states[k].covariance)))
     fused, weights = states[order[0]], np.ones(len(states))
     for at, k in enumerate(order[1:], 1):
@@ -296,38 +299,63 @@ def together(
     bodies : by body the reports of its tracks, all of one instant
     itself : by number of a body the terminal that it is, and what that one says of itself
     """
+    if not bodies:
+        return []
     owners = {name for name, _ in itself.values()}
     owners |= {_teller(report.key) for reports in bodies for report in reports}
     links = dict.fromkeys(report.key.origin for reports in bodies for report in reports)
-    first = SIZE * len(bodies)
     count = ERRORS - 1
-    of_pose = {
-        name: range(first + count * k, first + count * (k + 1))
-        for k, name in enumerate(sorted(owners))
-    }
-    clock = {origin: first + count * len(of_pose) + k for k, origin in enumerate(links)}
-    size = first + count * len(of_pose) + len(clock)
-    information, vector = np.zeros((size, size)), np.zeros(size)
-    information[range(first, size), range(first, size)] = 1.0
-
-    def add(k: int, errors: list[int], state: Gaussian, lever: np.ndarray, weight: float) -> None:
-        rows = [*range(SIZE * k, SIZE * k + SIZE), *errors]
-        A = np.hstack([np.eye(SIZE), lever[:, : len(errors)]])
-        gain = weight * np.linalg.solve(state.covariance, A).T
-        information[np.ix_(rows, rows)] += gain @ A
-        vector[rows] += gain @ state.mean
-
+    of_pose = {name: range(count * k, count * (k + 1)) for k, name in enumerate(sorted(owners))}
+    size = count * len(of_pose)
+    clock = {origin: size + k for k, origin in enumerate(links)}
+    size += len(clock)
+    words: list[tuple[int, list[int], Told, float]] = []
     for k, reports in enumerate(bodies):
         _, weights = _intersected([report.whole for report in reports])
         for report, w in zip(reports, weights, strict=True):
             errors = [*of_pose[_teller(report.key)], clock[report.key.origin]]
-            add(k, errors, report.state, report.lever, w)
-    for k, (name, (state, lever)) in itself.items():
-        add(k, [*of_pose[name]], state, lever, 1.0)
-    P = np.linalg.inv(information)
-    mean, P = P @ vector, (P + P.T) / 2
-    each = [slice(SIZE * k, SIZE * k + SIZE) for k in range(len(bodies))]
-    return [Gaussian(mean[rows], P[rows, rows]) for rows in each]
+            words.append((k, errors, Told(report.state, report.lever), w))
+    # no clock is in a terminal's word of itself
+    words += [(k, [*of_pose[name], size], word, 1.0) for k, (name, word) in itself.items()]
+    return _solved(len(bodies), size, words)
+
+
+def _solved(
+    num_bodies: int, num_errors: int, words: Sequence[tuple[int, list[int], Told, float]]
+) -> list[Gaussian]:
+    """The bodies of `together`, whose information of each other is by way of the errors alone: the
+    errors first, then each body.
+
+    Parameters
+    ----------
+    words : a body's number, the numbers of the errors in what is told of it (`num_errors`: one that
+        is in none), what is told, and its weight
+    """
+    numbers, errors = np.array([w[0] for w in words]), np.array([w[1] for w in words])
+    covariances = np.stack([told.state.covariance for _, _, told, _ in words])
+    levers = np.stack([told.lever for _, _, told, _ in words])
+    A = np.concatenate([np.broadcast_to(np.eye(SIZE), covariances.shape), levers], axis=2)
+    weights = np.array([w[3] for w in words])[:, None, None]
+    gain = weights * np.linalg.solve(covariances, A).swapaxes(1, 2)
+    each = gain @ A
+    more = (gain @ np.stack([told.state.mean for _, _, told, _ in words])[..., None])[..., 0]
+
+    B, b = np.zeros((num_bodies, SIZE, SIZE)), np.zeros((num_bodies, SIZE))
+    C = np.zeros((num_bodies, SIZE, num_errors + 1))
+    E, e = np.eye(num_errors + 1), np.zeros(num_errors + 1)
+    np.add.at(B, numbers, each[:, :SIZE, :SIZE])
+    np.add.at(b, numbers, more[:, :SIZE])
+    at = numbers[:, None, None], np.arange(SIZE)[:, None], errors[:, None]
+    np.add.at(C, at, each[:, :SIZE, SIZE:])
+    np.add.at(E, (errors[:, :, None], errors[:, None]), each[:, SIZE:, SIZE:])
+    np.add.at(e, errors, more[:, SIZE:])
+
+    D, d = np.linalg.solve(B, C), np.linalg.solve(B, b[..., None])
+    rest = np.linalg.inv(E - np.einsum("kij,kil->jl", C, D))
+    error = rest @ (e - np.einsum("kij,ki->j", C, d[..., 0]))
+    means = d[..., 0] - D @ error
+    P = np.linalg.inv(B) + D @ rest @ D.swapaxes(1, 2)
+    return [Gaussian(m, (p + p.T) / 2) for m, p in zip(means, P, strict=True)]
 
 
 def _teller(key: Key) -> str:
@@ -421,6 +449,11 @@ class Picture:
             members = [key for key in body.members if key in by_key]
             if not members:
                 continue
+            if len(members) == 1:
+                body.members = members
+                kept.append(body)
+                del alone[members[0]]
+                continue
             members.sort(key=lambda k: float(np.trace(whole[k].covariance)))
             d2, _ = distances([whole[members[0]]], [whole[k] for k in members])
             surest = {k.origin: k for k in reversed(members)}
@@ -456,16 +489,16 @@ class Picture:
         states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
         d2, _ = distances(states, states)
         gone: set[int] = set()
-        for i, body in enumerate(self._bodies):
-            for j in range(i):
-                if {i, j} & gone or d2[i, j] > gate(JOIN_PROBABILITY):
-                    continue
-                pairs = product(body.members, self._bodies[j].members)
-                gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
-                if gaps and max(gaps) < LEAST_APART:
-                    self._bodies[j].members += body.members
-                    self._bodies[j].name = min(body.name, self._bodies[j].name)
-                    gone.add(i)
+        for i, j in np.argwhere(np.tril(d2 <= gate(JOIN_PROBABILITY), -1)).tolist():
+            if {i, j} & gone:
+                continue
+            body, other = self._bodies[i], self._bodies[j]
+            pairs = product(body.members, other.members)
+            gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
+            if gaps and max(gaps) < LEAST_APART:
+                other.members += body.members
+                other.name = min(body.name, other.name)
+                gone.add(i)
         self._bodies = [b for i, b in enumerate(self._bodies) if i not in gone]
 
     def _call(self, by_key: Mapping[Key, Report]) -> None:
