@@ -97,7 +97,10 @@ class Walls:
         return np.flatnonzero((away**2).sum(axis=1) < reach**2)
 
     def within(self, place: np.ndarray, reach: float) -> bool:
-        """Whether a face of a mirror lies within reach [m] of a place (3,)."""
+        """Whether a face of a mirror lies within reach [m] of a place (3,); none does within less
+        than nothing."""
+        if reach <= 0:
+            return False
         near = self.about(place, reach)
         _, normals, offsets = self.mirrors
         off = normals[near] @ place - offsets[near]

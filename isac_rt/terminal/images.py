@@ -33,8 +33,12 @@ BESIDE_CELLS = 1.5
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ECHOED_FRAMES = 3
-"""So many frames in a row a confirmed track fits a nearer body's echo before it ends: the body may
-be known only after its echo was confirmed, and a UAV may cross the place of another one's echo."""
+"""So many frames in a row a confirmed track fits a nearer body's echo, or lies behind a wall,
+before it ends: the body may be known only after its echo was confirmed, the place only then well
+enough, and a UAV may cross the place of another one's echo."""
+CROSSING_M = 3.0
+"""Confirmed tracks are held against the walls so near to them [m]: one that lay before all walls
+comes by here on its way behind one."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is a third as long."""
 
@@ -89,21 +93,26 @@ class Doubts:
         told: Sequence[Gaussian] = (),
     ) -> None:
         """Take out the tracks, among those `new` to be confirmed, that a wall explains, and of
-        the others those that are a nearer body's echoes over a wall frame after frame; at a passive
-        terminal with its `reference`. Of bodies that were `told` echoes are known as well as of
-        tracks. Where mirrors are eyes, those stay that a wall shows and nothing else explains, as
-        long as it does."""
+        the others those that are a nearer body's echoes over a wall frame after frame, or that went
+        behind one; at a passive terminal with its `reference`. Of bodies that were `told` echoes
+        are known as well as of tracks. Where mirrors are eyes, those stay that a wall shows and
+        nothing else explains, as long as it does."""
         old = {t.id for t in tracker.tracks if t.mirror.size}
         confirmed = {t.id for t in tracker.tracks if t.confirmed}
         hidden = set(old)
         out: set[int] = set()
         if confirmed - old:
             tracks = tracker.snapshot(own, reference)
-            asked = np.isin(tracks.ids, [*(confirmed & new)]) & ~tracks.is_reference
+            crossing = {
+                t.id
+                for t in tracker.tracks
+                if t.id in confirmed - new - old and self.walls.within(t.state.mean[:3], CROSSING_M)
+            }
+            asked = np.isin(tracks.ids, [*(confirmed & new | crossing)]) & ~tracks.is_reference
             others = track_set([Track.of_body(body) for body in told], own, reference)
             said = suspicion(tracks, own, self.walls, self._leeway, others, asked)
             out = confirmed & new & set(tracks.ids[said.suspect].tolist())
-            echoes = set(tracks.ids[said.mirrored >= 0].tolist())
+            echoes = set(tracks.ids[said.suspect].tolist())
             for track in tracker.tracks:
                 track.echoed = track.echoed + 1 if track.id in echoes else 0
                 if track.echoed >= ECHOED_FRAMES:

@@ -1,9 +1,11 @@
-"""Echoes that stand still beside each other: a building that the terminal's mesh lacks.
+"""Echoes that stand still: of a face of the terminal's mesh, or of a building that it lacks.
 
-A UAV may hover, but it hovers alone and in one place. What stands still in the world at several
-places near each other, and is explained by nothing that the terminal knows, is a surface. The
-terminal remembers such echoes for a while, because each frame shows other parts of it. Echoes of
-one surface are about as strong as each other: what stands far out of its neighbours is a body.
+A UAV may hover, but not in a face: what stands still there, as far as is known of its place, is
+the wall, whose brightest spots pass the threshold that its mean return sets. It hovers alone, too,
+and in one place. What stands still in the world at several places near each other, and is explained
+by nothing that the terminal knows, is a surface. The terminal remembers such echoes for a while,
+because each frame shows other parts of it. Echoes of one surface are about as strong as each other:
+what stands far out of its neighbours is a body.
 """
 
 from __future__ import annotations
@@ -30,6 +32,11 @@ STANDS = 11.3
 squared of three."""
 CROWD = 3
 """So many beside it make an echo part of a surface."""
+ON_FACE_M = 0.3
+"""Off a face by no more than this, and three deviations, what stands still may be the face [m]."""
+CLEAR_M = 0.5
+"""No UAV flies nearer to a face than this [m]: its arms are as long. What does, by two deviations,
+is an echo of something else over the wall."""
 STANDS_OUT = 10.0
 """An echo weaker than another by more than this factor is not of the same surface."""
 
@@ -73,8 +80,9 @@ class Standing:
         period: float,
         sender: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Take down a frame's echoes that stand still, of those that may start a track. What would
-        stand still in a direction that it may be an alias of stands there.
+        """Take down a frame's echoes that stand still, of those that may start a track, but those
+        on faces of the mesh. What would stand still in a direction that it may be an alias of
+        stands there.
 
         Parameters
         ----------
@@ -84,7 +92,7 @@ class Standing:
 
         Returns
         -------
-        (Q,) which of all detections stand still within a crowd
+        (Q,) which of all detections stand still within a crowd or on a face
         """
         u = d.direction[:, None] + self._aliases
         real = (u**2).sum(axis=-1) < 1
@@ -97,10 +105,25 @@ class Standing:
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         place = place[each, best]
+        spread = np.hypot(d.std[:, 0], d.range * d.std[:, 2:].max(axis=1, initial=0.0))
+        on = self._on_face(place, spread, still)
         new = np.column_stack([np.full(len(d), time), place, d.snr])
-        new = new[still & d.starts & ~d.is_reference]
+        new = new[still & d.starts & ~d.is_reference & ~on]
         self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
-        return still & self.crowded(place, d.snr)
+        return on | still & self.crowded(place, d.snr)
+
+    def _on_face(self, places: np.ndarray, spread: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """(n,) which of the places (n, 3) asked for, known to a deviation (n,), may lie on a face.
+        What is not known to `BESIDE_M` may lie on any, and is told by its crowd."""
+        reach = ON_FACE_M + 3 * spread
+        out = asked & (reach < BESIDE_M[0])
+        if self._walls is None:
+            return np.zeros(len(out), bool)
+        out[out] = [
+            self._walls.within(place, float(far))
+            for place, far in zip(places[out], reach[out], strict=True)
+        ]
+        return out
 
     def crowded(self, places: np.ndarray, snr: np.ndarray) -> np.ndarray:
         """(n,) whether what is seen at places (n, 3), so far above the noise (n,), lies among
@@ -121,16 +144,20 @@ class Standing:
         return some
 
     def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
-        """Tracks but those that stand still within a crowd, and those among `new` that an echo (Q,)
-        of one confirms: from beyond the view they seem to move."""
+        """Tracks but those that stand still within a crowd or on a face, and those among `new` that
+        an echo (Q,) of either confirms: from beyond the view they seem to move."""
         part = {t.id for t in tracks if t.detection >= 0 and crowd[t.detection]} & new
         return [t for t in tracks if not (self.holds(t) or (t.confirmed and t.id in part))]
 
     def holds(self, track: Track) -> bool:
-        """Whether a track stands still, as far as is known of it, within a crowd."""
-        return rests(track) and bool(
-            self.crowded(track.state.mean[None, :3], np.array([track.snr]))[0]
-        )
+        """Whether a track stands still, as far as is known of it, within a crowd or on a face, or
+        flies where no UAV can, in a face."""
+        place = track.state.mean[:3]
+        spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
+        if not rests(track):
+            return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
+        on = self._on_face(place[None], np.array([spread]), np.ones(1, bool))
+        return bool(on[0] or self.crowded(place[None], np.array([track.snr]))[0])
 
 
 def rests(track: Track) -> bool:

@@ -72,6 +72,11 @@ PATIENCE = 25
 """So many frames of disbelief in a row, and the next pilot is right and the track wrong."""
 NAMED_CELLS = 1.5
 """Cells of length and of its rate within which a path is one that the city explains."""
+WORD_FRAMES = 5
+"""A passive terminal that is told of others' tracks confirms none of its own before so many frames:
+what flies near its line of sight it cannot see, its echoes over walls it can. To the active
+terminal such a body shows itself as early; it has it confirmed after three frames, and its word is
+two on the way."""
 REFERENCE_STD_CELLS = 0.02
 """Floor of the reference's range and velocity deviations in cells, for what other paths beside it
 leave."""
@@ -296,7 +301,7 @@ class PassiveTerminal:
         self._clutter: ExpectedClutter | None = None
         self._teller: Track | None = None
         self._word: Track | None = None
-        self._read = False
+        self._read = self._awaits_word = False
         self._retrospect: Retrospect | None = None
         if receivers.link_acquisition == "blind":
             self._retrospect = Retrospect(self._receiver, waveform)
@@ -332,6 +337,7 @@ class PassiveTerminal:
         self._time = time
         self.tracker.predict(time)
         self._word = self._teller = None
+        self._awaits_word = sender is not None
         if sender is not None:
             word = Track.of_body(of_itself(sender), self._acceleration, self._time)
             over_another = self._retrospect is not None and self._retrospect.path is not None
@@ -450,6 +456,9 @@ class PassiveTerminal:
             crowd = self._standing.look(allowed, own, self._time, period, place.mean[:6])
         allowed = replace(allowed, starts=allowed.starts & ~crowd)
         self.tracker.update(allowed, own, sender)
+        if self._awaits_word:
+            for track in self.tracker.tracks:
+                track.confirmed &= track.age >= WORD_FRAMES
         self._doubts.remove_ghosts(self.tracker, new, own, reference, [b.state for b in told])
         self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
 

@@ -34,6 +34,9 @@ from isac_rt.terminal.filter import (
 )
 from isac_rt.world.swarm import Pose
 
+SURE_HITS = 2
+"""With `tracking.births: unexplained` a track is confirmed if so many of its detections could have
+started it: what carries tracks on passes lower thresholds, and where clutter is strong none."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
 
@@ -79,12 +82,13 @@ class Track:
     recent : whether each of the latest frames held a detection, newest last, the first detection
         included
     missed : frames since the last detection
-    confirmed : M hits in N frames were reached
+    confirmed : M hits in N frames were reached, `SURE_HITS` of them sure
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
     mirror : (4,) plane of the wall by which the body is seen, of which the state is the image;
         (0,): it is seen straight
     echoed : frames in a row that it fits a nearer body's echo over a wall
+    sure : detections that could have started it
     """
 
     id: int
@@ -98,6 +102,7 @@ class Track:
     last: float = -np.inf
     mirror: np.ndarray = field(default_factory=lambda: np.zeros(0))
     echoed: int = 0
+    sure: int = 1
 
     @classmethod
     def of_body(cls, body: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf) -> Track:
@@ -262,6 +267,7 @@ class Tracker:
             free = [q for q in free if q not in taken]
         for k, track in enumerate(self.tracks):
             q = hit.get(k)
+            track.sure += q is not None and bool(detections.starts[q])
             self._live(track, q is not None)
             if q is not None:
                 R = measurement_covariance(detections.std[q], track.state.mean, transmitter)
@@ -326,7 +332,9 @@ class Tracker:
         track.age += 1
         track.missed = 0 if hit else track.missed + 1
         track.recent = [*track.recent, hit][-s.confirm_window :]
-        track.confirmed = track.confirmed or sum(track.recent) >= s.confirm_hits
+        enough = sum(track.recent) >= s.confirm_hits
+        sure = s.births == "all" or track.sure >= min(SURE_HITS, s.confirm_hits)
+        track.confirmed = track.confirmed or (enough and sure)
 
     def _dead(self, track: Track) -> bool:
         """A confirmed track dies of `drop_misses` misses in a row, or of `drop_after_s` without a

@@ -562,3 +562,30 @@ def test_a_mesh_detector_without_a_mesh_says_so():
             FEW,
             Receivers(clutter_detector="map"),
         )
+
+
+@pytest.mark.parametrize(
+    ("there", "back", "clutter", "starts"),
+    [
+        ((0.3, 0.0), (0.3, 0.0), False, True),
+        ((0.3, 0.0), (-0.2, 0.3), False, False),
+        ((0.3, 0.0), (-0.2, 0.3), True, True),
+    ],
+    ids=["straight", "over a wall", "in clutter"],
+)
+def test_an_echo_over_a_wall_on_one_way_starts_no_track(there, back, clutter, starts):
+    """A UAV's echo leaves and comes from one direction. Over a wall on one of the ways two equal
+    waves arrive, which leave where the other comes from, and no direction explains both. In a cell
+    with clutter, where other waves are anyway, that says nothing. Planted bugs: what the channels
+    leave not asked; asked where clutter is."""
+    w, schedule, payload = frame(waveform=SHORT)
+    sent = known(w, schedule, payload, ANTENNAS)
+    paths = [Path(60.0, 9.0, 0.5, there, back), Path(60.0, 9.0, 0.5, back, there)]
+    spectra = clean_spectrum(cube(w, schedule, payload, paths, ANTENNAS, noise=1.0, seed=5), sent)
+    guess = expected([Path(60.0, 9.0, 0.05, (0.1, -0.1), (0.1, -0.1))])
+    guess = guess if clutter else guess.select(np.zeros(1, bool))
+    settings = Receivers(clutter_detector="angle_doppler")
+    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, guess).detections
+    best = d.snr.argmax()
+    assert abs(d.range[best] - 30.0) < w.range_cell(2)
+    assert bool(d.starts[best]) is starts

@@ -184,6 +184,27 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
         assert len(tracker.tracks) == left
 
 
+@pytest.mark.parametrize(
+    ("depth", "std", "frames"),
+    [(0.6, 0.05, 3), (0.6, 0.3, None), (-0.6, 0.05, None), (3.5, 0.05, None)],
+)
+def test_a_confirmed_track_that_goes_behind_a_wall_ends(depth, std, frames):
+    """Its place is known well enough only after it was confirmed. What lies before the wall, or
+    perhaps, stays; so does what is far behind, which never came by. Planted bugs: only new tracks
+    asked; deviations left out; it ends at once."""
+    w = Waveform()
+    antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
+    doubts, tracker = Doubts(Walls(wall()), antennas, w), Tracker(Tracking(), Ambiguity(PERIOD))
+    one = track(5, np.array([WALL_X + depth, 24.0, 5.0]), np.zeros(3))
+    one.state = Gaussian(one.state.mean, np.diag([std**2] * 3 + [1e-2] * 3))
+    tracker.tracks = [one]
+    ended = None
+    for frame in range(1, 5):
+        doubts.remove_ghosts(tracker, set(), OWN)
+        ended = frame if ended is None and not tracker.tracks else ended
+    assert ended == frames
+
+
 @pytest.mark.parametrize("passes", [1, 2])
 def test_directions_turn_by_what_the_array_tells_apart_whatever_the_view(passes):
     """Every channel hears two directions one turn apart alike, and two half as far apart not, where

@@ -10,8 +10,9 @@ from test_images import ORIGIN, VELOCITY, WALL, city, pose
 
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers, Tracking
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import Gaussian, measure
 from isac_rt.terminal.terminal import PassiveTerminal, Surroundings
 from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose
@@ -106,3 +107,30 @@ def test_the_city_is_expected_from_where_the_data_say(read):
         terminal.step(None, OWN, 0.0, True, sender=told)
     expected = tracked.mean - off * read
     np.testing.assert_allclose(asked[0], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("word", "first"), [(False, 2), (True, 5)])
+def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first):
+    """A UAV in the open, seen in every frame: alone the terminal confirms it in the third, in a
+    swarm when the active one, that saw it as early, can have told of it. Planted bug: no wait."""
+    around = Surroundings(city([[x + 200.0, y, z] for x, y, z in WALL]))
+    tracking = Tracking(births="unexplained")
+    terminal = PassiveTerminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
+    sender = Track.of_body(Gaussian(np.concatenate([SENDER, VELOCITY]), np.eye(6) * 1e-6))
+    flies = np.concatenate([TARGET, VELOCITY + np.array([1.0, 0.0, 0.0])])
+    z = measure(flies, OWN, sender.state.mean)
+    found = Detections(
+        range=z[:1],
+        velocity=z[1:2],
+        direction=z[None, 2:],
+        snr=np.full(1, 50.0),
+        std=np.array([[0.03, 0.08, 0.005, 0.006]]),
+        is_reference=np.zeros(1, bool),
+    )
+    terminal._awaits_word = word
+    confirmed = []
+    for n in range(7):
+        terminal.tracker.predict(1e-6 * n)
+        terminal._track(found, OWN, sender, ())
+        confirmed += [n] * terminal.tracker.tracks[0].confirmed
+    assert confirmed == [*range(first, 7)]

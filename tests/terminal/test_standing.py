@@ -200,3 +200,50 @@ def test_a_line_of_sight_is_no_echo():
         Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0, PERIOD
     )
     assert len(standing.memory()) == 0
+
+
+def ground() -> Walls:
+    """A square of 50 m and more about the places of these tests, at height nothing."""
+    corners = np.array([[-60.0, -9, 0], [60, -9, 0], [60, 90, 0], [-60, 90, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return Walls(CityMesh("ground", corners, faces, np.zeros(2, np.int16), (), np.zeros(3)))
+
+
+@pytest.mark.parametrize(
+    ("height", "velocity", "std", "expected"),
+    [
+        (0.2, (0.0, 0.0, 0.0), 2e-3, True),
+        (0.6, (0.0, 0.0, 0.0), 2e-3, False),
+        (0.6, (0.0, 0.0, 0.0), 5e-3, True),  # three deviations at 30 m are 0.45 m, and 0.3 m
+        (0.2, (0.0, 0.0, 0.0), 2e-2, False),  # known to 1.8 m, it may lie on any face
+        (0.2, (0.0, 3.0, 0.0), 2e-3, False),
+    ],
+)
+def test_what_stands_still_on_a_face_is_the_face(height, velocity, std, expected):
+    """One echo alone, 30 m away, and nothing that it is remembered by. Planted bugs: the mesh not
+    asked; deviations left out; any place taken for a face; the rate not held against the flight."""
+    standing = Standing(1.71, ground())
+    d = seen(0.0, [(0.0, 30.0, height)], [velocity])
+    d = Detections(**{**vars(d), "std": np.array([[0.01, 0.01, std, std]])})
+    assert standing.look(d, own(0.0), 0.0, PERIOD).tolist() == [expected]
+    if expected:
+        assert len(standing.memory()) == 0
+
+
+@pytest.mark.parametrize(
+    ("height", "velocity", "std", "expected"),
+    [
+        (0.5, (0.2, -0.1, 0.0), 0.1, True),
+        (0.7, (0.2, -0.1, 0.0), 0.1, False),
+        (0.2, (0.0, 9.0, 0.0), 0.1, True),
+        (0.4, (0.0, 9.0, 0.0), 0.1, False),
+        (0.2, (0.0, 9.0, 0.0), 0.3, False),
+    ],
+)
+def test_no_uav_flies_in_a_face(height, velocity, std, expected):
+    """Tracks that stand still within 0.3 m and three deviations, and others surely within 0.5 m.
+    Planted bugs: speed not asked; deviations added for those that fly."""
+    P = np.diag([std**2] * 3 + [0.09] * 3 + [9.0] * 3)
+    track = Track(1, Gaussian(np.array([0.0, 30.0, height, *velocity, 0, 0, 0]), P), 10.0)
+    assert Standing(1.71, ground()).holds(track) is expected
+    assert not Standing(1.71).holds(track)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -460,3 +461,21 @@ def test_a_track_says_which_detection_updated_it():
         tracker.predict(t)
         tracker.update(detections(z), now)
         assert tracker.snapshot(now).detection.tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("sure", "frame"), [((1, 1, 0, 0), 2), ((1, 0, 0, 1), 3), ((1, 0, 0, 0), None)]
+)
+def test_one_sure_detection_confirms_no_track(sure, frame):
+    """Four detections in a row, some of which could have started the track: it is confirmed by
+    three, two of them sure. Planted bugs: any three; the first not counted."""
+    settings = Tracking(births="unexplained")
+    tracker, first = Tracker(settings, Ambiguity(np.inf, 0.0)), None
+    z = measure(BODY, OWN)
+    for n, starts in enumerate(sure):
+        tracker.predict(1e-6 * n)
+        one = detections(z)
+        tracker.update(replace(one, starts=np.array([bool(starts)])), OWN)
+        if first is None and tracker.tracks[0].confirmed:
+            first = n
+    assert first == frame

@@ -10,7 +10,7 @@ them. A new detector is a subclass of `ClutterDetector` in a file of its own, an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,14 +48,14 @@ class Judged:
     cosines : (rows, P, 2) direction in which a filter found most, NaN where the detector does not
         look at directions
     whiteners : of cells (row, bin) in which all channels were whitened R^-1 (L, L), R in units of
-        the noise
+        the noise; None: the detector whitens none
     """
 
     ratio: np.ndarray
     sure: np.ndarray
     level: np.ndarray
     cosines: np.ndarray
-    whiteners: Mapping[tuple[int, int], np.ndarray] = field(default_factory=dict)
+    whiteners: Mapping[tuple[int, int], np.ndarray] | None = None
 
     @classmethod
     def everywhere(cls, ratio: np.ndarray, level: np.ndarray) -> Judged:
@@ -112,9 +112,10 @@ class ClutterDetector:
         ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
         found, towards = [], judged.cosines[rows, bins]
+        whiteners = judged.whiteners or {}
         for row, column, cosines in zip(rows.tolist(), bins.tolist(), towards, strict=True):
             if np.isfinite(cosines).all():
-                weights = beam_weights(known, cosines, judged.whiteners.get((row, column)))
+                weights = beam_weights(known, cosines, whiteners.get((row, column)))
                 beam = BeamSpectra(spectra, known, row, weights)
                 found.append(self.estimator.at(beam, ratio, row, column))
             else:
@@ -126,9 +127,12 @@ class ClutterDetector:
         direction = detections.direction.copy()
         for i, cosines in enumerate(towards):
             if np.isfinite(cosines).all():
-                white = judged.whiteners.get((int(rows[i]), int(bins[i])))
+                white = whiteners.get((int(rows[i]), int(bins[i])))
                 direction[i] = cosines if on_grid else near_beam(found[i], known, cosines, white)
         starts = judged.sure[rows, bins] > 1
+        if judged.whiteners is not None:  # where there is no clutter a UAV's echo is one wave
+            cells = zip(rows.tolist(), bins.tolist(), strict=True)
+            starts &= detections.starts | np.array([cell in whiteners for cell in cells], bool)
         if first:
             starts &= ~in_skirt(rows, bins, power, first)
         detections = replace(detections, direction=direction, starts=starts)
