@@ -5,7 +5,7 @@ the wall, whose brightest spots pass the threshold that its mean return sets. It
 and in one place. What stands still in the world at several places near each other, and is explained
 by nothing that the terminal knows, is a surface. The terminal remembers such echoes for a while,
 because each frame shows other parts of it. Echoes of one surface are about as strong as each other:
-what stands far out of its neighbours is a body.
+what stands far out of its neighbours is a body, and no neighbour of what is far weaker.
 """
 
 from __future__ import annotations
@@ -131,6 +131,7 @@ class Standing:
         the foot of a wall shines too."""
         apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:4], axis=-1)
         beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
+        beside &= self._seen[:, 4] < STANDS_OUT * snr[:, None]
         some = self._among(beside)
         out = some & ~self._among(beside & (STANDS_OUT * self._seen[:, 4] > snr[:, None]))
         if self._walls is not None:

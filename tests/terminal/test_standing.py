@@ -180,6 +180,18 @@ def test_a_uav_that_stands_out_of_a_wall_by_ten_decibels_is_none_of_it(snr, crow
     assert standing.holds(Track(1, state, snr)) is crowd
 
 
+@pytest.mark.parametrize(("snr", "crowd"), [(390.0, True), (410.0, False)])
+def test_what_stands_out_by_ten_decibels_makes_no_crowd_of_the_weaker(snr, crowd):
+    """A UAV at 40 that hovers beside two others' places and a body that outshines it: three places,
+    of which the brightest is no part of a surface that the UAV could be of. Planted bug: the
+    strength of those beside it ignored."""
+    places = [(0.0, 28.0, 6.0), (-4.0, 29.0, 7.0), (3.0, 30.0, 9.0), (-2.0, 24.0, 4.0)]
+    found = Standing(1.71).look(
+        above(seen(0.0, places), [40.0, 40.0, 40.0, snr]), own(0.0), 0.0, PERIOD
+    )
+    assert found[:3].tolist() == [crowd] * 3
+
+
 @pytest.mark.parametrize(("height", "crowd"), [(1.4, True), (1.6, False)])
 def test_what_touches_the_mesh_does_not_stand_out(height, crowd):
     """A bright echo before a wall that the mesh lacks, over the ground that it has. Planted bug:

@@ -6,7 +6,9 @@ of mean :math:`m = n + e^{\theta_0} C(\theta_1..\theta_3)`, with
 :math:`\theta_1..\theta_3` what the velocity is off [m/s]. Fisher scoring of that likelihood, with
 Gaussian priors as wide as such errors usually are, gives the level to tenths of a decibel and the
 velocity along boresight to hundredths of m/s; across it, where little clutter is, less well, and
-there it matters less. Cells that stand far out (`OUTLIER`), UAVs among them, do not count.
+there it matters less. Cells that stand far out (`OUTLIER`), UAVs among them, do not count. Where
+the mesh predicts so little that too few cells count, but those of most clutter hold far more than
+noise, the fit starts from their level.
 """
 
 from __future__ import annotations
@@ -27,6 +29,12 @@ OUTLIER = 8.0
 0.03 % of the cells, four times its mean, with the level 3 dB off, in 2 %."""
 FEWEST = 100
 """Cells with more clutter than noise below which nothing is fitted."""
+FAR_OFF = np.log(10) * np.array([0.6, 2.0])
+"""A level off by 6 to 20 dB is taken from the cells of most clutter where too few are predicted
+over the noise: less may be these cells' chance, more is not the clutter's."""
+FAR_OFF = np.log(10) * 0.6, np.log(10) * 2.0
+"""Logarithms of the level, 6 and 20 dB, between which it is taken from the cells of most clutter
+where no fit can start: less may be the chance of so few cells, more is something else."""
 UNTAPERED = Taper(doppler_bins=0.0)
 """What is fitted is not averaged over; range cells migrate all the same."""
 STEPS = 6
@@ -65,6 +73,10 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
             at, slopes = theta[1:].copy(), parts[1:]
         parts = np.exp(theta[0]) * np.concatenate([parts[:1], slopes])
         used = parts[0] > noise
+        if used.sum() < FEWEST and not theta.any():
+            theta[0] = _far_off(power[:rows], noise, parts[0])
+            parts = np.exp(theta[0]) * parts
+            used = parts[0] > noise
         if used.sum() < FEWEST:
             return Correction(0.0, np.zeros(3))
         mean, found = parts[0][used] + noise, power[:rows][used]
@@ -75,3 +87,14 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
         if np.abs(step).max() < SETTLED:
             break
     return Correction(float(theta[0]), theta[1:])
+
+
+def _far_off(power: np.ndarray, noise: float, expected: np.ndarray) -> float:
+    """Logarithm of the factor by which the cells of most expected clutter hold more of it in the
+    median; 0 where that is not far off, or not told from noise."""
+    most = np.argpartition(expected, -FEWEST, axis=None)[-FEWEST:]
+    found = float(np.median(power.ravel()[most])) / np.log(2) - noise
+    if found < noise:
+        return 0.0
+    level = float(np.log(found / expected.ravel()[most].mean()))
+    return level if FAR_OFF[0] < level < FAR_OFF[1] else 0.0
