@@ -124,6 +124,30 @@ def test_slopes_that_are_used_again_follow_the_level(monkeypatch, level_db: floa
     assert 10 * np.log10(np.exp(found.level)) == pytest.approx(level_db, abs=0.1)
 
 
+@pytest.mark.parametrize("too_low_db", [8.0, 15.0])
+def test_a_level_expected_far_too_low_is_found(too_low_db: float):
+    """Exponential cells of the clutter's mean beside noise of 45 channels. As the mesh predicts it,
+    fewer than a hundred cells hold more clutter than noise; in truth 600 do. The level comes back
+    to 0.6 dB, three deviations of some 300 cells, and of noise alone nothing is said. Planted bugs:
+    the fit given up; the median taken for the mean (1.6 dB in the start alone); noise not asked."""
+    rng = np.random.default_rng(4)
+    towards, ranges, powers = surroundings(COUNT, rng)
+    _, schedule, payload = frame(waveform=W)
+    one = known(W, schedule, payload)
+    truth = ExpectedClutter(2 * ranges / C, -2 * (towards @ VELOCITY) / C, powers, towards, towards)
+    mean = expected_power(truth, one, ROWS, UNTAPERED)
+    noise = float(np.sort(mean, axis=None)[-600])
+    low = ExpectedClutter(
+        truth.delay, truth.delay_rate, powers / 10 ** (too_low_db / 10), towards, towards
+    )
+    white = noise * rng.gamma(45, 1 / 45, mean.shape)
+    factor = 10 ** (too_low_db / 10)
+    assert (mean > factor * noise).sum() < correction.FEWEST
+    found = fit(mean * rng.exponential(size=mean.shape) + white, noise, low, one)
+    assert 10 * np.log10(np.exp(found.level)) == pytest.approx(too_low_db, abs=0.6)
+    assert fit(white, noise, low, one).level == 0
+
+
 def test_detectors_judge_with_the_corrected_clutter():
     """Circular Gaussian cells of the clutter's own mean; the terminal believes in a third of the
     power and 0.15 m/s too much. The level that its threshold map rests on is the true one: 15 % at
