@@ -392,8 +392,8 @@ OF_CASES = {
     ),
     "scatter of directions": Bug(
         "receive/estimate.py",
-        "apart = known.wavenumber * line.places[: values.shape[1], axis]",
-        "apart = 1.02 * known.wavenumber * line.places[: values.shape[1], axis]",
+        "apart = known.wavenumber * line.places[: values.shape[2], axis]",
+        "apart = 1.02 * known.wavenumber * line.places[: values.shape[2], axis]",
     ),
     "processing gain": Bug("frame/level.py", "- 2 * 10 * np.log10(1.5)", "- 10 * np.log10(1.5)"),
     "standing clutter is removed": Bug(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import copysign
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -328,17 +329,19 @@ def refine(
     w = local.waveform
     delay_unit, rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)
     # coordinates: beat at mid-frame and Doppler, which decouple; the beat holds the coupling
-    beat = delay / delay_unit + delay_rate / rate_unit * (w.sampled_duration / w.frame_duration)
+    coupling = w.sampled_duration / w.frame_duration
+    beat = delay / delay_unit + delay_rate / rate_unit * coupling
     doppler = delay_rate / rate_unit
 
     def split(b: T, d: T) -> tuple[T, T]:
-        return (b - d * (w.sampled_duration / w.frame_duration)) * delay_unit, d * rate_unit
+        return (b - d * coupling) * delay_unit, d * rate_unit
 
     hxy = 0.0
     for number, step in enumerate(steps):
         count = 5 if number else len(_STENCIL)
         down, across = step * _STENCIL[:count].T
-        g = np.log(np.maximum(local.powers(*split(beat + down, doppler + across)), 1e-300))
+        powers = local.powers(*split(beat + down, doppler + across))
+        g = np.log(np.maximum(powers, 1e-300)).tolist()
         gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
         hxx = (g[2] - 2 * g[0] + g[1]) / step**2
         hyy = (g[4] - 2 * g[0] + g[3]) / step**2
@@ -346,10 +349,11 @@ def refine(
             hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2)
         det = hxx * hyy - hxy**2
         if hxx < 0 and det > 0:
-            move = np.array([hyy * gx - hxy * gy, hxx * gy - hxy * gx]) / -det
+            move = (hyy * gx - hxy * gy) / -det, (hxx * gy - hxy * gx) / -det
         else:
-            move = step * np.sign([gx, gy])
-        beat, doppler = np.array([beat, doppler]) + np.clip(move, -3 * step, 3 * step)
+            move = copysign(step, gx), copysign(step, gy)
+        beat += min(max(move[0], -3 * step), 3 * step)
+        doppler += min(max(move[1], -3 * step), 3 * step)
     delay, delay_rate = split(beat, doppler)
     return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
 
@@ -384,16 +388,22 @@ def direction_cosine(
     receivers and in power over the transmitters, whose direction of departure is another and
     ambiguous.
     """
+    return float(_along(channels[None], known, axis, on_grid=on_grid)[0])
+
+
+def _along(channels: np.ndarray, known: Known, axis: int, *, on_grid: bool) -> np.ndarray:
+    """(Q,) `direction_cosine` of channels (Q, L_tx, L_rx)."""
     a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
     if not a.observes(known.passes)[axis // 2]:
-        return float("nan")
+        return np.full(len(channels), np.nan)
     limit = min(1.0, np.pi / (known.wavenumber * a.spacing))
-    values = channels[line.tx, line.rx].reshape(1 if echo else a.num_tx, -1)
+    rows = 1 if echo else a.num_tx
+    values = channels[:, line.tx, line.rx].reshape(len(channels), rows, len(line) // rows)
     # the receivers stand alike for every transmitter
-    apart = known.wavenumber * line.places[: values.shape[1], axis]
+    apart = known.wavenumber * line.places[: values.shape[2], axis]
     count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
-    best = _strongest(values, apart, limit, count, not on_grid)
-    return best if abs(best) <= 1 else float("nan")
+    best = np.array([_strongest(one, apart, limit, count, not on_grid) for one in values], float)
+    return np.where(np.abs(best) <= 1, best, np.nan)
 
 
 @jit
@@ -436,72 +446,90 @@ def _beam(values, turn):
 
 
 def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False) -> list[float]:
-    """u_x and u_z of a detection.
+    """u_x and u_z of a detection (`directions`)."""
+    delay = np.array([estimate.delay])
+    return directions(estimate.channels[None], delay, known, on_grid=on_grid)[0].tolist()
+
+
+def directions(
+    channels: np.ndarray, delays: np.ndarray, known: Known, *, on_grid: bool = False
+) -> np.ndarray:
+    """(Q, 2) u_x and u_z of detections from their channels (Q, L_tx, L_rx) and delays (Q,) [s].
 
     A second pass takes out the curvature of the wavefront, k (|r|^2 - (r.u)^2) / (2 R) for an
     element at r and a source at R, which would turn the estimate by 0.02 degrees at 11 m. R is the
     estimated range; behind a reflector on the way to a PT the true radius is shorter.
     """
-    channels = estimate.channels
     u = _cosines(channels, known, on_grid=on_grid)
-    radius = estimate.delay * SPEED_OF_LIGHT / known.passes
+    radius = delays * SPEED_OF_LIGHT / known.passes
     flat_u = in_plane(u, known)
-    if not np.all(np.isfinite(flat_u)) or flat_u[0] ** 2 + flat_u[1] ** 2 > 1 or radius <= 0:
-        return u
-    towards = unit_vector(flat_u)
-    scale = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius)
+    bent = _within(flat_u) & (radius > 0)
+    towards = unit_vector(flat_u[bent])
+    scale = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT / (2 * radius[bent, None])
     tx, rx = (
-        scale * ((r**2).sum(1) - (r @ towards) ** 2)
+        scale * ((r**2).sum(1) - (towards @ r.T) ** 2)
         for r in (known.antennas.tx_positions, known.antennas.rx_positions)
     )
-    flat = channels * np.exp(-1j * (tx[:, None] + rx[None, :]))
-    return _cosines(flat, known, on_grid=on_grid)
+    flat = channels[bent] * np.exp(-1j * (tx[:, :, None] + rx[:, None, :]))
+    u[bent] = _cosines(flat, known, on_grid=on_grid)
+    return u
 
 
-def _cosines(channels: np.ndarray, known: Known, *, on_grid: bool) -> list[float]:
-    """u_x and u_z of plane waves: by the arms of an L one by one, or by all channels."""
+def _cosines(channels: np.ndarray, known: Known, *, on_grid: bool) -> np.ndarray:
+    """(Q, 2) u_x and u_z of plane waves: by the arms of an L one by one, or by all channels."""
     if not known.antennas.is_l:
-        return planar.cosines(channels, known, on_grid=on_grid)
-    return [direction_cosine(channels, known, axis, on_grid=on_grid) for axis in (0, 2)]
+        found = [planar.cosines(one, known, on_grid=on_grid) for one in channels]
+        return np.array(found, float).reshape(-1, 2)
+    return np.stack([_along(channels, known, axis, on_grid=on_grid) for axis in (0, 2)], axis=1)
 
 
-def in_plane(u: Sequence[float], known: Known) -> list[float]:
-    """Direction cosines with 0 on an axis that the array does not observe."""
-    seen = known.antennas.observes(known.passes)
-    return [value if observed else 0.0 for value, observed in zip(u, seen, strict=True)]
+def in_plane(u: np.ndarray, known: Known) -> np.ndarray:
+    """Direction cosines (Q, 2) with 0 on an axis that the array does not observe."""
+    return np.where(known.antennas.observes(known.passes), u, 0.0)
 
 
-def excess(estimate: Estimate, direction: Sequence[float], snr: float, known: Known) -> float:
-    """Power that one wave from `direction` leaves in the channels of an estimate, over the wave's
-    own and beyond what noise leaves; 0 where there is no direction, and of a single channel.
+def _within(u: np.ndarray) -> np.ndarray:
+    """(Q,) which direction cosines (Q, 2) are of a direction."""
+    return np.isfinite(u).all(axis=1) & (u[:, 0] ** 2 + u[:, 1] ** 2 <= 1)
+
+
+def excess(
+    channels: np.ndarray, delays: np.ndarray, u: np.ndarray, snr: np.ndarray, known: Known
+) -> np.ndarray:
+    """(Q,) power that one wave from a direction (Q, 2) leaves in the channels (Q, L_tx, L_rx) of an
+    estimate, over the wave's own and beyond what noise leaves; 0 where there is no direction, and
+    of a single channel.
 
     A wave has one amplitude at the active terminal and one for each transmit antenna at a passive
     one. What is left comes from other paths in the cell.
     """
-    u = np.asarray(in_plane(direction, known), float)
-    if not np.isfinite(u).all() or (u**2).sum() > 1:
-        return 0.0
-    a, radius = known.antennas, known.radius(estimate.delay)
+    out, u = np.zeros(len(u)), in_plane(u, known)
+    a, free = known.antennas, 1 if known.passes == 2 else known.antennas.num_tx
+    some = _within(u)
+    if free == known.channels or not some.any():
+        return out
+    heard, radius = channels[some], known.radius(delays[some])[:, None]
     turn = 2j * np.pi * known.waveform.effective_carrier
-    sent, heard = (
-        np.exp(turn * element_delays(places, u, radius)[0])
+    to, fro = (
+        np.exp(turn * element_delays(places, u[some], radius)[0]).conj() / len(places)
         for places in (a.tx_positions, a.rx_positions)
     )
-    waves = estimate.channels @ heard.conj() / heard.size
-    free = waves.size
+    waves = (heard * fro[:, None]).sum(axis=2)
     if known.passes == 2:
-        waves, free = np.atleast_1d(waves @ sent.conj() / sent.size), 1
-    if free == estimate.channels.size:
-        return 0.0
-    total = float((np.abs(estimate.channels) ** 2).mean())
-    wave = float((np.abs(waves) ** 2).mean())
-    left = (total - wave) / (1 - free / estimate.channels.size)
-    return max(left - total / max(snr, 1.0), 0.0) / max(wave, 1e-3 * total)
+        waves = (waves * to).sum(axis=1, keepdims=True)
+    total = (np.abs(heard) ** 2).mean(axis=(1, 2))
+    wave = (np.abs(waves) ** 2).mean(axis=1)
+    left = (total - wave) / (1 - free / known.channels)
+    beyond = np.maximum(left - total / np.maximum(snr[some], 1.0), 0.0)
+    out[some] = beyond / np.maximum(wave, 1e-3 * total)
+    return out
 
 
-def standard_deviations(snr: float, excess: float, known: Known) -> np.ndarray:
-    """Standard deviations of range, velocity, u_x, u_z of a path; infinite on an axis that the
-    array does not observe.
+def standard_deviations(
+    snr: float | np.ndarray, excess: float | np.ndarray, known: Known
+) -> np.ndarray:
+    """Standard deviations (..., 4) of range, velocity, u_x, u_z of paths; infinite on an axis that
+    the array does not observe.
 
     Cramer-Rao of a tone, with Hann's loss of 2 on the two windowed axes, and never below the floors
     at which other paths' sidelobes usually end the gain. Other paths in the cell count twice: as
@@ -510,25 +538,26 @@ def standard_deviations(snr: float, excess: float, known: Known) -> np.ndarray:
 
     Parameters
     ----------
-    snr : of a channel, after processing
-    excess : power of other paths in the cell over the path's own
+    snr : of a channel, after processing (...)
+    excess : power of other paths in the cell over the path's own (...)
     """
-    w, total = known.waveform, known.channels / (1 / max(snr, 1.0 / known.channels) + excess)
-    tone, pull = np.sqrt(2 * 6 / (4 * np.pi**2 * max(total, 1.0))), PULL * excess / (1 + excess)
+    w, least = known.waveform, 1.0 / known.channels
+    total = np.maximum(known.channels / (1 / np.maximum(snr, least) + excess), 1.0)
+    tone, pull = np.sqrt(2 * 6 / (4 * np.pi**2 * total)), PULL * excess / (1 + excess)
     spread = [
-        np.hypot(max(tone, 2e-3), pull) * known.range_cell,
-        np.hypot(max(tone, 4e-3), pull) * w.velocity_cell(known.passes),
+        np.hypot(np.maximum(tone, 2e-3), pull) * known.range_cell,
+        np.hypot(np.maximum(tone, 4e-3), pull) * w.velocity_cell(known.passes),
     ]
-    angles = []
     if not known.antennas.is_l:
-        variance = np.diag(planar.direction_covariance(max(total, 1.0), known))
-        return np.array([*spread, *np.maximum(np.sqrt(variance), 2e-4)])
+        variance = [np.diag(planar.direction_covariance(t, known)) for t in np.ravel(total)]
+        angles = np.maximum(np.sqrt(np.reshape(variance, (-1, 2))), 2e-4)
+        return np.concatenate([np.stack(spread, axis=-1), angles.reshape(*total.shape, 2)], axis=-1)
     for axis, observed in zip((0, 2), known.antennas.observes(known.passes), strict=True):
         if not observed:
-            angles.append(np.inf)
+            spread.append(np.full(total.shape, np.inf))
             continue
         place = arm(known.antennas, axis, known.passes).places[:, axis]
         slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
         share = place.size / known.channels
-        angles.append(max(1 / (slope * np.sqrt(2 * max(total, 1.0) * share)), 2e-4))
-    return np.array(spread + angles)
+        spread.append(np.maximum(1 / (slope * np.sqrt(2 * total * share)), 2e-4))
+    return np.stack(spread, axis=-1)

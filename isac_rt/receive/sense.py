@@ -16,7 +16,7 @@ from isac_rt.receive.estimate import (
     Estimate,
     Estimator,
     LocalSpectra,
-    direction_cosines,
+    directions,
     excess,
     standard_deviations,
 )
@@ -164,21 +164,18 @@ def describe(
     What a single wave does not explain, such as a wall, carries on a track and starts none.
     """
     count = len(estimates)
-    direction, std = np.full((count, 2), np.nan), np.zeros((count, 4))
-    others = np.zeros(count)
-    limit = known.antennas.view_limit
-    for i, e in enumerate(estimates):
-        u = direction_cosines(e, known, on_grid=on_grid)
-        direction[i] = [v if abs(v) <= limit else np.nan for v in u]
-        others[i] = excess(e, u, snr[i], known)
-        std[i] = standard_deviations(snr[i], others[i], known)
-    noise = 1 / (np.asarray(snr, float) * np.sqrt(known.channels))
+    shape = count, known.antennas.num_tx, known.antennas.num_rx
+    channels = np.array([e.channels for e in estimates], complex).reshape(shape)
+    delays, snr = np.array([e.delay for e in estimates], float), np.asarray(snr, float)
+    u = directions(channels, delays, known, on_grid=on_grid)
+    others = excess(channels, delays, u, snr, known)
+    noise = 1 / (snr * np.sqrt(known.channels))
     return Detections(
-        range=np.array([e.delay for e in estimates]) * known.metres,
-        velocity=np.array([e.delay_rate for e in estimates]) * known.metres,
-        direction=direction,
-        snr=np.asarray(snr, float),
-        std=std,
+        range=delays * known.metres,
+        velocity=np.array([e.delay_rate for e in estimates], float) * known.metres,
+        direction=np.where(np.abs(u) <= known.antennas.view_limit, u, np.nan),
+        snr=snr,
+        std=standard_deviations(snr, others, known),
         is_reference=np.zeros(count, bool),
         starts=others <= MIXED + noise,
     )

@@ -373,7 +373,7 @@ def _described(
     """Detections with deviations by what the beam holds."""
     w, looks = known.waveform, known.antennas.num_tx
     snr = np.maximum(statistic - looks, 1.0) / known.channels
-    std = np.array([standard_deviations(s, 0.0, known) for s in snr]).reshape(-1, 4)
+    std = standard_deviations(snr, 0.0, known)
     floor = STD_CELLS * np.array([w.range_cell(1), w.velocity_cell(1), 0.0, 0.0])
     limit = known.antennas.view_limit
     return Detections(
