@@ -153,7 +153,8 @@ class Cooperation:
         notes = self._notes[link.rx]
         if isinstance(notes, Notes):
             told = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
-            states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock) for k in told}
+            cell = setup.waveform.range_cell(1)
+            states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in told}
             notes.see(str(link), time, states)
             return
         look = look_of(link, frame, time, own, heard, clock)

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 from scipy.special import gammaincinv
 
 from isac_rt.terminal.filter import Gaussian, normalised, singer
-from isac_rt.terminal.tracker import TrackSet, assign
+from isac_rt.terminal.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
 
 SIZE = 6
@@ -45,9 +45,13 @@ SPLIT_PROBABILITY = 1 - 1e-6
 """Two tracks are joined within the first gate and parted beyond the second, so that noise does not
 join and part them in turns."""
 
-LEAST_APART = 0.5
-"""UAVs keep farther from each other than this [m]: two tracks of one terminal within it, and within
-their errors, are one; beyond twice this they are parted."""
+
+MASKED_CELLS = 3.0
+"""What a passive terminal hears no more cells than this behind its line of sight is masked on that
+side: its lobes, and what is left where they were taken out, push the estimate off them."""
+PULL = 0.5
+"""Cells by which they do, frame after frame alike, so that the track's own deviation knows nothing
+of it. Near the line of sight a body's place hangs on the length of its way thirty times over."""
 
 
 class Key(NamedTuple):
@@ -171,18 +175,39 @@ def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussi
     return Gaussian(F[:SIZE, :SIZE] @ state.mean, (F @ P @ F.T + Q)[:SIZE, :SIZE])
 
 
-def in_world(tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0) -> Told:
+def in_world(
+    tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0, cell: float = 0.0
+) -> Told:
     """A track as it is told to others: its own covariance, and apart from it what the errors of the
     terminal do to it: of its position and velocity (`POSE_STD`), of its attitude (`ATTITUDE_STD`),
     which turns place and motion about the terminal, and of its clock (`clock_std`, the speed of
-    light times the deviation of what is left of its offset [m])."""
+    light times the deviation of what is left of its offset [m]). Its own covariance has what the
+    line of sight pulls, by the `cell` of ranges [m]."""
     offset, motion = np.split(tracks.mean[row], 2)
     lever = np.zeros((SIZE, ERRORS))
     lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
     lever[:3, 6:9], lever[3:, 6:9] = -ATTITUDE_STD * cross(offset), -ATTITUDE_STD * cross(motion)
     lever[:3, 9] = clock_std * _by_clock(tracks, row)
     mean = tracks.mean[row] + np.concatenate([own.position, own.velocity])
-    return Told(Gaussian(mean, tracks.covariance[row]), lever)
+    pulled = np.zeros(SIZE)
+    pulled[:3] = PULL * cell * _by_length(tracks, row, MASKED_CELLS * cell)
+    return Told(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
+
+
+def _by_length(tracks: TrackSet, row: int, masked: float) -> np.ndarray:
+    """How far a passive terminal's body moves along its direction for each metre that its way is
+    too long alone (3,); nothing, if that way is not `masked` [m] longer than the line of sight."""
+    if tracks.is_reference[row] or not tracks.is_reference.any():
+        return np.zeros(3)
+    offset, baseline = tracks.mean[row, :3], tracks.mean[tracks.is_reference][0, :3]
+    rho = float(np.linalg.norm(offset))
+    length = rho + float(np.linalg.norm(offset - baseline))
+    if length - np.linalg.norm(baseline) > masked:
+        return np.zeros(3)
+    u = offset / rho
+    # of rho = (L^2 - d^2) / (2 (L - d.u)) by L
+    out: np.ndarray = u * (length - rho) / (length - float(baseline @ u))
+    return out
 
 
 def _by_clock(tracks: TrackSet, row: int) -> np.ndarray:

@@ -309,6 +309,28 @@ def test_a_lever_is_what_an_error_does():
         assert moved == pytest.approx(lever[:, k], abs=1e-5 + 1e-3 * deviation), k
 
 
+@pytest.mark.parametrize(("beside", "pulled"), [(4.0, True), (9.0, False)])
+def test_what_the_line_of_sight_pulls_is_unsure_along_its_direction(beside, pulled):
+    """A reflector halfway to a transmitter 40 m away, whose way is 0.79 m longer, and one 3.9 m
+    longer, where three cells are 1.4 m: half a cell more puts it, at the same direction, where the
+    told covariance has it, by exact geometry. An active terminal has no line of sight. Planted
+    bugs: the direction to the transmitter; the way pulled with its reference, as by a clock; pulled
+    however far it is."""
+    own, sender = Pose.at_rest((5.0, -3.0, 20.0)), np.array([0.0, 40.0, 0.0])
+    body = np.array([beside, 20.0, 0.0, 3.0, -2.0, 1.0])
+    tracks = tracked([*sender, 0, 0, 0], body, reference=0)
+    more = in_world(tracks, 1, own, cell=0.47).state.covariance - tracks.covariance[1]
+    rho = np.linalg.norm(body[:3])
+    length, u = rho + np.linalg.norm(body[:3] - sender), body[:3] / rho
+    step = 1e-5
+    moved = (bistatic_distance(length + step, sender, u) - rho) / step * 0.5 * 0.47 * u
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = pulled * np.outer(moved, moved)
+    assert more == pytest.approx(expected, rel=1e-3, abs=1e-6)  # of the difference
+    alone = tracked([0.0, 40.0, 0.0, 1.0, 2.0, 3.0])
+    assert np.array_equal(in_world(alone, 0, own, cell=0.47).state.covariance, alone.covariance[0])
+
+
 def levered(key, mean, P, rng):
     lever = np.zeros((6, ERRORS))
     lever[:, : ERRORS - 1] = 0.3 * rng.normal(size=(6, ERRORS - 1))
