@@ -341,10 +341,10 @@ def turning_bound(
     of the centroid. A body that turns itself moves its elements by so much.
     """
     t, k = frame_reach(waveform), 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
-    poses = [swarm.poses(paths.epoch + later) for later in (0.0, -t, t)]
+    poses = swarm.poses(paths.epoch)
     way = {
         name: t * (float(np.linalg.norm(p.velocity)) + t * float(np.linalg.norm(p.acceleration)))
-        for name, p in poses[0].items()
+        for name, p in poses.items()
     }
     targets = np.array([*(way[name] for name in paths.target_names), 0.0])[paths.target]
     ends = (
@@ -353,7 +353,9 @@ def turning_bound(
     )
     out = np.zeros(len(paths))
     for own, other, positions, radius in ends:
-        here, *then = (p[own].to_world(positions) for p in poses)
+        flight = swarm.trajectories[own]
+        here = poses[own].to_world(positions)
+        then = [flight.pose(paths.epoch + later).to_world(positions) for later in (-t, t)]
         r = float(np.linalg.norm(positions, axis=1).max())
         flown = way[own] + np.where(paths.target >= 0, targets, way[other])
         flown = np.where(paths.kind == PathKind.DIFFUSE, way[own], flown)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from isac_rt.scenario.swarm import Uav
@@ -82,6 +82,15 @@ def turned(yaw_pitch_roll: npt.ArrayLike) -> Rotation:
     return Rotation.from_euler("ZXY", angles, degrees=True)
 
 
+def _with_derivatives(spline: CubicSpline) -> PPoly:
+    """Values of a spline (3,), their first and second derivatives as one (9,)."""
+    c = spline.c
+    first, second = np.zeros((2, *c.shape))
+    first[1:] = np.array([3.0, 2.0, 1.0])[:, None, None] * c[:3]
+    second[2:] = np.array([6.0, 2.0])[:, None, None] * c[:2]
+    return PPoly(np.concatenate([c, first, second], axis=2), spline.x)
+
+
 class Trajectory:
     """Position, velocity, acceleration and attitude of one UAV at any time.
 
@@ -109,6 +118,7 @@ class Trajectory:
             self._spline = CubicSpline(
                 times, np.array([w.position_m for w in uav.waypoints]), bc_type="natural"
             )
+            self._motion = _with_derivatives(self._spline)
             angles = [w.attitude_deg for w in uav.waypoints if w.attitude_deg is not None]
             if angles:
                 self._attitude = RotationSpline(times, turned(angles))
@@ -129,10 +139,10 @@ class Trajectory:
                 np.zeros(3),
             )
         else:
-            inside = float(np.clip(time, *self._span))
-            velocity = self._spline(inside, 1)
-            position = self._spline(inside) + (time - inside) * velocity
-            acceleration = self._spline(inside, 2) if inside == time else np.zeros(3)
+            inside = min(max(time, self._span[0]), self._span[1])
+            position, velocity, acceleration = self._motion(inside).reshape(3, 3)
+            if inside != time:
+                position, acceleration = position + (time - inside) * velocity, np.zeros(3)
         boresight = self._fixed_boresight if self._fixed_boresight is not None else velocity
         if not np.any(boresight):
             boresight = np.array([0.0, 1.0, 0.0])  # a hovering UAV looks north
