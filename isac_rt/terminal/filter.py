@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
@@ -326,6 +325,7 @@ def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
     return out
 
 
+@jit
 def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray) -> float:
     """Distance from the receiver to a reflector, rho = (L^2 - d^2) / (2 (L - d.u)) [m].
 
@@ -333,7 +333,8 @@ def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray
     `direction` u (3,) unit to the reflector. Not positive where the length is not longer than the
     baseline.
     """
-    return float((length**2 - baseline @ baseline) / (2 * (length - baseline @ direction)))
+    ahead = np.sum(baseline * direction)
+    return (length**2 - np.sum(baseline * baseline)) / (2 * (length - ahead))
 
 
 def birth(
@@ -357,40 +358,76 @@ def birth(
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
         return None
-    t = None if transmitter is None else transmitter.mean
-    mean = _resting(measurement, own, t)
-    if mean is None:
-        return None
-    still = measure(mean, own, t)
-    measurement = still + wrapped(measurement - still, ambiguity)
-    mean = _resting(measurement, own, t)
-    if mean is None:
-        return None
-    rho = np.linalg.norm(mean[:3] - own.position)
-    J = jacobian(mean, own, t)[_POSITION, :3]
+    terms = _terms(own, None if transmitter is None else transmitter.mean)
+    doubt = np.zeros((0, 0)) if transmitter is None else transmitter.covariance
+    seen = np.asarray(measurement, float), np.fmax(std, STD_FLOOR)
+    born, mean, covariance = _born(*seen, *terms, doubt, float(acceleration_std), tuple(ambiguity))
+    return Gaussian(mean, covariance) if born else None
+
+
+@jit
+def _born(
+    measurement: np.ndarray,
+    std: np.ndarray,
+    own: np.ndarray,
+    transmitter: np.ndarray,
+    doubt: np.ndarray,
+    acceleration_std: float,
+    ambiguity: tuple[float, float],
+) -> tuple[bool, np.ndarray, np.ndarray]:
+    """`birth`: whether there is one, its mean and covariance; `doubt` is the
+    transmitter's covariance, `own` and `transmitter` are as of `_linearised`."""
+    mean, P = _resting(measurement, own, transmitter), np.zeros((9, 9))
+    if not mean.size:
+        return False, mean, P
+    read = measurement.copy()
+    if np.isfinite(ambiguity[0]):
+        off = measurement[1] - _linearised(mean, own, transmitter)[0][1]
+        periods = np.round(off / ambiguity[0])
+        read[0] += periods * ambiguity[1]
+        read[1] -= periods * ambiguity[0]
+        mean = _resting(read, own, transmitter)
+        if not mean.size:
+            return False, mean, P
+    rho = np.sqrt(np.sum((mean[:3] - own[0]) ** 2))
+    H, R = _linearised(mean, own, transmitter)[1], np.diag(std**2)
+    if transmitter.size:
+        T = _transmitter_jacobians(mean[None], transmitter)[0]
+        R += T @ doubt @ T.T
+    J, shown = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        J[i] = H[_POSITION[i], :3]
+        for j in range(3):
+            shown[i, j] = R[_POSITION[i], _POSITION[j]]
     if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
-        return None
-    R = measurement_covariance(std, mean, transmitter)
+        return False, mean, P
     back = np.linalg.inv(J)
-    P = np.zeros((9, 9))
-    P[:3, :3] = back @ R[np.ix_(_POSITION, _POSITION)] @ back.T
+    P[:3, :3] = back @ shown @ back.T
     if np.trace(P) > BIRTH_POSITION_STD_LIMIT**2:
-        return None
-    P[3:6, 3:6] = BIRTH_SPEED_STD**2 * np.eye(3)
-    P[6:, 6:] = acceleration_std**2 * np.eye(3)
-    rate_only = np.array([np.nan, measurement[1], np.nan, np.nan])
-    return update(Gaussian(mean, _symmetric(P)), rate_only, R, own, t)
+        return False, mean, P
+    for i in range(3, 6):
+        P[i, i], P[i + 3, i + 3] = BIRTH_SPEED_STD**2, acceleration_std**2
+    P = (P + P.T) / 2
+    rate = np.array([1])
+    x, K, h = _settled(mean, P, read, R[1:2, 1:2], rate, own, transmitter, (np.inf, 0.0))
+    A = np.eye(9) - K @ h
+    P = A @ P @ A.T + K @ R[1:2, 1:2] @ K.T
+    return True, x, (P + P.T) / 2
 
 
-def _resting(
-    measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None
-) -> np.ndarray | None:
-    """State (9,) of a body at rest where range and direction place it; None: nowhere."""
-    e = own.to_world(unit_vector(measurement[2:]))
-    rho = float(measurement[0])
-    if transmitter is not None:
-        rho = bistatic_distance(rho, transmitter[:3] - own.position, e)
-    return np.concatenate([own.position + rho * e, np.zeros(6)]) if rho > 0 else None
+@jit
+def _resting(measurement: np.ndarray, own: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+    """State (9,) of a body at rest where range and direction place it, (0,): nowhere."""
+    u_x, u_z, rho = measurement[2], measurement[3], measurement[0]
+    forward = np.sqrt(max(1 - u_x**2 - u_z**2, 0.0))
+    e = u_x * own[2] + forward * own[3] + u_z * own[4]
+    if transmitter.size:
+        rho = bistatic_distance(rho, transmitter[:3] - own[0], e)
+    if not rho > 0:
+        return np.zeros(0)
+    out = np.zeros(9)
+    out[:3] = own[0] + rho * e
+    return out
 
 
 def mahalanobis(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
