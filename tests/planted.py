@@ -112,8 +112,8 @@ OF_CASES = {
     ),
     "velocity along waypoints": Bug(
         "world/swarm.py",
-        "velocity = self._spline(inside, 1)",
-        "velocity = self._spline(inside, 1) * 1.001",
+        "self._motion(inside).reshape(3, 3)",
+        "self._motion(inside).reshape(3, 3) * [[1.0], [1.001], [1.0]]",
     ),
     "longitude and latitude to metres": Bug("world/city/place.py", "+ellps=WGS84", "+ellps=sphere"),
     "buildings are closed and face outward": Bug(
@@ -411,8 +411,8 @@ OF_CASES = {
     ),
     "bistatic range": Bug(
         "terminal/filter.py",
-        "(2 * (length - baseline @ direction))",
-        "(2 * (length + baseline @ direction))",
+        "(2 * (length - ahead))",
+        "(2 * (length + ahead))",
     ),
     "covariance of an unknown acceleration": Bug(
         "terminal/filter.py",
