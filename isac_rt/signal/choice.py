@@ -75,9 +75,9 @@ class Candidate:
     def covered(self, power: np.ndarray, cover: Cover, limit: float) -> np.ndarray:
         """Which paths (K,) may take the way for those that noise covers, if the setting has one:
         the powers [W] of the errors of all paths of their cell stay within a limit."""
-        if not self.setting.faint:
+        if not self.setting.faint or not power.size:
             return np.zeros(power.size, bool)
-        _, number = np.unique(cover.cell, return_inverse=True)
+        number = cover.cell - cover.cell.min()
         return np.bincount(number, power * cover.error**2)[number] <= limit
 
 

@@ -159,8 +159,7 @@ class Auto:
         size, none = float(np.prod(shape)), np.zeros(power.size, bool)
         best = Choice(DEFAULT, ~none, none)
         least = model.seconds(DIRECT, shape, scale * power.size)
-        top = np.zeros(power.size, bool)
-        top[np.argsort(-power, kind="stable")[: self.max_direct]] = True
+        top = _strongest(power, self.max_direct)
         for candidate in CANDIDATES:
             error = candidate.error_at(speed)
             strong = power * error**2 * size > self.noise_power
@@ -182,6 +181,16 @@ class Auto:
 
 
 Method = Exact | Direct | Gridded | Auto | Separable
+
+
+def _strongest(power: np.ndarray, count: int) -> np.ndarray:
+    """Which (K,) of some powers are the strongest, so many of them; of equal ones the first."""
+    if count >= power.size:
+        return np.ones(power.size, bool)
+    least = np.partition(power, power.size - count)[power.size - count] if count else np.inf
+    top = power > least
+    top[np.flatnonzero(power == least)[: count - top.sum()]] = True
+    return top
 
 
 def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:

@@ -26,7 +26,7 @@ from isac_rt.signal.choice import (
 )
 from isac_rt.signal.covered import summed_share
 from isac_rt.signal.gridded import COVERING, DEFAULT
-from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, _strongest
 from isac_rt.signal.tones import tones_of
 from isac_rt.simulation.plan import decisions
 from isac_rt.simulation.setup import prepare
@@ -222,3 +222,14 @@ def test_files_that_are_no_model(tmp_path):
     (tmp_path / "mine.json").write_text("[]")
     with pytest.raises(ScenarioError, match=r"accuracy\.cost_model.*is no cost model"):
         prepare(load(tmp_path / "s.yaml"))
+
+
+def test_the_strongest_paths_are_the_first_of_equal_ones():
+    """Against a stable sort, with many ties. Planted bug: paths as strong as the weakest that goes
+    direct are taken from the end."""
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        power, count = rng.integers(0, 6, rng.integers(0, 12)).astype(float), rng.integers(0, 14)
+        expected = np.zeros(power.size, bool)
+        expected[np.argsort(-power, kind="stable")[:count]] = True
+        assert _strongest(power, int(count)).tolist() == expected.tolist()
