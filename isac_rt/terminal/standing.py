@@ -80,9 +80,8 @@ class Standing:
         period: float,
         sender: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Take down a frame's echoes that stand still, of those that may start a track, but those
-        on faces of the mesh. What would stand still in a direction that it may be an alias of
-        stands there.
+        """Take down a frame's echoes that stand still, of those that may start a track. What would
+        stand still in a direction that it may be an alias of stands there.
 
         Parameters
         ----------
@@ -108,7 +107,7 @@ class Standing:
         spread = np.hypot(d.std[:, 0], d.range * d.std[:, 2:].max(axis=1, initial=0.0))
         on = self._on_face(place, spread, still)
         new = np.column_stack([np.full(len(d), time), place, d.snr])
-        new = new[still & d.starts & ~d.is_reference & ~on]
+        new = new[still & d.starts & ~d.is_reference]
         self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
         return on | still & self.crowded(place, d.snr)
 
