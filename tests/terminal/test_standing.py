@@ -233,7 +233,8 @@ def ground() -> Walls:
 )
 def test_what_stands_still_on_a_face_is_the_face(height, velocity, std, expected):
     """One echo alone, 30 m away; it is remembered as others are, for a wall that the mesh lacks
-    stands beside. Planted bugs: the mesh not asked; deviations left out; any place taken for a face; the rate not held against the flight."""
+    stands beside. Planted bugs: the mesh not asked; deviations left out; any place taken for a
+    face; the rate not held against the flight."""
     standing = Standing(1.71, ground())
     d = seen(0.0, [(0.0, 30.0, height)], [velocity])
     d = Detections(**{**vars(d), "std": np.array([[0.01, 0.01, std, std]])})
