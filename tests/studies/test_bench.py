@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -135,6 +137,26 @@ def test_whole_commands_are_a_table():
     assert "| peak memory [MiB] | 1,234 | 1,234 |" in lines
     found = {"machine": report.machine(), "quick": True, "rows": [], "growth": []}
     assert lines[3] in report.markdown(found | {"commands": [one, one | {"scene": "town"}]})
+
+
+def test_the_peak_of_memory_is_of_the_process_alone():
+    """A process that takes 400 MB starts another, which says what it has had: some 50 MB, and what
+    it then takes. The children of a benchmark said 1,248 MB each, that of the benchmark itself.
+    Planted bug: `resource.getrusage`."""
+    child = (
+        "from isac_rt.studies.bench.command import peak_memory_mib as peak; few = peak(); "
+        "taken = bytearray(150 << 20); print(few, peak())"
+    )
+    parent = (
+        "import subprocess, sys; taken = bytearray(400 << 20); "
+        f"print(subprocess.run([sys.executable, '-c', {child!r}], capture_output=True, "
+        "text=True, check=True).stdout)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", parent], capture_output=True, text=True, check=True
+    )
+    few, many = map(float, done.stdout.split())
+    assert 0 < few < 300 and many - few == pytest.approx(150, abs=10)
 
 
 @pytest.mark.slow
