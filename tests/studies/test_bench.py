@@ -139,6 +139,19 @@ def test_whole_commands_are_a_table():
     assert lines[3] in report.markdown(found | {"commands": [one, one | {"scene": "town"}]})
 
 
+def test_whole_commands_say_which_one_is_at_work(monkeypatch, caplog):
+    """Half an hour without `quick`. Planted bug: nothing logged, so that the step before is said
+    to go on."""
+    monkeypatch.setattr(command, "_answer", lambda *_: {"seconds_of_run": {}})
+    with caplog.at_level("INFO", "isac_rt"):
+        command.measured("Munich", quick=False)
+    assert caplog.messages == [
+        "Munich, 78 frames, call 1 of 2",
+        "Munich, 78 frames, call 2 of 2",
+        "Munich, what its plan says",
+    ]
+
+
 def test_the_peak_of_memory_is_of_the_process_alone():
     """A process that takes 400 MB starts another, which says what it has had: some 50 MB, and what
     it then takes. The children of a benchmark said 1,248 MB each, that of the benchmark itself.

@@ -9,6 +9,7 @@ earlier calls: every scene is run twice, but with `quick` once, and the last cal
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import resource
@@ -23,6 +24,7 @@ from typing import Any
 
 from isac_rt.studies import scene_file
 
+_LOG = logging.getLogger(__name__)
 PARTS = ("import", "set-up", "first frame", "other frames", "saving", "figures", "report")
 LONGEST_S = 3000
 SAN_FRANCISCO = (
@@ -58,10 +60,13 @@ def measured(name: str, quick: bool) -> dict[str, Any]:
     file, frames, few, changes = SCENES[name]
     number = few if quick else frames
     told = [*changes, f"frames={number}"]
-    for _ in range(1 if quick else 2):
+    calls = 1 if quick else 2
+    for call in range(calls):
+        _LOG.info("%s, %s frames, call %s of %s", name, number, call + 1, calls)
         job = json.dumps([file, told, time.time()])
         found = _answer(file, "isac_rt.studies.bench.command", job)
     overrides = [word for change in told for word in ("--set", change)]
+    _LOG.info("%s, what its plan says", name)
     asked = ["plan", str(scene_file(file)), "--receivers", "--json", *overrides]
     predicted = _answer(file, "isac_rt.cli.cli", *asked)["seconds_of_run"]
     return {"scene": name, "frames": number, **found, "predicted": predicted}
