@@ -156,12 +156,18 @@ def look_at(
 
 
 def describe(
-    estimates: list[Estimate], snr: np.ndarray, known: Known, *, on_grid: bool = False
+    estimates: list[Estimate],
+    snr: np.ndarray,
+    known: Known,
+    *,
+    on_grid: bool = False,
+    mixed: float = MIXED,
 ) -> Detections:
     """Detections in ranges, velocities and direction cosines; what lies outside the field of view
     has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam.
 
-    What a single wave does not explain, such as a wall, carries on a track and starts none.
+    What a single wave does not explain, such as a wall, carries on a track and starts none: where
+    others have more than `mixed` of its power.
     """
     count = len(estimates)
     shape = count, known.antennas.num_tx, known.antennas.num_rx
@@ -177,7 +183,7 @@ def describe(
         snr=snr,
         std=standard_deviations(snr, others, known),
         is_reference=np.zeros(count, bool),
-        starts=others <= MIXED + noise,
+        starts=others <= mixed + noise,
     )
 
 

@@ -564,23 +564,30 @@ def test_a_mesh_detector_without_a_mesh_says_so():
         )
 
 
+STRAIGHT, ASIDE = (0.3, 0.0), (-0.2, 0.3)
+
+
 @pytest.mark.parametrize(
-    ("there", "back", "clutter", "starts"),
+    ("ways", "beside", "clutter", "starts"),
     [
-        ((0.3, 0.0), (0.3, 0.0), False, True),
-        ((0.3, 0.0), (-0.2, 0.3), False, False),
-        ((0.3, 0.0), (-0.2, 0.3), True, True),
+        ((STRAIGHT, STRAIGHT), 0.0, False, True),
+        ((STRAIGHT, STRAIGHT), 0.2, False, True),
+        ((STRAIGHT, ASIDE), 0.0, False, False),
+        ((STRAIGHT, ASIDE), 0.0, True, True),
     ],
-    ids=["straight", "over a wall", "in clutter"],
+    ids=["straight", "beside a wall", "over a wall", "in clutter"],
 )
-def test_an_echo_over_a_wall_on_one_way_starts_no_track(there, back, clutter, starts):
-    """A UAV's echo leaves and comes from one direction. Over a wall on one of the ways two equal
-    waves arrive, which leave where the other comes from, and no direction explains both. In a cell
-    with clutter, where other waves are anyway, that says nothing. Planted bugs: what the channels
-    leave not asked; asked where clutter is."""
+def test_an_echo_over_a_wall_on_one_way_starts_no_track(ways, beside, clutter, starts):
+    """A UAV's echo leaves and comes from one direction; of a wall it may have a fifth of its power
+    in its cell. Over a wall on one of the ways two equal waves arrive, which leave where the other
+    comes from, and no direction explains both. In a cell with clutter, where other waves are
+    anyway, that says nothing. Planted bugs: what the channels leave not asked; asked where clutter
+    is; `MIXED` instead of `TWO_WAVES`."""
     w, schedule, payload = frame(waveform=SHORT)
     sent = known(w, schedule, payload, ANTENNAS)
+    there, back = ways
     paths = [Path(60.0, 9.0, 0.5, there, back), Path(60.0, 9.0, 0.5, back, there)]
+    paths += [Path(60.0, 9.0, np.sqrt(beside), ASIDE, ASIDE)]  # the straight ones add up to one
     spectra = clean_spectrum(cube(w, schedule, payload, paths, ANTENNAS, noise=1.0, seed=5), sent)
     guess = expected([Path(60.0, 9.0, 0.05, (0.1, -0.1), (0.1, -0.1))])
     guess = guess if clutter else guess.select(np.zeros(1, bool))

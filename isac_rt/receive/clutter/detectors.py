@@ -32,6 +32,10 @@ QUIET = 0.3
 the noise's."""
 FINE = 0.03, 0.01, 0.003
 """Steps of the search for a direction around the filter's beam [cosine]."""
+TWO_WAVES = 0.5
+"""Power of other waves over its own from which an echo starts no track where no clutter is
+expected: over a wall on one way there are two equal ones. What is weaker, and pulls a UAV's echo, is
+a wall's: beside a canyon's it has 0.1 to 0.2 of U1's."""
 SCANNED = {"arms": ((0,), (2,)), "joint": ((0, 2),)}
 """Axes of the L that are filtered together, by `receivers.clutter_channels`."""
 
@@ -123,7 +127,7 @@ class ClutterDetector:
                 found.append(self.estimator.at(local, power, row, column))
         snr = np.maximum(power[rows, bins] / judged.level[rows, bins], ratio[rows, bins])
         on_grid = self.estimator.on_grid
-        detections = describe(found, snr, known, on_grid=on_grid)
+        detections = describe(found, snr, known, on_grid=on_grid, mixed=TWO_WAVES)
         direction = detections.direction.copy()
         for i, cosines in enumerate(towards):
             if np.isfinite(cosines).all():
