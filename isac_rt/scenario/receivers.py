@@ -211,7 +211,8 @@ class Tracking(Node):
     alone, nor one that lies in a face or behind a wall, or is a wall's image of a nearer one, or of
     a nearer body that others told of (`cooperation`). One that fits such an image, or lies behind a
     wall, in three frames in a row ends. With `cooperation` a passive terminal confirms none before
-    the active one could have told it what flies near its line of sight, five frames."""
+    the active one could have told it what flies near its line of sight, five frames after
+    the first."""
     mirrors: Literal["ignore", "place"] = "ignore"
     """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
     terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a

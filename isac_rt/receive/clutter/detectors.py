@@ -34,8 +34,8 @@ FINE = 0.03, 0.01, 0.003
 """Steps of the search for a direction around the filter's beam [cosine]."""
 TWO_WAVES = 0.5
 """Power of other waves over its own from which an echo starts no track where no clutter is
-expected: over a wall on one way there are two equal ones. What is weaker, and pulls a UAV's echo, is
-a wall's: beside a canyon's it has 0.1 to 0.2 of U1's."""
+expected: over a wall on one way there are two equal ones. Less is of a wall that a UAV flies by:
+in a canyon 0.1 to 0.2 of U1's."""
 SCANNED = {"arms": ((0,), (2,)), "joint": ((0, 2),)}
 """Axes of the L that are filtered together, by `receivers.clutter_channels`."""
 
