@@ -129,7 +129,7 @@ def test_a_level_expected_far_too_low_is_found(too_low_db: float):
     """Exponential cells of the clutter's mean beside noise of 45 channels. As the mesh predicts it,
     fewer than a hundred cells hold more clutter than noise; in truth 600 do. The level comes back
     to 0.6 dB, three deviations of some 300 cells, and of noise alone nothing is said. Planted bugs:
-    the fit given up; the median taken for the mean (1.6 dB in the start alone); noise not asked."""
+    the fit given up; the least level that counts taken for the most."""
     rng = np.random.default_rng(4)
     towards, ranges, powers = surroundings(COUNT, rng)
     _, schedule, payload = frame(waveform=W)
