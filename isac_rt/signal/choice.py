@@ -33,6 +33,9 @@ FORMAT = "isac_rt cost model 2"
 DIRECT = "direct"
 FAINT = ", covered"
 """After the name of a candidate: its paths that noise covers."""
+MOST_CELLS = 1 << 24
+"""Span of cells whose sums are kept as one array: a hundred times what a link spans. Transmitters
+whose clocks are a second apart span 10^11."""
 SHIPPED = Path(__file__).with_name("cost_model.json")
 
 
@@ -78,6 +81,8 @@ class Candidate:
         if not self.setting.faint or not power.size:
             return np.zeros(power.size, bool)
         number = cover.cell - cover.cell.min()
+        if number.max() > MOST_CELLS:
+            number = np.unique(number, return_inverse=True)[1]
         return np.bincount(number, power * cover.error**2)[number] <= limit
 
 

@@ -103,9 +103,10 @@ def test_sights_fast_and_strong_paths_go_direct():
 
 def test_noise_covers_what_a_cell_holds_together():
     """Twelve hundred paths in cells of one, one cell of forty of the same power, one strong path,
-    one whose error is large and a line of sight: what is covered is known cell by cell. Planted
-    bugs: the cell's sum taken for the path's own; one error for all paths; what they cost here left
-    out."""
+    one whose error is large and a line of sight: what is covered is known cell by cell, also where
+    cells lie as far apart as those of transmitters whose clocks differ by a second. Planted bugs:
+    the cell's sum taken for the path's own; one error for all paths; what they cost here left out;
+    a sum for every cell of the span, a terabyte of them."""
     count, size = 1200, float(np.prod(SHAPE))
     cell, power = np.arange(count), np.full(count, 1e-9)
     cell[100:140], power[500], sight = 7, 1e-6, np.arange(count) == 600
@@ -118,6 +119,9 @@ def test_noise_covers_what_a_cell_holds_together():
     assert choice.setting == COVERING
     np.testing.assert_array_equal(choice.faint, expected)
     assert np.flatnonzero(choice.alone).tolist() == [600]
+    apart = cover._replace(cell=cell * 10**8)
+    far = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, apart)
+    np.testing.assert_array_equal(far.faint, expected)
     none = Auto(noise).choose(SHAPE, power, speed, sight, cover)
     assert not none.faint.any()
     dear = Auto(noise, covered=0.01).choose(SHAPE, power, speed, sight, cover._replace(dearer=9.0))

@@ -3,6 +3,8 @@ picture."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -19,6 +21,7 @@ from isac_rt.terminal.fusion import (
     Name,
     Picture,
     Report,
+    _intersected,
     advance,
     in_world,
     intersection,
@@ -357,6 +360,67 @@ def test_what_one_body_shows_of_a_terminal_helps_the_others():
     moved = -L2 @ L1.T @ np.linalg.solve(S, mean - itself.mean)
     assert (found[1].mean - other) / spread == pytest.approx(moved / spread, abs=1e-7)
     assert np.linalg.norm(moved) > 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_picture_is_the_solution_of_its_normal_equations(seed):
+    """Everything at once in one dense system, from the formula, row by row and error by error. A
+    terminal tells of four bodies over two links, whose clocks differ; another one of three, two of
+    them the same; a third tells of nothing but itself. Weights are those of `_intersected`, which
+    has tests of its own. Planted bugs: one clock for both links; errors that several words share
+    counted once; the errors' own information left out; a word's own weight left out; `D` added in
+    place of taken off."""
+    rng = np.random.default_rng([23, seed])
+    told_by = [("A->A", "S->A", "A->B"), ("A->A",), ("S->A", "A->B"), ("A->A", "A->B"), ("A->B",)]
+    bodies = [
+        [
+            replace(
+                levered((origin, k), rng.normal(size=6), 0.1 * covariance(rng), rng),
+                lever=0.4 * rng.normal(size=(6, ERRORS)),
+            )
+            for origin in origins
+        ]
+        for k, origins in enumerate(told_by)
+    ]
+    words = {
+        name: its_word(Gaussian(rng.normal(size=6), np.eye(6))).after(0.3, 2.0)
+        for name in ("B", "T")
+    }
+    found = together(bodies, {1: ("B", words["B"]), 4: ("T", words["T"])})
+
+    unknown = [("body", k, i) for k in range(len(bodies)) for i in range(6)]
+    unknown += [("pose", name, i) for name in "ABT" for i in range(ERRORS - 1)]
+    unknown += [("clock", link) for link in ("A->A", "S->A", "A->B")]
+    number = {what: n for n, what in enumerate(unknown)}
+    information, vector = np.zeros((len(number),) * 2), np.zeros(len(number))
+    for what, n in number.items():
+        information[n, n] = what[0] != "body"
+
+    def add(k, terminal, clock, state, lever, weight):
+        A = np.zeros((6, len(number)))
+        for i in range(6):
+            A[i, number["body", k, i]] = 1
+            for j in range(ERRORS - 1):
+                A[i, number["pose", terminal, j]] = lever[i, j]
+            if clock is not None:
+                A[i, number["clock", clock]] = lever[i, -1]
+        inverse = weight * np.linalg.inv(state.covariance)
+        information[:] += A.T @ inverse @ A
+        vector[:] += A.T @ inverse @ state.mean
+
+    for k, reports in enumerate(bodies):
+        for report, w in zip(reports, _intersected([r.whole for r in reports])[1], strict=True):
+            origin = report.key.origin
+            add(k, origin[-1], origin, report.state, report.lever, w)
+    for k, name in ((1, "B"), (4, "T")):
+        add(k, name, None, *words[name], 1.0)
+    C = np.linalg.inv(information)
+    mean, spread = C @ vector, np.sqrt(np.diag(C))
+    for k, body in enumerate(found):
+        rows = slice(6 * k, 6 * k + 6)
+        off = (body.covariance - C[rows, rows]) / np.outer(spread[rows], spread[rows])
+        assert np.abs(off).max() < 1e-8  # rounding, of a conditioning of 1e6
+        assert np.abs((body.mean - mean[rows]) / spread[rows]).max() < 1e-7
 
 
 @pytest.mark.parametrize("acceleration", [0.1, 3.0])

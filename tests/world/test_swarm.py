@@ -114,7 +114,7 @@ def test_what_looks_nowhere_looks_north_and_straight_up_has_east_to_its_right():
 
 def natural_spline(times, values, t):
     """The cubic through the values with no curvature at its ends, by solving for the second
-    derivatives at the knots in the textbook's form."""
+    derivatives at the knots in the textbook's form: (3, 3) place, velocity and acceleration."""
     n, h = len(times), np.diff(times)
     A, b = np.eye(n), np.zeros((n, 3))
     for i in range(1, n - 1):
@@ -123,11 +123,10 @@ def natural_spline(times, values, t):
     m = np.linalg.solve(A, b)
     i = min(int(np.searchsorted(times, t, side="right")) - 1, n - 2)
     left, right = times[i + 1] - t, t - times[i]
-    return (
-        (m[i] * left**3 + m[i + 1] * right**3) / (6 * h[i])
-        + (values[i] / h[i] - m[i] * h[i] / 6) * left
-        + (values[i + 1] / h[i] - m[i + 1] * h[i] / 6) * right
-    )
+    ends = values[i] / h[i] - m[i] * h[i] / 6, values[i + 1] / h[i] - m[i + 1] * h[i] / 6
+    place = (m[i] * left**3 + m[i + 1] * right**3) / (6 * h[i]) + ends[0] * left + ends[1] * right
+    velocity = (m[i + 1] * right**2 - m[i] * left**2) / (2 * h[i]) + ends[1] - ends[0]
+    return np.stack([place, velocity, (m[i] * left + m[i + 1] * right) / h[i]])
 
 
 def test_the_curve_through_waypoints_is_the_natural_spline():
@@ -139,13 +138,30 @@ def test_the_curve_through_waypoints_is_the_natural_spline():
     values = np.array([w.position_m for w in WAYPOINTS])
     for t in (0.0, 0.41, 1.3, 2.2, 3.3, 4.0999):
         assert trajectory.pose(t).position == pytest.approx(
-            natural_spline(times, values, t), abs=1e-12
+            natural_spline(times, values, t)[0], abs=1e-12
         )
     first = trajectory.pose(0.0)
     assert first.acceleration == pytest.approx(np.zeros(3), abs=1e-12)
     before = trajectory.pose(-1.5)
     assert before.position == pytest.approx(first.position - 1.5 * first.velocity)
     assert before.velocity == pytest.approx(first.velocity) and not before.acceleration.any()
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_a_pose_moves_as_the_natural_spline_does(count):
+    """Place, velocity and acceleration, at waypoints and between them, by the closed form of the
+    curve; of two waypoints it is a straight line. Rounding is 1e-14 of 20 m and 20 m/s^2. Planted
+    bugs: a factor of the second derivative off by 1e-4, which differences of places do not show;
+    velocity and acceleration exchanged; waypoints a millisecond late."""
+    flown = WAYPOINTS[:count]
+    trajectory = Trajectory(Uav(role="target", waypoints=flown))
+    times = np.array([w.time_s for w in flown])
+    values = np.array([w.position_m for w in flown])
+    for t in np.sort(np.concatenate([times, np.linspace(times[0], times[-1], 12)])):
+        pose = trajectory.pose(float(t))
+        found = np.stack([pose.position, pose.velocity, pose.acceleration])
+        assert found == pytest.approx(natural_spline(times, values, t), abs=1e-11)
+    assert count == 2 or abs(trajectory.pose(1.0).acceleration).max() > 1
 
 
 def test_places_on_straight_lines():

@@ -29,9 +29,6 @@ OUTLIER = 8.0
 0.03 % of the cells, four times its mean, with the level 3 dB off, in 2 %."""
 FEWEST = 100
 """Cells with more clutter than noise below which nothing is fitted."""
-FAR_OFF = np.log(10) * np.array([0.6, 2.0])
-"""A level off by 6 to 20 dB is taken from the cells of most clutter where too few are predicted
-over the noise: less may be these cells' chance, more is not the clutter's."""
 FAR_OFF = np.log(10) * 0.6, np.log(10) * 2.0
 """Logarithms of the level, 6 and 20 dB, between which it is taken from the cells of most clutter
 where no fit can start: less may be the chance of so few cells, more is something else."""
