@@ -50,7 +50,7 @@ Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
 
 
-MOST_EARLY = 8
+MOST_EARLY = 10
 """First frames at the most that show what passive terminals take."""
 
 
@@ -390,66 +390,91 @@ def summarise(
 
 def stage_seconds(
     setup: Setup, frames: Sequence[int], receive: bool
-) -> tuple[dict[Link, dict[str, float]], dict[str, float]]:
+) -> tuple[dict[Link | None, dict[str, float]], dict[str, float]]:
     """Processor seconds of synthesis and, if asked for, reception and scoring, as some frames of
     the run show them.
 
-    Passive terminals read what they have acquired: their reception is that of the first frames of
-    the run, one after the other. Sets of receivers that are compared count too.
+    Passive terminals read what they have acquired, so that they hear the first frames of the run
+    one after the other; active ones hear `frames` too. What is scored and told is that of the last
+    two of the first frames, when tracks are confirmed. Sets of receivers that are compared count.
 
     Returns
     -------
-    per_frame : by link and stage, for one frame of the run on average
+    per_frame : by link and stage, for one frame of the run on average; None for what is of no link
     once : by stage what the first frame takes beyond that: machine code and tables are loaded
     """
-    timetable = setup.timetable
-    acquired = timetable.modulation.acquisition_frames + 2
-    early = range(min(acquired, MOST_EARLY, timetable.frames) if receive else 0)
-    observers = {link: _fresh(setup, link) for link in timetable.all_links}
-    first: dict[tuple[Link, str], float] = {}
-    spent: dict[tuple[Link, str], list[float]] = {}
+    timetable, sets = setup.timetable, _standard(setup)
+    early = range(_first_frames(setup.scenario) if receive else 0)
+    first: dict[tuple[Link | None, str], float] = {}
+    spent: dict[tuple[Link | None, str], dict[bool, list[float]]] = {}
     for i, number in enumerate([frames[0], *dict.fromkeys([*early, *frames])]):
+        fresh, whole = not i or number not in early, receive and (not i or number in early)
         frame = setup.frame(number)
-        for link in timetable.links(number):
-            fresh, heard = link.own or not i, receive and (link.own or number in early)
-            by = (_fresh(setup, link) if fresh else observers[link]) if heard else []
-            for stage, seconds in _stages_of(frame, link, by).items():
-                if not i:
-                    first[link, stage] = seconds
-                else:
-                    spent.setdefault((link, stage), []).append(seconds)
-    per_frame: dict[Link, dict[str, float]] = {}
+        took = _seconds_of(frame, _standard(setup) if fresh else sets, whole, receive)
+        if not i:
+            first = took
+            continue
+        if number in early[:-2]:
+            del took[None, "track"]
+        for of, seconds in took.items():
+            by_kind = spent.setdefault(of, {})
+            by_kind.setdefault(timetable.modulated(number), []).append(seconds)
+    per_frame: dict[Link | None, dict[str, float]] = {}
     once: dict[str, float] = {}
-    for (link, stage), each in spent.items():
-        share = np.mean([timetable.holds(link, frame) for frame in range(timetable.frames)])
-        per_frame.setdefault(link, {})[stage] = float(share * np.mean(each))
+    for (link, stage), by_kind in spent.items():
+        heard = [f for f in range(timetable.frames) if link is None or link in timetable.links(f)]
+        kinds = [timetable.modulated(f) for f in heard]
+        each = [np.mean(by_kind.get(kind) or sum(by_kind.values(), [])) for kind in kinds]
+        per_frame.setdefault(link, {})[stage] = float(np.sum(each)) / timetable.frames
         beyond = max(first.get((link, stage), 0.0) - float(np.mean(each)), 0.0)
         once[stage] = once.get(stage, 0.0) + beyond
     return per_frame, once
 
 
-def _stages_of(frame: Frame, link: Link, observers: Sequence[_Observer]) -> dict[str, float]:
-    """Processor seconds of a link's frame by stage, heard by some observers."""
-    stopwatch = Stopwatch()
-    with stopwatch.stage("synthesis"):
+def _first_frames(scenario: Scenario) -> int:
+    """How many frames it takes until data are read and active terminals' tracks are told of."""
+    acquired = scenario.modulation.acquisition_frames + 2
+    confirmed = scenario.tracking.confirm_hits * scenario.receivers.active_every_frames + 4
+    return min(max(acquired, confirmed), MOST_EARLY, scenario.frames)
+
+
+def _seconds_of(
+    frame: Frame, sets: Sequence[_Listeners], whole: bool, receive: bool
+) -> dict[tuple[Link | None, str], float]:
+    """Processor seconds of a frame by link and stage, heard by active terminals if they `receive`,
+    as a `whole` by all, and then scored."""
+    out: dict[tuple[Link | None, str], float] = {}
+
+    def count(link: Link | None, stage: str, begun: float) -> None:
+        out[link, stage] = time.thread_time() - begun
+
+    heard: list[dict[Link, Heard]] = [{} for _ in sets]
+    for link in sets[0].recorder.timetable.links(frame.number):
+        begun = time.thread_time()
         cube = frame.heard(link)
-    for observer in observers:
-        with stopwatch.stage("receive"):
-            heard = observer.hear(frame, cube, False)
-        with stopwatch.stage("track"):
-            observer.record(frame, heard)
-    stages = ["synthesis", "receive", "track"] if observers else ["synthesis"]
-    return {stage: stopwatch.spent[stage].processor for stage in stages}
+        count(link, "synthesis", begun)
+        if whole or (receive and link.own):
+            begun = time.thread_time()
+            for by_link, one in zip(heard, sets, strict=True):
+                by_link[link] = one.observers[link].hear(frame, cube, False)
+            count(link, "receive", begun)
+    if whole:
+        begun = time.thread_time()
+        for by_link, one in zip(heard, sets, strict=True):
+            one.record(frame, by_link, False)
+        count(None, "track", begun)
+    return out
 
 
-def _fresh(setup: Setup, link: Link) -> list[_Observer]:
-    """A link's receivers before their first frame, the scenario's own and those compared."""
-    own, *compared = (setup.scenario, *setup.scenario.compare.values())
-    made = [
-        _Observer(setup, link, standard_terminal(setup, link, one), one.receivers)
-        for one in compared
+def _standard(setup: Setup) -> list[_Listeners]:
+    """The scenario's own receivers and those compared, before their first frame."""
+    return [
+        _Listeners.of(setup, partial(standard_terminal, setup, settings=one), settings)
+        for one, settings in [
+            (None, setup.scenario.receivers),
+            *((one, one.receivers) for one in setup.scenario.compare.values()),
+        ]
     ]
-    return [_Observer(setup, link, standard_terminal(setup, link), own.receivers), *made]
 
 
 @dataclass
