@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -424,7 +425,7 @@ def stage_seconds(
     for (link, stage), by_kind in spent.items():
         heard = [f for f in range(timetable.frames) if link is None or link in timetable.links(f)]
         kinds = [timetable.modulated(f) for f in heard]
-        each = [np.mean(by_kind.get(kind) or sum(by_kind.values(), [])) for kind in kinds]
+        each = [np.mean(by_kind.get(kind) or [*chain(*by_kind.values())]) for kind in kinds]
         per_frame.setdefault(link, {})[stage] = float(np.sum(each)) / timetable.frames
         beyond = max(first.get((link, stage), 0.0) - float(np.mean(each)), 0.0)
         once[stage] = once.get(stage, 0.0) + beyond
