@@ -173,7 +173,8 @@ def test_a_foreign_variant_is_refused():
 
 @pytest.mark.parametrize("ends", [None, KeyError])
 def test_rays_are_traced_in_one_thread_for_a_while(ends):
-    """The number of threads is what it was afterwards, whether or not what was done ended well."""
+    """The number of threads is what it was afterwards, whether or not what was done ended well.
+    Planted bugs: the number not set; not set back after an error."""
     runtime.activate()
     import drjit
 

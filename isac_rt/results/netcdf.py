@@ -31,9 +31,9 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletc
 def netcdf(dataset: xr.Dataset) -> bytes:
     """The file of a dataset, compressed and with checksums.
 
-    Numbers that are not finite may be in it: NaN is the fill value of floats. Booleans are bytes
-    that say so, and coordinates without a dimension of their own are named by the attribute
-    ``coordinates``, both as xarray reads them.
+    Variables hold numbers, truth values or words; dates and missing words have no place in it. NaN
+    is the fill value of floats. Booleans are bytes that say so, and coordinates without a dimension
+    of their own are named by the attribute ``coordinates``, both as xarray reads them.
     """
     import h5py
 
@@ -89,6 +89,6 @@ def _variable(file: h5py.File, name: str, variable: xr.Variable) -> h5py.Dataset
 
 
 def _describe(of: h5py.Dataset | h5py.File, attributes: Any) -> None:
-    """Attributes: words as they are, numbers as arrays of one."""
+    """Attributes: words and lists as they are, single numbers as arrays of one."""
     for name, value in attributes.items():
-        of.attrs[name] = value if isinstance(value, str | list) else np.atleast_1d(value)
+        of.attrs[name] = value if isinstance(value, str | list | tuple) else np.atleast_1d(value)

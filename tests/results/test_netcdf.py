@@ -38,7 +38,8 @@ def dataset():
         "power": ("frame", np.linspace(0, 1, 7), {"units": "W"}),
         "place": (("frame", "uav"), level, {}),
     }
-    return xr.Dataset(values, along, {"title": "a \u03bb", "seed": 4, "carrier": 7.7e10})
+    about = {"title": "a \u03bb", "seed": 4, "carrier": 7.7e10, "made_by": ("", "\u03bb")}
+    return xr.Dataset(values, along, about)
 
 
 @pytest.fixture
@@ -54,7 +55,8 @@ def both(dataset, tmp_path):
 
 def test_it_reads_back_as_what_xarray_writes(dataset, both):
     """Values, types, attributes and coordinates. Planted bugs: no attribute `dtype` for booleans;
-    no `coordinates`; a scale attached to the wrong dimension; no fill value."""
+    no `coordinates`; a scale attached to the wrong dimension; no fill value; words in a tuple taken
+    for numbers."""
     ours, theirs = map(read_dataset, both)
     assert ours.identical(theirs) and ours.identical(dataset)
     for name in dataset.variables:

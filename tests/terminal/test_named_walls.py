@@ -86,6 +86,10 @@ class Asked(Exception):
     """What the city shows was asked for."""
 
 
+def _raise(what):
+    raise what
+
+
 @pytest.mark.parametrize("read", [False, True])
 def test_the_city_is_expected_from_where_the_data_say(read):
     """Once a data frame was read its word counts, and before it the track, 1 m off and 1.2 m/s.
@@ -110,9 +114,10 @@ def test_the_city_is_expected_from_where_the_data_say(read):
 
 
 @pytest.mark.parametrize(("word", "first"), [(False, 2), (True, 5)])
-def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first):
+def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, monkeypatch):
     """A UAV in the open, seen in every frame: alone the terminal confirms it in the third, in a
-    swarm when the active one, that saw it as early, can have told of it. Planted bug: no wait."""
+    swarm when the active one, that saw it as early, can have told of it. Planted bugs: no wait; a
+    step that does not ask whether data say where the transmitter is."""
     around = Surroundings(city([[x + 200.0, y, z] for x, y, z in WALL]))
     tracking = Tracking(births="unexplained")
     terminal = PassiveTerminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
@@ -127,7 +132,15 @@ def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first):
         std=np.array([[0.03, 0.08, 0.005, 0.006]]),
         is_reference=np.zeros(1, bool),
     )
-    terminal._awaits_word = word
+    monkeypatch.setattr(terminal, "_expected_clutter", lambda own: _raise(Asked))
+    with pytest.raises(Asked):  # nothing is received here
+        terminal.step(
+            None,
+            OWN,
+            0.0,
+            True,
+            sender=Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3)) if word else None,
+        )
     confirmed = []
     for n in range(7):
         terminal.tracker.predict(1e-6 * n)
