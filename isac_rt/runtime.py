@@ -354,8 +354,10 @@ def activate() -> Backend:
 
 @contextmanager
 def tracing_in_one_thread() -> Iterator[None]:
-    """Let the ray tracer, where it is loaded, work in the thread that asks for rays: other threads
-    of its own look for work all the time while there is none."""
+    """Let the ray tracer, where it is loaded, work in a single thread.
+
+    Its other threads look for work all the time while there is none.
+    """
     drjit = sys.modules.get("drjit")
     if drjit is None:
         yield

@@ -206,13 +206,14 @@ class Tracking(Node):
     births: Literal["all", "unexplained"] = "all"
     """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
     mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
-    at the edge of the view, nor those that stand still beside each other as a building does that
-    the mesh lacks, nor those on a face of the mesh; and no track is confirmed by one such detection
-    alone, nor one that lies in a face or behind a wall, or is a wall's image of a nearer one, or of
-    a nearer body that others told of (`cooperation`). One that fits such an image, or lies behind a
-    wall, in three frames in a row ends. With `cooperation` a passive terminal confirms none before
-    the active one could have told it what flies near its line of sight, five frames after
-    the first."""
+    at the edge of the view, nor those on a face of the mesh, nor those that stand still beside each
+    other as a building does that the mesh lacks. A track is confirmed only if two of its detections
+    could have started one, and not if it lies in a face or behind a wall, or is a wall's image of a
+    nearer one, or of a nearer body that others told of (`cooperation`). One that fits such an
+    image, or lies behind a wall, in three frames in a row ends. Two confirmed ones within 0.5 m of
+    which no frame shows both are one. With `cooperation` a passive terminal confirms none before
+    its sixth frame: until then the active one cannot have told it what flies near its line of
+    sight."""
     mirrors: Literal["ignore", "place"] = "ignore"
     """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
     terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a

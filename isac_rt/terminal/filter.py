@@ -399,6 +399,8 @@ def _born(
         J[i] = H[_POSITION[i], :3]
         for j in range(3):
             shown[i, j] = R[_POSITION[i], _POSITION[j]]
+    if not np.isfinite(J).all():  # in the very place of the transmitter
+        return False, mean, P
     if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
         return False, mean, P
     back = np.linalg.inv(J)
@@ -408,10 +410,10 @@ def _born(
     for i in range(3, 6):
         P[i, i], P[i + 3, i + 3] = BIRTH_SPEED_STD**2, acceleration_std**2
     P = (P + P.T) / 2
-    rate = np.array([1])
-    x, K, h = _settled(mean, P, read, R[1:2, 1:2], rate, own, transmitter, (np.inf, 0.0))
+    rate, variance = np.array([1]), R[1:2, 1:2].copy()
+    x, K, h = _settled(mean, P, read, variance, rate, own, transmitter, (np.inf, 0.0))
     A = np.eye(9) - K @ h
-    P = A @ P @ A.T + K @ R[1:2, 1:2] @ K.T
+    P = A @ P @ A.T + K @ variance @ K.T
     return True, x, (P + P.T) / 2
 
 

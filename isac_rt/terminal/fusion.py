@@ -45,13 +45,17 @@ SPLIT_PROBABILITY = 1 - 1e-6
 """Two tracks are joined within the first gate and parted beyond the second, so that noise does not
 join and part them in turns."""
 
-
 MASKED_CELLS = 3.0
-"""What a passive terminal hears no more cells than this behind its line of sight is masked on that
-side: its lobes, and what is left where they were taken out, push the estimate off them."""
+"""An echo that comes no more range cells than this behind a passive terminal's line of sight is
+pushed away from it: by the line's sidelobes, and by what is left where these were taken out."""
 PULL = 0.5
-"""Cells by which they do, frame after frame alike, so that the track's own deviation knows nothing
-of it. Near the line of sight a body's place hangs on the length of its way thirty times over."""
+"""Range cells of that push. It is alike from frame to frame, so that a track's own deviation knows
+nothing of it. Near the line of sight a metre of path length moves a body by thirty and more."""
+MOST_PULLED = 1e6
+"""On the line of sight a metre moves it by infinitely many. So many say as much as that nothing is
+known of it along its direction, and leave the digits of its covariance across it."""
+SAME_M = 1e-9
+"""Lengths that differ by less are the same [m]."""
 
 
 class Key(NamedTuple):
@@ -195,8 +199,11 @@ def in_world(
 
 
 def _by_length(tracks: TrackSet, row: int, masked: float) -> np.ndarray:
-    """How far a passive terminal's body moves along its direction for each metre that its way is
-    too long alone (3,); nothing, if that way is not `masked` [m] longer than the line of sight."""
+    """What a metre more of path length does to the place of a passive terminal's body (3,).
+
+    It moves along its direction. Zero if the way is more than `masked` [m] longer than the line of
+    sight, and at an active terminal.
+    """
     if tracks.is_reference[row] or not tracks.is_reference.any():
         return np.zeros(3)
     offset, baseline = tracks.mean[row, :3], tracks.mean[tracks.is_reference][0, :3]
@@ -205,8 +212,9 @@ def _by_length(tracks: TrackSet, row: int, masked: float) -> np.ndarray:
     if length - np.linalg.norm(baseline) > masked:
         return np.zeros(3)
     u = offset / rho
-    # of rho = (L^2 - d^2) / (2 (L - d.u)) by L
-    out: np.ndarray = u * (length - rho) / (length - float(baseline @ u))
+    # of rho = (L^2 - d^2) / (2 (L - d.u)) by L; on the line of sight L = d.u
+    room = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
+    out: np.ndarray = u * (length - rho) / room
     return out
 
 
@@ -220,6 +228,8 @@ def _by_clock(tracks: TrackSet, row: int) -> np.ndarray:
     baseline = tracks.mean[tracks.is_reference][0, :3]
     d, u = float(np.linalg.norm(baseline)), offset / rho
     length, ahead = rho + float(np.linalg.norm(offset - baseline)), float(baseline @ u)
+    if length - ahead < SAME_M:  # on the line of sight
+        return u * (rho / d) ** 2
     # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
     return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
 

@@ -35,8 +35,8 @@ CROWD = 3
 ON_FACE_M = 0.3
 """Off a face by no more than this, and three deviations, what stands still may be the face [m]."""
 CLEAR_M = 0.5
-"""No UAV flies nearer to a face than this [m]: its arms are as long. What does, by two deviations,
-is an echo of something else over the wall."""
+"""No UAV flies nearer to a face than this [m]: its arms are as long. What is nearer, by two
+deviations, is an echo of something else over the wall."""
 STANDS_OUT = 10.0
 """An echo weaker than another by more than this factor is not of the same surface."""
 

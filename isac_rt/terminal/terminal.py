@@ -74,9 +74,9 @@ NAMED_CELLS = 1.5
 """Cells of length and of its rate within which a path is one that the city explains."""
 WORD_FRAMES = 5
 """A passive terminal that is told of others' tracks confirms none of its own before so many frames
-after the first: what flies near its line of sight it cannot see, its echoes over walls it can. To
-the active terminal such a body shows itself a frame later at worst; it has it confirmed after three
-frames, and its word is two on the way."""
+after the first. It cannot see what flies near its line of sight, but hears its echoes over walls.
+The active terminal sees such a body a frame later at worst, confirms it in the third frame, and its
+word takes two more."""
 REFERENCE_STD_CELLS = 0.02
 """Floor of the reference's range and velocity deviations in cells, for what other paths beside it
 leave."""

@@ -36,7 +36,7 @@ from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
 """With `tracking.births: unexplained` a track is confirmed if so many of its detections could have
-started it: what carries tracks on passes lower thresholds, and where clutter is strong none."""
+started it: others pass a lower threshold, which strong clutter passes again and again."""
 LEAST_APART = 0.5
 """UAVs keep farther from each other than this [m]: two tracks of one terminal within it, and within
 their errors, are one; a picture parts them beyond twice this."""
@@ -90,7 +90,7 @@ class Track:
     last : time of the last detection [s]
     mirror : (4,) plane of the wall by which the body is seen, of which the state is the image;
         (0,): it is seen straight
-    echoed : frames in a row that it fits a nearer body's echo over a wall
+    echoed : frames in a row that it fits a nearer body's echo over a wall, or lies behind one
     sure : detections that could have started it
     """
 
@@ -174,10 +174,12 @@ class TrackSet:
 
 
 def united(tracks: Sequence[Track]) -> list[Track]:
-    """Tracks, oldest first, but confirmed ones known to be within `LEAST_APART` of an older one,
-    unless this frame shows both: where own errors part a track from its body's detections they
-    start another one, and the two share them. The older one goes on from where the body was seen
-    last."""
+    """Tracks, oldest first, of which no two confirmed ones are of one body.
+
+    Where a terminal's own errors part a track from its body's detections, these start another one,
+    and the two share them. One known to be within `LEAST_APART` of an older one goes, unless this
+    frame shows both; the older one goes on from where the body was seen last.
+    """
     kept: list[Track] = []
     for track in tracks:
         twin = next((t for t in kept if _of_one_body(t, track)), None)

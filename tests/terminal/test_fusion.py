@@ -334,6 +334,34 @@ def test_what_the_line_of_sight_pulls_is_unsure_along_its_direction(beside, pull
     assert np.array_equal(in_world(alone, 0, own, cell=0.47).state.covariance, alone.covariance[0])
 
 
+@pytest.mark.parametrize("aside", [0.0, 1e-9, 1e-6, 1e-3])
+def test_a_body_on_the_line_of_sight_is_told_with_nothing_known_along_it(aside):
+    """A passive terminal's track that crosses its line of sight a third of the way: what it tells
+    is known up and down as well as the track is, along the line to hundreds of metres at best, and
+    in a picture the word of who sees it from aside counts. A metre of clock moves it by (13/39)^2,
+    the limit of the geometry. Planted bugs: a division by nothing on the line, of a pull and of a
+    clock."""
+    turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+    sender, body = turn @ [0.0, 39.0, 0.0], turn @ [aside, 13.0, 0.0]
+    tracks = tracked([*sender, 0, 0, 0], [*body, 0, 0, 0], reference=0)
+    own = Pose.at_rest((5.0, -3.0, 20.0))
+    told = in_world(tracks, 1, own, clock_std=1.0, cell=0.47)
+    P, own_P = (turn.T @ C[:3, :3] @ turn for C in (told.state.covariance, tracks.covariance[1]))
+    assert P[1, 1] > 100**2
+    assert P[2, 2] == pytest.approx(own_P[2, 2], abs=1e-3)  # rounding of (200 km)^2 is 1e-5
+    assert turn.T @ told.lever[:3, 9] == pytest.approx([0, 1 / 9, 0], abs=1e-3)
+    seen = Gaussian(told.state.mean + 0.01, 0.01 * np.eye(6))
+    reports = [
+        Report(Key(origin, 1), 0.0, Name(0.0, origin, 1), 0.0, state, lever)
+        for origin, state, lever in (
+            ("A->B", told.state, told.lever),
+            ("A->A", seen, np.zeros((6, ERRORS))),
+        )
+    ]
+    (one,) = Picture().update(reports)
+    assert np.abs(one.state.mean - seen.mean).max() < 0.1
+
+
 def levered(key, mean, P, rng):
     lever = np.zeros((6, ERRORS))
     lever[:, : ERRORS - 1] = 0.3 * rng.normal(size=(6, ERRORS - 1))

@@ -166,6 +166,19 @@ def test_birth_refuses_what_fixes_no_position():
     assert start(np.array([short, 1.0, 0.2, 0.1]), transmitter=at) is None
 
 
+def test_nothing_is_born_in_the_very_place_of_the_transmitter():
+    """It has no direction from there. A length next to the baseline's puts a body there by
+    rounding. Planted bug: the Jacobian not asked, which then is not a number and no matrix to
+    invert."""
+    own, at = Pose.at_rest((0.0, 0.0, 0.0)), np.array([0.0, 10.0, 0.0])
+    lengths = 10.0 + np.spacing(10.0) * np.arange(1, 40)
+    there = [x for x in lengths if bistatic_distance(x, at, at / 10) == 10.0]
+    assert there
+    sender = Gaussian(np.concatenate([at, np.zeros(3)]), 1e-4 * np.eye(6))
+    for length in there:
+        assert birth(np.array([length, 0, 0, 0]), STD, own, sender, acceleration_std=1.0) is None
+
+
 def test_filter_against_the_joint_posterior():
     """A body so far away that the measurement is affine: filter against the batch posterior over
     all states and measurements, from the full precision matrix; planted bugs: Q without the

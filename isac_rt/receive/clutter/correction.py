@@ -87,8 +87,10 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
 
 
 def _far_off(power: np.ndarray, noise: float, expected: np.ndarray) -> float:
-    """Logarithm of the factor by which the cells of most expected clutter hold more of it in the
-    median; 0 where that is not far off, or not told from noise."""
+    """Logarithm of the level, by the median of the cells of most expected clutter.
+
+    0 where it is not far off (`FAR_OFF`), or the clutter found is weaker than the noise.
+    """
     most = np.argpartition(expected, -FEWEST, axis=None)[-FEWEST:]
     found = float(np.median(power.ravel()[most])) / np.log(2) - noise
     if found < noise:

@@ -33,9 +33,9 @@ the noise's."""
 FINE = 0.03, 0.01, 0.003
 """Steps of the search for a direction around the filter's beam [cosine]."""
 TWO_WAVES = 0.5
-"""Power of other waves over its own from which an echo starts no track where no clutter is
-expected: over a wall on one way there are two equal ones. Less is of a wall that a UAV flies by:
-in a canyon 0.1 to 0.2 of U1's."""
+"""Where no clutter is expected an echo starts no track if other waves in its cell have more than
+this share of its power: over a wall on one way alone two equal waves arrive. A wall that a UAV
+flies by adds less, in a canyon 0.1 to 0.2 of the UAV's echo."""
 SCANNED = {"arms": ((0,), (2,)), "joint": ((0, 2),)}
 """Axes of the L that are filtered together, by `receivers.clutter_channels`."""
 

@@ -145,8 +145,11 @@ def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
 
 
 def peak_memory_mib() -> float:
-    """The most memory that this process has had. The kernel's count for a process begins with that
-    of the one that started it; the one for its address space does not, where there is one."""
+    """The most memory that this process has had [MiB].
+
+    ``ru_maxrss`` begins with that of the process that started this one. Linux's count for the
+    address space does not, and is taken where there is one.
+    """
     status = Path("/proc/self/status")
     found = re.search(r"^VmHWM:\s+(\d+) kB", status.read_text() if status.exists() else "", re.M)
     used = int(found[1]) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
