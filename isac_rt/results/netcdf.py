@@ -25,6 +25,9 @@ _CLASHES = "_nc4_non_coord_"
 """Before the name of a variable that a dimension has too."""
 _NUMBER, _COORDINATES = "_Netcdf4Dimid", "_Netcdf4Coordinates"
 """The number of a scale's dimension, or of a variable's first one; and the numbers of all."""
+_FORMAT = "v110", "v110"
+"""HDF5 1.10's, of 2016: its descriptions have checksums as well as the numbers. In older ones a bent
+byte may lead to another variable's numbers, and they are four times as long."""
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}
 
 
@@ -38,7 +41,7 @@ def netcdf(dataset: xr.Dataset) -> bytes:
     import h5py
 
     made = io.BytesIO()
-    with h5py.File(made, "w", track_order=True) as file:
+    with h5py.File(made, "w", track_order=True, libver=_FORMAT) as file:
         properties = f"version=2,h5py={h5py.__version__},hdf5={h5py.version.hdf5_version}"
         file.attrs["_NCProperties"] = np.bytes_(properties)
         _describe(file, dataset.attrs)
