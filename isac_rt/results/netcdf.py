@@ -26,8 +26,8 @@ _CLASHES = "_nc4_non_coord_"
 _NUMBER, _COORDINATES = "_Netcdf4Dimid", "_Netcdf4Coordinates"
 """The number of a scale's dimension, or of a variable's first one; and the numbers of all."""
 _FORMAT = "v110", "v110"
-"""HDF5 1.10's, of 2016: its descriptions have checksums as well as the numbers. In older ones a bent
-byte may lead to another variable's numbers, and they are four times as long."""
+"""HDF5 1.10's, of 2016: what describes the numbers has checksums as they have. In older ones a bent
+byte may lead to another variable's, and files are longer."""
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}
 
 
