@@ -159,6 +159,7 @@ def explain(
     count = len(detections)
     apart = places.select(others).apart(detections.range[:, None], detections.velocity[:, None])
     shares = reach(apart[0]) * np.minimum(reach(apart[1]) + UNION_FLOOR, 1.0)
+    close = (apart[0] <= 1) & (apart[1] <= 1)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
     )
@@ -166,10 +167,12 @@ def explain(
     for q in range(count):
         at = detections.range[q]
         first, last = np.searchsorted(ranges, [at - beside, at + beside])
-        some = np.sort(np.concatenate([others, field_rows[first:last]]))
+        around = np.sort(field_rows[first:last])
+        some = np.sort(np.concatenate([others, around]))
         field, own = diffuse[some], power[some]
-        rows, bins = places.select(some).apart(at, detections.velocity[q])
-        near = (rows <= 1) & (bins <= 1)
+        rows, bins = places.select(around).apart(at, detections.velocity[q])
+        near = np.zeros(some.size, bool)
+        near[field], near[~field] = (rows <= 1) & (bins <= 1), close[q]
         here = np.where(field, 0.0, own)
         here[~field] *= shares[q]
         clutter = np.where(near & field, own, 0.0)

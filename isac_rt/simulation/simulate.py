@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -422,12 +422,20 @@ def stage_seconds(
             by_kind.setdefault(timetable.modulated(number), []).append(seconds)
     per_frame: dict[Link | None, dict[str, float]] = {}
     once: dict[str, float] = {}
+    heard = Counter(
+        (link, timetable.modulated(f))
+        for f in range(timetable.frames)
+        for link in (None, *timetable.links(f))
+    )
     for (link, stage), by_kind in spent.items():
-        heard = [f for f in range(timetable.frames) if link is None or link in timetable.links(f)]
-        kinds = [timetable.modulated(f) for f in heard]
-        each = [np.mean(by_kind.get(kind) or [*chain(*by_kind.values())]) for kind in kinds]
-        per_frame.setdefault(link, {})[stage] = float(np.sum(each)) / timetable.frames
-        beyond = max(first.get((link, stage), 0.0) - float(np.mean(each)), 0.0)
+        count = [heard[link, kind] for kind in (False, True)]
+        each = [
+            float(np.mean(by_kind.get(kind) or [*chain(*by_kind.values())]))
+            for kind in (False, True)
+        ]
+        per_frame.setdefault(link, {})[stage] = float(np.dot(count, each)) / timetable.frames
+        mean = float(np.average(each, weights=count))
+        beyond = max(first.get((link, stage), 0.0) - mean, 0.0)
         once[stage] = once.get(stage, 0.0) + beyond
     return per_frame, once
 

@@ -217,6 +217,15 @@ def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
 
 
 @jit
+def _unfold(measured: np.ndarray, off: float, ambiguity: tuple[float, float]) -> None:
+    """Take from range and velocity, in place, the periods in a velocity so far `off`."""
+    if np.isfinite(ambiguity[0]) and np.isfinite(off):
+        periods = np.round(off / ambiguity[0])
+        measured[0] += periods * ambiguity[1]
+        measured[1] -= periods * ambiguity[0]
+
+
+@jit
 def _settled(
     mean: np.ndarray,
     P: np.ndarray,
@@ -233,10 +242,7 @@ def _settled(
     for _ in range(_ITERATIONS):
         z, full = _linearised(x, own, transmitter)
         off = measurement - z
-        if np.isfinite(ambiguity[0]) and np.isfinite(off[1]):
-            periods = np.round(off[1] / ambiguity[0])
-            off[0] += periods * ambiguity[1]
-            off[1] -= periods * ambiguity[0]
+        _unfold(off, off[1], ambiguity)
         y, H = off[rows], full[rows]
         K = np.linalg.solve(H @ P @ H.T + R, H @ P).T.copy()
         new = mean + K @ (y - H @ (mean - x))
@@ -381,14 +387,10 @@ def _born(
     if not mean.size:
         return False, mean, P
     read = measurement.copy()
-    if np.isfinite(ambiguity[0]):
-        off = measurement[1] - _linearised(mean, own, transmitter)[0][1]
-        periods = np.round(off / ambiguity[0])
-        read[0] += periods * ambiguity[1]
-        read[1] -= periods * ambiguity[0]
-        mean = _resting(read, own, transmitter)
-        if not mean.size:
-            return False, mean, P
+    _unfold(read, measurement[1] - _linearised(mean, own, transmitter)[0][1], ambiguity)
+    mean = _resting(read, own, transmitter)
+    if not mean.size:
+        return False, mean, P
     rho = np.sqrt(np.sum((mean[:3] - own[0]) ** 2))
     H, R = _linearised(mean, own, transmitter)[1], np.diag(std**2)
     if transmitter.size:

@@ -301,7 +301,7 @@ def _intersection(a: Gaussian, b: Gaussian) -> tuple[Gaussian, float]:
 
 def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
     """Covariance intersection of one or more, one after the other, the surest first."""
-    return states[0] if len(states) == 1 else _intersected(states)[0]
+    return _intersected(states)[0]
 
 
 def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:

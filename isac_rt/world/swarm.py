@@ -84,11 +84,9 @@ def turned(yaw_pitch_roll: npt.ArrayLike) -> Rotation:
 
 def _with_derivatives(spline: CubicSpline) -> PPoly:
     """Values of a spline (3,), their first and second derivatives as one (9,)."""
-    c = spline.c
-    first, second = np.zeros((2, *c.shape))
-    first[1:] = np.array([3.0, 2.0, 1.0])[:, None, None] * c[:3]
-    second[2:] = np.array([6.0, 2.0])[:, None, None] * c[:2]
-    return PPoly(np.concatenate([c, first, second], axis=2), spline.x)
+    orders = [spline.derivative(k).c for k in range(3)]
+    same = [np.pad(c, ((len(spline.c) - len(c), 0), (0, 0), (0, 0))) for c in orders]
+    return PPoly(np.concatenate(same, axis=2), spline.x)
 
 
 class Trajectory:
