@@ -94,8 +94,10 @@ class Standing:
         (Q,) which of all detections stand still within a crowd or on a face
         """
         u = d.direction[:, None] + self._aliases
-        real = (u**2).sum(axis=-1) < 1
-        towards = own.to_world(unit_vector(np.where(real[..., None], u, 0.0)))
+        far = np.linalg.norm(u, axis=-1)
+        real = far < 1 + 3 * d.std[:, None, 2:].max(axis=-1, initial=0.0)
+        u = u / np.maximum(far, 1.0)[..., None]  # square to the boresight, but for the error
+        towards = own.to_world(unit_vector(u))
         place, rate, speed = _still(d.range, towards, own, sender)
         off = d.velocity[:, None] - rate
         off = np.where(real, np.abs(off - period * np.round(off / period)), np.inf)
@@ -144,10 +146,11 @@ class Standing:
         return some
 
     def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
-        """Tracks but those that stand still within a crowd or on a face, and those among `new` that
-        an echo (Q,) of either confirms: from beyond the view they seem to move."""
+        """Tracks but those that stand still within a crowd or on a face, and those among `new`, not
+        confirmed before, that an echo (Q,) of either carries on: from beyond the view and along a
+        wall they seem to move."""
         part = {t.id for t in tracks if t.detection >= 0 and crowd[t.detection]} & new
-        return [t for t in tracks if not (self.holds(t) or (t.confirmed and t.id in part))]
+        return [t for t in tracks if not (self.holds(t) or t.id in part)]
 
     def holds(self, track: Track) -> bool:
         """Whether a track stands still, as far as is known of it, within a crowd or on a face, or
