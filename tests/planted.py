@@ -355,8 +355,8 @@ OF_CASES = {
     ),
     "orthogonal matching pursuit": Bug(
         "receive/omp.py",
-        'np.einsum("vk,vkp->vp", solution, gram[support].conj())',
-        'np.einsum("vk,vkp->vp", solution, gram[support])',
+        "re[p] -= a * c[p] + b * d[p]\n        im[p] -= b * c[p] - a * d[p]",
+        "re[p] -= a * c[p] - b * d[p]\n        im[p] -= b * c[p] + a * d[p]",
     ),
     "false alarm factor": Bug(
         "receive/cfar.py",

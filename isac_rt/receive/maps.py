@@ -98,10 +98,12 @@ def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
 
 
 class Levels(NamedTuple):
-    """A map and its background (rows, P)."""
+    """A map and its background (rows, P), and what OMP recovers of the rows with a cell above the
+    threshold, where it was asked (`isac_rt.receive.omp.omp_power`)."""
 
     power: np.ndarray
     background: np.ndarray
+    recovered: np.ndarray | None = None
 
 
 class LatinUnion:
@@ -121,9 +123,7 @@ class LatinUnion:
         """(rows, P) power, Doppler centred."""
         return power_map(spectra, known)
 
-    def keep(
-        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
-    ) -> np.ndarray:
+    def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
         """Which of the cells `above` the threshold may be peaks."""
         return above
 
@@ -140,9 +140,7 @@ class Conventional(LatinUnion):
     def power(self, spectra: np.ndarray, known: Known) -> np.ndarray:
         return conventional_power(spectra, known)
 
-    def keep(
-        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
-    ) -> np.ndarray:
+    def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
         return above & own_bins(known.waveform)
 
 
@@ -155,9 +153,7 @@ class Banded(LatinUnion):
     leave two bands alike the lowest velocities do.
     """
 
-    def keep(
-        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
-    ) -> np.ndarray:
+    def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
         w = known.waveform
         share = known.unambiguous_share
         if share == 1:

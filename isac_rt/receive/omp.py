@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import LatinUnion, Levels
 
@@ -14,6 +16,9 @@ SPARSITY = 4
 MOST_UNEXPLAINED = 1 / 3
 """Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably
 may leave."""
+RIDGE = 1e-9
+"""Of an atom's energy, added to it: few or evenly spaced samples do not tell all atoms apart, and
+alike ones share an amplitude then."""
 
 
 def recovery_limit(num_samples: int, num_chirps: int) -> int:
@@ -26,22 +31,6 @@ def recovery_limit(num_samples: int, num_chirps: int) -> int:
     pursuit", 2007: S >= 2 K ln P.
     """
     return max(int(num_samples / (2 * np.log(num_chirps))), 1)
-
-
-def unexplained(spectra: np.ndarray, rows: np.ndarray, known: Known) -> np.ndarray:
-    """(len(rows),) share of each row's power that as many OMP atoms as the sampling's
-    `recovery_limit` do not explain."""
-    num_chirps = known.waveform.num_chirps
-    total, left = np.zeros(len(rows)), np.zeros(len(rows))
-    for part, chosen in _sparse_samples(spectra, rows, known):
-        limit = recovery_limit(chosen.size, num_chirps)
-        found = omp(part.reshape(-1, chosen.size), chosen, num_chirps, limit)
-        turns = np.outer(np.arange(num_chirps), chosen)
-        atoms = np.exp(2j * np.pi * turns / num_chirps) / chosen.size
-        rest = part - (found @ atoms).reshape(part.shape)
-        total += (np.abs(part) ** 2).sum(axis=(0, 2))
-        left += (np.abs(rest) ** 2).sum(axis=(0, 2))
-    return left / np.maximum(total, 1e-300)
 
 
 def _sparse_samples(
@@ -70,16 +59,36 @@ def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, known: Kn
     rows : indices of the occupied rows; none is sparse
     noise : mean power of a sample of `spectra` without paths
     """
+    return advise(spectra, rows, noise, known)[0]
+
+
+def advise(
+    spectra: np.ndarray, rows: np.ndarray, noise: float, known: Known
+) -> tuple[bool, np.ndarray]:
+    """`sparse_enough`, and `omp_power` with `SPARSITY` atoms, by one search where it has as many as
+    the sampling recovers dependably."""
+    w = known.waveform
     if not len(rows):
-        return True
+        return True, np.zeros((0, w.num_chirps), np.float32)
+    recovered = np.zeros((len(rows), w.num_chirps))
+    total, left = np.zeros(len(rows)), np.zeros(len(rows))
+    for part, chosen in _sparse_samples(spectra, rows, known):
+        vectors, limit = part.reshape(-1, chosen.size), recovery_limit(chosen.size, w.num_chirps)
+        found = pursued(vectors, chosen, w.num_chirps, limit)
+        power = (np.abs(part) ** 2).sum(axis=(0, 2))
+        total += power
+        left += power - found.explained.reshape(part.shape[:2]).sum(axis=0)
+        if limit != SPARSITY:
+            found = pursued(vectors, chosen, w.num_chirps, SPARSITY)
+        found.add_power(recovered)
     power = np.mean(np.abs(spectra[:, :, rows]) ** 2, axis=(0, 1, 3))
     above = np.maximum(power - noise, 1e-3 * noise)
-    w = known.waveform
     size = w.num_chirps // w.num_tx
     # of the noise: each atom takes one dimension
     kept = 1 - recovery_limit(size, w.num_chirps) / size
-    share = (unexplained(spectra, rows, known) * power - kept * noise) / above
-    return bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
+    share = (left / np.maximum(total, 1e-300) * power - kept * noise) / above
+    sparse = bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
+    return sparse, _mean_power(recovered, spectra, known)
 
 
 def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> np.ndarray:
@@ -102,25 +111,98 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     .. [1] R. Rubinstein et al., "Efficient Implementation of the K-SVD Algorithm using Batch OMP",
     2008 (the Gram-matrix form).
     """
-    count, size = vectors.shape
-    atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
-    gram = atoms.conj().T @ atoms
-    # few or evenly spaced samples do not tell all atoms apart: alike ones share a coefficient then
-    ridge = 1e-9 * size
-    first = vectors @ atoms.conj()
-    correlation, support = first.copy(), np.zeros((count, 0), np.int64)
-    solution = np.zeros((count, 0), np.complex128)
-    rows = np.arange(count)
-    for _ in range(sparsity):
-        best = np.abs(correlation)
-        best[rows[:, None], support] = -1
-        support = np.concatenate([support, best.argmax(axis=1)[:, None]], axis=1)
-        inner = gram[support[:, :, None], support[:, None, :]] + ridge * np.eye(support.shape[1])
-        solution = np.linalg.solve(inner, first[rows[:, None], support][..., None])[..., 0]
-        correlation = first - np.einsum("vk,vkp->vp", solution, gram[support].conj())
-    out = np.zeros((count, num_chirps), np.complex64)
-    out[rows[:, None], support] = solution * size
+    found = pursued(vectors, chosen, num_chirps, sparsity)
+    out = np.zeros((len(vectors), num_chirps), np.complex64)
+    np.put_along_axis(out, found.support, found.amplitude, axis=1)
     return out
+
+
+class Pursued(NamedTuple):
+    """Atoms of vectors (V, sparsity), S times their amplitudes, and the power that they explain
+    (V,)."""
+
+    support: np.ndarray
+    amplitude: np.ndarray
+    explained: np.ndarray
+
+    def add_power(self, power: np.ndarray) -> None:
+        """Add the squared amplitudes of vectors of (L_rx, rows) to `power` (rows, P)."""
+        row = np.arange(len(self.support)) % len(power)
+        np.add.at(power, (row[:, None], self.support), np.abs(self.amplitude) ** 2)
+
+
+def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> Pursued:
+    """What `omp` finds; parameters likewise."""
+    bins = np.arange(num_chirps)
+    atoms = np.exp(2j * np.pi * np.outer(chosen, bins) / num_chirps)
+    # of an atom and the one k bins on; twice, so that no stretch of P ends at the edge
+    gram = np.tile(atoms.sum(axis=0), 2)
+    first = vectors @ atoms.conj()
+    support = np.empty((len(vectors), sparsity), np.int64)
+    amplitude = np.empty((len(vectors), sparsity), np.complex128)
+    _pursue(first, gram.real.copy(), gram.imag.copy(), support, amplitude)
+    matched = np.take_along_axis(first, support, axis=1)
+    explained = (matched.conj() * amplitude).real.sum(axis=1)
+    return Pursued(support, amplitude * chosen.size, explained)
+
+
+@jit
+def _pursue(first, gram_re, gram_im, support, amplitude):
+    """Fill `support` and `amplitude` from the correlations `first` (V, P); `gram` is that of an
+    atom and the one k bins on, for k in [0, 2 P)."""
+    num_chirps, sparsity = first.shape[1], support.shape[1]
+    re, im, power = np.empty(num_chirps), np.empty(num_chirps), np.empty(num_chirps)
+    lower = np.empty((sparsity, sparsity), np.complex128)
+    forward = np.empty(sparsity, np.complex128)
+    for v in range(first.shape[0]):
+        chosen, x = support[v], amplitude[v]
+        for k in range(sparsity):
+            for p in range(num_chirps):
+                re[p], im[p] = first[v, p].real, first[v, p].imag
+            for i in range(k):
+                _take_out(re, im, x[i], chosen[i], gram_re, gram_im)
+            for p in range(num_chirps):
+                power[p] = re[p] * re[p] + im[p] * im[p]
+            power[chosen[:k]] = -1.0
+            best = 0
+            for p in range(num_chirps):
+                if power[p] > power[best]:
+                    best = p
+            chosen[k] = best
+            _fit(first[v], chosen[: k + 1], gram_re, gram_im, lower, forward, x)
+
+
+@jit
+def _take_out(re, im, amplitude, atom, gram_re, gram_im):
+    """Take an atom out of correlations."""
+    a, b = amplitude.real, amplitude.imag
+    c, d = gram_re[re.size - atom :], gram_im[re.size - atom :]
+    for p in range(re.size):  # the correlation with bin p is the Gram's conjugate
+        re[p] -= a * c[p] + b * d[p]
+        im[p] -= b * c[p] - a * d[p]
+
+
+@jit
+def _fit(first, chosen, gram_re, gram_im, lower, forward, x):
+    """Least-squares amplitudes x of the atoms `chosen`; `lower` and `forward` are Cholesky's of all
+    but the last atom, and become those of all."""
+    k, num_chirps = chosen.size - 1, first.size
+    left, value = gram_re[0] * (1.0 + RIDGE), first[chosen[k]]
+    for i in range(k):
+        at = chosen[i] - chosen[k] + num_chirps
+        inner = complex(gram_re[at], gram_im[at])
+        for j in range(i):
+            inner -= lower[k, j] * lower[i, j].conjugate()
+        lower[k, i] = inner / lower[i, i].real
+        left -= lower[k, i].real ** 2 + lower[k, i].imag ** 2
+        value -= lower[k, i] * forward[i]
+    lower[k, k] = np.sqrt(max(left, gram_re[0] * RIDGE))
+    forward[k] = value / lower[k, k].real
+    for i in range(k, -1, -1):
+        value = forward[i]
+        for j in range(i + 1, k + 1):
+            value -= lower[j, i].conjugate() * x[j]
+        x[i] = value / lower[i, i].real
 
 
 def omp_power(spectra: np.ndarray, rows: np.ndarray, known: Known, sparsity: int) -> np.ndarray:
@@ -132,13 +214,18 @@ def omp_power(spectra: np.ndarray, rows: np.ndarray, known: Known, sparsity: int
     power : (len(rows), P) float32, Doppler centred, in units of the squared correlation of one
         group's antenna
     """
-    num_groups, num_rx, _, num_chirps = spectra.shape
-    power = np.zeros((len(rows), num_chirps), np.float64)
+    power = np.zeros((len(rows), known.waveform.num_chirps))
     for part, chosen in _sparse_samples(spectra, rows, known):
-        found = omp(part.reshape(-1, chosen.size), chosen, num_chirps, sparsity)
-        power += (np.abs(found.reshape(num_rx, len(rows), num_chirps)) ** 2).sum(axis=0)
-    power /= num_groups * known.waveform.num_tx * num_rx
-    return np.fft.fftshift(power, axes=-1).astype(np.float32)
+        vectors = part.reshape(-1, chosen.size)
+        pursued(vectors, chosen, power.shape[1], sparsity).add_power(power)
+    return _mean_power(power, spectra, known)
+
+
+def _mean_power(power: np.ndarray, spectra: np.ndarray, known: Known) -> np.ndarray:
+    """`omp_power` of what was added up over groups, antennas and receivers."""
+    num_groups, num_rx = spectra.shape[:2]
+    mean = power / (num_groups * known.waveform.num_tx * num_rx)
+    return np.fft.fftshift(mean, axes=-1).astype(np.float32)
 
 
 class Omp(LatinUnion):
@@ -151,14 +238,11 @@ class Omp(LatinUnion):
 
     advises = True
 
-    def keep(
-        self, above: np.ndarray, levels: Levels, spectra: np.ndarray, known: Known
-    ) -> np.ndarray:
+    def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
+        assert levels.recovered is not None  # for it advises
         rows, out = np.flatnonzero(above.any(axis=1)), np.zeros_like(above)
-        if rows.size:
-            found = omp_power(spectra, rows, known, SPARSITY)
-            # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2,
-            # OMP one group's
-            gain = (len(known.schedule) / 2) ** 2
-            out[rows] = found * gain > levels.background[rows]
+        # the united correlation adds P/L_tx * groups chirps coherently with Hann's mean of 1/2,
+        # OMP one group's
+        gain = (len(known.schedule) / 2) ** 2
+        out[rows] = levels.recovered * gain > levels.background[rows]
         return above & out

@@ -30,7 +30,7 @@ from isac_rt.receive.maps import (
     doppler_bins,
     slow_window,
 )
-from isac_rt.receive.omp import Omp, sparse_enough
+from isac_rt.receive.omp import Omp, advise
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps, Neighbours
 from isac_rt.scenario.receivers import Receivers
 
@@ -107,12 +107,13 @@ class Cfar:
         power = way.power(spectra, known)
         above, level = self.rule(known).detect(power)
         above[: first_row(self.settings, known.range_cell)] = False
-        sparse = None
+        sparse, recovered = None, None
         if way.advises:
             added = len(known.schedule) if way.separate else 1
             noise = float(np.median(power)) * added / window_gain(known)
-            sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, known)
-        above = way.keep(above, Levels(power, level), spectra, known)
+            rows = np.flatnonzero(above.any(axis=1))
+            sparse, recovered = advise(spectra, rows, noise, known)
+        above = way.keep(above, Levels(power, level, recovered), known)
         rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
         estimates = [
             self.estimate(spectra, known, power, row, column)

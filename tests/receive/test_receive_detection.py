@@ -45,7 +45,7 @@ from isac_rt.receive.maps import (
     slow_window,
     union_operator,
 )
-from isac_rt.receive.omp import Omp, omp
+from isac_rt.receive.omp import Omp, omp, pursued
 from isac_rt.receive.sense import Cfar
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.scenario.receivers import Receivers
@@ -111,13 +111,14 @@ def test_sparse_correlation_is_the_sum_over_the_samples():
 
 def test_omp_against_a_plain_loop():
     """Batch-OMP against least squares on a growing support. Planted bugs: correlation updated with
-    the transposed Gram matrix, first atom chosen twice."""
+    the transposed Gram matrix, first atom chosen twice, Cholesky's factor not conjugated."""
     rng = np.random.default_rng(6)
     chosen = np.sort(rng.choice(120, 40, replace=False))
     vectors = rng.standard_normal((12, 40)) + 1j * rng.standard_normal((12, 40))
     got = omp(vectors, chosen, 120, 3)
+    explained = pursued(vectors, chosen, 120, 3).explained
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(120)) / 120)
-    for v, row in zip(vectors, got, strict=True):
+    for v, row, power in zip(vectors, got, explained, strict=True):
         support, residual = [], v
         for _ in range(3):
             support.append(int(np.abs(atoms.conj().T @ residual).argmax()))
@@ -125,6 +126,8 @@ def test_omp_against_a_plain_loop():
             residual = v - atoms[:, support] @ x
         assert sorted(np.flatnonzero(row)) == sorted(support)
         assert np.abs(row[support] - 40 * x).max() < 1e-5 * np.abs(40 * x).max()  # complex64
+        left = np.linalg.norm(residual) ** 2
+        assert power == pytest.approx(np.linalg.norm(v) ** 2 - left, rel=1e-6)  # 1e-9 is the ridge
 
 
 def test_omp_recovers_three_tones_beyond_the_unambiguous_velocity_of_one_antenna():
