@@ -28,8 +28,9 @@ SPAN = 0.5
 COAST_CELLS = 0.2
 """A prediction whose range is known worse than this many cells cannot read the fraction of a
 cell."""
-GATE_CELLS = 0.4
-"""Cells within which the path is found again in a frame that was read over it."""
+GATE_CELLS, GATE_STDS = 0.4, 3.0
+"""Cells, or deviations of what is predicted, within which the path is found again in a frame that
+was read over it."""
 STD_CELLS = 0.02
 """Floor of its range and velocity deviations in cells."""
 FIRST_BEND = 3.0
@@ -158,7 +159,10 @@ class Retrospect:
             return None
         d = out.detections
         off = np.abs(np.stack([d.range, d.velocity]).T - self.path.mean[:2])
-        near = (off < GATE_CELLS * self._cells).all(axis=1) & np.isfinite(d.direction).all(axis=1)
+        gate = np.maximum(
+            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(self.path.covariance)[:2])
+        )
+        near = (off < gate).all(axis=1) & np.isfinite(d.direction).all(axis=1)
         if near.any():
             i = int(np.where(near, d.snr, -1.0).argmax())
             measured = np.array([d.range[i], d.velocity[i]])
