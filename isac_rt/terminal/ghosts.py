@@ -24,6 +24,7 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.terminal.filter import Ambiguity, measure, wrapped
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
@@ -84,7 +85,7 @@ class Walls:
 
     def near(self, own: Pose, reach: float) -> np.ndarray:
         """Numbers of the mirrors of which something may lie within reach [m] and in front."""
-        low, high = self._faces[2]
+        low, high = self.boxes
         p, forward = own.position, own.rotation[:, 1]
         ahead = np.where(forward > 0, high - p, low - p) @ forward
         some = self.about(p, reach)
@@ -92,7 +93,7 @@ class Walls:
 
     def about(self, place: np.ndarray, reach: float) -> np.ndarray:
         """Numbers of the mirrors of which something may lie within reach [m] of a place."""
-        low, high = self._faces[2]
+        low, high = self.boxes
         away = np.maximum(np.maximum(low - place, place - high), 0.0)
         return np.flatnonzero((away**2).sum(axis=1) < reach**2)
 
@@ -110,27 +111,27 @@ class Walls:
 
     def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""
-        low, high = self._faces[2]
+        low, high = self.boxes
         return ((points >= low[mirrors] - edge) & (points <= high[mirrors] + edge)).all(axis=1)
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """(2, W, 3) lowest and highest corner of each mirror's faces, world coordinates."""
+        return self._faces[2]
 
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
         `edge` of it."""
+        return held(mirrors, points - self.city.origin, *self._sides, edge)
+
+    @cached_property
+    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the mirrors' faces one after the other the corners (n, 3, 3), and what points from the
+        side behind each to the inside, as long as the side; where each mirror's begin."""
         faces, first, _ = self._faces
-        count = first[mirrors + 1] - first[mirrors]
-        which = np.repeat(np.arange(mirrors.size), count)
-        at = np.arange(which.size) - np.repeat(np.cumsum(count) - count - first[mirrors], count)
-        face = faces[at]
-        point, normal = points[which] - self.city.origin, self.city.normals[face]
-        inside = np.ones(which.size, bool)
-        for k in range(3):
-            a, b = self.city.corners[face, k], self.city.corners[face, (k + 1) % 3]
-            inward = np.cross(normal, b - a)
-            height = (inward * (point - a)).sum(axis=1)
-            inside &= height >= -edge * np.linalg.norm(inward, axis=1)
-        out = np.zeros(mirrors.size, bool)
-        out[which[inside]] = True
-        return out
+        corners = self.city.corners[faces]
+        along = np.roll(corners, -1, axis=1) - corners
+        return corners, np.cross(self.city.normals[faces][:, None], along), first
 
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Faces (n,) that the open segment between two points (3,) crosses."""
@@ -148,6 +149,25 @@ class Walls:
         return np.flatnonzero(
             (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
         )
+
+
+@jit
+def held(mirrors, points, corners, inward, first, edge):
+    """`Walls.holds`."""
+    out = np.zeros(mirrors.size, np.bool_)
+    for i in range(mirrors.size):
+        for face in range(first[mirrors[i]], first[mirrors[i] + 1]):
+            inside = 0
+            for k in range(3):
+                n, a = inward[face, k], corners[face, k]
+                height = 0.0
+                for c in range(3):
+                    height += n[c] * (points[i, c] - a[c])
+                inside += height >= -edge * np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+            if inside == 3:
+                out[i] = True
+                break
+    return out
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.filter import Gaussian, wrapped
 from isac_rt.terminal.ghosts import Leeway, Walls, suspicion
@@ -199,29 +201,79 @@ def _by_two(
     """The wave over plane i, then j, comes from the image p_ij of the start's image in i; it meets
     j at B, and i at A."""
     _, normals, offsets = walls.mirrors
-    first, last = near
-    n, d, m, c = normals[first], offsets[first], normals[last], offsets[last]
-    p, v = end[:3], start[3:]
-    s, e = n @ start[:3] - d, m @ p - c
-    once = start[:3] - 2 * s[:, None] * n
-    beyond = once @ m.T - c
-    length = np.sqrt(((once[:, None] - 2 * beyond[..., None] * m - p) ** 2).sum(axis=-1))
-    both = (length < reach) & (length > 2 * LEAST_RANGE) & (beyond * e > 0)
-    i, j = np.nonzero(both & (first[:, None] != last))
-    # from the image behind j to the end before it
-    at_j = once[i] - 2 * beyond[i, j][:, None] * m[j]
-    B = at_j + (p - at_j) * (beyond[i, j] / (beyond[i, j] + e[j]))[:, None]
-    kept = walls.bounded(last[j], B, EDGE)
-    i, j, at_j, B = i[kept], j[kept], at_j[kept], B[kept]
-    height = (B * n[i]).sum(axis=1) - d[i]
-    A = once[i] + (B - once[i]) * (s[i] / (s[i] + height))[:, None]
-    kept = (height * s[i] > -EDGE * np.abs(s[i])) & walls.bounded(first[i], A, EDGE)
-    i, j, at_j, A, B = i[kept], j[kept], at_j[kept], A[kept], B[kept]
-    kept = walls.holds(first[i], A, EDGE) & walls.holds(last[j], B, EDGE)
-    i, j, at_j = i[kept], j[kept], at_j[kept]
-    turned = v - 2 * (n[i] @ v)[:, None] * n[i]
-    turned -= 2 * (turned * m[j]).sum(axis=1)[:, None] * m[j]
+    planes = _Planes(normals, offsets, *walls.boxes)
+    pairs, places = _met(start[:3], end[:3], planes, *near, reach)
+    i, j = pairs.T
+    A, B, at_j = places.swapaxes(0, 1)
+    kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
+    n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
+    turned = start[3:] - 2 * (n @ start[3:])[:, None] * n
+    turned -= 2 * (turned * m).sum(axis=1)[:, None] * m
     return _ways(at_j, turned, end)
+
+
+class _Planes(NamedTuple):
+    """Normals (W, 3), offsets (W,) and corners of the boxes (W, 3) of mirrors."""
+
+    normals: np.ndarray
+    offsets: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+@jit
+def _met(start, end, planes, first, last, reach):
+    """Pairs (K, 2) of mirrors over which a way may lead, with A, B and p_ij (K, 3, 3)."""
+    pairs, places, count = np.empty((64, 2), np.int64), np.empty((64, 3, 3)), 0
+    once, at_j, A, B = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    before = np.array([_dot(planes.normals[j], end) - planes.offsets[j] for j in last])
+    for i in first:
+        n, d = planes.normals[i], planes.offsets[i]
+        s = _dot(n, start) - d
+        for c in range(3):
+            once[c] = start[c] - 2 * s * n[c]
+        for j, e in zip(last, before):  # noqa: B905 - compiled
+            m = planes.normals[j]
+            beyond = _dot(m, once) - planes.offsets[j]
+            if i == j or not beyond * e > 0:
+                continue
+            length = 0.0
+            for c in range(3):
+                at_j[c] = once[c] - 2 * beyond * m[c]
+                length += (at_j[c] - end[c]) ** 2
+            if not 2 * LEAST_RANGE < np.sqrt(length) < reach:
+                continue
+            # from the image behind j to the end before it
+            if not _within(at_j, end, beyond / (beyond + e), planes, j, B):
+                continue
+            height = _dot(n, B) - d
+            if not height * s > -EDGE * abs(s):
+                continue
+            if not _within(once, B, s / (s + height), planes, i, A):
+                continue
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, np.empty_like(pairs)))
+                places = np.concatenate((places, np.empty_like(places)))
+            pairs[count, 0], pairs[count, 1] = i, j
+            places[count, 0], places[count, 1], places[count, 2] = A, B, at_j
+            count += 1
+    return pairs[:count], places[:count]
+
+
+@jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@jit
+def _within(a, b, share, planes, mirror, out):
+    """Whether the place that lies so far on the way from a to b, put into `out`, is in the box of a
+    mirror or within `EDGE` of it."""
+    for c in range(3):
+        out[c] = a[c] + (b[c] - a[c]) * share
+        if not planes.low[mirror, c] - EDGE <= out[c] <= planes.high[mirror, c] + EDGE:
+            return False
+    return True
 
 
 def _ways(places: np.ndarray, motions: np.ndarray, end: np.ndarray) -> np.ndarray:
