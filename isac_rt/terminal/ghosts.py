@@ -122,7 +122,8 @@ class Walls:
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
         `edge` of it."""
-        return held(mirrors, points - self.city.origin, *self._sides, edge)
+        out: np.ndarray = held(mirrors, points - self.city.origin, *self._sides, edge)
+        return out
 
     @cached_property
     def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,7 +153,14 @@ class Walls:
 
 
 @jit
-def held(mirrors, points, corners, inward, first, edge):
+def held(
+    mirrors: np.ndarray,
+    points: np.ndarray,
+    corners: np.ndarray,
+    inward: np.ndarray,
+    first: np.ndarray,
+    edge: float,
+) -> np.ndarray:
     """`Walls.holds`."""
     out = np.zeros(mirrors.size, np.bool_)
     for i in range(mirrors.size):

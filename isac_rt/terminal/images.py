@@ -222,7 +222,14 @@ class _Planes(NamedTuple):
 
 
 @jit
-def _met(start, end, planes, first, last, reach):
+def _met(
+    start: np.ndarray,
+    end: np.ndarray,
+    planes: _Planes,
+    first: np.ndarray,
+    last: np.ndarray,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (K, 2) of mirrors over which a way may lead, with A, B and p_ij (K, 3, 3)."""
     pairs, places, count = np.empty((64, 2), np.int64), np.empty((64, 3, 3)), 0
     once, at_j, A, B = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -261,12 +268,14 @@ def _met(start, end, planes, first, last, reach):
 
 
 @jit
-def _dot(a, b):
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit
-def _within(a, b, share, planes, mirror, out):
+def _within(
+    a: np.ndarray, b: np.ndarray, share: float, planes: _Planes, mirror: int, out: np.ndarray
+) -> bool:
     """Whether the place that lies so far on the way from a to b, put into `out`, is in the box of a
     mirror or within `EDGE` of it."""
     for c in range(3):

@@ -122,9 +122,9 @@ def length_over(walls: Walls, mirrors: list[int], start: np.ndarray, end: np.nda
 
 
 def test_all_ways_over_one_and_two_planes_are_found():
-    """Against each mirror and each pair by itself, among thirty walls at random; rates by
-    the lengths 2e-4 s apart. Planted bugs: faces of a mirror but its first left out; pairs of mirrors
-    in one order alone; more than 64 pairs forgotten."""
+    """Against each mirror and each pair by itself, among thirty walls at random; rates by the
+    lengths 2e-4 s apart. Planted bugs: a mirror's faces but the first left out; pairs of mirrors in
+    one order alone; more than 64 pairs forgotten."""
     rng = np.random.default_rng(11)
     quads = []
     for _ in range(30):
@@ -134,7 +134,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
         quads.append([middle - a - b, middle + a - b, middle + a + b, middle - a + b])
     walls = city(*np.array(quads).tolist())
     own = pose([3.7, -2.9, 4.2], [1.0, 0.3, 0.0])
-    sender = np.append(ORIGIN + [-7.1, 12.3, 8.4], [4.3, -3.4, 2.2])
+    sender = np.append(ORIGIN + np.array([-7.1, 12.3, 8.4]), [4.3, -3.4, 2.2])
     here, near = np.append(own.position, own.velocity), np.arange(len(walls.planes))
     expected = []
     chains = [[i] for i in near] + [[i, j] for i in near for j in near if i != j]
