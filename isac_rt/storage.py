@@ -260,7 +260,7 @@ def checksum(key: str, content: bytes) -> str:
 
 
 def pack(value: Any) -> tuple[str, bytes]:
-    """A tree of plain values and arrays as JSON and bytes.
+    """A tree of plain values and arrays, also of rows with named fields, as JSON and bytes.
 
     Examples
     --------
@@ -278,7 +278,8 @@ def pack(value: Any) -> tuple[str, bytes]:
             arrays.append(value.tobytes(order))
             here = position
             position += value.nbytes
-            return {ARRAY: [value.dtype.str, list(value.shape), order, here]}
+            kind = value.dtype.descr if value.dtype.names else value.dtype.str
+            return {ARRAY: [kind, list(value.shape), order, here]}
         if isinstance(value, np.generic):
             return value.item()
         if isinstance(value, dict):
@@ -294,8 +295,12 @@ def unpack(tree: str, arrays: bytes) -> Any:
     def made(node: dict[str, Any]) -> Any:
         if node.keys() != {ARRAY}:
             return node
-        dtype, shape, order, begin = node[ARRAY]
-        if np.dtype(dtype).kind not in "biufc" or min(shape, default=0) < 0:
+        kind, shape, order, begin = node[ARRAY]
+        if isinstance(kind, list):
+            kind = [(name, of, *map(tuple, size)) for name, of, *size in kind]
+        dtype = np.dtype(kind)
+        parts = [dtype[name].base for name in dtype.names] if dtype.names else [dtype]
+        if any(part.kind not in "biufc" for part in parts) or min(shape, default=0) < 0:
             raise ValueError(f"an array of {dtype}, {shape}")
         flat = np.frombuffer(arrays, dtype, math.prod(shape), begin)
         return flat.reshape(shape, order=order).copy(order)

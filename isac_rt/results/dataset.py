@@ -1,4 +1,4 @@
-"""Records of frames to rows of plain arrays and numbers, and rows to one labelled dataset.
+"""Records of frames to rows of tables, and tables to one labelled dataset.
 
 What every link has in every frame is an array over frame and observer; what differs in number
 (detections, tracks, paths) is ragged: flat columns beside the frame and the observer of each row.
@@ -7,7 +7,8 @@ What every link has in every frame is an array over frame and observer; what dif
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple
+from dataclasses import astuple, fields
+from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,24 +17,37 @@ import numpy as np
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.results.losses import LOSSES
-from isac_rt.results.records import (
-    KINDS,
-    FrameRecord,
-    LateRecord,
-    ObserverRecord,
-    PictureRecord,
-)
+from isac_rt.results.metrics import SymbolCount
+from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord, Use
+from isac_rt.results.spool import Table
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Row = dict[str, Any]
-"""A frame, or an observer in it, as numbers, arrays and further rows by name."""
+Row = dict[str, dict[str, Any]]
+"""A frame: of each of `TABLES`, and of a snapshot's ``path`` and ``maps``, what each observer or
+picture has."""
+Tables = Mapping[str, Mapping[str, Table]]
+"""The frames so far: of each of `TABLES`, what each observer or picture has."""
+Columns = Mapping[str, np.ndarray] | np.ndarray
+"""Rows of a table: arrays by name, or an array with named fields."""
 DIMENSIONLESS = "1"
 COMPONENTS = ("x", "y", "z", "v_x", "v_y", "v_z")
-ROW_SIZES = {"axis": 3, "component": 6, "component_2": 6}
-"""Of the dimensions of a row that are as long without rows."""
 SYMBOLS = ("delay", "dpsk", "bit")
+PARTS = ("localisation", "missed", "false")
+"""Of the GOSPA distance."""
+ERRORS = ("position", "velocity", "squared")
+"""Measures of a body's error."""
+SIZES = {
+    "kind": len(KINDS),
+    "symbol": len(SYMBOLS),
+    "part": len(PARTS),
+    "measure": len(ERRORS),
+    "count": len(fields(SymbolCount)),
+    **dict.fromkeys(("axis", "body_axis"), 3),
+    **dict.fromkeys(("component", "component_2"), len(COMPONENTS)),
+}
+"""Lengths of the dimensions of a row, but for that of the UAVs."""
 MEASURES = {
     "range": ("m", "range_m"),
     "velocity": ("m s-1", "velocity_mps"),
@@ -43,9 +57,9 @@ MEASURES = {
 """What is estimated of a UAV: unit inside, key in the summary."""
 
 
-def errors_of(values: xr.Dataset | Row, group: str, name: str) -> np.ndarray:
+def errors_of(values: xr.Dataset | Columns, group: str, name: str) -> np.ndarray:
     """Value of "detected" or "tracked" less the truth, NaN where none: (frame, observer, uav) of a
-    dataset, (uav,) of an observer's row.
+    dataset, (frame, uav) of an observer's table.
 
     Angles are wrapped to (-pi, pi] [rad].
     """
@@ -76,8 +90,8 @@ def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray
 
 
 class Column(NamedTuple):
-    """How an array of the dataset is made: from which attribute (or by which function) of an
-    `ObserverRecord` or a `PathSet`, over which dimensions beside frame and observer (or beside a
+    """How an array of the dataset is made: from which attribute (or by which function) of a record
+    or a `PathSet`, over which dimensions beside frame and observer (or beside a
     row), and with which value where an observer did not receive (or a row is shorter)."""
 
     dtype: type
@@ -109,6 +123,28 @@ def _path_powers(o: ObserverRecord) -> np.ndarray:
     return np.bincount(o.paths.kind, weights=o.paths.power, minlength=len(KINDS))
 
 
+def _of_poses(name: str) -> Callable[[FrameRecord], list[np.ndarray]]:
+    return lambda record: [getattr(pose, name) for pose in record.poses.values()]
+
+
+FRAMES: dict[str, Column] = {
+    "frame": _number("index of the frame", "frame", np.int64),
+    "time": Column(float, "s", "time of the middle of the frame", "time"),
+    "modulated": _number("the frame carries data", "modulated", bool),
+    **{
+        f"uav_{name}": Column(
+            float, units, f"{name} of the UAV in world axes", _of_poses(name), ("uav", "axis")
+        )
+        for name, units in (("position", "m"), ("velocity", "m s-1"), ("acceleration", "m s-2"))
+    },
+    "uav_attitude": _number(
+        "body axes of the UAV in world axes",
+        _of_poses("rotation"),
+        float,
+        dims=("uav", "axis", "body_axis"),
+    ),
+}
+"""One value for each frame."""
 OBSERVERS: dict[str, Column] = {
     **{
         f"{group}_{name}": Column(
@@ -472,33 +508,48 @@ PATHS: dict[str, Column] = {
     ),
 }
 """Columns of the path ledger, read off a `PathSet`."""
-RAGGED = (
-    ("det", "detection", DETECTIONS),
-    ("track", "track", TRACKS),
-    ("path", "path", PATHS),
-)
-"""(prefix of the variables, dimension, columns)"""
+USES = {f.name: _number("", f.name, float) for f in fields(Use)} | {
+    "kept": _number("", lambda use: [use.kept.get(kind, 0) for kind in KINDS], int, dims=("kind",))
+}
+"""Of a `Use`, which only the summary needs."""
+TABLES: dict[str, dict[str, Column]] = {
+    "frame": FRAMES | {"dropped": _number("", "dropped", int)},
+    "observer": OBSERVERS
+    | {"symbols": _number("", lambda o: astuple(o.symbols), np.int64, dims=("count",))},
+    "det": DETECTIONS,
+    "track": TRACKS,
+    "use": USES,
+    "picture": PICTURES,
+    "fused": FUSED,
+}
+"""What is kept of every frame: in the dataset and beside it."""
+READ_LATE = ("decoded", "latency_frames", "symbol_errors", "symbol_erased", "symbols")
+"""Of an observer what changes when a frame is read after others have come."""
 
 
-def read(columns: Mapping[str, Column], record: object) -> Row:
-    """The values of a record by name."""
-    return {name: column.read(record) for name, column in columns.items()}
+@cache
+def row_type(kind: str, num_uavs: int) -> np.dtype:
+    """Type of a row of one of `TABLES`."""
+    sizes = SIZES | {"uav": num_uavs}
+    return np.dtype(
+        [(n, c.dtype, tuple(sizes[dim] for dim in c.dims)) for n, c in TABLES[kind].items()]
+    )
 
 
-READ_LATE = ("decoded", "latency_frames", "symbol_errors", "symbol_erased")
-"""Of `OBSERVERS` what changes when a frame is read after others have come."""
-
-
-def amended(row: Row, late: LateRecord) -> Row:
-    """An observer's row once its frame's data were read."""
-    values: Row = {name: OBSERVERS[name].read(late) for name in READ_LATE}
-    return {**row, **values, "symbols": list(astuple(late.symbols))}
+def read(kind: str, record: object, num_uavs: int) -> np.ndarray:
+    """A record as rows of one of `TABLES`: one, or of those that are ragged as many as it has."""
+    values = {name: column.read(record) for name, column in TABLES[kind].items()}
+    count = len(next(iter(values.values()))) if kind in ("det", "track", "fused") else 1
+    out = np.zeros(count, row_type(kind, num_uavs))
+    for name, value in values.items():
+        out[name] = value
+    return out
 
 
 def stacked(parts: Sequence[np.ndarray], column: Column) -> np.ndarray:
     """The rows of all parts, one after the other, their further axes widened to the longest."""
     count = sum(len(part) for part in parts)
-    least = tuple(ROW_SIZES.get(dim, 0) for dim in column.dims)
+    least = tuple(SIZES.get(dim, 0) for dim in column.dims)
     tails = zip(least, *(part.shape[1:] for part in parts), strict=True)
     out = np.full((count, *map(max, tails)), column.missing, column.dtype)
     at = 0
@@ -509,55 +560,38 @@ def stacked(parts: Sequence[np.ndarray], column: Column) -> np.ndarray:
 
 
 def row_of(record: FrameRecord) -> Row:
-    """What is kept of a frame: numbers, arrays and words only. The paths themselves and the maps
-    are kept of snapshots alone."""
+    """What is kept of a frame: numbers and arrays only. The paths themselves and the maps are kept
+    of snapshots alone."""
     uavs = list(record.poses)
-    rows = {}
-    for label, o in record.observers.items():
-        rows[label] = {
-            **read(OBSERVERS, o),
-            "symbols": list(astuple(o.symbols)),
-            "det": read(DETECTIONS, o),
-            "track": read(TRACKS, o),
-        }
-        if record.snapshot:
-            lookup = np.array([uavs.index(name) for name in o.paths.target_names] + [-1])
-            rows[label]["path"] = {**read(PATHS, o.paths), "target": lookup[o.paths.target]}
-        if o.reception.maps is not None:
-            rows[label]["maps"] = vars(o.reception.maps)
-    return {
-        "frame": record.frame,
-        "time": record.time,
-        "modulated": record.modulated,
-        **{
-            f"uav_{name}": np.array([getattr(pose, value) for pose in record.poses.values()])
-            for name, value in POSES.items()
-        },
-        "observers": rows,
-        "uses": {str(link): asdict(use) for link, use in record.uses.items()},
-        "dropped": record.dropped,
-        "pictures": {
-            name: {**read(PICTURES, p), "fused": read(FUSED, p)}
-            for name, p in record.pictures.items()
-        },
+
+    def rows(kind: str, of: Mapping[Any, Any]) -> dict[str, np.ndarray]:
+        return {str(label): read(kind, one, len(uavs)) for label, one in of.items()}
+
+    out: Row = {
+        "frame": rows("frame", {"": record}),
+        **{kind: rows(kind, record.observers) for kind in ("observer", "det", "track")},
+        "use": rows("use", record.uses),
+        **{kind: rows(kind, record.pictures) for kind in ("picture", "fused")},
     }
+    for label, o in record.observers.items() if record.snapshot else ():
+        lookup = np.array([uavs.index(name) for name in o.paths.target_names] + [-1])
+        ledger = {name: column.read(o.paths) for name, column in PATHS.items()}
+        out.setdefault("path", {})[label] = ledger | {"target": lookup[o.paths.target]}
+    for label, o in record.observers.items():
+        if o.reception.maps is not None:
+            out.setdefault("maps", {})[label] = vars(o.reception.maps)
+    return out
 
 
-POSES = {
-    "position": "position",
-    "velocity": "velocity",
-    "acceleration": "acceleration",
-    "attitude": "rotation",
-}
-"""Variables of every UAV in every frame, and the attribute of its pose."""
-
-
-def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str]) -> xr.Dataset:
+def dataset_of(
+    tables: Tables, shots: Mapping[int, Row], timetable: Timetable, states: Sequence[str]
+) -> xr.Dataset:
     """The labelled arrays of a run.
 
     Parameters
     ----------
-    rows : of `row_of`
+    tables : of its frames
+    shots : ``path`` and ``maps`` of the snapshots by frame
     states : names of the terminals' state codes
     """
     import xarray as xr  # as dear as a frame, and not needed before the last
@@ -586,52 +620,30 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
     for i, end in enumerate(("transmitter", "receiver")):
         ends = np.array([link[i] for link in timetable.labels], object)
         put(end, ["observer"], ends, DIMENSIONLESS, f"{end} of the observer's link")
-    for name, dtype, units, meaning in (
-        ("frame", np.int64, DIMENSIONLESS, "index of the frame"),
-        ("time", float, "s", "time of the middle of the frame"),
-        ("modulated", bool, DIMENSIONLESS, "the frame carries data"),
-    ):
-        put(name, ["frame"], np.array([row[name] for row in rows], dtype), units, meaning)
-    for name, units in zip(POSES, ("m", "m s-1", "m s-2", DIMENSIONLESS), strict=True):
-        turned = name == "attitude"
-        dims = ["frame", "uav", "axis", *(["body_axis"] if turned else [])]
-        shape = (-1, len(uavs), 3, *([3] if turned else []))
-        values = np.array([row[f"uav_{name}"] for row in rows], float).reshape(shape)
-        what = "body axes" if turned else name
-        put(f"uav_{name}", dims, values, units, f"{what} of the UAV in world axes")
-
-    present = [
-        (i, j, row["observers"][label])
-        for i, row in enumerate(rows)
-        for j, label in enumerate(labels)
-        if label in row["observers"]
-    ]
-    sizes = {"uav": len(uavs), "kind": len(KINDS), "symbol": len(SYMBOLS)}
-    for name, column in OBSERVERS.items():
-        shape = (len(rows), len(labels), *(sizes[dim] for dim in column.dims))
-        values = np.full(shape, column.missing, column.dtype)
-        for i, j, row in present:
-            values[i, j] = row[name]
-        put(name, ["frame", "observer", *column.dims], values, column.units, column.meaning)
+    frames = tables["frame"][""].whole()
+    for name, column in FRAMES.items():
+        put(name, ["frame", *column.dims], frames[name].copy(), column.units, column.meaning)
+    sizes = {"frame": len(frames), "observer": len(labels), "uav": len(uavs)}
+    _put_dense(put, "observer", OBSERVERS, [tables["observer"][label] for label in labels], sizes)
     for name, flags in (("state", states), ("loss", LOSSES)):
         out[name].attrs |= {
             "flag_values": np.arange(len(flags), dtype=np.int8),
             "flag_meanings": " ".join(flags),
         }
-    for prefix, dim, columns in RAGGED:
-        some = [(i, j, row[prefix]) for i, j, row in present if prefix in row]
-        count = [len(row[next(iter(columns))]) for _, _, row in some]
-        places = np.array([place[:2] for place in some], np.int32).reshape(-1, 2)
-        for k, along in enumerate(("frame", "observer")):
-            where = np.repeat(places[:, k], count)
-            meaning = f"position along the dimension {along}"
-            put(f"{prefix}_{along}", [dim], where, DIMENSIONLESS, meaning)
-        for name, column in columns.items():
-            parts: list[np.ndarray] = [np.asarray(r[name], column.dtype) for _, _, r in some]
-            values = stacked(parts, column)
-            put(f"{prefix}_{name}", [dim, *column.dims], values, column.units, column.meaning)
-    _put_maps(put, [(i, j, row["maps"]) for i, j, row in present if "maps" in row], len(labels))
-    _put_pictures(put, rows, len(uavs))
+    _put_ragged(put, "det", "detection", "observer", [tables["det"][label] for label in labels])
+    _put_ragged(put, "track", "track", "observer", [tables["track"][label] for label in labels])
+    found = {
+        part: [
+            (i, j, shot[part][label])
+            for i, shot in shots.items()
+            for j, label in enumerate(labels)
+            if label in shot.get(part, {})
+        ]
+        for part in ("path", "maps")
+    }
+    _put_paths(put, found["path"])
+    _put_maps(put, found["maps"], len(labels))
+    _put_pictures(put, tables, sizes)
     numbers = {
         "carrier_hz": w.carrier_frequency,
         "effective_carrier_hz": w.effective_carrier,
@@ -643,40 +655,77 @@ def dataset_of(rows: Sequence[Row], timetable: Timetable, states: Sequence[str])
     return xr.Dataset(out, attrs=numbers)
 
 
-def _put_pictures(put: Callable[..., None], rows: Sequence[Row], num_uavs: int) -> None:
+def _put_dense(
+    put: Callable[..., None],
+    along: str,
+    columns: Mapping[str, Column],
+    of: Sequence[Table],
+    sizes: Mapping[str, int],
+    prefix: str = "",
+) -> None:
+    """One value for each frame and each table, which go along a dimension."""
+    sizes = {**SIZES, **sizes, along: len(of)}
+    dims = {name: ("frame", along, *column.dims) for name, column in columns.items()}
+    values: dict[str, np.ndarray] = {
+        name: np.full([sizes[dim] for dim in dims[name]], column.missing, column.dtype)
+        for name, column in columns.items()
+    }
+    for j, table in enumerate(of):
+        at, rows = table.frames(), table.whole()
+        for name in columns:
+            values[name][at, j] = rows[name]
+    for name, column in columns.items():
+        put(f"{prefix}{name}", dims[name], values[name], column.units, column.meaning)
+
+
+def _put_ragged(
+    put: Callable[..., None], kind: str, dim: str, along: str, of: Sequence[Table]
+) -> None:
+    """Rows of any number for each frame and each table, in this order."""
+    frame = np.concatenate([table.frames() for table in of])
+    order = np.argsort(frame, kind="stable")
+    number = np.repeat(np.arange(len(of)), [len(table.frames()) for table in of])
+    rows = np.concatenate([table.whole() for table in of])
+    _put_places(put, kind, dim, along, np.column_stack([frame, number])[order])
+    for name, column in TABLES[kind].items():
+        values = rows[name][order]
+        put(f"{kind}_{name}", [dim, *column.dims], values, column.units, column.meaning)
+
+
+def _put_places(
+    put: Callable[..., None], prefix: str, dim: str, along: str, places: np.ndarray
+) -> None:
+    """Of which frame, and which of another dimension, rows are (K, 2)."""
+    for k, name in enumerate(("frame", along)):
+        meaning = f"position along the dimension {name}"
+        put(f"{prefix}_{name}", [dim], places[:, k].astype(np.int32), DIMENSIONLESS, meaning)
+
+
+def _put_paths(put: Callable[..., None], found: Sequence[tuple[int, int, Columns]]) -> None:
+    """The paths of the snapshots."""
+    places = np.array([[i, j] for i, j, _ in found], int).reshape(-1, 2)
+    count = [len(ledger["delay"]) for _, _, ledger in found]
+    _put_places(put, "path", "path", "observer", np.repeat(places, count, axis=0))
+    for name, column in PATHS.items():
+        parts: list[np.ndarray] = [np.asarray(one[name], column.dtype) for _, _, one in found]
+        values = stacked(parts, column)
+        put(f"path_{name}", ["path", *column.dims], values, column.units, column.meaning)
+
+
+def _put_pictures(put: Callable[..., None], tables: Tables, sizes: Mapping[str, int]) -> None:
     """The pictures of terminals that cooperate; nothing where none does."""
-    names = list(dict.fromkeys(name for row in rows for name in row["pictures"]))
+    names = list(tables["picture"])
     if not names:
         return
-    parts = ("localisation", "missed", "false")
-    measures = ("position", "velocity", "squared")
     for name, words, meaning in (
         ("picture", names, "terminal, or all of them together"),
-        ("part", parts, "part of the GOSPA distance"),
-        ("measure", measures, "measure of an error"),
+        ("part", PARTS, "part of the GOSPA distance"),
+        ("measure", ERRORS, "measure of an error"),
     ):
         put(name, [name], np.array(list(words), object), DIMENSIONLESS, meaning)
-    sizes = {"uav": num_uavs, "part": len(parts), "measure": len(measures)}
-    for name, column in PICTURES.items():
-        shape = (len(rows), len(names), *(sizes[dim] for dim in column.dims))
-        values: np.ndarray = np.full(shape, column.missing, column.dtype)
-        for i, row in enumerate(rows):
-            for j, picture in enumerate(names):
-                values[i, j] = row["pictures"][picture][name]
-        dims = ["frame", "picture", *column.dims]
-        put(f"picture_{name}", dims, values, column.units, column.meaning)
-    tables = [
-        (i, j, row["pictures"][picture]["fused"])
-        for i, row in enumerate(rows)
-        for j, picture in enumerate(names)
-    ]
-    for k, along in enumerate(("frame", "picture")):
-        where = np.repeat([t[k] for t in tables], [len(t[2]["uav"]) for t in tables])
-        meaning = f"position along the dimension {along}"
-        put(f"fused_{along}", ["fused"], where.astype(np.int32), DIMENSIONLESS, meaning)
-    for name, column in FUSED.items():
-        every = np.concatenate([np.asarray(t[2][name], column.dtype) for t in tables])
-        put(f"fused_{name}", ["fused"], every, column.units, column.meaning)
+    of = list(tables["picture"].values())
+    _put_dense(put, "picture", PICTURES, of, sizes, "picture_")
+    _put_ragged(put, "fused", "fused", "picture", list(tables["fused"].values()))
 
 
 MAPS = (
@@ -711,7 +760,9 @@ MAPS = (
 
 
 def _put_maps(
-    put: Callable[..., None], found: list[tuple[int, int, Row]], num_observers: int
+    put: Callable[..., None],
+    found: list[tuple[int, int, Mapping[str, np.ndarray]]],
+    num_observers: int,
 ) -> None:
     """The maps of the snapshots, padded with NaN to the largest."""
     shots = sorted({i for i, _, _ in found})

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
-from isac_rt.results.dataset import Row, amended, dataset_of, row_of
+from isac_rt.results.dataset import (
+    READ_LATE,
+    TABLES,
+    Columns,
+    Row,
+    dataset_of,
+    row_of,
+    row_type,
+)
 from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord, LateRecord
 from isac_rt.results.sensing import Sensing, latencies, summary_block
+from isac_rt.results.spool import Spool, Table
 from isac_rt.results.swarm import summary_of
 from isac_rt.scenario.tree import Scenario
 
@@ -84,67 +94,102 @@ class Figures:
 
 @dataclass
 class Recorder:
-    """Collects the frames of a run as rows of plain arrays and numbers. An observer is a link's
-    receiver; `states` are the names of the terminals' state codes."""
+    """Collects the frames of a run as rows of numbers, which lie on the disk meanwhile. An observer
+    is a link's receiver; `states` are the names of the terminals' state codes; `folder` says whose
+    disk it is, None: that of the system's temporary files."""
 
     timetable: Timetable
     states: Sequence[str]
-    rows: list[Row] = field(default_factory=list)
+    folder: Path | None = None
+    tables: dict[str, dict[str, Table]] = field(init=False)
+    shots: dict[int, Row] = field(default_factory=dict)
+    """Path ledgers and maps of the snapshots by frame."""
     amended: set[int] = field(default_factory=set)
-    """Rows that have changed since they were last kept for a later call."""
+    """Frames whose rows have changed since they were last kept for a later call."""
+
+    def __post_init__(self) -> None:
+        self._num_uavs, self._spool = len(self.timetable.first_roles), Spool(self.folder)
+        self.tables = {kind: {} for kind in TABLES}
+        self._count = 0
+        self._begin("frame", [""])
+        for kind in ("observer", "det", "track"):
+            self._begin(kind, self.timetable.labels.values())
+
+    def __len__(self) -> int:
+        """Frames so far."""
+        return self._count
+
+    def _begin(self, kind: str, labels: Iterable[str]) -> None:
+        dtype = row_type(kind, self._num_uavs)
+        for label in labels:
+            self.tables[kind][label] = Table(dtype, self._spool, self._count)
 
     def add(self, record: FrameRecord) -> None:
         """Append the next frame."""
-        self.rows.append(row_of(record))
+        self._append(row_of(record))
+
+    def _append(self, row: Row) -> None:
+        for kind, tables in self.tables.items():
+            self._begin(kind, [label for label in row[kind] if label not in tables])
+            for label, table in tables.items():
+                table.append(row[kind].get(label, np.zeros(0, table.dtype)))
+        shot = {part: of for part, of in row.items() if part not in TABLES}
+        if shot:
+            self.shots[self._count] = shot
+        self._count += 1
 
     def amend(self, link: Link, late: LateRecord) -> None:
         """Say of an earlier frame what became of its data."""
-        observers = self.rows[late.frame]["observers"]
-        label = self.timetable.labels[link]
-        observers[label] = amended(observers[label], late)
+        table = self.tables["observer"][self.timetable.labels[link]]
+        rows = table[late.frame]
+        for name in READ_LATE:
+            rows[name] = TABLES["observer"][name].read(late)
+        table[late.frame] = rows
         self.amended.add(late.frame)
+
+    def row(self, frame: int) -> Row:
+        """A frame, for `restore`."""
+        return self.shots.get(frame, {}) | {
+            kind: {label: table[frame] for label, table in tables.items()}
+            for kind, tables in self.tables.items()
+        }
 
     def restore(self, rows: Sequence[Row], again: Sequence[tuple[int, Row]] = ()) -> None:
         """Append rows of an earlier call, and take rows `again` that have changed since, by their
-        places.
+        frames.
 
         Raises
         ------
         IndexError, KeyError, ValueError, TypeError  If they are no rows of this run.
         """
-        for place, row in again:
-            if place < 0 or self.rows[place]["frame"] != row["frame"]:
-                raise ValueError(f"row {place} is not of frame {row['frame']}")
-        self._check([*rows, *(row for _, row in again)])
-        for place, row in again:
-            self.rows[place] = row
-        self.rows += rows
-
-    def _check(self, rows: Sequence[Row]) -> None:
-        """Refuse what is no row of this run."""
-        dataset_of(rows, self.timetable, self.states)
-        kept_of_paths([row["uses"] for row in rows])
-        _ = [SymbolCount(*o["symbols"]) for row in rows for o in row["observers"].values()]
-        _ = [
-            Sensing.of([o], len(self.timetable.first_roles))
-            for row in rows
-            for o in row["observers"].values()
-        ]
+        alone = Recorder(self.timetable, self.states)
+        for row in (*rows, *(row for _, row in again)):
+            alone._append(row)
+        alone.dataset()
+        alone.blocks()
+        kept = self.tables["frame"][""]
+        for frame, row in again:
+            if frame < 0 or kept[frame]["frame"] != row["frame"][""]["frame"]:
+                raise ValueError(f"row {frame} is not of frame {row['frame']}")
+        for frame, row in again:
+            for label, changed in row["observer"].items():
+                self.tables["observer"][label][frame] = changed
+        for row in rows:
+            self._append(row)
 
     def dataset(self) -> xr.Dataset:
         """The labelled arrays of the frames so far."""
-        return dataset_of(self.rows, self.timetable, self.states)
+        return dataset_of(self.tables, self.shots, self.timetable, self.states)
 
     def summary(self, figures: Figures) -> dict[str, Any]:
         """The keys of `summary.json` but for the scenario's name and seed; null stands for what
         does not apply."""
-        rows = self.rows
         of_kind = sum(
-            (o["path_count"] for row in rows for o in row["observers"].values()),
+            (t.whole()["path_count"].sum(axis=0) for t in self.tables["observer"].values()),
             np.zeros(len(KINDS), int),
         )
         return {
-            "frames": len(rows),
+            "frames": len(self),
             **self.blocks(),
             "compared": dict(figures.compared),
             "paths": {kind: int(n) for kind, n in zip(KINDS, of_kind, strict=True)},
@@ -152,8 +197,8 @@ class Recorder:
             | ({"by_set": dict(figures.costs)} if figures.costs else {}),
             "fidelity": {
                 **figures.plan,
-                "links": kept_of_paths([row["uses"] for row in rows]),
-                "paths_contradicted": sum(row["dropped"] for row in rows),
+                "links": {link: kept_of_paths(t.whole()) for link, t in self.tables["use"].items()},
+                "paths_contradicted": int(self.tables["frame"][""].whole()["dropped"].sum()),
             },
             "access": figures.access,
             "sparsity": {
@@ -167,11 +212,10 @@ class Recorder:
 
     def blocks(self) -> dict[str, Any]:
         """The keys `terminals`, `links` and `swarm` of the summary."""
-        rows, timetable = self.rows, self.timetable
+        timetable, number = self.timetable, self.tables["frame"][""].whole()["frame"]
         duration = (
-            (rows[-1]["frame"] - rows[0]["frame"]) * timetable.interval
-            + timetable.waveform.frame_duration
-            if rows
+            int(number[-1] - number[0]) * timetable.interval + timetable.waveform.frame_duration
+            if len(self)
             else 0.0
         )
         symbols = {link: self._symbols(link) for link in timetable.all_links}
@@ -183,7 +227,7 @@ class Recorder:
             sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
             others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
             found = summary_block(role, sensing, symbols, duration)
-            waits = [o["latency_frames"] for link in links for o in self._of(link)]
+            waits = [n for link in links for n in self._of(link)["latency_frames"].tolist()]
             return found | {"latency_frames": latencies(symbols, waits), "targets": others}
 
         terminals = {}
@@ -200,62 +244,66 @@ class Recorder:
             str(link): block("active" if link.own else "passive", [link], counted)
             for link, counted in symbols.items()
         }
-        swarm = summary_of(rows, list(timetable.first_roles))
+        pictures = {
+            name: (table.whole(), self.tables["fused"][name].whole())
+            for name, table in self.tables["picture"].items()
+        }
+        swarm = summary_of(pictures, list(timetable.first_roles))
         return {"terminals": terminals, "links": links, "swarm": swarm}
 
-    def _of(self, link: Link) -> list[Row]:
+    def _of(self, link: Link) -> np.ndarray:
         """The rows of a link's receiver."""
-        label = self.timetable.labels[link]
-        return [row["observers"][label] for row in self.rows if label in row["observers"]]
+        return self.tables["observer"][self.timetable.labels[link]].whole()
 
     def _sensing(self, link: Link) -> Sensing:
         """What a link's receiver saw."""
-        return Sensing.of(self._of(link), len(self.timetable.first_roles))
+        label = self.timetable.labels[link]
+        heard, tracks = (self.tables[kind][label] for kind in ("observer", "track"))
+        frame = np.searchsorted(heard.frames(), tracks.frames())
+        return Sensing.of(heard.whole(), tracks.whole(), frame)
 
     def _sparsity(self, link: Link) -> dict[str, int] | None:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent
         by the conventional schedule for that reason; None where no frame was judged."""
         rows = self._of(link)
-        judged = [row["sparse"] for row in rows if row["sparse"] >= 0]
-        if not judged:
+        judged = rows["sparse"][rows["sparse"] >= 0]
+        if not len(judged):
             return None
-        fell_back = sum(row["fell_back"] for row in rows)
-        return {"judged": len(judged), "dense": judged.count(0), "fell_back": fell_back}
+        dense, fell_back = int((judged == 0).sum()), int(rows["fell_back"].sum())
+        return {"judged": len(judged), "dense": dense, "fell_back": fell_back}
 
     def _symbols(self, link: Link) -> SymbolCount | None:
         """What was sent over a link and became of it; None for a terminal's own echoes."""
         if link.own:
             return None
-        return sum((SymbolCount(*row["symbols"]) for row in self._of(link)), SymbolCount())
+        return SymbolCount(*self._of(link)["symbols"].sum(axis=0).tolist())
 
 
-def kept_of_paths(frames: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-    """What was kept and left out over a run, link by link: paths per frame, and the largest bounds
-    of all frames.
+def kept_of_paths(use: Columns) -> dict[str, Any]:
+    """What was kept and left out of a link's paths over a run: paths per frame, and the largest
+    bounds of all frames.
 
     Parameters
     ----------
-    frames : the values of `Use` by link, frame by frame
+    use : the values of `Use`, frame by frame
     """
-    out = {}
-    for link in dict.fromkeys(link for frame in frames for link in frame):
-        rows = [frame[link] for frame in frames if link in frame]
+    kept = np.asarray(use["kept"])
+    order = np.argsort((kept > 0).argmax(axis=0), kind="stable")  # of the kinds as they come up
 
-        def mean(values: Iterable[float]) -> float:
-            return round(float(np.mean(list(values))), 2)
+    def mean(values: np.ndarray) -> float:
+        return round(float(np.mean(values)), 2)
 
-        counts = ("found", "unheard", "weak", "plane", "straight")
-        kinds = dict.fromkeys(kind for row in rows for kind in row["kept"])
-        out[link] = {
-            "frames": len(rows),
-            **{f"{name}_per_frame": mean(row[name] for row in rows) for name in counts},
-            "kept_per_frame": {
-                kind: mean(row["kept"].get(kind, 0) for row in rows) for kind in kinds
-            },
-            "bounces": max(row["bounces"] for row in rows),
-            "left_out_db": decibels(max(row["left_out"] for row in rows)),
-            "plane_error_rad": max(row["plane_error"] for row in rows),
-            "straight_error_rad": max(row["straight_error"] for row in rows),
-            "turning_error_rad": max(row["turning_error"] for row in rows),
-        }
-    return out
+    return {
+        "frames": len(kept),
+        **{
+            f"{name}_per_frame": mean(use[name])
+            for name in ("found", "unheard", "weak", "plane", "straight")
+        },
+        "kept_per_frame": {KINDS[k]: mean(kept[:, k]) for k in order if kept[:, k].any()},
+        "bounces": int(use["bounces"].max()),
+        "left_out_db": decibels(float(use["left_out"].max())),
+        **{
+            f"{name}_rad": float(use[name].max())
+            for name in ("plane_error", "straight_error", "turning_error")
+        },
+    }

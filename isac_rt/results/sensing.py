@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.bounds import error_quantile
-from isac_rt.results.dataset import MEASURES, Row, errors_of
+from isac_rt.results.dataset import MEASURES, PARTS, Columns, errors_of, row_type
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.metrics import GOSPA_CUTOFF_M, SymbolCount
 from isac_rt.results.records import KINDS
@@ -18,7 +19,6 @@ from isac_rt.results.records import KINDS
 RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
 """Shares of a summary that have a numerator and a denominator."""
 ERROR_KEYS = tuple(key for _, key in MEASURES.values())
-GOSPA_PARTS = ("localisation", "missed", "false")
 FALSE_CAUSES = (*KINDS, "noise")
 """What a false track is fed by; the last stands for -1."""
 
@@ -71,47 +71,67 @@ class Sensing:
     ghosts: np.ndarray
 
     @classmethod
-    def of(cls, rows: Sequence[Row], num_uavs: int) -> Sensing:
-        """One link's frames, of `isac_rt.results.dataset.row_of`, in their order."""
-        count = len(rows)
+    def of(cls, values: Columns, tracks: Columns, frame: np.ndarray) -> Sensing:
+        """One link's frames in their order, of `isac_rt.results.dataset.TABLES`.
 
-        def column(name: str, dtype: type, width: tuple[int, ...] = (num_uavs,)) -> np.ndarray:
-            return np.array([row[name] for row in rows], dtype).reshape(count, *width)
+        Parameters
+        ----------
+        values : (F,) of the observer
+        tracks, frame : (K,) its tracks, and the frame of each
+        """
+        in_view, shadowed = np.array(values["in_view"]), np.array(values["shadowed"])
+        count, num_uavs = in_view.shape
 
         def errors(group: str) -> np.ndarray:
-            out = np.full((count, num_uavs, len(MEASURES)), np.nan)
-            for f, row in enumerate(rows):
-                for k, (name, (unit, _)) in enumerate(MEASURES.items()):
-                    e = row[f"bound_{name}"] if group == "bound" else errors_of(row, group, name)
-                    out[f, :, k] = np.rad2deg(e) if unit == "rad" else e
-            return out
+            found = {
+                name: values[f"bound_{name}"]
+                if group == "bound"
+                else errors_of(values, group, name)
+                for name in MEASURES
+            }
+            in_units = [np.rad2deg(e) if MEASURES[n][0] == "rad" else e for n, e in found.items()]
+            return np.stack(in_units, axis=-1)
 
         def parts(of: str) -> np.ndarray:
-            return np.stack([column(f"{of}_{part}", float, ()) for part in GOSPA_PARTS], axis=-1)
+            return np.stack([values[f"{of}_{part}"] for part in PARTS], axis=-1)
 
-        in_view, shadowed = column("in_view", bool), column("shadowed", bool)
-        false = [_false_tracks(row["track"], num_uavs) for row in rows]
+        def counted(what: np.ndarray, of: np.ndarray, most: int) -> np.ndarray:
+            """How many of some tracks are of each number under `most`, frame by frame."""
+            out = np.zeros((count, most), int)
+            np.add.at(out, (frame[of], what[of]), 1)
+            return out
+
+        confirmed, mirror = tracks["confirmed"] > 0, tracks["mirror"]
+        false = confirmed & (tracks["uav"] < 0) & (mirror < 2)
+        kind, ghost_of = tracks["kind"], tracks["target"]
+        ghost = false & (kind == PathKind.GHOST) & (ghost_of >= 0)
         return cls(
             in_view & ~shadowed,
             shadowed,
-            column("hit", bool),
+            np.array(values["hit"]),
             errors("detected"),
             errors("tracked"),
             errors("bound"),
-            column("loss", int),
-            *_breaks(rows, in_view & ~shadowed),
-            column("cooperative", bool),
-            column("genie", float),
-            column("clutter_free", float),
+            np.array(values["loss"]),
+            *_breaks(tracks, frame, in_view & ~shadowed),
+            np.array(values["cooperative"]),
+            np.array(values["genie"]),
+            np.array(values["clutter_free"]),
             parts("gospa"),
             parts("gospa_targets"),
-            column("num_false", int, ()),
-            column("num_clutter", int, ()),
-            column("shown", bool),
-            np.array([_mirrored(row["track"]) for row in rows], int).reshape(count, 2),
-            np.array([f for f, _ in false], int).reshape(count, len(FALSE_CAUSES)),
-            np.array([g for _, g in false], int).reshape(count, num_uavs),
+            np.array(values["num_false"]),
+            np.array(values["num_clutter"]),
+            np.array(values["shown"]),
+            counted(mirror - 1, confirmed & (mirror > 0), 2),
+            counted(np.where(kind < 0, len(KINDS), kind), false, len(FALSE_CAUSES)),
+            counted(ghost_of, ghost, num_uavs),
         )
+
+    @classmethod
+    def of_nothing(cls, num_uavs: int) -> Sensing:
+        """No frame at all."""
+        values, tracks = (np.zeros(0, row_type(kind, num_uavs)) for kind in ("observer", "track"))
+        return cls.of(values, tracks, np.zeros(0, int))
 
     @staticmethod
     def pooled(parts: Sequence[Sensing]) -> Sensing:
@@ -217,35 +237,17 @@ def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
     }
 
 
-def _false_tracks(track: Row, num_uavs: int) -> tuple[np.ndarray, np.ndarray]:
-    """Confirmed tracks of a frame that follow no UAV in view: by `FALSE_CAUSES`, and those of
-    ghosts by UAV."""
-    false = np.asarray(track["confirmed"], bool) & (np.asarray(track["uav"]) < 0)
-    false &= np.asarray(track["mirror"], int) < 2
-    kind = np.asarray(track["kind"], int)[false]
-    ghost_of = np.asarray(track["target"], int)[false][kind == PathKind.GHOST]
-    causes = np.where(kind < 0, len(KINDS), kind)
-    return (
-        np.bincount(causes, minlength=len(FALSE_CAUSES)),
-        np.bincount(ghost_of[ghost_of >= 0], minlength=num_uavs),
-    )
-
-
-def _mirrored(track: Row) -> list[int]:
-    """Confirmed tracks of a frame that a wall places, wrongly and rightly."""
-    code = np.asarray(track["mirror"], int)[np.asarray(track["confirmed"], bool)]
-    return [int((code == value).sum()) for value in (1, 2)]
-
-
-def _breaks(rows: Sequence[Row], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _breaks(tracks: Columns, frame: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(F, U) where another track follows a UAV than the last that did, and where one follows it
     again after frames in view in which none did."""
     switched, resumed = np.zeros((2, *seen.shape), bool)
     last: dict[int, int] = {}
     lost: set[int] = set()
-    for f, row in enumerate(rows):
-        track = row["track"]
-        follows = {int(u): int(k) for u, k in zip(track["uav"], track["id"], strict=True) if u >= 0}
+    some = tracks["uav"] >= 0
+    uav, number, frame = tracks["uav"][some], tracks["id"][some], frame[some]
+    edges = np.searchsorted(frame, np.arange(len(seen) + 1))
+    for f, (begin, end) in enumerate(pairwise(edges)):
+        follows = dict(zip(uav[begin:end].tolist(), number[begin:end].tolist(), strict=True))
         for u, k in follows.items():
             switched[f, u] = last.get(u, k) != k
             resumed[f, u] = u in lost

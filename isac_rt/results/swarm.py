@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.dataset import Columns
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
 from isac_rt.results.records import ObserverRecord, PictureRecord
 from isac_rt.results.sensing import gospa_block
@@ -188,56 +189,65 @@ def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:
     return float(np.linalg.norm(position)), float(np.linalg.norm(e[3:])), nees
 
 
-def summary_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any] | None:
+def summary_of(
+    pictures: Mapping[str, tuple[Columns, Columns]], names: Sequence[str]
+) -> dict[str, Any] | None:
     """The key `swarm` of the summary: the picture of all terminals together, and under `terminals`
     that of each (`docs/outputs.md` says what each figure means); None without pictures.
 
     Parameters
     ----------
-    rows : frames, of `isac_rt.results.dataset.row_of`
+    pictures : by name the frames, and the bodies of all frames one after the other, of
+        `isac_rt.results.dataset.TABLES`
     names : of the UAVs
     """
-    frames = [row["pictures"] for row in rows if row.get("pictures")]
-    if not frames:
+    if not pictures:
         return None
-    of = {name: _block([f[name] for f in frames], names) for name in frames[0]}
+    of = {name: _block(frames, bodies, names) for name, (frames, bodies) in pictures.items()}
     together = of.pop(SWARM)
     return {**together, "terminals": of}
 
 
-def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, Any]:
     """The figures of one picture."""
-    seen, found = (np.array([row[key] for row in rows], bool) for key in ("seen", "found"))
-    error = np.array([row["error"] for row in rows], float)[found]
-    ages = np.array([row["age"] for row in rows], float)
-    reports = np.array([row["reports"] for row in rows])
+    seen, found = frames["seen"], frames["found"]
+    error, ages, reports = frames["error"][found], frames["age"], frames["reports"]
     heard = reports.sum()
     position, velocity, nees = np.mean(error ** [2, 2, 1], axis=0) if len(error) else [None] * 3
     in_view = int(seen.sum())
+
+    def total(name: str) -> int:
+        return int(frames[name].sum())
+
     return {
         "hit_rate": int(found.sum()) / in_view if in_view else None,
-        "gospa": gospa_block(np.array([row["gospa"] for row in rows]), seen),
-        "false_tracks_per_frame": float(np.mean([row["false"] for row in rows])),
-        "hidden_per_frame": float(np.mean([row["hidden"] for row in rows])),
-        "unrecognised_per_frame": float(np.mean([row["unrecognised"] for row in rows])),
+        "gospa": gospa_block(frames["gospa"], seen),
+        **{
+            f"{what}_per_frame": float(np.mean(frames[name]))
+            for what, name in (
+                ("false_tracks", "false"),
+                ("hidden", "hidden"),
+                ("unrecognised", "unrecognised"),
+            )
+        },
         "rmse": {
             "position_m": None if position is None else float(np.sqrt(position)),
             "velocity_mps": None if velocity is None else float(np.sqrt(velocity)),
         },
         "nees": None if nees is None else float(nees),
-        "reports_per_frame": float(heard / len(rows)),
+        "reports_per_frame": float(heard / len(seen)),
         "age_s": float(np.nansum(ages * reports) / heard) if heard else None,
-        "messages": int(sum(row["messages"] for row in rows)),
-        "messages_lost": int(sum(row["lost"] - row["late"] for row in rows)),
-        "messages_late": int(sum(row["late"] for row in rows)),
-        "bits": int(sum(row["bits"] for row in rows)),
-        "bits_room": int(sum(row["room"] for row in rows)),
-        "left_out": int(sum(row["left_out"] for row in rows)),
+        "messages": total("messages"),
+        "messages_lost": total("lost") - total("late"),
+        "messages_late": total("late"),
+        "bits": total("bits"),
+        "bits_room": total("room"),
+        "left_out": total("left_out"),
         "targets": {
             name: {
                 "in_view": int(seen[:, u].sum()),
                 "found": int(found[:, u].sum()),
-                "switches": _switches(rows, u),
+                "switches": _switches(bodies, u),
             }
             for u, name in enumerate(names)
             if seen[:, u].any()
@@ -245,12 +255,8 @@ def _block(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str,
     }
 
 
-def _switches(rows: Sequence[Mapping[str, Any]], u: int) -> int:
+def _switches(bodies: Columns, u: int) -> int:
     """Times that a UAV had another name than when it was found last."""
-    tables = [row["fused"] for row in rows]
-    names = [
-        (int(t["origin"][k]), int(t["number"][k]))
-        for t in tables
-        for k in np.flatnonzero(np.asarray(t["uav"]) == u)
-    ]
+    mine = bodies["uav"] == u
+    names = zip(bodies["origin"][mine].tolist(), bodies["number"][mine].tolist(), strict=True)
     return sum(a != b for a, b in pairwise(names))

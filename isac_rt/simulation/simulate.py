@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -256,13 +257,18 @@ class _Listeners:
 
     @classmethod
     def of(
-        cls, setup: Setup, terminal: Callable[[Link], Terminal], receivers: Receivers
+        cls,
+        setup: Setup,
+        terminal: Callable[[Link], Terminal],
+        receivers: Receivers,
+        folder: Path | None = None,
     ) -> _Listeners:
-        """Before the first frame; `receivers` are the settings that the terminals have."""
+        """Before the first frame; `receivers` are the settings that the terminals have, `folder`
+        is where the recorder keeps frames."""
         links = setup.timetable.all_links
         return cls(
             {link: _Observer(setup, link, terminal(link), receivers) for link in links},
-            Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
+            Recorder(setup.timetable, [state.name.lower() for state in TerminalState], folder),
             None if setup.scenario.cooperation == "none" else _Swarm(setup),
         )
 
@@ -308,10 +314,10 @@ class _Listeners:
     def memory(self, first: int) -> dict[str, Any]:
         """The rows from a frame on, earlier ones that have changed, and what every terminal carries
         over."""
-        rows = self.recorder.rows
+        recorder = self.recorder
         return {
-            "rows": rows[first:],
-            "amended": [[i, rows[i]] for i in sorted(self.recorder.amended) if i < first],
+            "rows": [recorder.row(i) for i in range(first, len(recorder))],
+            "amended": [[i, recorder.row(i)] for i in sorted(recorder.amended) if i < first],
             "observers": {str(link): o.memory() for link, o in self.observers.items()},
             "swarm": None if self.swarm is None else self.swarm.memory(),
         }
@@ -360,7 +366,7 @@ def run(
     >>> results.summary["terminals"]["PT1"]["ser_delay"]
     0.0
     """
-    run = _Run.begin(scenario, setup, snapshots, terminal)
+    run = _Run.begin(scenario, setup, snapshots, terminal, resume.file.parent if resume else None)
     run.fly(progress, threads, resume)
     summary = run.summary()
     materials = {m.name: vars(m) for m in run.setup.city.materials}
@@ -507,19 +513,24 @@ class _Run:
         setup: Setup | None,
         snapshots: int,
         terminal: Callable[[Setup, Link], Terminal | Receiver],
+        folder: Path | None = None,
     ) -> _Run:
         """Before the first frame."""
         s, stopwatch = setup or prepare(scenario), Stopwatch()
         stopwatch.set_up(s.seconds)
+
+        def own(link: Link) -> Terminal:
+            return terminal_with(s, link, terminal(s, link))
+
         compared = {
-            name: _Listeners.of(s, partial(standard_terminal, s, settings=one), one.receivers)
+            name: _Listeners.of(
+                s, partial(standard_terminal, s, settings=one), one.receivers, folder
+            )
             for name, one in scenario.compare.items()
         }
         return cls(
             s,
-            _Listeners.of(
-                s, lambda link: terminal_with(s, link, terminal(s, link)), scenario.receivers
-            ),
+            _Listeners.of(s, own, scenario.receivers, folder),
             compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),
@@ -549,11 +560,11 @@ class _Run:
             while len(at_work) > left:
                 self.collect(*at_work.popleft())
             if keep is not None and keep.append(self.memory()):
-                self.kept = len(self.recorder.rows)
+                self.kept = len(self.recorder)
                 for one in (self.own, *self.compared.values()):
                     one.recorder.amended.clear()
             if progress:
-                progress(len(self.recorder.rows), frames)
+                progress(len(self.recorder), frames)
 
         with (
             threadpool_limits(limits=1),
@@ -637,7 +648,7 @@ class _Run:
         last = None
         for entry in resume.entries():
             with resume.reading():
-                if entry["first"] == len(self.recorder.rows):  # not another call's at the same time
+                if entry["first"] == len(self.recorder):  # not another call's at the same time
                     self.recorder.restore(entry["rows"], entry["amended"])
                     for name, one in self.compared.items():
                         part = entry["compared"][name]
@@ -650,7 +661,7 @@ class _Run:
                     one.restore(last["compared"][name])
                 self.schedules.restore(last["advice"])
                 self.stopwatch.restore(last["seconds"])
-        self.kept = len(self.recorder.rows)
+        self.kept = len(self.recorder)
         return self.kept
 
     def summary(self) -> dict[str, Any]:

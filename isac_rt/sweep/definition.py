@@ -313,7 +313,7 @@ def flat_numbers(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def quantities() -> tuple[str, ...]:
     """Names of what a link's outcome holds (see `isac_rt.results.sensing.summary_block`), the
     pooled rates included."""
-    block = summary_block("passive", Sensing.of((), 0), SymbolCount(), 1.0)
+    block = summary_block("passive", Sensing.of_nothing(0), SymbolCount(), 1.0)
     names = [name for name, _ in flat_numbers(block)]
     return (
         *names,

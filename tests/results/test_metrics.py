@@ -116,7 +116,7 @@ def test_symbol_counts():
         count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False))
         == SymbolCount()
     )
-    block = summary_block("passive", Sensing.of((), 3), one + lost, duration=0.1)
+    block = summary_block("passive", Sensing.of_nothing(3), one + lost, duration=0.1)
     assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(
         21 / 36
     )

@@ -15,10 +15,10 @@ from fake_run import TIMING, fake_records, fake_run, fake_scenario
 
 from isac_rt import storage
 from isac_rt.results import provenance
-from isac_rt.results.dataset import errors_of
+from isac_rt.results.dataset import errors_of, read
 from isac_rt.results.files import ResultsError, check_folder, open_results, save
 from isac_rt.results.recorder import kept_of_paths
-from isac_rt.results.records import KINDS
+from isac_rt.results.records import KINDS, Use
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.simulation import simulate
@@ -354,26 +354,29 @@ def missing(old, new, at="summary"):
 
 def test_what_was_kept_of_the_paths_is_means_and_the_worst():
     """Three frames of one link and one of another, generic numbers. Planted bugs: the kinds left
-    out; one that a frame has none of left out of the mean; the last frame's bounds."""
+    out; one that a frame has none of left out of the mean; the last frame's bounds; the kinds not
+    as they come up."""
 
     def use(found, kept, bounces, left_out, error):
         worst = dict.fromkeys(("plane_error", "straight_error", "turning_error"), error)
         counts = dict.fromkeys(("unheard", "weak", "plane", "straight"), 2 * found)
-        return (
-            counts
-            | worst
-            | {"found": found, "kept": kept, "bounces": bounces, "left_out": left_out}
-        )
+        own = {"found": found, "kept": kept, "bounces": bounces, "left_out": left_out}
+        return read("use", Use(**counts, **worst, **own), 3)
 
-    frames = [
-        {"A->A": use(3, {"target": 2, "ghost": 1}, 1, 0.02, 0.3), "A->B": use(1, {}, 0, 0, 0.1)},
-        {"A->A": use(5, {"target": 4}, 2, 0.5, 0.1)},
-        {"A->A": use(6, {"target": 5, "diffuse": 3}, 0, 0.1, 0.2)},
-    ]
-    found = kept_of_paths(frames)
-    assert {link: block["frames"] for link, block in found.items()} == {"A->A": 3, "A->B": 1}
-    one = found["A->A"]
-    assert (one["found_per_frame"], one["weak_per_frame"]) == (4.67, 9.33)
-    assert one["kept_per_frame"] == {"target": 3.67, "ghost": 0.33, "diffuse": 1.0}
-    assert (one["bounces"], one["left_out_db"], one["plane_error_rad"]) == (2, -3.01, 0.3)
-    assert found["A->B"]["left_out_db"] is None and found["A->B"]["kept_per_frame"] == {}
+    found = kept_of_paths(
+        np.concatenate(
+            [
+                use(3, {"target": 2, "ghost": 1}, 1, 0.02, 0.3),
+                use(5, {"target": 4}, 2, 0.5, 0.1),
+                use(6, {"target": 5, "diffuse": 3}, 0, 0.1, 0.2),
+            ]
+        )
+    )
+    assert found["frames"] == 3
+    assert (found["found_per_frame"], found["weak_per_frame"]) == (4.67, 9.33)
+    kept = {"target": 3.67, "ghost": 0.33, "diffuse": 1.0}
+    assert found["kept_per_frame"] == kept and list(found["kept_per_frame"]) == list(kept)
+    assert (found["bounces"], found["left_out_db"]) == (2, -3.01)
+    assert found["plane_error_rad"] == 0.3
+    other = kept_of_paths(use(1, {}, 0, 0, 0.1))
+    assert other["left_out_db"] is None and other["kept_per_frame"] == {}

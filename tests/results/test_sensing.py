@@ -43,6 +43,14 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     return out | more
 
 
+def sensing(rows):
+    """What frames show, their tracks one after the other."""
+    values = {name: np.array([r[name] for r in rows]) for name in rows[0] if name != "track"}
+    tracks = {name: np.concatenate([r["track"][name] for r in rows]) for name in rows[0]["track"]}
+    counts = [len(r["track"]["id"]) for r in rows]
+    return Sensing.of(values, tracks, np.repeat(np.arange(len(rows)), counts))
+
+
 def test_errors_of_each_uav_and_of_all():
     """Of UAV 0 errors of 1, -3, 2 and 10 cm and one without a direction, of UAV 1 one of 7 m/s;
     what is out of view counts nowhere. Planted bugs: the median of signed errors; angles in
@@ -51,7 +59,7 @@ def test_errors_of_each_uav_and_of_all():
     rows = [row(errors=(e, None)) for e in cm]
     rows += [row(errors=((0.02, 0.1, np.nan, np.nan), (0.0, 7.0, 0.0, 0.0)))]
     rows += [row(seen=(0, 0), errors=((9.0, 9.0, 1.0, 1.0), None))]
-    s = Sensing.of(rows, 2)
+    s = sensing(rows)
     one, two = s.targets(["U1", "U2"]).values()
     assert one["in_view"] == 5
     assert one["median"]["range_m"] == pytest.approx(0.02)
@@ -75,7 +83,7 @@ def test_the_bound_is_of_the_frames_with_an_estimate():
         row(errors=(e, None), bound_range=np.array([s, 9.0])) for s in [0.001] * 5 + [0.004] * 5
     ]
     rows += [row(errors=(None, None), bound_range=np.array([9.0, 9.0]))]
-    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    one, two = sensing(rows).targets(["U1", "U2"]).values()
     drawn = np.abs(np.random.default_rng(3).normal(size=(2, 200_000)) * [[0.001], [0.004]])
     assert one["bound_median"]["range_m"] == pytest.approx(np.median(drawn), rel=0.01)
     assert one["bound_p90"]["range_m"] == pytest.approx(np.percentile(drawn, 90), rel=0.01)
@@ -90,7 +98,7 @@ def test_counts_add_up():
         row(seen=(1, b >= 0), loss=np.array([a, b]), hit=np.array([a == 0, b == 0]), num_false=k)
         for k, (a, b) in enumerate(kinds)
     ]
-    s = Sensing.of(rows, 2)
+    s = sensing(rows)
     block, targets = s.block(), s.targets(["U1", "U2"])
     assert block["losses"] == dict.fromkeys(LOSSES, 0) | {
         "found": 2,
@@ -107,7 +115,7 @@ def test_counts_add_up():
 def test_hidden_is_not_in_view():
     """In the field of view but behind the city."""
     rows = [row(shadowed=np.array([True, False])), row()]
-    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    one, two = sensing(rows).targets(["U1", "U2"]).values()
     assert (one["in_view"], one["hidden"], two["in_view"], two["hidden"]) == (1, 1, 2, 0)
 
 
@@ -118,7 +126,7 @@ def test_gospa_is_the_root_of_its_parts():
         row(gospa_localisation=0.5, gospa_missed=12.5),
         row(seen=(0, 0), gospa_false=25.0),
     ]
-    found = Sensing.of(rows, 2).block()["gospa"]
+    found = sensing(rows).block()["gospa"]
     assert found["missed"] == pytest.approx(0.5)
     assert found["false"] == pytest.approx(1.0)
     assert found["localisation_m"] == pytest.approx(0.5)
@@ -126,7 +134,7 @@ def test_gospa_is_the_root_of_its_parts():
     parts = found["localisation_m"] ** 2 + 12.5 * (found["missed"] + found["false"])
     assert found["total_m"] ** 2 == pytest.approx(parts)
     assert found["empty_m"] == pytest.approx(np.sqrt((2 * 12.5 + 0) / 2))
-    five = Sensing.of([row(), row(seen=(1, 0)), row()], 2).block()["gospa"]
+    five = sensing([row(), row(seen=(1, 0)), row()]).block()["gospa"]
     assert five["empty_m"] == pytest.approx(np.sqrt(5 * 12.5 / 3))
 
 
@@ -143,7 +151,7 @@ def test_false_tracks_by_cause():
         (6, 1, ghost, 1, -1),
         (7, 1, target, 0, -1),
     ]
-    s = Sensing.of([row(tracks=tracks), row()], 2)
+    s = sensing([row(tracks=tracks), row()])
     block = s.block()
     expected = {"diffuse": 0.5, "noise": 0.5, "ghost": 1.0, "target": 0.5}
     assert block["false_tracks"] == dict.fromkeys(FALSE_CAUSES, 0.0) | expected
@@ -164,7 +172,7 @@ def test_tracks_that_a_wall_places():
     ]
     one = row(tracks=tracks)
     one["track"]["mirror"] = np.array([0, 1, 2, 2])
-    block = Sensing.of([one, row()], 2).block()
+    block = sensing([one, row()]).block()
     assert block["false_tracks_per_frame"] == pytest.approx(2 / 2)
     assert (block["mirrors"]["placed"], block["mirrors"]["right"]) == (2, 1)
 
@@ -178,15 +186,15 @@ def test_switches_and_interruptions():
         row(seen=(k is not None, 1), tracks=[(k, 1, 1, 0, 0)] if k else [(5, 1, 1, 0, -1)])
         for k in follow
     ]
-    one, two = Sensing.of(rows, 2).targets(["U1", "U2"]).values()
+    one, two = sensing(rows).targets(["U1", "U2"]).values()
     assert (one["switches"], one["interruptions"], one["tracked"]) == (2, 1, 5)
     assert (two["switches"], two["interruptions"], two["tracked"]) == (0, 0, 0)
 
 
 def test_links_pool_frame_by_frame():
     """Rates over the frames of both; a switch is counted within its link only."""
-    one = Sensing.of([row(tracks=[(5, 1, 1, 0, 0)], num_clutter=4)], 2)
-    two = Sensing.of([row(tracks=[(6, 1, 1, 0, 0)])] * 3, 2)
+    one = sensing([row(tracks=[(5, 1, 1, 0, 0)], num_clutter=4)])
+    two = sensing([row(tracks=[(6, 1, 1, 0, 0)])] * 3)
     both = Sensing.pooled([one, two])
     assert both.block()["clutter_per_frame"] == pytest.approx(1.0)
     assert both.block()["matched_tracked"] == pytest.approx(4 / 8)
@@ -195,7 +203,7 @@ def test_links_pool_frame_by_frame():
 
 def test_nothing_is_null():
     """No frame at all: shares and errors are null, counts are zero."""
-    block = summary_block("active", Sensing.of((), 2), None, 1.0)
+    block = summary_block("active", Sensing.of_nothing(2), None, 1.0)
     for key in ("hit_rate", "matched", "false_per_frame", "false_tracks_per_frame", "ser_dpsk"):
         assert block[key] is None
     assert block["gospa"] == dict.fromkeys(block["gospa"])
@@ -216,7 +224,7 @@ def test_terminals_and_targets_apart():
         )
         for k, hit in zip((1, 2, 0), hits, strict=True)
     ]
-    apart = Sensing.of(rows, 2).block()["apart"]
+    apart = sensing(rows).block()["apart"]
     targets, terminals = apart["targets"], apart["terminals"]
     assert (targets["in_view"], targets["hit_rate"]) == (2, 0.5)
     assert (terminals["in_view"], terminals["hit_rate"]) == (3, 1.0)
@@ -224,5 +232,5 @@ def test_terminals_and_targets_apart():
     assert terminals["bounds"] == pytest.approx({"genie": 0.4, "clutter_free": 0.7})
     assert targets["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
     assert targets["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
-    bounds = Sensing.of(rows, 2).block()["bounds"]
+    bounds = sensing(rows).block()["bounds"]
     assert bounds["genie"] == pytest.approx((2 * 0.9 + 3 * 0.4) / 5)

@@ -11,7 +11,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.results.dataset import FUSED, PICTURES, read
+from isac_rt.results.dataset import read
 from isac_rt.results.swarm import SWARM, SwarmScorer, Traffic, View, summary_of
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
@@ -138,11 +138,11 @@ def test_figures_of_a_run_by_hand():
         record([body(7, (10, 30, 51.2)), body(8, (90, 0, 0))], fed, (0.4,), Traffic(1, 0)),
         record([], fed),
     ]
-    rows = [
-        {"pictures": {k: {**read(PICTURES, r), "fused": read(FUSED, r)} for k in (SWARM, "PT")}}
-        for r in frames
-    ]
-    found = summary_of(rows, list(PLACES))
+    tables = tuple(
+        np.concatenate([read(kind, r, len(PLACES)) for r in frames])
+        for kind in ("picture", "fused")
+    )
+    found = summary_of({SWARM: tables, "PT": tables}, list(PLACES))
     one = found["terminals"]["PT"]
     assert {k: v for k, v in found.items() if k != "terminals"} == one
     assert one["hit_rate"] == pytest.approx(3 / 6)
@@ -160,4 +160,4 @@ def test_figures_of_a_run_by_hand():
         "U1": {"in_view": 3, "found": 2, "switches": 1},
         "U2": {"in_view": 3, "found": 1, "switches": 0},
     }
-    assert summary_of([{"pictures": {}}], list(PLACES)) is None
+    assert summary_of({}, list(PLACES)) is None

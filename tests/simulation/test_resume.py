@@ -22,6 +22,7 @@ from isac_rt.cli.cli import main
 from isac_rt.cli.interruption import Terminated
 from isac_rt.results.files import open_results
 from isac_rt.results.provenance import run_content
+from isac_rt.results.recorder import Recorder
 from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
 from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
 from isac_rt.simulation import resume as simulate_resume
@@ -106,6 +107,9 @@ def differences(a, b, at=""):
     if isinstance(a, np.ndarray):
         if a.dtype != b.dtype or a.shape != b.shape or a.tobytes() != b.tobytes():
             yield at
+    elif isinstance(a, Recorder):
+        rows = ([one.row(i) for i in range(len(one))] for one in (a, b))
+        yield from differences(*rows, at)
     elif isinstance(a, dict):
         if a.keys() != b.keys():
             yield f"{at}: keys"
@@ -272,6 +276,8 @@ def hostile(tree, arrays=b""):
         hostile("no JSON"),
         hostile(None),
         hostile(f'{{"{ARRAY}": ["O", [1], "C", 0]}}', bytes(8)),
+        hostile(f'{{"{ARRAY}": [[["a", "O"]], [1], "C", 0]}}', bytes(8)),
+        hostile(f'{{"{ARRAY}": [[["a", [["b", "O"]]]], [1], "C", 0]}}', bytes(8)),
         hostile(f'{{"{ARRAY}": ["<f8", [3], "C", 0]}}', bytes(8)),
         hostile(f'{{"{ARRAY}": ["<f8", [-1], "C", 0]}}', bytes(8)),
         hostile(f'{{"{ARRAY}": 3}}'),
@@ -396,7 +402,7 @@ def test_frames_that_two_calls_kept_are_taken_up_once(tmp_path):
         both.append(entry)
     run = simulate._Run.begin(scenario, prepare(scenario), 1, simulate.standard_terminal)
     assert run.restore(both) == 2
-    assert [row["frame"] for row in run.recorder.rows] == [0, 1]
+    assert run.recorder.dataset().frame.values.tolist() == [0, 1]
     assert_equal_results(simulate.run(scenario, snapshots=1, resume=both), whole)
 
 
