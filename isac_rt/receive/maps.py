@@ -10,6 +10,7 @@ the output is -P/2. Receding is positive.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -51,50 +52,60 @@ def channel_maps(spectra: np.ndarray, known: Known) -> np.ndarray:
     """
     num_rx, num_rows, num_chirps = spectra.shape[1:]
     out = np.empty((known.waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
-    for tx, (places, operator) in enumerate(_operators(spectra.shape, known)):
-        united = np.empty((num_rx * num_rows, places.size), np.complex64)
-        _unite(spectra.reshape(-1), places, num_chirps, united)
-        np.matmul(united, operator.T, out=out[tx].reshape(-1, num_chirps))
+    channels = out.reshape(-1, num_rows, num_chirps)
+    for channel, made in zip(channels, _parts(spectra, known), strict=True):
+        _join_both_bins(made, channel)
     return out
 
 
-def _operators(shape: tuple[int, ...], known: Known) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each transmit antenna where its chirps lie in the flat spectra of a `shape`, in the first
-    row, and the operator on them."""
-    w, (_, num_rx, num_rows, num_chirps) = known.waveform, shape
-    for sent in known.sent_by:
-        groups, chirps = np.nonzero(sent)
-        operator = (union_operator if known.full else correlation_operator)(w, known.slots[sent])
-        yield (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64), operator
-
-
 def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
-    """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, Doppler centred.
+    """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, centred."""
+    power = np.zeros(spectra.shape[2:], np.float32)
+    for made in _parts(spectra, known):
+        _add_both_bins(made, power)
+    return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
+
+
+def _parts(spectra: np.ndarray, known: Known) -> Iterator[np.ndarray]:
+    """Of each virtual channel a x, b x, a y and b y (x or y, rows, a or b, P/2 + 1), the same array
+    every time.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
     With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
     half of the multiplications.
     """
-    num_rx, num_rows, num_chirps = spectra.shape[1:]
+    _, num_rx, num_rows, num_chirps = spectra.shape
     half = num_chirps // 2 + 1
-    power = np.zeros((num_rows, num_chirps), np.float32)
-    for places, operator in _operators(spectra.shape, known):
-        rows = operator[:half].copy()
-        if num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
-            rows[-1] = rows[-1].conj()
-        parts = np.ascontiguousarray(np.concatenate([rows.real, rows.imag]).T)
+    for groups, chirps, parts in _operators(known):
+        places = (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64)
         united = np.empty((2, num_rows, places.size), np.float32)
         made = np.empty((2 * num_rows, 2 * half), np.float32)
         for rx in range(num_rx):
-            _unite_parts(
+            _unite(
                 spectra.reshape(-1),
                 places + np.uint64(rx * num_rows * num_chirps),
                 num_chirps,
                 united,
             )
             np.matmul(united.reshape(2 * num_rows, -1), parts, out=made)
-            _add_both_bins(made.reshape(2, num_rows, 2, half), power)
-    return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * num_rx)
+            yield made.reshape(2, num_rows, 2, half)
+
+
+@lru_cache(maxsize=8)
+def _operators(known: Known) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each transmit antenna the groups and numbers of its chirps (S,), and the real and
+    imaginary parts of the operator on them for the bins from 0 to P/2 (S, P + 2)."""
+    w, half = known.waveform, known.waveform.num_chirps // 2 + 1
+    out = []
+    for sent in known.sent_by:
+        groups, chirps = np.nonzero(sent)
+        operator = (union_operator if known.full else correlation_operator)(w, known.slots[sent])
+        rows = operator[:half].copy()
+        if w.num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
+            rows[-1] = rows[-1].conj()
+        parts = np.ascontiguousarray(np.concatenate([rows.real, rows.imag]).T)
+        out.append((groups, chirps, parts))
+    return out
 
 
 class Levels(NamedTuple):
@@ -167,8 +178,9 @@ class Banded(LatinUnion):
 
 
 @jit
-def _unite_parts(flat, places, num_chirps, out):
-    """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]."""
+def _unite(flat, places, num_chirps, out):
+    """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]; unsigned, so that no index is checked
+    for its sign."""
     for i in range(out.shape[1]):
         first = np.uint64(i * num_chirps)
         for s in range(out.shape[2]):
@@ -192,12 +204,15 @@ def _add_both_bins(made, power):
 
 
 @jit
-def _unite(flat, places, num_chirps, out):
-    """out[i, s] = flat[i P + places[s]]; unsigned, so that no index is checked for its sign."""
+def _join_both_bins(made, out):
+    """out[i, k] and out[i, -k] from made[x or y, i, a or b, k]."""
+    num_chirps = out.shape[1]
     for i in range(out.shape[0]):
-        first = np.uint64(i * num_chirps)
-        for s in range(out.shape[1]):
-            out[i, s] = flat[first + places[s]]
+        ax, bx, ay, by = made[0, i, 0], made[0, i, 1], made[1, i, 0], made[1, i, 1]
+        for k in range((num_chirps + 1) // 2):
+            out[i, k] = complex(ax[k] - by[k], bx[k] + ay[k])
+        for k in range(1, num_chirps // 2 + 1):
+            out[i, num_chirps - k] = complex(ax[k] + by[k], ay[k] - bx[k])
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:

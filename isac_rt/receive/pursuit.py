@@ -10,6 +10,7 @@ sparse sampling go with it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,14 @@ from isac_rt.receive.estimate import (
     start_point,
 )
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import LATIN_UNION, UNION_FLOOR, LatinUnion, power_map
+from isac_rt.receive.maps import (
+    LATIN_UNION,
+    UNION_FLOOR,
+    LatinUnion,
+    accumulate,
+    channel_maps,
+    power_map,
+)
 from isac_rt.receive.omp import Omp, sparse_enough
 from isac_rt.receive.sense import Cfar, Sensed, describe, doppler_of, window_gain
 from isac_rt.receive.types import ExpectedClutter
@@ -132,13 +140,32 @@ def pursue(
     return [f.estimate for f in found], np.array([f.snr for f in found]), whole
 
 
-def take_strong(
-    spectra: np.ndarray, known: Known, settings: Receivers
-) -> tuple[list[Estimate], np.ndarray, np.ndarray, np.ndarray]:
-    """Paths `STRONG_DB` over the noise and more, their SNR, the spectra without them, and the map
-    (rows, P) with them; parameters as for `pursue`."""
+class Taken(NamedTuple):
+    """Strong paths of a frame and what is left without them.
+
+    Attributes
+    ----------
+    paths : list of Estimate
+    snr : of each, on the map in which it was found
+    whole : (rows, P) power before anything was taken out
+    left : spectra without the paths
+    maps : `channel_maps` of what is left
+    power : `accumulate` of these
+    """
+
+    paths: list[Estimate]
+    snr: np.ndarray
+    whole: np.ndarray
+    left: np.ndarray
+    maps: np.ndarray
+    power: np.ndarray
+
+
+def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken:
+    """Paths `STRONG_DB` over the noise and more; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
-    power = power_map(left, known)
+    maps = channel_maps(left, known)
+    power = accumulate(maps)
     whole = power.copy()
     noise = max(float(np.median(power)), 1e-30)
     taken, level = np.zeros(power.shape), np.full(power.shape, noise)
@@ -151,8 +178,10 @@ def take_strong(
         if not rows.size:
             break
         changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
-        _map_again(power, left, changed, known)
-    return [f.estimate for f in found], np.array([f.snr for f in found]), left, whole
+        some = channel_maps(np.ascontiguousarray(left[:, :, changed]), known)
+        maps[:, :, changed], power[changed] = some, accumulate(some)
+    paths, snr = [f.estimate for f in found], np.array([f.snr for f in found])
+    return Taken(paths, snr, whole, left, maps, power)
 
 
 def _find(

@@ -41,7 +41,7 @@ from isac_rt.receive.clutter.detectors import FINE, noise_level
 from isac_rt.receive.clutter.power import TAPER, expected_power
 from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR, accumulate, add_power, channel_maps
+from isac_rt.receive.maps import UNION_FLOOR, add_power
 from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import Detections, ExpectedClutter
@@ -74,10 +74,8 @@ class BeamSearch(BySchedule):
     ) -> Sensed:
         if not known.full:
             return super().sense(spectra, known, clutter)
-        strong, snr, left, power = take_strong(spectra, known, self.settings)
+        strong, snr, power, left, maps, rest = take_strong(spectra, known, self.settings)
         _, level = self.rule(known).detect(power)
-        maps = channel_maps(left, known)
-        rest = accumulate(maps)
         left_over = Remainder.of(strong, snr, known, rest.shape)
         noise, expected = self._noise(rest, known, clutter)
         ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter, left_over)
