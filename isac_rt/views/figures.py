@@ -359,9 +359,8 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
     if name == "range":
-        ax.set_title(
-            f"{dataset.observer.values[observer]}: truth (line), detections (dots), tracks (broad)"
-        )
+        forms = "truth (line), detections (dots), tracks (broad), hidden (shaded)"
+        ax.set_title(f"{dataset.observer.values[observer]}: {forms}")
     return _labelled(ax, "time [s]", f"{name} [{unit}]", columns=8)
 
 
