@@ -30,6 +30,7 @@ from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.coherent import (
+    BLOCK,
     DIRECTIONS,
     Bucketed,
     Found,
@@ -244,11 +245,13 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     looks, size = maps.shape[0], len(search.channels)
     flat, scale = maps.reshape(looks, size, -1), 1 / (size * noise)
     bound = np.zeros(flat.shape[2], np.float32)
-    for lines in (search.along_x, search.along_z):
-        power = np.zeros((DIRECTIONS // BOUNDED, bound.size), np.float32)
-        for one in flat:
-            add_power(power, lines.spectra[0][::BOUNDED] @ one[lines.members[0]])
-        bound += np.sqrt(power.max(axis=0)) * np.float32(SCALLOPED)
+    for first in range(0, bound.size, BLOCK):
+        block = slice(first, first + BLOCK)
+        for lines in (search.along_x, search.along_z):
+            power = np.zeros((DIRECTIONS // BOUNDED, bound[block].size), np.float32)
+            for one in flat:
+                add_power(power, lines.spectra[0][::BOUNDED] @ one[lines.members[0], block])
+            bound[block] += np.sqrt(power.max(axis=0)) * np.float32(SCALLOPED)
     cell = np.flatnonzero(bound**2 * scale >= least)
     y = np.ascontiguousarray(flat[:, :, cell].transpose(2, 0, 1))
     peak, cosines = _best(y, np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32), search)
