@@ -18,11 +18,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
-from scipy import ndimage, special
+from scipy import special
 
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import hann
+from isac_rt.kernels.jit import jit
+from isac_rt.receive.transform import transform
 
 GAP = 3
 MARGIN = 2
@@ -72,12 +73,22 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
     """
     lines = power.reshape(-1, power.shape[-1])
     floor = np.median(lines, axis=1, keepdims=True)
-    occupied = lines > occupied_factor(looks) * floor
-    bridge = np.ones((1, GAP + 1), bool)
-    padded = np.pad(occupied, [(0, 0), (GAP, GAP)])
-    closed = ndimage.binary_closing(padded, bridge)[:, GAP:-GAP]
-    long = ndimage.binary_opening(closed, np.ones((1, least), bool))
-    return ndimage.binary_dilation(long, np.ones((1, 2 * MARGIN + 1), bool)).reshape(power.shape)
+    inside = np.zeros(lines.shape, bool)
+    _mark(lines > occupied_factor(looks) * floor, least, inside)
+    return inside.reshape(power.shape)
+
+
+@jit
+def _mark(occupied, least, inside):
+    """Mark runs of occupied cells of at least `least`, gaps closed, with a margin."""
+    count = occupied.shape[1]
+    for i in range(len(occupied)):
+        begin, last = 0, -count
+        for k in range(count + GAP + 1):
+            if k < count and occupied[i, k]:
+                begin, last = (begin if k - last <= GAP + 1 else k), k
+            elif k - last == GAP + 1 and last - begin + 1 >= least:
+                inside[i, max(begin - MARGIN, 0) : last + MARGIN + 1] = True
 
 
 def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
@@ -122,10 +133,9 @@ def chirp_runs(samples: np.ndarray, turn: np.ndarray, least: int) -> np.ndarray:
     -------
     inside : (P, N) bool
     """
-    num_rx, _, num_samples = samples.shape
+    num_rx, num_chirps, num_samples = samples.shape
     window = (turn * hann(np.arange(num_samples), num_samples)).astype(np.complex64)
     power = np.zeros(samples.shape[1:], np.float32)
-    for one in samples:
-        spectrum = scipy.fft.fft(one * window, axis=-1, workers=1)
-        power += spectrum.real**2 + spectrum.imag**2
+    none = np.zeros(0, int), np.empty((num_rx, 0, num_chirps), np.complex64)
+    transform(samples, window, *none, power=power)
     return runs(power / num_rx, num_rx, least)
