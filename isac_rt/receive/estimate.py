@@ -171,6 +171,13 @@ class LocalSpectra:
         amplitude alone would draw the estimate out."""
         return _powers(self._chirps, self._axis, delays, delay_rates, self._antennas)
 
+    def beam_powers(
+        self, delays: np.ndarray, delay_rates: np.ndarray, beam: np.ndarray, *, in_phase: bool
+    ) -> np.ndarray:
+        """Powers (K,) of the responses, times a `beam` (L_tx, L_rx) and added over the receivers;
+        over the transmit antennas in phase, or in power."""
+        return _beam_powers(self._chirps, self._axis, delays, delay_rates, beam, in_phase)
+
 
 class _Chirps(NamedTuple):
     """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
@@ -286,6 +293,26 @@ def _powers(chirps, axis, delays, delay_rates, antennas):
             for c in range(t * line, (t + 1) * line):
                 square += np.float64(out[c]) ** 2
             total[j] += square / max(energy[t], 1e-30)
+    return total
+
+
+@jit
+def _beam_powers(chirps, axis, delays, delay_rates, beam, in_phase):
+    """`LocalSpectra.beam_powers`."""
+    total, added = np.zeros(delays.size), np.empty(beam.shape[0], np.complex128)
+    for j in range(delays.size):
+        out, energy = _match(chirps, axis, delays[j], delay_rates[j], beam.shape[0])
+        line = out.size // beam.shape[0]
+        added[:] = 0.0
+        for t in range(beam.shape[0]):
+            for r in range(beam.shape[1]):
+                at = t * line + r // LANES * 2 * LANES + r % LANES
+                added[t] += beam[t, r] * complex(out[at], out[at + LANES])
+            added[t] /= max(energy[t], 1e-30)
+        if in_phase:
+            added[0] = added.sum()
+        for t in range(1 if in_phase else added.size):
+            total[j] += added[t].real ** 2 + added[t].imag ** 2
     return total
 
 

@@ -138,6 +138,23 @@ def test_omp_recovers_three_tones_beyond_the_unambiguous_velocity_of_one_antenna
     assert np.abs(found[tones] - [1.0, 0.6j, -0.4]).max() < 1e-5
 
 
+@pytest.mark.parametrize("in_phase", [False, True])
+def test_power_of_a_beam_is_that_of_the_responses(in_phase: bool):
+    """Seventeen receivers, more than lie side by side. Planted bugs: receivers beyond the
+    sixteenth left out; the energy of another antenna's chirps."""
+    w, schedule, payload = frame(waveform=Waveform(num_chirps=36))
+    rng, sent = np.random.default_rng(4), known(w, schedule, payload)
+    spectra = (rng.standard_normal((3, 17, 20, 36, 2)) @ [1, 1j]).astype(np.complex64)
+    beam = rng.standard_normal((w.num_tx, 17, 2)) @ [1, 1j]
+    local = LocalSpectra(spectra, sent, 9)
+    delays, rates = np.array([8.8, 9.3]) * w.delay_step, np.array([1.1e-8, -2.3e-8])
+    got = local.beam_powers(delays, rates, beam, in_phase=in_phase)
+    for power, delay, rate in zip(got, delays, rates, strict=True):
+        towards = (beam * local.respond(delay, rate)).sum(axis=1)
+        expected = abs(towards.sum()) ** 2 if in_phase else np.linalg.norm(towards) ** 2
+        assert power == pytest.approx(expected, rel=1e-12)  # rounding
+
+
 def test_method_follows_the_schedule():
     _, schedule, _ = frame()
     two = Waveform(num_groups=2)

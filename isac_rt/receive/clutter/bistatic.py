@@ -347,13 +347,12 @@ class _Beam(LocalSpectra):
 
     def __init__(self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray) -> None:
         super().__init__(spectra, known, row)
-        search = search_of(known.antennas, known.wavenumber)
-        self._towards = search.steering(cosines).conj()
+        towards = search_of(known.antennas, known.wavenumber).steering(cosines).conj()
+        self._beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
 
     def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
         """Powers (K,) of the beam: what the estimate maximises."""
-        heard = [self.respond(*at) @ self._towards for at in zip(delays, delay_rates, strict=True)]
-        return (np.abs(heard) ** 2).sum(axis=1)
+        return self.beam_powers(delays, delay_rates, self._beam, in_phase=False)
 
 
 def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:

@@ -192,8 +192,7 @@ class BeamSpectra(LocalSpectra):
 
     def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
         """Powers (K,) of the beam: what the estimate maximises."""
-        heard = [self.respond(*at) for at in zip(delays, delay_rates, strict=True)]
-        return np.abs((self._beam * heard).sum(axis=(1, 2))) ** 2
+        return self.beam_powers(delays, delay_rates, self._beam, in_phase=True)
 
 
 def beam_weights(

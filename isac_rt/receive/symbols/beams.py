@@ -11,7 +11,6 @@ of them at once and taken out.
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 from scipy import special
 
 from isac_rt.frame.antennas import Antennas
@@ -21,6 +20,7 @@ from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter.filter import chirp_runs
+from isac_rt.receive.spectrum import tones
 from isac_rt.receive.symbols.powers import (
     EXTRA_CELLS,
     WEAKEST_WEIGHT,
@@ -30,6 +30,7 @@ from isac_rt.receive.symbols.powers import (
     nearest_symbols,
     symbol_cells,
 )
+from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Prediction
 
 SHARED_CELLS = 2.0
@@ -164,17 +165,16 @@ def _beam_spectra(
         .astype(np.complex64)
     )
     out = np.empty((len(beats), *shape, cells.size), np.complex64)
-    fast = np.arange(w.num_samples)
-    for k, beat in enumerate(beats):
-        for m in range(shape[0]):
-            turn = np.exp(-2j * np.pi * ((beat[m][:, None] * fast / w.num_samples) % 1.0)).astype(
-                np.complex64
-            )
-            beam = np.tensordot(weights[k], cube.samples[m], axes=1)
-            spectrum = scipy.fft.fft(beam * turn, axis=-1, workers=1, overwrite_x=True)
+    made = np.empty((1, cells.size, shape[1]), np.complex64)
+    for m in range(shape[0]):
+        beams = np.tensordot(weights, cube.samples[m], axes=1)
+        for k, beat in enumerate(beats):
+            turn = tones(-beat[m] / w.num_samples, w.num_samples)
+            transform(beams[k : k + 1], turn, cells, made)
+            out[k, m] = made[0].T
             if run_cells is not None:
-                spectrum[chirp_runs(cube.samples[m], turn, run_cells)] = 0
-            out[k, m] = spectrum[:, cells % w.num_samples]
+                runs = chirp_runs(cube.samples[m], turn, run_cells)
+                out[k, m][runs[:, cells % w.num_samples]] = 0
     return out
 
 
