@@ -57,9 +57,10 @@ class Walls:
         """Largest face (W,), unit normal (W, 3) and offset n.x (W,) [m] of the planes of
         `SMALLEST_WALL` and more."""
         plane, areas = self.city.plane_of_face, self.city.areas
+        largest_first = np.lexsort((-areas, plane))
+        planes, first = np.unique(plane[largest_first], return_index=True)
         total = np.bincount(plane, weights=areas)
-        members = [np.flatnonzero(plane == p) for p in np.flatnonzero(total >= SMALLEST_WALL)]
-        faces = np.array([m[np.argmax(areas[m])] for m in members], int)
+        faces = largest_first[first[total[planes] >= SMALLEST_WALL]]
         normals = self.city.normals[faces]
         return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
 
@@ -74,14 +75,15 @@ class Walls:
         highest corner of each (2, W, 3), world coordinates."""
         plane = self.city.plane_of_face
         order = np.argsort(plane, kind="stable")
-        mine = plane[self.mirrors[0]]
-        begin, end = (np.searchsorted(plane[order], mine, side) for side in ("left", "right"))
-        members = [order[a:b] for a, b in zip(begin, end, strict=True)]
-        corners = self.city.corners + self.city.origin
-        bounds = [(corners[m].min(axis=(0, 1)), corners[m].max(axis=(0, 1))) for m in members]
-        first = np.concatenate([[0], np.cumsum(end - begin)])
-        faces = np.concatenate([*members, np.zeros(0, int)])
-        return faces, first, np.array(bounds).reshape(-1, 2, 3).swapaxes(0, 1)
+        faces = order[np.isin(plane[order], self.planes)]
+        first = np.append(np.searchsorted(plane[faces], self.planes), faces.size)
+        corners = self.city.corners[faces] + self.city.origin
+        if not faces.size:
+            return faces, first, np.zeros((2, 0, 3))
+        bounds = [
+            of.reduceat(of.reduce(corners, axis=1), first[:-1]) for of in (np.minimum, np.maximum)
+        ]
+        return faces, first, np.array(bounds)
 
     def near(self, own: Pose, reach: float) -> np.ndarray:
         """Numbers of the mirrors of which something may lie within reach [m] and in front."""
