@@ -14,6 +14,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -90,15 +91,33 @@ def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> No
         err().print(Text.assemble(("warning", "yellow"), f" {message}"), soft_wrap=True)
 
 
+def _leave(status: list[int]) -> None:
+    """End the process, once all else that waits for its end is done: Python would look through all
+    that was loaded, and take it apart (1 s)."""
+    with suppress(OSError, ValueError):  # nobody reads what it says: as Python ends then
+        sys.stdout.flush()
+        sys.stderr.flush()
+        if status:
+            os._exit(*status)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit status."""
+    """Run the command line and return the exit status; of the process, if no arguments are given,
+    which are then the process's own."""
+    if arguments is not None:
+        return _main(arguments)
+    status: list[int] = []
+    atexit.register(_leave, status)
+    status.append(_main(sys.argv[1:]))
+    return status[0]
+
+
+def _main(arguments: Sequence[str]) -> int:
     gc.set_threshold(COLLECT)
-    atexit.register(gc.freeze)  # at its end Python would look through all that was loaded: 0.8 s
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
-    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = app(
-            args=captures.with_standard_output(given),
+            args=captures.with_standard_output(list(arguments)),
             prog_name="isac-rt",
             standalone_mode=False,
         )

@@ -63,7 +63,7 @@ def errors_of(values: xr.Dataset | Columns, group: str, name: str) -> np.ndarray
 
     Angles are wrapped to (-pi, pi] [rad].
     """
-    e = np.asarray(values[f"{group}_{name}"] - values[f"truth_{name}"])
+    e = np.asarray(values[f"{group}_{name}"]) - np.asarray(values[f"truth_{name}"])
     return np.angle(np.exp(1j * e)) if MEASURES[name][0] == "rad" else e
 
 
@@ -601,9 +601,9 @@ def dataset_of(
     out: dict[str, xr.Variable] = {}
 
     def put(name: str, dims: Sequence[str], values: Any, units: str, meaning: str) -> None:
-        out[name] = xr.Variable(
-            tuple(dims), np.asarray(values), {"units": units, "long_name": meaning}
-        )
+        said = {"units": units, "long_name": meaning}
+        # fastpath: another look at the array would load dask, which takes as long as three figures
+        out[name] = xr.Variable(tuple(dims), np.asarray(values), said, fastpath=True)
 
     for name, words, meaning in (
         ("observer", labels, "link, by its receiver where that is enough"),

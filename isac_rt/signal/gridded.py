@@ -66,6 +66,7 @@ from isac_rt.signal.direct import numbers, passed
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
 from isac_rt.signal.tones import Tones, sources
+from isac_rt.storage import kept
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,12 @@ def grid_size(num_samples: int, oversampling: float, width: int) -> int:
 
 @lru_cache(maxsize=16)
 def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -> Kernel:
+    """As `_weights`, which takes as long as two cubes, or as an earlier run kept them."""
+    of = num_samples, oversampling, width, faint
+    return Kernel(*kept("grid weights", of, lambda: list(_weights(*of))))
+
+
+def _weights(num_samples: int, oversampling: float, width: int, faint: int) -> Kernel:
     r"""Grid size, weight polynomials and deconvolution for chirps of N samples.
 
     A tone r grid steps from the middle of its cell has, on the grid points j - (WIDTH - 1)/2,

@@ -65,6 +65,7 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # where they are anyway; else all tick labels are measured once more
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.4,
@@ -279,9 +280,9 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
     """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded
     into the map's span."""
-    here = {"frame": frame, "observer": observer}
-    seen = dataset.in_view[here].values & ~dataset.shadowed[here].values
-    r, v = dataset.truth_range[here].values[seen], dataset.truth_velocity[here].values[seen]
+    here = frame, observer
+    seen = dataset.in_view.values[here] & ~dataset.shadowed.values[here]
+    r, v = dataset.truth_range.values[here][seen], dataset.truth_velocity.values[here][seen]
     axis = dataset.map_velocity.values[observer]
     axis = axis[np.isfinite(axis)]
     span = (axis[1] - axis[0]) * len(axis)
@@ -341,33 +342,37 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     intervals shaded in its colour."""
     scale, unit = _UNITS[name]
     here = _processed(dataset, observer)
-    t = here.time.values
+    t = here("time")
     for u, uav in enumerate(dataset.uav.values):
-        if uav == dataset.receiver.values[observer] or not here.in_view.values[:, u].any():
+        if uav == dataset.receiver.values[observer] or not here("in_view")[:, u].any():
             continue
-        colour, seen = colour_of(u), here.in_view.values[:, u]
+        colour, seen = colour_of(u), here("in_view")[:, u]
         ax.plot(
             t,
-            np.where(seen, here[f"truth_{name}"].values[:, u] * scale, np.nan),
+            np.where(seen, here(f"truth_{name}")[:, u] * scale, np.nan),
             color=colour,
             lw=0.9,
             label=str(uav),
         )
-        ax.plot(
-            t, here[f"detected_{name}"].values[:, u] * scale, ".", color=colour, ms=4, alpha=0.7
-        )
-        ax.plot(t, here[f"tracked_{name}"].values[:, u] * scale, color=colour, lw=3, alpha=0.45)
-        _shade(ax, t, here.shadowed.values[:, u] & seen, colour)
+        ax.plot(t, here(f"detected_{name}")[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
+        ax.plot(t, here(f"tracked_{name}")[:, u] * scale, color=colour, lw=3, alpha=0.45)
+        _shade(ax, t, here("shadowed")[:, u] & seen, colour)
     if name == "range":
         forms = "truth (line), detections (dots), tracks (broad), hidden (shaded)"
         ax.set_title(f"{dataset.observer.values[observer]}: {forms}")
     return _labelled(ax, "time [s]", f"{name} [{unit}]", columns=8)
 
 
-def _processed(dataset: xr.Dataset, observer: int) -> xr.Dataset:
-    """One observer, and only the frames that it processed: an active terminal may skip most."""
-    here = dataset.isel(observer=observer)
-    return here.isel(frame=np.flatnonzero(here.processed.values))
+def _processed(dataset: xr.Dataset, observer: int) -> Callable[[str], np.ndarray]:
+    """What gives variables of one observer by name, in the frames that it processed: an active
+    terminal may skip most. As arrays, since the dataset's own indexing loads dask."""
+    frames = np.flatnonzero(dataset.processed.values[:, observer])
+
+    def values(name: str) -> np.ndarray:
+        of_all = dataset[name].values
+        return of_all[frames] if name == "time" else of_all[frames, observer]
+
+    return values
 
 
 def _shade(ax: Axes, t: np.ndarray, active: np.ndarray, colour: str) -> None:
@@ -395,6 +400,7 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
                 )
     ax.set(xscale="log", ylim=(0, 1.02), yticks=np.linspace(0, 1, 6))
     ax.minorticks_off()  # they take longer to draw than the curves
+    ax.xaxis.set_major_formatter("{x:g}")  # powers of ten are set as formulas
     return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", columns=2)
 
 
@@ -435,11 +441,10 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
 def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     """Symbol error rates of every data frame; frames without a decision and shadowed ones stand
     out."""
-    d = dataset.isel(observer=observer)
-    t, total = dataset.time.values, d.symbol_total.values
+    t, total = dataset.time.values, dataset.symbol_total.values[:, observer]
     for s, colour, mark in ((0, "#0072B2", "o"), (1, "#D55E00", "s")):
         rate = np.divide(
-            d.symbol_errors.values[:, s],
+            dataset.symbol_errors.values[:, observer, s],
             total[:, s],
             out=np.full(len(t), np.nan),
             where=total[:, s] > 0,
@@ -454,7 +459,7 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
             label=f"{'delay' if s == 0 else 'DPSK'} symbols",
         )
     data = total[:, 0] > 0
-    lost = data & ~d.decoded.values
+    lost = data & ~dataset.decoded.values[:, observer]
     ax.plot(
         t[lost],
         np.full(lost.sum(), 1.06),
@@ -464,9 +469,10 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
         label=f"not decided ({lost.sum()} of {data.sum()} data frames)",
     )
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
-    _shade(ax, t, d.shadowed.values[:, sender], "#303030")
+    _shade(ax, t, dataset.shadowed.values[:, observer, sender], "#303030")
     ax.set_ylim(-0.04, 1.14)
-    ax.set_title(f"{d.observer.values} (shaded: the city hides {d.transmitter.values})")
+    hidden = dataset.transmitter.values[observer]
+    ax.set_title(f"{dataset.observer.values[observer]} (shaded: the city hides {hidden})")
     return _labelled(ax, "time [s]", "symbol error rate", columns=3)
 
 
@@ -475,9 +481,9 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
     for o, name in enumerate(dataset.observer.values):
         here = _processed(dataset, o)
         with np.errstate(divide="ignore", invalid="ignore"):
-            snr = 10 * np.log10(here.reference_snr.values)
+            snr = 10 * np.log10(here("reference_snr"))
         ax.plot(
-            here.time.values,
+            here("time"),
             np.where(np.isfinite(snr), snr, np.nan),
             ".-",
             ms=3,
@@ -491,13 +497,13 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
 def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     """Power received by kind of path over time (all paths of a kind added)."""
     here = _processed(dataset, observer)
-    power, count = here.path_power.values, here.path_count.values
+    power, count = here("path_power"), here("path_count")
     for k, name in enumerate(KINDS):
         shown = count[:, k] > 0
         if shown.any():
             level = np.where(shown, 10 * np.log10(np.maximum(power[:, k], 1e-300)), np.nan)
             ax.plot(
-                here.time.values,
+                here("time"),
                 level,
                 ".-",
                 ms=3,
@@ -587,8 +593,8 @@ def _maps(
 ) -> Iterator[Drawing]:
     """Maps of the terminals that have one; where profiles were made directly the data were never
     in."""
-    values = d["map_power" if function is range_doppler else "map_equivalent_range"][snapshot]
-    shown = np.flatnonzero(np.isfinite(values.values).any(axis=(1, 2)))
+    values = d["map_power" if function is range_doppler else "map_equivalent_range"].values
+    shown = np.flatnonzero(np.isfinite(values[snapshot]).any(axis=(1, 2)))
     draw = [partial(function, dataset=d, snapshot=snapshot, observer=o) for o in shown]
     if draw:
         yield Drawing(f"{name}_{_moment(d, snapshot)[1]:04d}", draw, height)

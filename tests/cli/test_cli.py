@@ -55,17 +55,28 @@ def test_garbage_is_looked_for_less_often(capsys):
 
 def test_the_end_looks_through_nothing():
     """An object that only refers to itself is looked at when Python ends, and then says so; after
-    a command it is not. Planted bug: no freeze at the exit."""
+    a command it is not. What waits for the end is done, and the status is the command's. Planted
+    bugs: no leaving; before what waits; with status 0; without what was said."""
     code = (
-        "import gc\ngc.disable()\nclass Garbage:\n    def __del__(self): print('looked through')\n"
+        "import atexit, gc, sys\ngc.disable()\nclass Garbage:\n"
+        "    def __del__(self): print('looked through')\n"
         "one = Garbage(); one.itself = one; del one\n"
     )
-    command = "from isac_rt.cli.cli import main; main(['--version'])"
-    for after, said in ((code, True), (code + command, False)):
+    command = (
+        "from isac_rt.cli.cli import main\nstatus = main()\natexit.register(print, 'waited')\n"
+        "sys.exit(status)"
+    )
+    for given, after, ends, said in (
+        ((), "", 0, ["looked"]),
+        (("--version",), command, 0, ["isac-rt", "waited"]),
+        (("none",), command, 2, ["waited"]),
+    ):
         done = subprocess.run(
-            [sys.executable, "-c", after], capture_output=True, text=True, cwd=ROOT, check=True
+            [sys.executable, "-c", code + after, *given], capture_output=True, text=True, cwd=ROOT
         )
-        assert ("looked through" in done.stdout) == said
+        first_words = [line.split()[0] for line in done.stdout.splitlines()]
+        assert (done.returncode, first_words) == (ends, said)
+        assert "Traceback" not in done.stderr
 
 
 @pytest.fixture

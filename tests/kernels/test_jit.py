@@ -73,8 +73,8 @@ def change(file: Path, old: str, new: str) -> None:
 )
 def test_a_changed_line_runs(copy, file, old, new, answer):
     """In the function itself, in one that it calls and in a constant from another module. Planted
-    bug: `digest` of kernels/jit.py alone (the called function's and the constant's old values
-    answer)."""
+    bugs: `digest` of kernels/jit.py alone (the called function's and the constant's old values
+    answer); a function that was loaded links the module of names to one that is compiled."""
     assert run(copy) == ["21001", "0"]
     assert run(copy) == ["21001", "1"]
     change(copy / "isac_rt" / file, old, new)

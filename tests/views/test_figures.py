@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -207,3 +210,22 @@ def test_leakage_does_not_set_the_scale_of_a_map(run):
     assert after == pytest.approx(before, abs=0.1)  # the median of the cells moves by one
     power[np.isfinite(d.map_range.values[at]).sum() - 1, 0] = power[0, 0]
     assert range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()[1] > before[1] + 10
+
+
+def test_figures_and_report_load_no_dask(tmp_path):
+    """Arrays of arrays in blocks take longer to load than three figures to draw. Planted bugs: a
+    variable made with a look at its type; an observer taken by the dataset's own indexing."""
+    code = (
+        "import sys\nfrom fake_run import fake_run\nfrom isac_rt.views.figures import make_figures\n"
+        "from isac_rt.views.report import write_report\nresults, out = fake_run(), sys.argv[1]\n"
+        "write_report(results, out, make_figures(results, out))\n"
+        "print([name for name in sys.modules if name == 'dask.array'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.stdout.split() == ["[]"]
