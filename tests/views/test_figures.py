@@ -216,8 +216,8 @@ def test_figures_and_report_load_no_dask(tmp_path):
     """Arrays of arrays in blocks take longer to load than three figures to draw. Planted bugs: a
     variable made with a look at its type; an observer taken by the dataset's own indexing."""
     code = (
-        "import sys\nfrom fake_run import fake_run\nfrom isac_rt.views.figures import make_figures\n"
-        "from isac_rt.views.report import write_report\nresults, out = fake_run(), sys.argv[1]\n"
+        "import sys\nfrom fake_run import fake_run\n"
+        "from isac_rt.views.figures import make_figures\nfrom isac_rt.views.report import write_report\nresults, out = fake_run(), sys.argv[1]\n"
         "write_report(results, out, make_figures(results, out))\n"
         "print([name for name in sys.modules if name == 'dask.array'])"
     )
