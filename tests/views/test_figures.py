@@ -217,7 +217,9 @@ def test_figures_and_report_load_no_dask(tmp_path):
     variable made with a look at its type; an observer taken by the dataset's own indexing."""
     code = (
         "import sys\nfrom fake_run import fake_run\n"
-        "from isac_rt.views.figures import make_figures\nfrom isac_rt.views.report import write_report\nresults, out = fake_run(), sys.argv[1]\n"
+        "from isac_rt.views.figures import make_figures\n"
+        "from isac_rt.views.report import write_report\n"
+        "results, out = fake_run(), sys.argv[1]\n"
         "write_report(results, out, make_figures(results, out))\n"
         "print([name for name in sys.modules if name == 'dask.array'])"
     )
