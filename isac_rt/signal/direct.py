@@ -174,59 +174,38 @@ def _direct(out, shape, w, path, offset, t, fresh, room, turn):
     """Add the listed (path, group offset) of the tones to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
     half = float(num_samples // 2)
-    terms = np.empty((path.shape[0], 3))
-    weight = np.empty(path.shape[0], np.complex128)
-    chosen = np.empty(path.shape[0], np.int64)
-    for m in range(groups):
-        for p in range(chirps):
-            time = w.first + p * w.slot + m * w.spacing
-            count = 0
-            for i in range(path.shape[0]):
-                k, source = path[i], m - offset[i]
-                if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
-                    continue
-                q = t.link[k]
-                tau = (
-                    t.symbol_delay[q, source, p]
-                    + t.delay[k]
-                    + (t.rate[k] + t.accel[k] * time / 2) * time
-                    - offset[i] * w.spacing
-                )
-                amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
-                if amplitude == 0:
-                    continue
-                if t.tx_gain.shape[0]:
-                    amplitude *= t.tx_gain[k, t.antenna[q, source, p]]
-                chosen[count], weight[count] = i, amplitude
-                terms[count, 0], terms[count, 1], terms[count, 2] = (
-                    tau,
-                    t.rate[k] + t.accel[k] * time,
-                    t.antenna[q, source, p],
-                )
-                count += 1
-            if count == 0 and not fresh:
+    for line in range(groups * num_rx * chirps):  # as they lie in memory
+        m, r, p = line // (num_rx * chirps), line // chirps % num_rx, line % chirps
+        time = w.first + p * w.slot + m * w.spacing
+        count = 0
+        for i in range(path.shape[0]):
+            k, source = path[i], m - offset[i]
+            if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
                 continue
-            for r in range(num_rx):
-                for i in range(count):
-                    k, a = path[chosen[i]], int(terms[i, 2])
-                    element = (
-                        terms[i, 0]
-                        + t.tx_delay[k, a]
-                        + t.rx_delay[k, r]
-                        + t.cross[t.cross_row[k], a, r]
-                    )
-                    phase, frequency, quadratic = chirp_terms(w, element, terms[i, 1], t.accel[k])
-                    own = weight[i] * t.rx_gain[k, r] if t.rx_gain.shape[0] else weight[i]
-                    _tone(room, half, own, phase, frequency, quadratic)
-                if turn.shape[0]:
-                    _turned(room.sums, turn[m * chirps + p])
-                _flush(
-                    out,
-                    2 * num_samples * ((m * num_rx + r) * chirps + p),
-                    num_samples,
-                    room.sums,
-                    fresh,
-                )
+            q = t.link[k]
+            tau = (
+                t.symbol_delay[q, source, p]
+                + t.delay[k]
+                + (t.rate[k] + t.accel[k] * time / 2) * time
+                - offset[i] * w.spacing
+            )
+            amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
+            if amplitude == 0:
+                continue
+            a = t.antenna[q, source, p]
+            if t.tx_gain.shape[0]:
+                amplitude *= t.tx_gain[k, a]
+            if t.rx_gain.shape[0]:
+                amplitude *= t.rx_gain[k, r]
+            element = tau + t.tx_delay[k, a] + t.rx_delay[k, r] + t.cross[t.cross_row[k], a, r]
+            terms = chirp_terms(w, element, t.rate[k] + t.accel[k] * time, t.accel[k])
+            _tone(room, half, amplitude, *terms)
+            count += 1
+        if count == 0 and not fresh:
+            continue
+        if turn.shape[0]:
+            _turned(room.sums, turn[m * chirps + p])
+        _flush(out, 2 * num_samples * line, num_samples, room.sums, fresh)
 
 
 def add_direct(

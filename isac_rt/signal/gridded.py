@@ -42,6 +42,7 @@ from isac_rt.kernels.vector import (
     narrow,
     splat,
     store,
+    stream,
     transpose,
     zip_high,
     zip_low,
@@ -111,6 +112,7 @@ COVERING = Setting(1.5, 12, True, faint=4)
 _MANY = 4000
 _TOGETHER = 6
 _MARGIN = LANES  # rows beyond the grid
+_TILE = 2 * LANES * LANES  # floats of 16 complex samples of 16 channels
 _STEP = 4 * LANES  # floats between the weights of a grid point and those of the next
 _DOPPLER = 4 / 1024  # cycles per sample, more than motion and elements move a frequency
 _FIELDS = 3  # float64 of a path before its transmit elements' delays
@@ -493,9 +495,10 @@ def _fold(grid, size, low, width):
 @jit(fast=True)
 def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fresh):
     """Write the rows of the samples, divided by the kernel's response: channel r of sample n to
-    out[at + r stride + 2 n]."""
+    out[at + r stride + 2 n]. Fresh ones are put together channel by channel in the tile first, for
+    the channels lie in memory where they would drive each other out of the cache."""
     num_samples, size = deconvolution.shape[0], order.shape[0]
-    half = num_samples // 2
+    half, line = num_samples // 2, 2 * num_samples + ROW
     for start in range(0, num_samples, 16):
         count = min(16, num_samples - start)
         for i in range(count):
@@ -510,8 +513,9 @@ def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fres
             to = at + r * stride + 2 * start
             re, im = load(tile, 16 * r), load(tile, 256 + 16 * r)
             if count == 16 and fresh:
-                store(out, to, zip_low(re, im))
-                store(out, to + 16, zip_high(re, im))
+                here = _TILE + r * line + 2 * start
+                store(tile, here, zip_low(re, im))
+                store(tile, here + 16, zip_high(re, im))
             elif count == 16:
                 store(out, to, load(out, to) + zip_low(re, im))
                 store(out, to + 16, load(out, to + 16) + zip_high(re, im))
@@ -520,6 +524,14 @@ def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fres
                     re_i, im_i = tile[16 * r + i], tile[256 + 16 * r + i]
                     out[to + 2 * i] = re_i if fresh else out[to + 2 * i] + re_i
                     out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
+    whole = (out.ctypes.data + 4 * at) % 64 == 0 and stride % 16 == 0
+    for r in range(channels if fresh else 0):
+        to, here = at + r * stride, _TILE + r * line
+        for i in range(0, num_samples // 16 * 32, 16):
+            if whole:
+                stream(out, to + i, load(tile, here + i))
+            else:
+                store(out, to + i, load(tile, here + i))
 
 
 @jit(fast=True)
@@ -828,7 +840,8 @@ def _synthesise(
         kernel.faint.ravel(),
     )
     grids = aligned(int(order.parts[:, 1].max()) * stride)
-    room = _Room(grids, aligned(80), aligned(_STEP * setting.width), aligned(512))
+    tile = aligned(_TILE + LANES * (2 * num_samples + ROW))
+    room = _Room(grids, aligned(80), aligned(_STEP * setting.width), tile)
     flat, rx, shared = out.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     for first in range(0, shape[1], LANES):
         steer = _steering(w, rx, b.path, first, setting.wideband)
