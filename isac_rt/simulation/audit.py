@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.link import Link
@@ -37,6 +38,7 @@ from isac_rt.receive.sense import window_gain
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.results.metrics import decibels
 from isac_rt.results.records import Use
+from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.simulation.plan import (
@@ -129,6 +131,11 @@ def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
         frames, without what loads the program and draws its results; what a machine does slowly or
         quickly is in them as it was while the plan was made
     """
+    with threadpool_limits(limits=1), tracing_in_one_thread():  # as in a run
+        return _make_plan(setup, receive)
+
+
+def _make_plan(setup: Setup, receive: bool) -> dict[str, Any]:
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}

@@ -52,8 +52,10 @@ Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
 
 
-MOST_EARLY = 10
+MOST_EARLY = 16
 """First frames at the most that show what passive terminals take."""
+FILLING = 6
+"""Frames in which the pictures of terminals that cooperate go on to fill, once tracks are told."""
 
 
 def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
@@ -447,10 +449,12 @@ def stage_seconds(
 
 
 def _first_frames(scenario: Scenario) -> int:
-    """How many frames it takes until data are read and active terminals' tracks are told of."""
+    """How many frames it takes until data are read and active terminals' tracks are told of, and
+    where terminals cooperate until their pictures show most of what they will."""
     acquired = scenario.modulation.acquisition_frames + 2
     confirmed = scenario.tracking.confirm_hits * scenario.receivers.active_every_frames + 4
-    return min(max(acquired, confirmed), MOST_EARLY, scenario.frames)
+    filled = confirmed + FILLING * (scenario.cooperation != "none")
+    return min(max(acquired, filled), MOST_EARLY, scenario.frames)
 
 
 def _seconds_of(

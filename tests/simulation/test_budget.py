@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from isac_rt.cli.cli import main
 from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation import simulate
+from isac_rt.simulation import audit, simulate
 from isac_rt.simulation.audit import check, delays, make_plan, present
 from isac_rt.simulation.plan import decisions
 from isac_rt.simulation.setup import prepare
@@ -213,3 +214,28 @@ def test_a_frame_of_the_run_on_average(monkeypatch):
     assert per_frame[None]["track"] == pytest.approx((8 + 9) / 2)
     beyond = [9 - sum(5.0 if p else 2.0 for p in at) / len(at) for at in (pilots[::2], pilots)]
     assert once["synthesis"] == pytest.approx(beyond[0] + 2 * beyond[1])
+
+
+def test_the_plan_works_in_one_thread_as_a_run_does(monkeypatch):
+    """Threads that wait for each other take five times as long for a map where the machine is busy.
+    Planted bug: the libraries' own threads."""
+    seen, usual = [], audit.stage_seconds
+
+    def stage_seconds(*of):
+        seen.extend(pool["num_threads"] for pool in threadpool_info())
+        return usual(*of)
+
+    monkeypatch.setattr(audit, "stage_seconds", stage_seconds)
+    setup = prepare(load(SCENES / "paper_swarm_consistent.yaml", frames=6))
+    with threadpool_limits(limits=2):
+        make_plan(setup)
+    assert seen and set(seen) == {1}
+
+
+def test_pictures_are_given_time_to_fill():
+    """Sixteen frames of the AT's every second where terminals cooperate, ten where they do not."""
+    keys = ["receivers.active_every_frames=2"]
+    s = load(SCENES / "paper_swarm_consistent.yaml", keys, frames=60)
+    assert simulate._first_frames(s) == 10
+    s = load(SCENES / "paper_swarm_consistent.yaml", [*keys, "cooperation=tracks"], frames=60)
+    assert simulate._first_frames(s) == 16
