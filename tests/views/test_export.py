@@ -86,11 +86,12 @@ def test_a_scene_stands_upright(run, tmp_path):
 
 def test_a_moving_scene_is_where_the_run_was(run):
     """Read off the figure that the page holds: UAVs, tracks and paths of a frame against the run,
-    to the centimetre that it keeps; of a flat roof the outline is drawn and not its diagonal.
-    Planted bug: tracks of all frames at once."""
-    corners = np.array([[0.0, -9, 3], [8, -9, 3], [8, 2, 3], [0, 2, 3]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    city = CityMesh("roof", corners, faces, np.zeros(2, np.int16), (), np.zeros(3))
+    to the centimetre that it keeps; of a flat roof and a wall under it the outlines are
+    drawn and not their diagonals. Planted bugs: tracks of all frames at once; the edge of both left
+    out; drawn twice."""
+    corners = np.array([[0.0, -9, 3], [8, -9, 3], [8, 2, 3], [0, 2, 3], [0, -9, 0], [8, -9, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 4, 1], [4, 5, 1]])
+    city = CityMesh("roof", corners, faces, np.zeros(4, np.int16), (), np.zeros(3))
     figure = json.loads(json.dumps(moving_scene(run.dataset, city)))
     d, frame = run.dataset, figure["frames"][4]
     assert [f["name"] for f in figure["frames"]] == [str(k) for k in range(7)]
@@ -109,7 +110,7 @@ def test_a_moving_scene_is_where_the_run_was(run):
     assert np.abs(sight - d.uav_position.sel(uav=["AT", "PT1"]).values[2]).max() <= 0.005 + 1e-9
     edges = points(next(t for t in figure["data"] if t["name"] == "edges")).reshape(-1, 2, 3)
     lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
-    assert sorted(lengths.tolist()) == [8, 8, 11, 11]  # of a rectangle, without its diagonal
+    assert sorted(lengths.tolist()) == [3, 3, 8, 8, 8, 11, 11]  # of rectangles, without diagonals
     assert "</script><script" not in page_part(figure, "scene")[-2000:]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 import trimesh
+from trimesh.triangles import closest_point
 
 from isac_rt import scenario
 from isac_rt.world.city import CityError, CityMesh, load_city
@@ -310,6 +311,21 @@ def test_bad_faces_are_removed_and_counted():
         )
     with pytest.raises(CityError, match="names vertex 7"):
         clean([Surface(vertices, faces[:1] + 5, MaterialUse("metal"))], "x", np.zeros(3), None)
+
+
+def test_distances_to_triangles_are_trimeshs():
+    """3,000 of three sizes, about the point and far from it, and one that is a line. Planted bugs:
+    the plane's distance beside the triangle; lines that go on beyond their ends."""
+    rng = np.random.default_rng(11)
+    corners = rng.normal(size=(3000, 3, 3)) * rng.choice([0.01, 1, 80], size=(3000, 1, 1))
+    corners += rng.normal(size=(3000, 1, 3)) * rng.choice([0, 3, 100], size=(3000, 1, 1))
+    point = np.array([0.3, -0.2, 0.1])
+    nearest = closest_point(corners, np.broadcast_to(point, (3000, 3)))
+    expected = np.linalg.norm(nearest - point, axis=1)
+    found = distance_to_triangles(corners, point)
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-11)  # sums of numbers up to 300
+    line = np.array([[[2.0, 0, 0], [5.0, 0, 0], [3.0, 0, 0]]])
+    assert distance_to_triangles(line, np.zeros(3)) == pytest.approx([2.0])
 
 
 def test_cropping_keeps_whole_faces_that_reach_into_the_radius():
