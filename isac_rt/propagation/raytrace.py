@@ -36,6 +36,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.frame.link import Link
+from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.resampled import scatterer_phase
@@ -118,7 +119,7 @@ class RayTracer:
         if clutter.model == "field":
             _LOG.info("placing the scatterers of the clutter")
             self.field = ClutterField.plan(
-                clutter, swarm, city, scene, wavelength, free.seed, floor
+                Density.of(clutter), swarm, city, scene, wavelength, free.seed, floor
             )
             if clutter.mirrors:
                 self.two_bounces = TwoBounces.plan(

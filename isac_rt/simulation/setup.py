@@ -234,7 +234,7 @@ class Setup:
             "reference": free,
             "plan": plan,
             "propagation": _maker(self.scenario, plan, free, self.city, floor)(),
-            "expectation": _expectation_of(self.scenario, plan, self.city),
+            "expectation": _expectation_of(self.scenario, plan, free, self.city),
         }
         for name, value in anew.items():
             object.__setattr__(self, name, value)
@@ -461,7 +461,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
         timetable,
         Connections(),
         plan,
-        _expectation_of(scenario, plan, city),
+        _expectation_of(scenario, plan, free, city),
     )
     _ = setup.calibration  # a file that is none is refused here
     setup = _connected(setup)
@@ -487,12 +487,16 @@ def _maker(
     )
 
 
-def _expectation_of(scenario: Scenario, plan: Plan, city: CityMesh) -> ClutterExpectation | None:
+def _expectation_of(
+    scenario: Scenario, plan: Plan, free: FreeSpace, city: CityMesh
+) -> ClutterExpectation | None:
     if not scenario.needs_mesh:
         return None
     believed = city.without(scenario.belief.missing_m)
     about = scenario.clutter, plan.swarm, believed, plan.waveform
-    return make_expectation(*about, plan.antennas, scenario.seed)
+    own = [link for link in plan.timetable.all_links if link.own]
+    floor = _floor_of(scenario, plan, free, own)
+    return make_expectation(*about, plan.antennas, scenario.seed, floor)
 
 
 def _noise_power(
@@ -517,12 +521,19 @@ def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFl
     wanted = clutter.model == "field" and scenario.propagation.model == "ray_traced"
     if not wanted or clutter.mirrors or scenario.access.establish or plan.preset == "everything":
         return None
-    frames = plan.spread_frames()
+    return _floor_of(scenario, plan, reference, timetable.all_links)
+
+
+def _floor_of(
+    scenario: Scenario, plan: Plan, reference: FreeSpace, links: list[Link]
+) -> NoiseFloor:
+    """What noise covers of some links' clutter."""
+    timetable, frames = plan.timetable, plan.spread_frames()
     times = np.array([timetable.epoch(frame) for frame in frames])
     poses = [plan.swarm.poses(time) for time in times]
     sets = [scenario.receivers, *(one.receivers for one in scenario.compare.values())]
     over_noise = {}
-    for link in timetable.all_links:
+    for link in links:
         by_beam = any(receivers.looks_by_beam(link.own) for receivers in sets)
         gain = plan.cell_noise_gain() * (BY_BEAM if by_beam else 1.0)
         over_noise[link] = np.array(

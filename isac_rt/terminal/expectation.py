@@ -1,7 +1,8 @@
 """The clutter that a terminal predicts from its own copy of the mesh. Import only after
 `isac_rt.runtime.activate()`.
 
-Its surfaces are cut as finely as the scenario's field, its points are its own.
+Its surfaces are cut as finely as the scenario's field, its points are its own. What an active
+terminal expects of its own link is cut finer near by (`NEAR`) and merged where noise covers it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField, Seen
+from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.two_bounces import SeenByMirror, TwoBounces
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
@@ -45,6 +48,12 @@ class Mistakes:
     seed: int = 1
 
 
+NEAR = 60.0
+"""Distance [m] from an active terminal's flight within which what it expects of its own link is cut
+finer. Its scatterers are a draw of a wall's directions, the true ones are another: what is 10 to 25
+dB over the noise is whitened only where the draw is dense."""
+
+
 class MeshExpectation:
     """Expected clutter along the flights of one run."""
 
@@ -57,9 +66,15 @@ class MeshExpectation:
         antennas: Antennas,
         wavelength: float,
         seed: int,
+        floor: NoiseFloor | None = None,
     ) -> None:
         own = int(seed_sequence(seed, "expected clutter").generate_state(1)[0])
-        self._field = ClutterField.plan(clutter, swarm, city, scene, wavelength, own)
+        about = city, scene, wavelength, own
+        density = Density.of(clutter)
+        self._field = ClutterField.plan(density, swarm, *about)
+        senders = {name: swarm.uavs[name] for name in swarm.transmitters}
+        alone = replace(swarm, uavs=senders)
+        self._own = ClutterField.plan(replace(density, near=NEAR), alone, *about, floor)
         self._two_bounces = (
             TwoBounces.plan(self._field, city, wavelength, own, clutter.mirrors)
             if clutter.mirrors
@@ -87,12 +102,13 @@ class MeshExpectation:
         error = self._errors(wrong)
         state = LinkState(Link(name, name), time, local, local)
         mirrored = [] if self._two_bounces is None else self._two_bounces.seen(state)
+        own = self._own.of(state.link).cells
         return ExpectedClutter.joined(
             [
                 self._expected(
                     part, error, amplitude * state.elements(self._antennas, part.seen), local
                 )
-                for part in _ways(self._field.seen(state), mirrored, error)
+                for part in self._ways(self._own.seen(state), own.face, mirrored, error)
             ]
         )
 
@@ -139,20 +155,35 @@ class MeshExpectation:
         state, error = LinkState(link, 0.0, start, end), self._errors(wrong)
         mirrored = [] if self._two_bounces is None else self._two_bounces.from_places(state)
         parts = []
-        for part in _ways(self._field.from_places(state), mirrored, error):
+        once, every = self._field.from_places(state), self._field.cells
+        for part in self._ways(once, every.face, mirrored, error):
             heard = self._antennas.element_gain(end.to_body(part.seen.arrival))
             gain = np.sqrt(self._antennas.gain * heard)
             parts.append(self._expected(part, error, amplitude * gain, end))
         return ExpectedClutter.joined(parts)
+
+    def _ways(
+        self, once: Seen, face: np.ndarray, mirrored: Sequence[SeenByMirror], error: np.ndarray
+    ) -> Iterator[_Way]:
+        """Ways of one bounce by cells on faces (N,), and by way of mirrors, whose faces are in
+        error along their normals."""
+        yield _Way(once, face[once.index], once.departure, once.arrival)
+        for part in mirrored:
+            n, s = part.mirror.normal, part.seen
+            met = s.departure if part.before else s.arrival
+            turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
+            there, back = (turned, s.arrival) if part.before else (s.departure, turned)
+            moved = 2 * error[part.mirror.faces[0]] * (met @ n)
+            yield _Way(s, self._field.cells.face[s.index], there, back, moved)
 
     def _expected(
         self, part: _Way, error: np.ndarray, amplitude: np.ndarray, axes: Pose
     ) -> ExpectedClutter:
         """Clutter of amplitudes (K,) where antennas were isotropic, on faces that are each in
         error; directions in the body's axes of a pose."""
-        seen, face = part.seen, self._field.cells.face[part.seen.index]
-        slopes = (self._city.normals[face] * (part.there + part.back)).sum(axis=1)
-        length = seen.length + part.moved + error[face] * slopes
+        seen = part.seen
+        slopes = (self._city.normals[part.face] * (part.there + part.back)).sum(axis=1)
+        length = seen.length + part.moved + error[part.face] * slopes
         power = (amplitude * seen.magnitude) ** 2
         some = power > 0
         return ExpectedClutter(
@@ -165,24 +196,14 @@ class MeshExpectation:
 
 
 class _Way(NamedTuple):
-    """What K scatterers do, along which unit vectors (K, 3) both ways meet them, and by how much
-    the ways are longer than thought as a mirror is in error [m]."""
+    """What K scatterers on faces (K,) do, along which unit vectors (K, 3) both ways meet them, and
+    by how much the ways are longer than thought as a mirror is in error [m]."""
 
     seen: Seen
+    face: np.ndarray
     there: np.ndarray
     back: np.ndarray
     moved: np.ndarray | float = 0.0
-
-
-def _ways(once: Seen, mirrored: Sequence[SeenByMirror], error: np.ndarray) -> Iterator[_Way]:
-    """Ways of one bounce and by way of mirrors, whose faces are in error along their normals."""
-    yield _Way(once, once.departure, once.arrival)
-    for part in mirrored:
-        n, s = part.mirror.normal, part.seen
-        met = s.departure if part.before else s.arrival
-        turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
-        there, back = (turned, s.arrival) if part.before else (s.departure, turned)
-        yield _Way(s, there, back, 2 * error[part.mirror.faces[0]] * (met @ n))
 
 
 class ClutterExpectation(Protocol):
@@ -215,12 +236,14 @@ def make_expectation(
     waveform: Waveform,
     antennas: Antennas,
     seed: int,
+    floor: NoiseFloor | None = None,
 ) -> ClutterExpectation:
-    """The receivers' copy of the mesh; starts the JIT back end."""
+    """The receivers' copy of the mesh; starts the JIT back end. `floor`: of the active terminals'
+    own links; None: nothing is merged."""
     from isac_rt import runtime
 
     runtime.activate()
     from isac_rt.world.city.scene import shared_scenes
 
     scene = shared_scenes(city, waveform.carrier_frequency).faces
-    return MeshExpectation(clutter, swarm, city, scene, antennas, waveform.wavelength, seed)
+    return MeshExpectation(clutter, swarm, city, scene, antennas, waveform.wavelength, seed, floor)

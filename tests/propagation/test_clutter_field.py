@@ -18,6 +18,7 @@ from scipy.integrate import dblquad
 from isac_rt import randomness, scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
+from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter import cells as clutter_cells
@@ -25,6 +26,10 @@ from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import seed_sequence
+from isac_rt.receive.clutter.coherent import Bucketed, searches
+from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
+from isac_rt.receive.known import Known
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
@@ -95,35 +100,40 @@ def test_cells_tile_the_faces_and_are_as_fine_as_asked():
 COARSE = Density(0.2, 0.28)
 
 
-def halved(corners: np.ndarray, places: np.ndarray, code: int = 1) -> list[tuple[int, float]]:
+def halved(
+    corners: np.ndarray, places: np.ndarray, density: Density, code: int = 1
+) -> list[tuple[int, float]]:
     """(code, area) of the cells of one triangle, by recursion, against every place."""
     a, b, c = corners
     area = np.linalg.norm(np.cross(b - a, c - a)) / 2
     middle = corners.mean(axis=0)
     reach = np.linalg.norm(corners - middle, axis=1).max()
     distance = max(np.linalg.norm(places - middle, axis=1).min() - reach, 0.0)
-    if area <= max(COARSE.smallest, COARSE.per_metre * distance):
+    finer = 4 if distance < density.near else 1
+    if area <= max(density.smallest, density.per_metre * distance) / finer:
         return [(code, area)]
     edges = [np.linalg.norm(corners[(k + 1) % 3] - corners[k]) for k in range(3)]
     k = next(k for k in range(3) if edges[k] > max(edges) * (1 - 1e-9))
     p, q, r = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
-    one = halved(np.array([p, (p + q) / 2, r]), places, 2 * code)
-    return one + halved(np.array([(p + q) / 2, q, r]), places, 2 * code + 1)
+    one = halved(np.array([p, (p + q) / 2, r]), places, density, 2 * code)
+    return one + halved(np.array([(p + q) / 2, q, r]), places, density, 2 * code + 1)
 
 
-def test_cells_of_a_long_flight_are_those_of_plain_recursion():
+@pytest.mark.parametrize("density", [COARSE, Density(0.8, 1.1, near=9.3)])
+def test_cells_of_a_long_flight_are_those_of_plain_recursion(density):
     """Area and order of all cells of a street beside 133 places of a bent flight, by recursion with
-    no shortcut. Planted bugs: boxes begin one place late; a box's distance with its corners
-    swapped; the second half begins at the other end of the edge."""
+    no shortcut; the second time in quarters near the flight. Planted bugs: boxes begin one place
+    late; a box's distance with its corners swapped; the second half begins at the other end of the
+    edge; quarters everywhere."""
     city = canyon()
     t = np.linspace(0, 1, 133)[:, None]
     places = np.hstack([3.1 * np.sin(5 * t), 71 * t - 30, 6 + 9 * t])
-    cells = cut(city, np.ones(city.num_faces, bool), places - city.origin, COARSE, 3)
+    cells = cut(city, np.ones(city.num_faces, bool), places - city.origin, density, 3)
     found = 0
     for face in range(city.num_faces):
         corners = city.corners[face]
         corners = corners[np.lexsort(corners.T[::-1])]
-        true = sorted(halved(corners, places - city.origin))
+        true = sorted(halved(corners, places - city.origin, density))
         mine = cells.area[cells.face == face]
         assert mine == pytest.approx([area for _, area in true], rel=1e-6, abs=0)  # float32
         found += len(true)
@@ -473,6 +483,45 @@ def expectation(
     swarm, antennas = swarm_of(s), antennas_of(s.array, w)
     copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
     return copy, swarm.poses(0.0)["A"]
+
+
+@pytest.mark.sionna
+def test_what_a_terminal_expects_of_a_wall_whitens_any_other_draw_of_it():
+    """A wall beside the flight, 17 to 27 dB over the noise in 440 cells of range and Doppler, as a
+    lattice of 80,000 points by Lambert's law: whitened by the terminal's own scatterers, no
+    direction keeps 1.7 times the noise, and the loudest of each cell 1.12 in the mean (1.34 and
+    1.05; noise alone is 1). Planted bug: scatterers as sparse as the field's (4.2 and 1.39)."""
+    at, speed = np.array([1.3, -0.7, 2.1]), np.array([5.7, 1.1, -0.4])
+    copy, pose = expectation(
+        rectangle((-5.0, 11.0, -8.0), (50.0, 0, 0), (0, 0, 16.0), METAL), speed, at
+    )
+    thought = copy.clutter("A", pose, 0.0, 1.0)
+    x, z = np.meshgrid(np.arange(-4.95, 45, 0.1), np.arange(-7.95, 8, 0.1))
+    towards = np.stack([x.ravel(), np.full(x.size, 11.0), z.ravel()], axis=1) - at
+    r = np.linalg.norm(towards, axis=1)
+    towards = towards / r[:, None]
+    power = towards[:, 1] ** 2 / r**4
+    power *= thought.power.sum() / power.sum()
+    body = pose.to_body(towards)
+    truth = ExpectedClutter(2 * r / C, -2 * towards @ speed / C, power, body, body)
+    w = waveform_of(scenario.Radio(), scenario.Array())
+    antennas = antennas_of(scenario.Array(), w)
+    turns = conventional_schedule(antennas.num_tx, w.num_chirps, antennas.num_tx)
+    known = Known.unmodulated(w, turns, antennas, 2)
+    search = searches(antennas, known.wavenumber)[0]
+    held = np.fft.ifftshift(expected_power(truth, known, 120), axes=1)
+    noise = held.max() / 10**2.7
+    cells = [part[:440] for part in np.nonzero(held > 50 * noise)]
+    R = Bucketed.of(truth, known, search, noise, Taper(0, 0, 0)).covariances(*cells)
+    inverse = np.linalg.inv(Bucketed.of(thought, known, search, noise, TAPER).covariances(*cells))
+    u = np.stack(np.meshgrid(search.cosines, search.cosines, indexing="ij"), axis=-1)
+    a = search.steering(u[search.inside])
+    left = []
+    for true, white in zip(R, inverse, strict=True):
+        y = a.conj() @ white
+        kept = ((y @ true) * y.conj()).sum(axis=1).real
+        left.append((kept / (y * a).sum(axis=1).real).max())
+    assert max(left) < 1.7 and np.mean(left) < 1.12
 
 
 @pytest.mark.sionna

@@ -559,7 +559,7 @@ def test_what_a_terminal_expects_of_mirrors():
     copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
     pose = swarm.poses(0.0)["A"]
     parts = copy._two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
-    once = len(copy._field.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)
+    once = len(copy._own.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)
     right, wrong = (
         copy.clutter("A", pose, 0.0, 1.0, Mistakes(mesh_std=std, seed=5)) for std in (0.0, 1e-4)
     )

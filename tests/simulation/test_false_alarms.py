@@ -19,6 +19,9 @@ from isac_rt.simulation.simulate import _Observer, standard_terminal
 SCENES = Path(__file__).parents[2] / "scenes"
 ROWS, BINS = 3, 1
 """About a path that is no clutter, what is found is its own or what its removal left."""
+STRONG_DB = -5.0
+"""Over the noise of a sample: 45 dB over that of a cell and 61 with all channels. What the
+resampling leaves of such a path, 50 dB below it, is found in any Doppler bin of its rows."""
 QUIET, CLUTTER = 0, 1
 PLACES = {
     "street_canyon": ["clutter={model: field}"],
@@ -58,10 +61,14 @@ class Counter:
             return
         w, held, beside, _ = self.seen
         paths = frame.paths[observer.link]
-        alone = paths.kind != PathKind.DIFFUSE
-        for i, j in zip(*self._cells(paths.delay[alone], paths.delay_rate[alone], w), strict=True):
+        alone = paths.select(paths.kind != PathKind.DIFFUSE)
+        level = frame.sent[observer.link.tx].amplitude ** 2 / frame.noise_power(observer.link)
+        strong = observer.link.own & (level * np.abs(alone.gain) ** 2 > 10 ** (STRONG_DB / 10))
+        at = self._cells(alone.delay, alone.delay_rate, w)
+        for i, j, whole in zip(*at, strong, strict=True):
             rows = np.arange(max(i - ROWS, 0), min(i + ROWS + 1, len(held)))
-            beside[np.ix_(rows, (np.arange(-BINS, BINS + 1) + j) % w.num_chirps)] = True
+            bins = np.arange(w.num_chirps) if whole else np.arange(-BINS, BINS + 1)
+            beside[np.ix_(rows, (bins + j) % w.num_chirps)] = True
         kind = np.where(held > bistatic.LEAST, CLUTTER, QUIET)
         kind[beside] = -1
         kind[:2] = -1
@@ -119,15 +126,13 @@ def test_a_passive_terminal_alarms_no_more_often_than_designed(scene, monkeypatc
 @pytest.mark.slow
 @pytest.mark.sionna
 @pytest.mark.parametrize("scene", PLACES)
-def test_an_active_terminal_alarms_as_designed_in_noise(scene, monkeypatch):
-    """Its own echoes; cells beside its mirror images, and the leakage's, are left out. In quiet
-    cells alarms come at 1e-4 a cell and starts at 1e-6; in those with clutter, where the design is
-    not kept (4 to 11 alarms in 10,000, of bright places of walls), no more than 15. Planted bugs:
-    nothing whitened; the thresholds of one direction."""
+def test_an_active_terminal_alarms_no_more_often_than_designed(scene, monkeypatch):
+    """Its own echoes, alarms at 1e-4 a cell; cells beside its mirror images, and the leakage's, are
+    left out. In quiet cells starts come at 1e-6, too; in clutter, where one strong scatterer more
+    or less makes them, at 1e-4 at most. Planted bugs: nothing whitened; the thresholds of one
+    direction; scatterers expected as sparse as the field's (4 to 10 alarms in 10,000 cells)."""
     counter = Counter(monkeypatch)
     rates = counted(counter, scene, Link("AT", "AT"), PLACES[scene])
-    cells, *found = counter.counts[QUIET]
-    for count, rate in zip(found, rates, strict=True):
-        assert no_more_than(count, cells, rate)
-    cells, alarms, _ = counter.counts[CLUTTER]
-    assert no_more_than(alarms, cells, 15e-4)
+    for (cells, *found), kind in zip(counter.counts, (rates, rates[:1] * 2), strict=True):
+        for count, rate in zip(found, kind, strict=True):
+            assert no_more_than(count, cells, rate)

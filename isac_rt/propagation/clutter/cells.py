@@ -10,7 +10,7 @@ scatterer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -27,6 +27,8 @@ ALIKE = 1e-9
 """Edges whose lengths differ by less than this share are equally long; then the first is halved."""
 BOX = 32
 """Places along a flight that are looked at only if the box about them is near enough."""
+FINER = 4.0
+"""How many cells near a flight share the surface of one, where a density asks for it."""
 MOST_CELLS = 8_000_000
 
 
@@ -34,14 +36,18 @@ MOST_CELLS = 8_000_000
 class Density:
     """How finely surfaces are cut: a cell's area is at most max(smallest, per_metre * distance).
 
+    Near a flight it is `FINER` times smaller.
+
     Attributes
     ----------
     per_metre : area over distance to the nearest point of any flight [m]
     smallest : [m^2]
+    near : distance to any flight within which cells are `FINER` times smaller [m]
     """
 
     per_metre: float
     smallest: float
+    near: float = 0.0
 
     @classmethod
     def of(cls, clutter: Clutter) -> Density:
@@ -50,6 +56,11 @@ class Density:
             clutter.cell_area_per_metre_m or area_for(clutter.max_error_db),
             clutter.smallest_cell_m2,
         )
+
+    def finest(self, distance: np.ndarray) -> np.ndarray:
+        """Largest areas of cells at distances from the nearest point of any flight [m]."""
+        area = np.maximum(self.smallest, self.per_metre * distance)
+        return np.where(distance < self.near, area / FINER, area)
 
 
 KNOWN_ERROR_DB, KNOWN_AREA = 0.2, 0.024
@@ -129,8 +140,9 @@ def cut(
     order = np.lexsort(corners.reshape(-1, 9).T[::-1])
     face, corners = face[order], corners[order]
     state = _face_state(corners + city.origin, seed)
-    limits = density.per_metre, density.smallest, MOST_CELLS
-    count, *leaves = _leaves(corners, city.areas[face], places, _boxes(places), *limits)
+    count, *leaves = _leaves(
+        corners, city.areas[face], places, _boxes(places), astuple(density), MOST_CELLS
+    )
     if count > MOST_CELLS:
         raise ValueError(
             f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, "
@@ -156,9 +168,10 @@ def _boxes(places: np.ndarray) -> np.ndarray:
 
 
 @jit
-def _leaves(corners, area, places, boxes, per_metre, smallest, most):
+def _leaves(corners, area, places, boxes, density, most):
     """Cells of faces (F, 3, 3) that are cut no further: how many, then the row of the face, code,
     area and corners, in the order of row and code. Ends early where there are more than `most`."""
+    per_metre, smallest, near = density
     room = max(2 * area.size, 1024)
     rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
     areas, cells = np.empty(room), np.empty((room, 3, 3))
@@ -171,8 +184,11 @@ def _leaves(corners, area, places, boxes, per_metre, smallest, most):
         while first < last:
             if count + last - first > most:
                 return most + 1, rows, codes, areas, cells
-            large = line_areas[first] > smallest
-            if not large or not _near(line[first], line_areas[first] / per_metre, places, boxes):
+            size = line_areas[first]
+            reach = size / per_metre if size > smallest else 0.0
+            if FINER * size > smallest:
+                reach = max(reach, min(FINER * size / per_metre, near))
+            if reach == 0 or not _near(line[first], reach, places, boxes):
                 if count == rows.size:
                     rows, codes = np.append(rows, rows), np.append(codes, codes)
                     areas, cells = np.append(areas, areas), np.concatenate((cells, cells))

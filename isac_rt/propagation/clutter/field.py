@@ -52,7 +52,6 @@ from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState, Ways
-from isac_rt.scenario.environment import Clutter
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
@@ -158,7 +157,7 @@ class ClutterField:
     @classmethod
     def plan(
         cls,
-        clutter: Clutter,
+        density: Density,
         swarm: Swarm,
         city: CityMesh,
         scene: mi.Scene,
@@ -176,7 +175,6 @@ class ClutterField:
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
-        density = Density.of(clutter)
         shadows = Shadows(scene)
         lookouts = _kept_places([flights[name] for name in swarm.transmitters])
 
@@ -235,9 +233,7 @@ class ClutterField:
         """The cells of each link, merged where noise covers them (`merging`); `poses` at the
         instants of `floor`, local."""
         cells, sight = self.cells, self.sight
-        finest = np.maximum(
-            density.smallest, density.per_metre * cKDTree(places).query(cells.points)[0]
-        )
+        finest = density.finest(cKDTree(places).query(cells.points)[0])
         error = 10 ** (error_for(density.per_metre) / 10) - 1
         seen = {
             name: sight.from_places(np.array([pose.position for pose in of]))

@@ -473,6 +473,9 @@ def _covariances(rows, bins, scatterers, tables, num_bins, parts):
                         re[k], im[k] = steer[s, k].real * root, steer[s, k].imag * root
                     for k in range(size):
                         a, b = re[k], im[k]
-                        for m in range(size):
+                        for m in range(k + 1):
                             parts[0, c, k, m] += a * re[m] + b * im[m]
                             parts[1, c, k, m] += b * re[m] - a * im[m]
+        for k in range(size):
+            for m in range(k):
+                parts[0, c, m, k], parts[1, c, m, k] = parts[0, c, k, m], -parts[1, c, k, m]
