@@ -48,7 +48,7 @@ class Mistakes:
     seed: int = 1
 
 
-NEAR = 60.0
+NEAR = 40.0
 """Distance [m] from an active terminal's flight within which what it expects of its own link is cut
 finer. Its scatterers are a draw of a wall's directions, the true ones are another: what is 10 to 25
 dB over the noise is whitened only where the draw is dense."""
