@@ -32,7 +32,7 @@ def paper():
 
 
 def test_the_papers_swarm_acquires_decodes_and_tracks(paper):
-    """Bounds of the issue for the whole flight (0.002 m, 0.05 m/s, 0.02 degrees at PT1 after the
+    """Bounds asked for over the whole flight (0.002 m, 0.05 m/s, 0.02 degrees at PT1 after the
     filter; no symbol errors), here on its first frames after acquisition. Planted bug: DPSK removal
     with the index of the symbol instead of the transition."""
     block = paper.summary["terminals"]["PT1"]
