@@ -95,8 +95,8 @@ def _leave(status: list[int]) -> None:
     """End the process, once all else that waits for its end is done: Python would look through all
     that was loaded, and take it apart (1 s)."""
     with suppress(OSError, ValueError):  # nobody reads what it says: as Python ends then
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for said in filter(None, (sys.stdout, sys.stderr)):  # None: closed before Python began
+            said.flush()
         if status:
             os._exit(*status)
 

@@ -131,8 +131,11 @@ class _Implementation(caching.CompileResultCacheImpl):
         """The compiled function as it was kept, but for its bitcode, which only functions that are
         compiled anew and call it ask for: reading it takes three quarters of the time. In its place
         stands a module that names what the machine code defines."""
-        (name, kind, (code, bitcode)), described, *rest = payload
-        defined = described.llvm_func_name, described.llvm_cpython_wrapper_name
+        try:
+            (name, kind, (code, bitcode)), described, *rest = payload
+            defined = described.llvm_func_name, described.llvm_cpython_wrapper_name
+        except (AttributeError, TypeError, ValueError):  # as a later numba may keep it
+            return super().rebuild(target_context, payload)
         text = "".join(f'define void @"{symbol}"() {{ ret void }}\n' for symbol in defined)
         named = binding.parse_assembly(text).as_bitcode()
         kept = (name, kind, (code, named)), described, *rest

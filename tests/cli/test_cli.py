@@ -79,6 +79,21 @@ def test_the_end_looks_through_nothing():
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("given", "closed", "status"),
+    [("--version", ">&-", 0), ("--version", "2>&-", 0), ("none", ">&-", 2)],
+)
+def test_it_ends_where_nobody_listens(given, closed, status):
+    """With an output that was closed before it began, which Python has as None. Planted bug: its
+    flush asked for (a traceback at the end, or Python's own end)."""
+    command = "import sys; from isac_rt.cli.cli import main; sys.exit(main())"
+    whole = f'exec "$0" -c "{command}" "$@" {closed}'
+    done = subprocess.run(
+        ["sh", "-c", whole, sys.executable, given], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == status and "Traceback" not in done.stderr
+
+
 @pytest.fixture
 def simulation(monkeypatch):
     """A stand-in for the simulation: it reports progress and hands back made-up results."""

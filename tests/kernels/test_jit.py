@@ -83,6 +83,19 @@ def test_a_changed_line_runs(copy, file, old, new, answer):
     assert run(copy) == ["21001", "1"]
 
 
+def test_a_layout_that_is_not_known_is_loaded_whole(copy):
+    """As a later numba may keep machine code: here in a box. Planted bug: it is taken apart all the
+    same (ValueError)."""
+    boxed = """
+from numba.core.caching import CompileResultCacheImpl as kept
+reduce, rebuild = kept.reduce, kept.rebuild
+kept.reduce = lambda self, result: [reduce(self, result)]
+kept.rebuild = lambda self, target, box: rebuild(self, target, *box)
+"""
+    assert run(copy, boxed + RUN) == ["21001", "0"]
+    assert run(copy, boxed + RUN) == ["21001", "1"]
+
+
 @pytest.mark.parametrize(
     ("module", "file"),
     [
