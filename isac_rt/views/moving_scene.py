@@ -76,17 +76,21 @@ def points_of(points: np.ndarray) -> dict[str, list[float | None]]:
 def city_traces(city: CityMesh, low: np.ndarray, high: np.ndarray) -> list[Trace]:
     """The faces that reach into a rectangle from `low` to `high` (2,) [m], lighter the higher, and
     the edges at which they meet."""
+    import trimesh
+
     if not city.num_faces:
         return []
     corners = city.corners + city.origin
     flat = corners[..., :2]
     near = ((flat.max(axis=1) > low) & (flat.min(axis=1) < high)).all(axis=1)
     near = near if near.any() else np.ones_like(near)
-    vertices, number = np.unique(corners[near].reshape(-1, 3).round(6), axis=0, return_inverse=True)
-    faces = number.reshape(-1, 3)
-    points = points_of(vertices)
-    corner = dict(zip("ijk", faces.T.tolist(), strict=True))
-    edges = vertices[_drawn_edges(faces, city.normals[near])]
+    mesh = trimesh.Trimesh(corners[near].reshape(-1, 3), np.arange(3 * near.sum()).reshape(-1, 3))
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    creases = mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE]
+    open_edges = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    edges = mesh.vertices[np.vstack([creases, open_edges])]
+    corner = dict(zip("ijk", mesh.faces.T.tolist(), strict=True))
+    points = points_of(mesh.vertices)
     shading = {
         "intensity": points["z"],
         "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
@@ -102,17 +106,6 @@ def city_traces(city: CityMesh, low: np.ndarray, high: np.ndarray) -> list[Trace
         | shading,
         _line(lines_of(list(edges)), "#5F666D", 1.5, "edges"),
     ]
-
-
-def _drawn_edges(faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(E, 2) vertices of the edges that one face has (F, 3), and of those at which two meet at more
-    than `CREASE`."""
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
-    edges, of, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    by_edge = np.argsort(of.ravel(), kind="stable") // 3  # faces
-    first = (np.cumsum(count) - count)[count == 2]
-    cosine = np.einsum("ei,ei->e", normals[by_edge[first]], normals[by_edge[first + 1]])
-    return np.concatenate([edges[count == 2][cosine < np.cos(CREASE)], edges[count == 1]])
 
 
 def _line(where: Mapping[str, Any], colour: str, width: float, name: str, **more: Any) -> Trace:

@@ -22,7 +22,6 @@ PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
 FACES_KEPT = 3000
 """The planes of fewer faces are found in less time than it takes to read them."""
-_TINY = np.finfo(float).tiny  # in place of the length of an edge or a normal that has none
 MAX_FACES = 10_000_000
 MAX_COORDINATE = 1e8
 """Farther out float64 places no corner to a wavelength's phase, and no map has it. [m]"""
@@ -297,17 +296,10 @@ def distance_to_triangles(
     distance : (F,) float64
         [m]
     """
-    a = corners - point
-    edges = np.roll(a, -1, axis=1) - a
-    lengths = np.maximum(np.einsum("fei,fei->fe", edges, edges), _TINY)
-    along = np.clip(-np.einsum("fei,fei->fe", a, edges) / lengths, 0.0, 1.0)
-    beside = np.linalg.norm(a + along[..., None] * edges, axis=-1).min(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    size = np.linalg.norm(normal, axis=1)
-    inward = np.einsum("fei,fi->fe", np.cross(a, edges), normal)
-    over = (inward >= 0).all(axis=1) & (size > 0)
-    height = np.abs(np.einsum("fi,fi->f", a[:, 0], normal)) / np.maximum(size, _TINY)
-    return np.where(over, height, beside)
+    from trimesh.triangles import closest_point
+
+    nearest = closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
+    return np.linalg.norm(nearest - point, axis=1)
 
 
 def gathered(surfaces: Iterable[Surface], name: str) -> list[Surface]:
