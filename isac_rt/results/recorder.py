@@ -218,8 +218,9 @@ class Recorder:
             if len(self)
             else 0.0
         )
-        symbols = {link: self._symbols(link) for link in timetable.all_links}
-        seen = {link: self._sensing(link) for link in timetable.all_links}
+        heard = {link: self._of(link) for link in timetable.all_links}
+        symbols = {link: _symbols(link, rows) for link, rows in heard.items()}
+        seen = {link: self._sensing(link, rows) for link, rows in heard.items()}
 
         def block(
             role: str | list[str], links: list[Link], symbols: SymbolCount | None
@@ -227,7 +228,7 @@ class Recorder:
             sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
             others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
             found = summary_block(role, sensing, symbols, duration)
-            waits = [n for link in links for n in self._of(link)["latency_frames"].tolist()]
+            waits = [n for link in links for n in heard[link]["latency_frames"].tolist()]
             return found | {"latency_frames": latencies(symbols, waits), "targets": others}
 
         terminals = {}
@@ -255,12 +256,11 @@ class Recorder:
         """The rows of a link's receiver."""
         return self.tables["observer"][self.timetable.labels[link]].whole()
 
-    def _sensing(self, link: Link) -> Sensing:
-        """What a link's receiver saw."""
+    def _sensing(self, link: Link, heard: np.ndarray) -> Sensing:
+        """What a link's receiver saw, of its rows."""
         label = self.timetable.labels[link]
-        heard, tracks = (self.tables[kind][label] for kind in ("observer", "track"))
-        frame = np.searchsorted(heard.frames(), tracks.frames())
-        return Sensing.of(heard.whole(), tracks.whole(), frame)
+        frames, tracks = self.tables["observer"][label].frames(), self.tables["track"][label]
+        return Sensing.of(heard, tracks.whole(), np.searchsorted(frames, tracks.frames()))
 
     def _sparsity(self, link: Link) -> dict[str, int] | None:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent
@@ -272,11 +272,11 @@ class Recorder:
         dense, fell_back = int((judged == 0).sum()), int(rows["fell_back"].sum())
         return {"judged": len(judged), "dense": dense, "fell_back": fell_back}
 
-    def _symbols(self, link: Link) -> SymbolCount | None:
-        """What was sent over a link and became of it; None for a terminal's own echoes."""
-        if link.own:
-            return None
-        return SymbolCount(*self._of(link)["symbols"].sum(axis=0).tolist())
+
+def _symbols(link: Link, heard: np.ndarray) -> SymbolCount | None:
+    """What was sent over a link and became of it, of its receiver's rows; None for a terminal's own
+    echoes."""
+    return None if link.own else SymbolCount(*heard["symbols"].sum(axis=0).tolist())
 
 
 def kept_of_paths(use: Columns) -> dict[str, Any]:
