@@ -110,7 +110,7 @@ def _operators(known: Known) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 
 class Levels(NamedTuple):
     """A map and its background (rows, P), and what OMP recovers of the rows with a cell above the
-    threshold, where it was asked (`isac_rt.receive.omp.omp_power`)."""
+    threshold, where it was asked (`isac_rt.receive.omp.advise`)."""
 
     power: np.ndarray
     background: np.ndarray

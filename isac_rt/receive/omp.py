@@ -65,8 +65,15 @@ def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, known: Kn
 def advise(
     spectra: np.ndarray, rows: np.ndarray, noise: float, known: Known
 ) -> tuple[bool, np.ndarray]:
-    """`sparse_enough`, and `omp_power` with `SPARSITY` atoms, by one search where it has as many as
-    the sampling recovers dependably."""
+    """`sparse_enough`, and what `SPARSITY` atoms have of the rows' power (the paper's map), by one
+    search where these are as many as the sampling recovers dependably.
+
+    Returns
+    -------
+    sparse : of `sparse_enough`
+    recovered : (len(rows), P) float32, mean over groups, antennas and receivers, Doppler centred,
+        in units of the squared correlation of one group's antenna
+    """
     w = known.waveform
     if not len(rows):
         return True, np.zeros((0, w.num_chirps), np.float32)
@@ -88,7 +95,8 @@ def advise(
     kept = 1 - recovery_limit(size, w.num_chirps) / size
     share = (left / np.maximum(total, 1e-300) * power - kept * noise) / above
     sparse = bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
-    return sparse, _mean_power(recovered, spectra, known)
+    recovered /= len(spectra) * w.num_tx * spectra.shape[1]
+    return sparse, np.fft.fftshift(recovered, axes=-1).astype(np.float32)
 
 
 def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> np.ndarray:
@@ -203,29 +211,6 @@ def _fit(first, chosen, gram_re, gram_im, lower, forward, x):
         for j in range(i + 1, k + 1):
             value -= lower[j, i].conjugate() * x[j]
         x[i] = value / lower[i, i].real
-
-
-def omp_power(spectra: np.ndarray, rows: np.ndarray, known: Known, sparsity: int) -> np.ndarray:
-    """Accumulated OMP power on some range rows (the paper's map): mean over groups, antennas and
-    receivers.
-
-    Returns
-    -------
-    power : (len(rows), P) float32, Doppler centred, in units of the squared correlation of one
-        group's antenna
-    """
-    power = np.zeros((len(rows), known.waveform.num_chirps))
-    for part, chosen in _sparse_samples(spectra, rows, known):
-        vectors = part.reshape(-1, chosen.size)
-        pursued(vectors, chosen, power.shape[1], sparsity).add_power(power)
-    return _mean_power(power, spectra, known)
-
-
-def _mean_power(power: np.ndarray, spectra: np.ndarray, known: Known) -> np.ndarray:
-    """`omp_power` of what was added up over groups, antennas and receivers."""
-    num_groups, num_rx = spectra.shape[:2]
-    mean = power / (num_groups * known.waveform.num_tx * num_rx)
-    return np.fft.fftshift(mean, axes=-1).astype(np.float32)
 
 
 class Omp(LatinUnion):
