@@ -59,7 +59,8 @@ def test_sight_over_an_edge_is_fresnels_integral():
         nu, expected = exact(pose.position, cells.points)
         off = np.abs(share - expected)
         # crossed within the run: the sight of others does not change, and stays as the rays say
-        crossed = np.unique(np.concatenate([c.index for c in model.field.sight._crossed.values()]))
+        stretches = model.field.sight._stretches.values()
+        crossed = np.unique(np.concatenate([c.index for s in stretches for c in s.crossed]))
         inner = np.zeros(len(cells), bool)
         inner[crossed] = True
         edge = (np.abs(nu) < 2) & inner

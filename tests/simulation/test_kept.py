@@ -13,6 +13,8 @@ import pytest
 from isac_rt import load, runtime
 from isac_rt.propagation import raytrace
 from isac_rt.propagation.clutter import field as clutter_field
+from isac_rt.propagation.clutter import sight
+from isac_rt.propagation.clutter.field import in_local
 from isac_rt.propagation.raytrace import RayTracer
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import KEPT, pack
@@ -63,14 +65,20 @@ def changed(tree: dict, change: dict) -> dict:
 
 
 def prepared(folder: Path, change: dict) -> bytes:
-    """City, planes and scatterers of a set-up, as bytes."""
+    """City, planes and scatterers of a set-up, and how they are seen in a frame, as bytes."""
     (folder / "scene.yaml").write_text(json.dumps(changed(TREE, change)))
     area._near_city.cache_clear()
     area._loaded_city.cache_clear()
     setup = prepare(load(folder / "scene.yaml"))
     field = setup.propagation.field
     cells = [vars(field.of(link).cells) for link in [*field.merged, ("no", "link")]]
-    tree, arrays = pack([setup.city.plain(), setup.city.plane_of_face, cells])
+    time, at = setup.timetable.epoch(5), setup.swarm.poses(setup.timetable.epoch(5))
+    shares = [
+        field.of(link).sight.share(name, in_local(at[name], setup.city.origin), time)
+        for link in field.merged
+        for name in link
+    ]
+    tree, arrays = pack([setup.city.plain(), setup.city.plane_of_face, cells, shares])
     return tree.encode() + arrays
 
 
@@ -86,7 +94,8 @@ def place(tmp_path, monkeypatch):
 
 def test_what_is_kept_is_what_would_be_prepared(place, monkeypatch):
     """Each change of a scenario, after the unchanged one was kept: the bytes are those of a set-up
-    without a store. Planted bugs: a key without the seed, the materials, the poses or the noise."""
+    without a store. Planted bugs: a key without the seed, the materials, the poses or the noise;
+    sight kept by its knots alone, without its points."""
     monkeypatch.setenv(KEPT, str(place / "kept"))
     first = prepared(place, {})
     found = {name: prepared(place, change) for name, change in CHANGES.items()}
@@ -98,14 +107,14 @@ def test_what_is_kept_is_what_would_be_prepared(place, monkeypatch):
 
 
 def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, monkeypatch):
-    """Nothing is cut nor merged again; one changed digit of the city's file, and all is made anew.
-    Planted bug: the file's name and size in the key instead of its bytes."""
+    """Nothing is cut, merged nor asked of rays again; one changed digit of the city's file, and all
+    is made anew. Planted bug: the file's name and size in the key instead of its bytes."""
     first = prepared(place, {})
     calls = []
-    for name in ("cut", "merge"):
-        old = getattr(clutter_field, name)
+    for room, name in ((clutter_field, "cut"), (clutter_field, "merge"), (sight, "crossings")):
+        old = getattr(room, name)
         monkeypatch.setattr(
-            clutter_field, name, lambda *a, old=old, name=name: calls.append(name) or old(*a)
+            room, name, lambda *a, old=old, name=name: calls.append(name) or old(*a)
         )
     assert prepared(place, {}) == first
     assert calls == []
@@ -115,7 +124,7 @@ def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, mo
     digit = next(i for i in range(at, len(text)) if text[i].isdigit() and text[i] not in "09")
     file.write_text(text[:digit] + str(int(text[digit]) + 1) + text[digit + 1 :])
     assert prepared(place, {}) != first
-    assert {*calls} == {"cut", "merge"}
+    assert {*calls} == {"cut", "merge", "crossings"}
 
 
 def test_a_bent_file_is_made_again(place):
@@ -123,7 +132,7 @@ def test_a_bent_file_is_made_again(place):
     the checksum."""
     first = prepared(place, {})
     files = sorted((place / "kept").glob("*/*.data"))
-    assert len(files) == 4
+    assert len(files) == 7
     rng = np.random.default_rng(2)
     for file in files:
         good = file.read_bytes()

@@ -186,7 +186,7 @@ class ClutterField:
         depends_on = [city.plain(), places, lookouts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
-        sight = Sight(shadows, flights, facets_of(cells, city), wavelength)
+        sight = Sight(shadows, flights, facets_of(cells, city), wavelength, city)
         field = cls(city, cells, sight, wavelength, had["of"])
         if floor is None:
             return field
@@ -221,7 +221,8 @@ class ClutterField:
         """Cells that a link alone sees."""
         flights = {name: self.sight.flights[name] for name in link}
         facets = facets_of(cells, self._city)
-        return Scatterers(cells, Sight(self.sight.shadows, flights, facets, self._wavelength))
+        sight = Sight(self.sight.shadows, flights, facets, self._wavelength, self._city)
+        return Scatterers(cells, sight)
 
     def _covered(
         self,

@@ -10,13 +10,17 @@ frames before it were computed or not. Import only after `isac_rt.runtime.activa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import mitsuba as mi
 import numpy as np
 from scipy.interpolate import BSpline
 
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, Triangles, crossings, penumbra
 from isac_rt.propagation.legs.rays import Shadows
+from isac_rt.storage import checksum, kept, pack
+from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory
 
 KNOT_SPACING = 0.5
@@ -28,6 +32,8 @@ REACH = 3
 goes."""
 AROUND = 8
 """Knots on each side whose crossings are known."""
+TOGETHER = 8
+"""Knots that are tested, and kept for later runs, at once."""
 WIDEST = (AROUND - 1) / PENUMBRA
 """Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is
 forgotten."""
@@ -90,6 +96,14 @@ class Flight:
         return out
 
 
+class _Stretch(NamedTuple):
+    """`TOGETHER` knots of a flight and the next: bits (TOGETHER + 1, N / 8) of what each sees, and
+    what crosses an edge between two of them."""
+
+    seen: np.ndarray
+    crossed: list[Crossings]
+
+
 class Sight:
     """How far N points are in sight of each terminal at any time of a run: 0, 1, and the modulus of
     the knife edge's factor in between.
@@ -100,23 +114,32 @@ class Sight:
     flights : by terminal
     facets : the N points
     wavelength : [m]
+    city : whose faces cast the shadows
     """
 
     def __init__(
-        self, shadows: Shadows, flights: dict[str, Flight], facets: Facets, wavelength: float
+        self,
+        shadows: Shadows,
+        flights: dict[str, Flight],
+        facets: Facets,
+        wavelength: float,
+        city: CityMesh,
     ) -> None:
         self.shadows, self.flights = shadows, flights
         self._facets, self._wavelength = facets, wavelength
-        self._seen: dict[tuple[str, int], np.ndarray] = {}
-        self._crossed: dict[tuple[str, int], Crossings] = {}
+        self._depends_on = [city.vertices, city.faces, [*facets], wavelength, mi.variant()]
+        self._content = ""
+        self._stretches: dict[tuple[str, int], _Stretch] = {}
         self._nearby: dict[str, _Nearby] = {}
         self._triangles: Triangles | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory of the tests and crossings kept."""
-        kept = [vars(c).values() for c in (*self._crossed.values(), *self._nearby.values())]
-        return sum(bits.nbytes for bits in self._seen.values()) + sum(
+        stretches = self._stretches.values()
+        kept = [vars(c).values() for c in self._nearby.values()]
+        kept += [vars(c).values() for stretch in stretches for c in stretch.crossed]
+        return sum(stretch.seen.nbytes for stretch in stretches) + sum(
             a.nbytes for c in kept for a in c if isinstance(a, np.ndarray)
         )
 
@@ -124,13 +147,14 @@ class Sight:
         """(N,) float32 for a terminal at a pose, local coordinates."""
         flight = self.flights[name]
         if not flight.holds(pose, time):
-            return self._test(pose.position).astype(np.float32)
+            return self.from_places(pose.position[None])[0].astype(np.float32)
         q = flight.number(time)
         knot = int(np.clip(np.rint(q), 0, len(flight.knots) - 1))
         if name not in self._nearby or self._nearby[name].knot != knot:
             self._nearby[name] = self._near(name, knot)
         near = self._nearby[name]
-        out = self._knot(name, knot).astype(np.float32)
+        bits = self._stretch(name, knot // TOGETHER).seen[knot % TOGETHER]
+        out = np.unpackbits(bits, count=len(self._facets.points)).astype(np.float32)
         if near.row.size:
             step = np.where(near.gained, 1, -1) * (
                 penumbra((q - near.where) / near.width) - (near.where < knot)
@@ -155,13 +179,10 @@ class Sight:
         """The crossings that matter about a knot, as one list."""
         flight = self.flights[name]
         spans = range(max(knot - AROUND, 0), min(knot + AROUND, len(flight.knots) - 1))
-        parts = [self._crossings(name, number) for number in spans]
-        for key in [k for k in self._crossed if k[0] == name and k[1] not in spans]:
-            del self._crossed[key]
-        for key in [
-            k for k in self._seen if k[0] == name and not knot - AROUND <= k[1] <= knot + AROUND
-        ]:
-            del self._seen[key]
+        parts = [self._stretch(name, n // TOGETHER).crossed[n % TOGETHER] for n in spans]
+        reach = range((knot - AROUND) // TOGETHER, (knot + AROUND) // TOGETHER + 1)
+        for key in [k for k in self._stretches if k[0] == name and k[1] not in reach]:
+            del self._stretches[key]
         if not parts:
             types = np.int32, np.int32, float, float, bool
             return _Nearby(knot, *(np.zeros(0, dtype) for dtype in types))
@@ -175,25 +196,28 @@ class Sight:
             knot, index, row.ravel().astype(np.int32), where, np.minimum(width, WIDEST), gained
         )
 
-    def _crossings(self, name: str, number: int) -> Crossings:
-        """What crosses an edge between a knot and the next."""
-        if (name, number) not in self._crossed:
-            seen = np.stack([self._knot(name, number), self._knot(name, number + 1)])
-            knots = self.flights[name].knots[number : number + 2]
-            if self._triangles is None:
-                self._triangles = Triangles(self.shadows.scene)
-            self._crossed[name, number] = crossings(
-                self._triangles, knots, seen, self._facets, self._wavelength
-            )
-        return self._crossed[name, number]
+    def _stretch(self, name: str, number: int) -> _Stretch:
+        """What is seen, and crosses edges, along a stretch of a flight."""
+        if (name, number) not in self._stretches:
+            knots = self.flights[name].knots[TOGETHER * number : TOGETHER * (number + 1) + 1]
 
-    def _knot(self, name: str, knot: int) -> np.ndarray:
-        if (name, knot) not in self._seen:
-            self._seen[name, knot] = np.packbits(self._test(self.flights[name].knots[knot]))
-        return np.unpackbits(self._seen[name, knot], count=len(self._facets.points))
+            def found() -> dict[str, Any]:
+                seen = self.from_places(knots)
+                pairs = [slice(k, k + 2) for k in range(len(knots) - 1)]
+                crossed = [self._crossings(knots[pair], seen[pair]) for pair in pairs]
+                return {"seen": np.packbits(seen, axis=1), "crossed": [vars(c) for c in crossed]}
 
-    def _test(self, place: np.ndarray) -> np.ndarray:
-        return self.shadows.sees(place, self._facets.points, self._facets.normals)
+            self._content = self._content or checksum(*pack(self._depends_on))
+            of = kept("sight", [self._content, knots], found)
+            crossed = [Crossings(**c) for c in of["crossed"]]
+            self._stretches[name, number] = _Stretch(of["seen"], crossed)
+        return self._stretches[name, number]
+
+    def _crossings(self, knots: np.ndarray, seen: np.ndarray) -> Crossings:
+        """What crosses an edge between two knots (2, 3), seen (2, N) from either."""
+        if self._triangles is None:
+            self._triangles = Triangles(self.shadows.scene)
+        return crossings(self._triangles, knots, seen, self._facets, self._wavelength)
 
 
 @dataclass(frozen=True)
