@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -117,6 +119,11 @@ class IFCube:
         rms = float(np.sqrt(np.mean(np.abs(self.samples) ** 2)))
         shape = f"{groups} groups x {antennas} antennas x {chirps} chirps x {size} samples"
         return f"<IFCube {shape} at {self.start_time:.4f} s, RMS {rms:.2e} sqrt(W)>"
+
+    @cached_property
+    def made(self) -> dict[str, Any]:
+        """What a receiver has made of the samples, for the next one that needs the same."""
+        return {}
 
     def of_groups(self, groups: Sequence[int]) -> IFCube:
         """What a receiver of these groups alone has."""

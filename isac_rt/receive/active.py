@@ -14,7 +14,7 @@ from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
-from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.types import ExpectedClutter, Gates, Reception
 from isac_rt.scenario.receivers import Receivers
 
@@ -47,10 +47,11 @@ class ActiveReceiver:
         """See `receive_active`; `sought` is where UAVs are expected."""
         known = Known.of(cube, payload, self.antennas, 2)
         if isinstance(cube, IFCube):
-            spectra = clean_spectrum(cube, known)
+            spectra, known = cleaned(cube, known)
         else:
-            spectra = cube.spectra if self.clutter_filter is None else cube.spectra.copy()
+            spectra = cube.spectra
         if self.clutter_filter is not None:
+            spectra = spectra.copy()
             self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
         spectra, known = known.decoded(spectra)
         detector = self.detector

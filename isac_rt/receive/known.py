@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import overload
@@ -70,6 +72,24 @@ class Known:
         known = Known.unmodulated(w.decoded, decoded_schedule(w), self.antennas, self.passes)
         known = replace(known, unambiguous_share=unambiguous_share(w))
         return spectra * codes.conj().astype(np.complex64)[:, None, None], known
+
+    def alike(self, other: Known) -> bool:
+        """Whether both know the same of one frame."""
+        same = self.antennas == other.antennas and self.passes == other.passes
+        same = same and np.array_equal(self.delay_symbols, other.delay_symbols)
+        return same and np.array_equal(self.phases, other.phases)
+
+    @cached_property
+    def _maps(self) -> list[tuple[weakref.ref[np.ndarray], np.ndarray]]:
+        return []
+
+    def mapped(self, spectra: np.ndarray, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The power map of spectra, made once for all receivers that look at them."""
+        for of, power in self._maps:
+            if of() is spectra:
+                return power
+        self._maps.append((weakref.ref(spectra), make()))
+        return self._maps[-1][1]
 
     @cached_property
     def channels(self) -> int:

@@ -132,7 +132,7 @@ class LatinUnion:
 
     def power(self, spectra: np.ndarray, known: Known) -> np.ndarray:
         """(rows, P) power, Doppler centred."""
-        return power_map(spectra, known)
+        return known.mapped(spectra, lambda: power_map(spectra, known))
 
     def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
         """Which of the cells `above` the threshold may be peaks."""

@@ -17,7 +17,7 @@ from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.joint.tones import JointPath
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
-from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.symbols.blind import Peaks, find_peaks, read_peaks
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.symbols.powers import (
@@ -100,9 +100,9 @@ class PassiveReceiver:
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
         if not modulated:
-            known = Known.unmodulated(w, cube.schedule, self.antennas, 1)
+            pilot = Known.unmodulated(w, cube.schedule, self.antennas, 1)
+            spectra, known = cleaned(cube, pilot)
             moments = Moments(cube.samples, known)
-            spectra = clean_spectrum(cube, known)
             found = self.detector.sense(spectra, known, clutter)
             detections, reference = self._earliest(found, known)
             found = replace(found, looks=self._look(spectra, known, detections, reference))
@@ -115,9 +115,9 @@ class PassiveReceiver:
             power = np.zeros((w.num_range_cells, w.num_chirps))
             picture = make_maps(power, cube, self.settings, 1) if maps else None
             return Reception.undecoded(w, no_detections(), picture)
-        known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        spectra = clean_spectrum(cube, known)
         found, detections, reference = self._sense_data(spectra, moments, prediction, clutter)
         phases = None
         if self.refiner is not None and reference is not None:
@@ -125,7 +125,7 @@ class PassiveReceiver:
         if phases is not None:
             turn = phases.conj() * known.phases
             if np.abs(turn - 1).max() > SAME_PHASE:
-                spectra *= turn.astype(np.complex64)[:, None, None]
+                spectra = spectra * turn.astype(np.complex64)[:, None, None]
                 moments = moments.read_by(replace(known, phases=phases))
                 found, detections, reference = self._sense_data(
                     spectra, moments, prediction, clutter
@@ -159,9 +159,10 @@ class PassiveReceiver:
         symbols = self.reader.read(cube, path, self.antennas, profile)
         if not self._believed(symbols, w):
             return Reception.undecoded(w, no_detections())
-        known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        found = self.detector.sense(clean_spectrum(cube, known), known, clutter)
+        found = self.detector.sense(spectra, known, clutter)
         detections, reference = self._alone(moments, *self._earliest(found, known))
         spread = velocity_spread(symbols, self.reader.order, path, w)
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))

@@ -165,8 +165,8 @@ def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken
     """Paths `STRONG_DB` over the noise and more; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
     maps = channel_maps(left, known)
-    power = accumulate(maps)
-    whole = power.copy()
+    whole = known.mapped(spectra, lambda: accumulate(maps))
+    power = whole.copy()
     noise = max(float(np.median(power)), 1e-30)
     taken, level = np.zeros(power.shape), np.full(power.shape, noise)
     found: list[_Path] = []

@@ -100,3 +100,12 @@ def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> n
         turn = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
         transform(samples[m], factor, np.arange(num_rows), out[m], turn=turn)
     return out
+
+
+def cleaned(cube: IFCube, known: Known) -> tuple[np.ndarray, Known]:
+    """`clean_spectrum`, made once for all receivers of a cube that read the same data, and what the
+    first of them knew. Whoever changes the spectra changes a copy."""
+    kept = cube.made.get("cleaned")
+    if kept is None or not kept[1].alike(known):
+        kept = cube.made["cleaned"] = clean_spectrum(cube, known), known
+    return kept
