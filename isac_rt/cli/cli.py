@@ -31,6 +31,10 @@ COLLECT = 20_000
 """Objects made until garbage is looked for among them: what commands import stays, and looking
 through it after each 700 takes over a second. Older ones are looked through as often as ever: what
 runs leave, figures above all, would pile up in a command of many runs."""
+LINEAR_ALGEBRA = "OPENBLAS_NUM_THREADS", "1"
+"""Frames work in threads of their own. Those of numpy's library have nothing to do, but look for
+work at first, both of the two copies that come with numpy and scipy: 0.2 s, more on a busy machine;
+they are begun when numpy is loaded, after this is set."""
 COMMANDS: dict[Callable[..., None], str] = {
     simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
     simulation.demo: "demo --out first_look",
@@ -114,6 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str]) -> int:
     gc.set_threshold(COLLECT)
+    os.environ.setdefault(*LINEAR_ALGEBRA)
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
     try:
         status = app(

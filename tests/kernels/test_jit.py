@@ -83,6 +83,25 @@ def test_a_changed_line_runs(copy, file, old, new, answer):
     assert run(copy) == ["21001", "1"]
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        "{'a': x, 'b': 2}['a'] + 1",
+        "np.linalg.solve(np.eye(3), np.full(3, 1.0 * x)).sum() + np.random.rand()",
+        "sorted([str(n) for n in range(x, x + 40)])[0]",
+        "len(set([x, 3, x + 1])) + math.erf(x) + abs((x + 2j) ** 0.5)",
+    ],
+)
+def test_machine_code_finds_what_it_calls(copy, body):
+    """What numba brings along: hashes of words, linear algebra, random numbers, lists, sets. A name
+    that is not there ends the process. Planted bug: the memory of arrays is not there."""
+    inner = copy / "isac_rt/kernels/inner.py"
+    inner.write_text("import math\nimport numpy as np\n" + INNER.replace("x + 1000", body))
+    code = "from isac_rt.kernels.inner import inner; inner(3); print(len(inner.stats.cache_hits))"
+    assert run(copy, code) == ["0"]
+    assert run(copy, code) == ["1"]
+
+
 def test_a_layout_that_is_not_known_is_loaded_whole(copy):
     """As a later numba may keep machine code: here in a box. Planted bug: it is taken apart all the
     same (ValueError)."""
