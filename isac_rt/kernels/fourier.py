@@ -16,6 +16,8 @@ from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import load, splat, store
 
 ROW = 32  # float32 numbers in a row
+NEAR = 256
+"""Rows that stay in the first-level cache (32 KB)."""
 _C3 = np.float32(np.cos(2 * np.pi / 3))
 _S3 = np.float32(np.sin(2 * np.pi / 3))
 _C5, _D5 = np.float32(np.cos(2 * np.pi / 5)), np.float32(np.cos(4 * np.pi / 5))
@@ -124,25 +126,42 @@ def _five(table, at, step, twiddles, t):
 
 
 @jit
+def _stage(table, first, length, radix, twiddles, t):
+    """One stage of the transform of `length` rows from float `first`."""
+    rows = length // radix
+    step = rows * ROW
+    for at in range(first, first + step, ROW):
+        if radix == 4:
+            _four(table, at, step, twiddles, t)
+        elif radix == 2:
+            _two(table, at, step, twiddles, t)
+        elif radix == 5:
+            _five(table, at, step, twiddles, t)
+        else:
+            _three(table, at, step, twiddles, t)
+        t += 2 * (radix - 1)
+
+
+@jit
 def transform(table, first, size, radices, twiddles):
     """sum_g x_g exp(+j 2 pi g k/size) of the rows from float `first` of the flat `table`, in place,
-    in the order of `plan`."""
-    length, t = size, 0
-    for r in radices:
-        rows = length // r
-        step = rows * ROW
-        for block in range(size // length):
-            at, u = first + block * length * ROW, t
-            for _ in range(rows):
-                if r == 4:
-                    _four(table, at, step, twiddles, u)
-                elif r == 2:
-                    _two(table, at, step, twiddles, u)
-                elif r == 5:
-                    _five(table, at, step, twiddles, u)
-                else:
-                    _three(table, at, step, twiddles, u)
-                at += ROW
-                u += 2 * (r - 1)
-        t += 2 * (r - 1) * rows
-        length = rows
+    in the order of `plan`.
+
+    Once a stage has left parts of at most `NEAR` rows, each part is finished before the next is
+    begun: all its other stages find it in the first-level cache.
+    """
+    length, t, done = size, 0, 0
+    while done < radices.size and length > NEAR:
+        radix = radices[done]
+        for part in range(first, first + size * ROW, length * ROW):
+            _stage(table, part, length, radix, twiddles, t)
+        length //= radix
+        t += 2 * (radix - 1) * length
+        done += 1
+    for near in range(first, first + size * ROW, length * ROW):
+        short, u = length, t
+        for radix in radices[done:]:
+            for part in range(near, near + length * ROW, short * ROW):
+                _stage(table, part, short, radix, twiddles, u)
+            short //= radix
+            u += 2 * (radix - 1) * short

@@ -23,7 +23,7 @@ from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import caching
+from numba.core import caching, codegen
 from numba.core.runtime.nrt import rtsys
 
 _LOG = logging.getLogger(__name__)
@@ -37,6 +37,11 @@ _COMPILES = re.compile(rb"^(from|import) (numba|isac_rt\.kernels\.jit)\b", re.MU
 _IMPORT = re.compile(rb"^from isac_rt\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CONSTANT = re.compile(rb"\b_?[A-Z][A-Z0-9_]+\b")
 _WORD = re.compile(rb"\w+")
+
+if numba.config.CPU_FEATURES is None and binding.get_host_cpu_features().get("avx512f"):
+    # loops take whole registers: LLVM takes half of one on Intel's processors, for the clock rates
+    # of the first that had AVX-512
+    numba.config.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"
 
 
 def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = False) -> Any:

@@ -367,12 +367,12 @@ def cube_memory(shape: tuple[int, ...]) -> np.ndarray:
     try:
         memory = _SPARE.pop()
     except IndexError:
-        memory = _new_memory(shape)
-    return np.asarray(_Lent(memory if memory.shape == shape else _new_memory(shape)))
+        memory = new_memory(shape)
+    return np.asarray(_Lent(memory if memory.shape == shape else new_memory(shape)))
 
 
-def _new_memory(shape: tuple[int, ...]) -> np.ndarray:
-    """From an address that is a multiple of 64."""
+def new_memory(shape: tuple[int, ...]) -> np.ndarray:
+    """Complex64 of any values from an address that is a multiple of 64."""
     size = 8 * int(np.prod(shape))
     room = np.empty(size + 64, np.uint8)
     start = -room.ctypes.data % 64

@@ -20,6 +20,7 @@ import numpy as np
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
 
@@ -93,7 +94,7 @@ def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> n
     num_groups, num_rx, num_chirps, num_samples = samples.shape
     num_rows = w.num_range_cells if num_rows is None else num_rows
     shift = w.data_shift(symbols)
-    out = np.empty((num_groups, num_rx, num_rows, num_chirps), np.complex64)
+    out = new_memory((num_groups, num_rx, num_rows, num_chirps))
     for m in range(num_groups):
         factor = _factors(num_samples, symbols[m], shift[m], w.window_length)
         phase = known.phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(symbols[m]))

@@ -19,7 +19,7 @@ import scipy.fft
 from isac_rt.kernels import fourier as lanefft
 from isac_rt.kernels.fourier import ROW
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, aligned, load, store, transpose, zip_high, zip_low
+from isac_rt.kernels.vector import LANES, aligned, load, store, stream, transpose, zip_high, zip_low
 
 
 def transform(
@@ -38,7 +38,8 @@ def transform(
     samples : (L_rx, P, N) complex64
     factor : (P, N) complex64, h: window, derotation
     cells : (rows,) int, c, modulo N
-    out : (L_rx, rows, P) complex64, filled with Y
+    out : (L_rx, rows, P) complex64, filled with Y; soonest from an address that is a multiple of 64
+        (`isac_rt.kernels.vector.new_memory`)
     turn : (rows, P) complex64, g; None: 1
     power : (P, N) float32, to which sum_r |spectrum|^2 is added over all cells, without g
     """
@@ -106,6 +107,7 @@ def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, 
     """`transform`; complex arrays as `_floats`."""
     table, factors, turns, added = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
+    lines = samples.reshape(num_rx * num_chirps, 2 * size)
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
         _fill(factor, 0, first, count, factors)
@@ -117,9 +119,7 @@ def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, 
                 )
         added[:] = 0.0
         for r in range(num_rx):
-            _fill(
-                samples.reshape(num_rx * num_chirps, 2 * size), r * num_chirps, first, count, table
-            )
+            _fill(lines, r * num_chirps, first, count, table)
             _multiply(table, factors)
             lanefft.transform(table, 0, size, radices, twiddles)
             if added.size:
@@ -166,15 +166,21 @@ def _add_power(table, place, added):
 
 @jit
 def _write(table, at, turns, first, count, out):
-    """out[i, first + l] = the cells, times g where there is one."""
+    """out[i, first + l] = the cells, times g where there is one; past the caches where whole cache
+    lines are written, which are not read from memory first then."""
     flat, width, spare = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
+    whole = out.ctypes.data % 64 == 0 and width % LANES == 0
     for i in range(at.size):
         a, b = load(table, at[i]), load(table, at[i] + LANES)
         if turns.size:
             c, d = load(turns, i * ROW), load(turns, i * ROW + LANES)
             a, b = a * c - b * d, a * d + b * c
         to = i * width + 2 * first
-        if count == LANES:
+        if whole and count % (LANES // 2) == 0:
+            stream(flat, to, zip_low(a, b))
+            if count == LANES:
+                stream(flat, to + LANES, zip_high(a, b))
+        elif count == LANES:
             store(flat, to, zip_low(a, b))
             store(flat, to + LANES, zip_high(a, b))
         else:
