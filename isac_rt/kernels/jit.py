@@ -38,10 +38,11 @@ _IMPORT = re.compile(rb"^from isac_rt\.([\w.]+) import (\([^)]*\)|.*)", re.MULTI
 _CONSTANT = re.compile(rb"\b_?[A-Z][A-Z0-9_]+\b")
 _WORD = re.compile(rb"\w+")
 
-if numba.config.CPU_FEATURES is None and binding.get_host_cpu_features().get("avx512f"):
+_CONFIG: Any = numba.config
+if _CONFIG.CPU_FEATURES is None and binding.get_host_cpu_features().get("avx512f"):
     # loops take whole registers: LLVM takes half of one on Intel's processors, for the clock rates
     # of the first that had AVX-512
-    numba.config.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"
+    _CONFIG.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"
 
 
 def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = False) -> Any:
