@@ -155,6 +155,7 @@ def _two(method):
 _add = _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST))
 _sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST))
 _mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST))
+larger = _two(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 zip_low = _two(
     lambda builder, a, b: builder.shuffle_vector(
         a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))

@@ -25,12 +25,10 @@ import numpy as np
 from scipy import ndimage, optimize, special
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.coherent import (
-    BLOCK,
     DIRECTIONS,
     Bucketed,
     Found,
@@ -40,9 +38,10 @@ from isac_rt.receive.clutter.coherent import (
 )
 from isac_rt.receive.clutter.detectors import FINE, noise_level
 from isac_rt.receive.clutter.power import TAPER, expected_power
+from isac_rt.receive.clutter.scan import line_bounds, search_by_power
 from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR, add_power
+from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import Detections, ExpectedClutter
@@ -245,13 +244,10 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     looks, size = maps.shape[0], len(search.channels)
     flat, scale = maps.reshape(looks, size, -1), 1 / (size * noise)
     bound = np.zeros(flat.shape[2], np.float32)
-    for first in range(0, bound.size, BLOCK):
-        block = slice(first, first + BLOCK)
-        for lines in (search.along_x, search.along_z):
-            power = np.zeros((DIRECTIONS // BOUNDED, bound[block].size), np.float32)
-            for one in flat:
-                add_power(power, lines.spectra[0][::BOUNDED] @ one[lines.members[0], block])
-            bound[block] += np.sqrt(power.max(axis=0)) * np.float32(SCALLOPED)
+    for lines in (search.along_x, search.along_z):
+        channels = np.arange(looks)[:, None] * size + lines.members[0]
+        power = line_bounds(flat.reshape(looks * size, -1), channels, lines.spectra[0][::BOUNDED])
+        bound += np.sqrt(power) * np.float32(SCALLOPED)
     cell = np.flatnonzero(bound**2 * scale >= least)
     y = np.ascontiguousarray(flat[:, :, cell].transpose(2, 0, 1))
     peak, cosines = _best(y, np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32), search)
@@ -303,43 +299,17 @@ def _climbed(
 def _best(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
     """The largest statistic over the grid of directions, and where, of cells (S, L_tx, L_rx)."""
     X, Z = search.along_x, search.along_z
-    along_x = (y[..., X.members[0]] @ X.spectra[0].T) * Z.turns[0].conj()
-    along_z = (y[..., Z.members[0]] @ Z.spectra[0].T).conj() * X.turns[0]
+    each = y.reshape(-1, y.shape[2])
+    along_x, along_z = (
+        ((each[:, one.members[0]] @ one.spectra[0].T) * other.turns[0].conj()).reshape(
+            *y.shape[:2], DIRECTIONS
+        )
+        for one, other in ((X, Z), (Z, X))
+    )
     peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.int64)
-    _search(along_x, along_z, np.where(search.inside, scale, 0).astype(np.float32), peak, place)
+    scale = np.where(search.inside, scale, 0).astype(np.float32)
+    search_by_power(along_x, along_z, scale, peak, place)
     return peak, search.cosines[place]
-
-
-@jit(fast=True)
-def _search(along_x, along_z, scale, peak, place):
-    """Largest sum over the transmit antennas of |a^H y|^2 times the scale of each cell, and its
-    place on the grid: the powers of both arms, and twice the real part of their product."""
-    looks, size = along_x.shape[1], along_x.shape[2]
-    re, im = np.empty((looks, size), np.float32), np.empty((looks, size), np.float32)
-    own, total = np.empty(size, np.float32), np.empty(size, np.float32)
-    for s in range(along_x.shape[0]):
-        norm = scale[min(s, scale.shape[0] - 1)]
-        own[:] = 0.0
-        for t in range(looks):
-            for j in range(size):
-                re[t, j], im[t, j] = along_z[s, t, j].real, along_z[s, t, j].imag
-                own[j] += re[t, j] * re[t, j] + im[t, j] * im[t, j]
-        best = np.float32(0.0)
-        for i in range(size):
-            for j in range(size):
-                total[j] = own[j]
-            for t in range(looks):
-                a, b = along_x[s, t, i].real, along_x[s, t, i].imag
-                power = a * a + b * b
-                for j in range(size):
-                    total[j] += power + np.float32(2.0) * (a * re[t, j] - b * im[t, j])
-            for j in range(size):
-                total[j] *= norm[i, j]
-            for j in range(size):
-                if total[j] > best:
-                    best = total[j]
-                    place[s, 0], place[s, 1] = i, j
-        peak[s] = best
 
 
 class _Beam(LocalSpectra):

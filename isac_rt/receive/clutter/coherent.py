@@ -30,6 +30,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import Channels, all_channels, both_arms
 from isac_rt.receive.clutter.power import REACH, Taper, cells_of, range_power, slow_power
+from isac_rt.receive.clutter.scan import line_bounds, search_coherent
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 
@@ -37,8 +38,6 @@ DIRECTIONS = 32
 """Values of each direction cosine that are searched; the peak between them is sought from there."""
 CLIMBED = 0.3, 0.12
 """Steps, in those of the grid, by which the peak between them is climbed."""
-BLOCK = 2048
-"""Cells whose lines are looked at together: they stay in the cache."""
 FINE = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
@@ -178,11 +177,9 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     channel = c.tx * maps.shape[1] + c.rx
     scale = 1 / (len(c) * noise)
     bound = np.zeros(x.shape[1], np.float32)
-    for first in range(0, bound.size, BLOCK):
-        block = slice(first, first + BLOCK)
-        for lines in (search.along_x, search.along_z):
-            for members, spectra in zip(lines.members, lines.spectra, strict=True):
-                _add_largest(spectra @ x[channel[members], block], bound[block])
+    for lines in (search.along_x, search.along_z):
+        for members, spectra in zip(lines.members, lines.spectra, strict=True):
+            bound += np.sqrt(line_bounds(x, channel[members][None], spectra))
     cell = np.flatnonzero(bound**2 * scale >= least)
     y = np.ascontiguousarray(x[:, cell].T)[:, channel]
     peak, cosines = _whitened(y, np.full((1, DIRECTIONS, DIRECTIONS), scale), search)
@@ -288,88 +285,11 @@ def _best(
     """The largest statistic over the directions and where, interpolated."""
     peak = np.zeros(len(along_x), np.float32)
     place = np.zeros((len(along_x), 2), np.float32)
-    turns = search.along_x.turns, search.along_z.turns
-    _search(along_x, along_z, *turns, search.inside, scale, peak, place)
+    turns = (np.stack([t.real, t.imag]) for t in (search.along_x.turns, search.along_z.turns))
+    inside = search.inside.ravel().astype(np.float32)
+    search_coherent(along_x, along_z, *turns, inside, scale, peak, place)
     u = search.cosines
     return peak, u[0] + place * (u[1] - u[0])
-
-
-@jit(fast=True)
-def _add_largest(line, bound):
-    """bound[s] += max_g |line[g, s]|."""
-    largest = np.zeros(bound.size, np.float32)
-    for g in range(line.shape[0]):
-        for s in range(bound.size):
-            power = line[g, s].real ** 2 + line[g, s].imag ** 2
-            largest[s] = max(largest[s], power)
-    for s in range(bound.size):
-        bound[s] += np.sqrt(largest[s])
-
-
-@jit(fast=True)
-def _search(along_x, along_z, turn_z, turn_x, inside, scale, peak, place):
-    """Largest |a^H y|^2 times the scale of each cell, and its place in steps of the grid.
-
-    A row of directions whose lines even in phase would not reach the best so far is passed over.
-    """
-    size = inside.shape[0]
-    for s in range(along_x.shape[0]):
-        norm = scale[min(s, scale.shape[0] - 1)]
-        highest, most = norm.max(), np.float32(0.0)
-        for j in range(size):
-            total = np.float32(0.0)
-            for k in range(turn_x.shape[0]):
-                total += np.sqrt(along_z[s, k, j].real ** 2 + along_z[s, k, j].imag ** 2)
-            most = max(most, total)
-        best, at_x, at_z = np.float32(0.0), 0, 0
-        for i in range(size):
-            total = most
-            for k in range(turn_z.shape[0]):
-                total += np.sqrt(along_x[s, k, i].real ** 2 + along_x[s, k, i].imag ** 2)
-            if total * total * highest <= best:
-                continue
-            for j in range(size):
-                if inside[i, j]:
-                    power = _power(along_x, along_z, turn_z, turn_x, s, i, j) * norm[i, j]
-                    if power > best:
-                        best, at_x, at_z = power, i, j
-        peak[s], place[s, 0], place[s, 1] = best, at_x, at_z
-        for axis in range(2):
-            if 0 < (at_x, at_z)[axis] < size - 1:
-                i, j = (at_x - 1, at_z) if axis == 0 else (at_x, at_z - 1)
-                k, m = (at_x + 1, at_z) if axis == 0 else (at_x, at_z + 1)
-                before = _power(along_x, along_z, turn_z, turn_x, s, i, j) * norm[i, j]
-                after = _power(along_x, along_z, turn_z, turn_x, s, k, m) * norm[k, m]
-                _between(before, best, after, s, axis, peak, place)
-
-
-@jit(fast=True, inline=True)
-def _power(along_x, along_z, turn_z, turn_x, s, i, j):
-    """|a^H y|^2 in one direction."""
-    re, im = np.float32(0.0), np.float32(0.0)
-    for k in range(turn_z.shape[0]):
-        a, b = along_x[s, k, i], turn_z[k, j]
-        re += a.real * b.real - a.imag * b.imag
-        im += a.real * b.imag + a.imag * b.real
-    for k in range(turn_x.shape[0]):
-        a, b = along_z[s, k, j], turn_x[k, i]
-        re += a.real * b.real - a.imag * b.imag
-        im += a.real * b.imag + a.imag * b.real
-    return re * re + im * im
-
-
-@jit(fast=True, inline=True)
-def _between(before, middle, after, s, axis, peak, place):
-    """Vertex of the parabola through the logarithms of three neighbours."""
-    low = np.log(max(before, np.float32(1e-20)) / middle)
-    high = np.log(max(after, np.float32(1e-20)) / middle)
-    curve = low + high
-    if curve < 0:
-        offset = min(max(np.float32(0.5) * (low - high) / curve, np.float32(-0.5)), np.float32(0.5))
-        place[s, axis] += offset
-        peak[s] *= np.exp(
-            np.float32(0.5) * (high - low) * offset + np.float32(0.5) * curve * offset * offset
-        )
 
 
 @dataclass(frozen=True)

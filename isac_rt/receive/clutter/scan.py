@@ -1,0 +1,169 @@
+"""Kernels of the search for directions, sixteen cells or directions at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store
+
+
+def line_bounds(maps: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> np.ndarray:
+    """(S,) largest power of each cell in a line's directions, added over the looks.
+
+    Parameters
+    ----------
+    maps : (C, S) complex64
+    channels : (looks, n) numbers of the line's channels
+    spectra : (G, n) complex64 of the line in its directions, an even number
+    """
+    maps = np.ascontiguousarray(maps)
+    short = -maps.shape[1] % LANES
+    if short:
+        maps = np.pad(maps, ((0, 0), (0, short)))
+    out = np.empty(maps.shape[1], np.float32)
+    parts = np.ascontiguousarray(spectra.real), np.ascontiguousarray(spectra.imag)
+    _line_bounds(maps.view(np.float32), channels, *parts, out)
+    return out[: out.size - short]
+
+
+@jit
+def _line_bounds(maps, channels, cosines, sines, out):
+    """`line_bounds`, two directions at a time; complex maps as real and imaginary parts in turn."""
+    looks, count = channels.shape
+    width, line = maps.shape[1], 2 * LANES * count
+    flat, cosine, sine = maps.reshape(-1), cosines.reshape(-1), sines.reshape(-1)
+    heard, zero = np.empty(looks * line, np.float32), splat(np.float32(0))
+    for first in range(0, out.size, LANES):
+        for t in range(looks):
+            for e in range(count):
+                at, to = channels[t, e] * width + 2 * first, t * line + 2 * LANES * e
+                a, b = load(flat, at), load(flat, at + LANES)
+                store(heard, to, evens(a, b))
+                store(heard, to + LANES, odds(a, b))
+        largest = zero
+        for g in range(0, len(cosines), 2):
+            one, other = zero, zero
+            for t in range(looks):
+                re_1, im_1, re_2, im_2 = zero, zero, zero, zero
+                for e in range(count):
+                    at, to = g * count + e, t * line + 2 * LANES * e
+                    re, im = load(heard, to), load(heard, to + LANES)
+                    c, s = splat(cosine[at]), splat(sine[at])
+                    re_1, im_1 = re_1 + c * re - s * im, im_1 + c * im + s * re
+                    c, s = splat(cosine[at + count]), splat(sine[at + count])
+                    re_2, im_2 = re_2 + c * re - s * im, im_2 + c * im + s * re
+                one = one + re_1 * re_1 + im_1 * im_1
+                other = other + re_2 * re_2 + im_2 * im_2
+            largest = larger(largest, larger(one, other))
+        store(out, first, largest)
+
+
+@jit(fast=True)
+def search_coherent(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
+    """Largest |a^H y|^2 times the scale of each cell, and its place in steps of the grid, between
+    its neighbours on both axes.
+
+    Parameters
+    ----------
+    along_x, along_z : (S, lines, G) complex64 spectra of the lines
+    turns_z, turns_x : (2, lines, G) float32, cosines and sines of the lines' places on the other
+        axis
+    inside : (G G) float32, 1 for directions of the unit disc, else 0
+    scale : (S or 1, G, G) float32
+    peak, place : (S,) and (S, 2) float32, filled
+    """
+    size, lines = along_x.shape[2], along_z.shape[1]
+    turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(size * size, np.float32)
+    heard, zero = np.empty(2 * lines * size, np.float32), splat(np.float32(0))
+    sine = turns_z.shape[1] * size
+    for s in range(along_x.shape[0]):
+        norm = min(s, scale.shape[0] - 1) * power.size
+        for k in range(lines):
+            for j in range(size):
+                heard[k * size + j] = along_z[s, k, j].real
+                heard[(lines + k) * size + j] = along_z[s, k, j].imag
+        for i in range(size):
+            for j in range(0, size, LANES):
+                re, im = zero, zero
+                for k in range(along_x.shape[1]):
+                    a, b = splat(along_x[s, k, i].real), splat(along_x[s, k, i].imag)
+                    c, d = load(turns, k * size + j), load(turns, sine + k * size + j)
+                    re, im = re + a * c - b * d, im + a * d + b * c
+                for k in range(lines):
+                    a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
+                    c, d = load(heard, k * size + j), load(heard, (lines + k) * size + j)
+                    re, im = re + a * c - b * d, im + a * d + b * c
+                at = i * size + j
+                store(power, at, (re * re + im * im) * load(each, norm + at))
+        best = _largest(power, inside)
+        peak[s] = power[best]
+        for axis, step in enumerate((size, 1)):
+            at = best // step % size
+            place[s, axis] = at
+            if 0 < at < size - 1:
+                _between(power[best - step], power[best], power[best + step], s, axis, peak, place)
+
+
+@jit(fast=True)
+def search_by_power(along_x, along_z, scale, peak, place):
+    """Largest sum over the transmit antennas of |along_x(i) + along_z(j)|^2 times the scale of
+    each cell, and its place (i, j) on the grid.
+
+    Parameters
+    ----------
+    along_x, along_z : (S, L_tx, G) complex64
+    scale : (S or 1, G, G) float32, 0 beyond the unit disc
+    peak, place : (S,) float32 and (S, 2) int64, filled
+    """
+    looks, size = along_x.shape[1:]
+    each, power = scale.reshape(-1), np.empty(size * size, np.float32)
+    every, zero = np.ones(size * size, np.float32), splat(np.float32(0))
+    heard = np.empty(2 * looks * size, np.float32)
+    for s in range(along_x.shape[0]):
+        norm = min(s, scale.shape[0] - 1) * power.size
+        for t in range(looks):
+            for j in range(size):
+                heard[t * size + j] = along_z[s, t, j].real
+                heard[(looks + t) * size + j] = along_z[s, t, j].imag
+        for i in range(size):
+            for j in range(0, size, LANES):
+                total = zero
+                for t in range(looks):
+                    re = splat(along_x[s, t, i].real) + load(heard, t * size + j)
+                    im = splat(along_x[s, t, i].imag) + load(heard, (looks + t) * size + j)
+                    total = total + re * re + im * im
+                at = i * size + j
+                store(power, at, total * load(each, norm + at))
+        best = _largest(power, every)
+        peak[s], place[s, 0], place[s, 1] = power[best], best // size, best % size
+
+
+@jit
+def _largest(power, inside):
+    """Number of the largest power that lies inside."""
+    most = splat(np.float32(0))
+    for n in range(0, power.size, LANES):
+        most = larger(most, load(power, n) * load(inside, n))
+    lanes, best = np.empty(LANES, np.float32), np.float32(0)
+    store(lanes, 0, most)
+    for value in lanes:
+        best = max(best, value)
+    first = power.size - 1
+    for n in range(power.size):  # without branches
+        first = min(first, n if power[n] * inside[n] == best else power.size)
+    return first
+
+
+@jit(fast=True, inline=True)
+def _between(before, middle, after, s, axis, peak, place):
+    """Vertex of the parabola through the logarithms of three neighbours."""
+    low = np.log(max(before, np.float32(1e-20)) / middle)
+    high = np.log(max(after, np.float32(1e-20)) / middle)
+    curve = low + high
+    if curve < 0:
+        offset = min(max(np.float32(0.5) * (low - high) / curve, np.float32(-0.5)), np.float32(0.5))
+        place[s, axis] += offset
+        peak[s] *= np.exp(
+            np.float32(0.5) * (high - low) * offset + np.float32(0.5) * curve * offset * offset
+        )

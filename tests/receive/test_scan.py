@@ -1,0 +1,61 @@
+"""Kernels of the search for directions against sums written out in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from isac_rt.receive.clutter.scan import line_bounds, search_by_power, search_coherent
+
+GRID = 32
+ROUNDING = 1e-5  # float32
+
+
+def noise(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return (rng.standard_normal((*shape, 2)) @ [1, 1j]).astype(np.complex64)
+
+
+@pytest.mark.parametrize("cells", [5, 64, 83])
+def test_bounds_are_the_largest_power_over_a_lines_directions(cells: int):
+    """Planted bugs: the looks' amplitudes added, not their powers; the last cells, which fill no
+    vector, left out; every second direction left out."""
+    rng = np.random.default_rng(1)
+    maps, spectra = noise(rng, 20, cells), noise(rng, 6, 7)
+    channels = rng.permutation(20)[:14].reshape(2, 7)
+    power = (np.abs(np.einsum("gn,tns->tgs", spectra, maps[channels])) ** 2).sum(axis=0)
+    found = line_bounds(maps, channels, spectra)
+    np.testing.assert_allclose(found, power.max(axis=0), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("scales", [1, 9])
+def test_the_coherent_search_finds_the_largest_inside(scales: int):
+    """Off the edges the parabola moves a place by half a step at most and no power down. Planted
+    bugs: the turns of both axes exchanged; one scale for all cells; beyond the disc too."""
+    rng = np.random.default_rng(2)
+    x, z = noise(rng, 9, 2, GRID), noise(rng, 9, 3, GRID)
+    turn_z, turn_x = noise(rng, 2, GRID), noise(rng, 3, GRID)
+    scale = rng.uniform(0.5, 1.5, (scales, GRID, GRID)).astype(np.float32)
+    inside = rng.uniform(size=(GRID, GRID)) < 0.3
+    peak, place = np.zeros(9, np.float32), np.zeros((9, 2), np.float32)
+    turns = (np.stack([t.real, t.imag]) for t in (turn_z, turn_x))
+    search_coherent(x, z, *turns, inside.ravel().astype(np.float32), scale, peak, place)
+    total = np.einsum("ski,kj->sij", x, turn_z) + np.einsum("slj,li->sij", z, turn_x)
+    power = np.where(inside, np.abs(total) ** 2 * scale, 0).reshape(9, -1)
+    best = np.column_stack(np.unravel_index(power.argmax(axis=1), inside.shape))
+    assert np.abs(place - best).max() <= 0.5
+    edge = ((best == 0) | (best == GRID - 1)).all(axis=1)
+    assert (peak >= power.max(axis=1) * (1 - ROUNDING)).all()
+    np.testing.assert_allclose(peak[edge], power.max(axis=1)[edge], rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("scales", [1, 9])
+def test_the_search_by_power_finds_the_largest(scales: int):
+    """Planted bugs: the looks added in amplitude; the places of both axes exchanged."""
+    rng = np.random.default_rng(3)
+    x, z = noise(rng, 9, 3, GRID), noise(rng, 9, 3, GRID)
+    scale = rng.uniform(0, 1.5, (scales, GRID, GRID)).astype(np.float32)
+    peak, place = np.zeros(9, np.float32), np.zeros((9, 2), np.int64)
+    search_by_power(x, z, scale, peak, place)
+    power = ((np.abs(x[..., None] + z[:, :, None]) ** 2).sum(axis=1) * scale).reshape(9, -1)
+    np.testing.assert_allclose(peak, power.max(axis=1), rtol=ROUNDING)
+    assert np.array_equal(place @ [GRID, 1], power.argmax(axis=1))
