@@ -70,8 +70,7 @@ class FreeSpace:
 
     def _link(self, state: LinkState, poses: dict[str, Pose]) -> PathSet:
         parts = [] if state.link.own else [self._line_of_sight(state)]
-        every = merge([*parts, self._echoes(state, poses)])
-        return every.select(every.gain != 0)
+        return merge([*parts, self._echoes(state, poses)])
 
     def _line_of_sight(self, state: LinkState) -> PathSet:
         """The straight path of a link, by Friis."""

@@ -223,21 +223,24 @@ def widened(a: np.ndarray, depth: int, fill: float) -> np.ndarray:
     return out
 
 
-def merge(parts: list[PathSet]) -> PathSet:
+def merge(parts: list[PathSet], shift: np.ndarray | float = 0.0) -> PathSet:
     """All paths of one link in one set, in the order given; interaction lists are padded to the
-    longest."""
+    longest, and their points moved by `shift` [m]."""
     first = parts[0]
     if len({(p.link, p.epoch, p.target_names) for p in parts}) > 1:
         raise ValueError("merge needs path sets of one link, epoch and list of targets")
-    depth = max(p.faces.shape[1] for p in parts)
-
-    def padded(name: str, a: np.ndarray) -> np.ndarray:
-        if name not in ("points", "faces"):
-            return a
-        return widened(a, depth, np.nan if name == "points" else -1)
-
-    columns = [p.arrays() for p in parts]
+    columns, depth = [p.arrays() for p in parts], max(p.faces.shape[1] for p in parts)
     joined: dict[str, Any] = {
-        name: np.concatenate([padded(name, c[name]) for c in columns]) for name in columns[0]
+        name: np.concatenate([c[name] for c in columns])
+        for name in columns[0]
+        if name not in ("points", "faces")
     }
+    count, row = sum(map(len, parts)), 0
+    joined["points"] = np.full((count, depth, 3), np.nan)
+    joined["faces"] = np.full((count, depth), -1, np.int32)
+    for p in parts:
+        rows, met = slice(row, row + len(p)), p.faces.shape[1]
+        np.add(p.points, shift, out=joined["points"][rows, :met])
+        joined["faces"][rows, :met] = p.faces
+        row = rows.stop
     return replace(first, **joined)

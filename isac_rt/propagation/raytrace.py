@@ -366,9 +366,7 @@ class RayTracer:
             parts.extend(self.two_bounces.paths(state, antennas, bodies))
         if link.own and self._propagation.leakage.enabled:
             parts.append(self._leakage(state))
-        every = merge(parts)
-        every = replace(every, points=every.points + self._city.origin)
-        return every.select(every.gain != 0)
+        return merge(parts, shift=self._city.origin)
 
     def _leakage(self, state: LinkState) -> PathSet:
         """A terminal's transmitter into its own receiver."""

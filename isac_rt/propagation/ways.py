@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -83,8 +84,9 @@ class LinkState:
         points: np.ndarray | None = None,
         faces: np.ndarray | None = None,
     ) -> PathSet:
-        """Paths along ways, with the interactions in the order in which the wave meets them."""
-        return make_paths(
+        """Paths along ways, with the interactions in the order in which the wave meets them; those
+        that no element sends or hears are left out."""
+        columns: dict[str, Any] = dict(
             gain=gain,
             delay=ways.length / SPEED_OF_LIGHT,
             delay_rate=ways.rate / SPEED_OF_LIGHT,
@@ -98,8 +100,9 @@ class LinkState:
             bounces=bounces,
             points=points,
             faces=faces,
-            tx=self.link.tx,
-            rx=self.link.rx,
-            epoch=self.epoch,
-            target_names=self.target_names,
         )
+        there = np.flatnonzero(gain)
+        if there.size < gain.size:
+            columns = {n: v.take(there, axis=0) if np.ndim(v) else v for n, v in columns.items()}
+        (tx, rx), names = self.link, self.target_names
+        return make_paths(tx=tx, rx=rx, epoch=self.epoch, target_names=names, **columns)

@@ -298,11 +298,9 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
     mask : (K,) bool
     most : largest sum that a cell lost
     """
-    if not len(power):
-        return np.zeros(0, bool), 0.0
-    order = np.lexsort([power, cell])
-    sorted_cell, sorted_power = cell[order], power[order]
-    total = _sums(sorted_cell, sorted_power)
+    some = np.flatnonzero(power <= limit)
+    order = some[np.lexsort([power[some], cell[some]])]
+    total = _sums(cell[order], power[order])
     gone = total <= limit
     mask = np.zeros(len(power), bool)
     mask[order] = gone

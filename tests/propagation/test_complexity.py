@@ -100,8 +100,11 @@ def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
             )
         )
         sight = tracer_of(setup).field.sight
-        sees, calls = sight.shadows.sees, []
-        sight.shadows.sees = lambda *args, sees=sees, calls=calls: (calls.append(1), sees(*args))[1]
+        sees, calls = sight.shadows.all_seen, []
+        sight.shadows.all_seen = lambda at, *args, sees=sees, calls=calls: (
+            calls.extend(at),
+            sees(at, *args),
+        )[1]
         clutter.advance(setup, range(3 * per_metre))
         tests.append(len(calls))
     assert 0 < tests[1] <= tests[0] + 2

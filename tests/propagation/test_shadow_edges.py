@@ -17,6 +17,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
+from isac_rt.propagation.legs.edges import MOST_TRIED, Edges, _near
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh
@@ -252,3 +253,36 @@ def test_clutter_behind_a_body_is_in_its_shadow():
                 checked += 1
         assert checked > 10
         assert ratio.min() < 0.2
+
+
+def test_no_edge_near_a_path_is_passed_over():
+    """Triangles strewn over 300 m, edges of 1 to 60 m: the shortest detours of paths against a
+    search along every edge, by thirds. Planted bugs: balls about blocks that hold the middles of
+    their edges alone; a last block without its edges."""
+    rng = np.random.default_rng(5)
+    size = 10 ** rng.uniform(0, 1.5, (700, 1, 1))
+    corners = rng.uniform(-150, 150, (700, 1, 3)) + size * rng.uniform(-1, 1, (700, 3, 3))
+    vertices, faces = corners.reshape(-1, 3), np.arange(2100, dtype=np.int32).reshape(-1, 3)
+    origin = np.zeros(3)
+    city = CityMesh("strewn", vertices, faces, np.zeros(700, np.int16), (METAL,), origin)
+    edges, found = Edges.of(city), 0
+    a, b = corners, np.roll(corners, -1, axis=1)
+    for _ in range(40):
+        source, sink = rng.uniform(-150, 150, (2, 3))
+        reach = 10 ** rng.uniform(-1, 0.5)
+        low, high = np.zeros((700, 3, 1)), np.ones((700, 3, 1))
+
+        def detour(share, ends=(source, sink)):
+            at = a + share * (b - a)
+            ways = [np.linalg.norm(at - end, axis=2, keepdims=True) for end in ends]
+            return ways[0] + ways[1] - np.linalg.norm(ends[0] - ends[1])
+
+        for _ in range(90):
+            one, other = low + (high - low) / 3, high - (high - low) / 3
+            left = detour(one) < detour(other)
+            low, high = np.where(left, low, one), np.where(left, other, high)
+        every = np.sort(detour(low).ravel())
+        every = every[every < reach][:MOST_TRIED]
+        assert _near(edges, source, sink, reach)[0] == pytest.approx(every, abs=1e-9)
+        found += every.size
+    assert found > 150

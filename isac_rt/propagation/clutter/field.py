@@ -279,7 +279,7 @@ class ClutterField:
             share = share * sight.share(rx, end, state.epoch)
         found = self._ways(cells, share, state)
         if bodies is not None:
-            points = cells.points[found.index]
+            points = cells.points.take(found.index, axis=0)
             sent, heard = (bodies.spared([(name,)]) for name in (tx, rx))
             there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, sent)
             back = (
@@ -288,10 +288,10 @@ class ClutterField:
                 else bodies.sight(end.position, points, found.rx_radius, self._wavelength, heard)
             )
             found.magnitude[:] *= there * back
-        lit = found.magnitude > 0
-        if lit.all():
+        lit = np.flatnonzero(found.magnitude)
+        if lit.size == found.magnitude.size:
             return found
-        parts = {id(a): a[lit] for a in vars(found).values()}
+        parts = {id(a): a.take(lit, axis=0) for a in vars(found).values()}
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
     def from_places(self, state: LinkState) -> Seen:
@@ -331,7 +331,7 @@ class ClutterField:
             cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
             PathKind.DIFFUSE,
             bounces=1,
-            points=cells.points[seen.index][:, None],
+            points=cells.points.take(seen.index, axis=0)[:, None],
             faces=cells.face[seen.index][:, None],
         )
 

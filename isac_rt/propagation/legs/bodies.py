@@ -74,62 +74,56 @@ class Bodies:
     ) -> np.ndarray:
         """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,)
         [m]."""
-        out = np.ones(len(points), complex)
-        self._shade(
-            out,
-            np.broadcast_to(place, points.shape),
-            points,
-            np.zeros(len(points)),
-            distance,
-            wavelength,
-            spared,
-        )
-        return np.abs(out)
+        factor, out = np.ones(len(points), complex), np.ones(len(points))
+        place, before = np.broadcast_to(place, points.shape), np.zeros(len(points))
+        path = self._shade(factor, place, points, before, distance, wavelength, spared)
+        out[path] = np.abs(factor[path])
+        return out
 
     def _shade(
         self, out, starts, ends, before, total, wavelength: float, spared: np.ndarray
-    ) -> None:
+    ) -> np.ndarray:
         """Multiply `out` by the factors of straight parts that begin `before` along paths of length
-        `total`."""
-        every = np.broadcast_to(spared, (len(out), len(self.names)))
-        for place, radius, left in zip(self.places, self.radii, every.T, strict=True):
-            if left.all():
-                continue
-            asked = np.flatnonzero(~left)
-            path, off, along = _near(
-                asked, starts, ends, before, total, place, radius, wavelength, LIT_REACH
-            )
-            if path.size:
-                far = np.maximum(
-                    total[path] - along, radius
-                )  # nearer than its own size a disc is none
-                unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
-                nu, size = off / unit, radius / unit
-                out[path] *= tapered(disc(nu, size), nu - size)
+        `total`; the paths that a body is near, once for each."""
+        path, body, off, along = _near(
+            starts, ends, before, total, self.places, self.radii, spared, wavelength, LIT_REACH
+        )
+        radius = self.radii[body]
+        far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
+        unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
+        nu, size = off / unit, radius / unit
+        np.multiply.at(out, path, tapered(disc(nu, size), nu - size))
+        return path
 
 
 @jit
-def _near(asked, starts, ends, before, total, place, radius, wavelength, reach):
-    """Paths, of those asked for, whose straight part passes the body within its shadow's reach, the
-    distance of its centre, and that along the path."""
-    which, off, along = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for i in asked:
+def _near(starts, ends, before, total, places, radii, spared, wavelength, reach):
+    """Paths, path by path, whose straight part passes a body within its shadow's reach, unless
+    `spared`; the body, the distance of its centre, and that along the path."""
+    which, body = [0 for _ in range(0)], [0 for _ in range(0)]
+    off, along = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
+    for i in range(len(total)):
         sx, sy, sz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]
-        wx, wy, wz = place[0] - starts[i, 0], place[1] - starts[i, 1], place[2] - starts[i, 2]
-        square, dot = sx * sx + sy * sy + sz * sz, sx * wx + sy * wy + sz * wz
-        if dot <= 0 or dot >= square:
-            continue
-        away = wx * wx + wy * wy + wz * wz
-        across = away - dot * dot / square
-        # a Fresnel unit is at most that of an endless path
-        edge = radius + reach * np.sqrt(wavelength * (before[i] + np.sqrt(away) + radius) / 2)
-        if across > edge * edge:
-            continue
-        at = before[i] + dot / np.sqrt(square)
-        near, far = max(at, radius), max(total[i] - at, radius)
-        h = np.sqrt(max(across, 0.0))
-        if h - radius < reach * np.sqrt(wavelength * near * far / (2 * (near + far))):
-            which.append(i)
-            off.append(h)
-            along.append(at)
-    return np.array(which, np.int64), np.array(off), np.array(along)
+        square = sx * sx + sy * sy + sz * sz
+        row = i if len(spared) > 1 else 0
+        for n in range(len(radii)):
+            wx, wy = places[n, 0] - starts[i, 0], places[n, 1] - starts[i, 1]
+            wz, radius = places[n, 2] - starts[i, 2], radii[n]
+            dot = sx * wx + sy * wy + sz * wz
+            if dot <= 0 or dot >= square or spared[row, n]:
+                continue
+            away = wx * wx + wy * wy + wz * wz
+            across = away - dot * dot / square
+            # a Fresnel unit is at most that of an endless path
+            edge = radius + reach * np.sqrt(wavelength * (before[i] + np.sqrt(away) + radius) / 2)
+            if across > edge * edge:
+                continue
+            at = before[i] + dot / np.sqrt(square)
+            near, far = max(at, radius), max(total[i] - at, radius)
+            h = np.sqrt(max(across, 0.0))
+            if h - radius < reach * np.sqrt(wavelength * near * far / (2 * (near + far))):
+                which.append(i)
+                body.append(n)
+                off.append(h)
+                along.append(at)
+    return np.array(which, np.int64), np.array(body, np.int64), np.array(off), np.array(along)

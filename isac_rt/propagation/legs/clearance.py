@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from isac_rt.kernels.jit import jit
 from isac_rt.world.city.mesh import CityMesh, distance_to_triangles
 
 CLEARANCE = 0.01
@@ -23,20 +24,18 @@ class Clearance:
 
     def __init__(self, city: CityMesh) -> None:
         self._city = city
+        self._box = city.corners.min(axis=1), city.corners.max(axis=1)
         self._warned: set[str] = set()
 
     def check(self, places: Mapping[str, np.ndarray], time: float) -> None:
         """Warn of bodies at local positions (3,)."""
-        city = self._city
-        for name, place in places.items():
-            if name in self._warned or not city.num_faces:
-                continue
-            near = np.flatnonzero(np.abs(city.normals @ place - city.plane_offsets) < CLEARANCE)
-            if (
-                near.size
-                and (apart := float(distance_to_triangles(city.corners[near], place).min()))
-                < CLEARANCE
-            ):
+        city, names = self._city, [name for name in places if name not in self._warned]
+        every = np.array([places[name] for name in names]).reshape(-1, 3)
+        body, face = _beside(city.normals, city.plane_offsets, *self._box, every, CLEARANCE)
+        for number in np.unique(body):
+            name, near = names[number], face[body == number]
+            apart = float(distance_to_triangles(city.corners[near], places[name]).min())
+            if apart < CLEARANCE:
                 self._warned.add(name)
                 warnings.warn(
                     f"{name} is {apart:.3f} m from a surface of {city.name} at {time:.4g} s: "
@@ -45,3 +44,23 @@ class Clearance:
                     ClearanceWarning,
                     stacklevel=2,
                 )
+
+
+@jit
+def _beside(normals, offsets, low, high, places, most):
+    """Numbers of places (N, 3) and of the faces in whose planes and boxes, but for so much, they
+    lie."""
+    place, face = [0 for _ in range(0)], [0 for _ in range(0)]
+    for f in range(len(offsets)):
+        x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
+        for k in range(len(places)):
+            height = x * places[k, 0] + y * places[k, 1] + z * places[k, 2] - offsets[f]
+            if abs(height) >= most:
+                continue
+            inside = True
+            for c in range(3):
+                inside &= low[f, c] - most < places[k, c] < high[f, c] + most
+            if inside:
+                place.append(k)
+                face.append(f)
+    return np.array(place, np.int64), np.array(face, np.int64)

@@ -26,6 +26,9 @@ BESIDE = 0.01
 good to a hundredth of that."""
 MOST_TRIED = 24
 """Edges near a path, the shortest detours first, that are tried."""
+TOGETHER, STRIP = 32, 30.0
+"""Edges of a block, which are passed over at once, and width of the strips in which edges are
+gathered [m]."""
 FLAT = 1e-3
 """Sine of the angle between two faces under which the edge between them is none."""
 
@@ -39,6 +42,8 @@ class Edges(NamedTuple):
     wings : (E, 2, 3) third corners of the two faces; the same twice where a surface ends
     middle : (E, 3) [m]
     half : (E,) half the length [m]
+    block, centre, radius : (C, TOGETHER) edges near each other, -1 where there are fewer, and the
+        balls (C, 3), (C,) that hold them [m]
     """
 
     start: np.ndarray
@@ -46,6 +51,9 @@ class Edges(NamedTuple):
     wings: np.ndarray
     middle: np.ndarray
     half: np.ndarray
+    block: np.ndarray
+    centre: np.ndarray
+    radius: np.ndarray
 
     @classmethod
     def of(cls, city: CityMesh) -> Edges:
@@ -70,7 +78,14 @@ class Edges(NamedTuple):
         start = city.vertices[ends[first, 0]]
         wings = city.vertices[np.stack([third[first], third[second]], axis=1)]
         span = city.vertices[ends[first, 1]] - start
-        return cls(start, span, wings, start + span / 2, np.linalg.norm(span, axis=1) / 2)
+        middle, half = start + span / 2, np.linalg.norm(span, axis=1) / 2
+        count = -(-len(half) // TOGETHER)
+        block = np.full((count, TOGETHER), -1)
+        block.flat[: len(half)] = np.lexsort([middle[:, 1], middle[:, 0] // STRIP])
+        centre = middle[block[:, 0]]
+        apart = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
+        radius = np.where(block < 0, 0.0, apart).max(axis=1, initial=0.0)
+        return cls(start, span, wings, middle, half, block, centre, radius)
 
 
 @dataclass(frozen=True)
@@ -128,11 +143,20 @@ class ShadowEdges:
         return Bends(nu, points)
 
 
+@jit(inline=True)
+def _off(place, source, ahead, length):
+    """Square of the distance of a place from the straight way of a length from a source."""
+    x, y, z = place[0] - source[0], place[1] - source[1], place[2] - source[2]
+    along = min(max(x * ahead[0] + y * ahead[1] + z * ahead[2], 0.0), length)
+    x, y, z = x - along * ahead[0], y - along * ahead[1], z - along * ahead[2]
+    return x * x + y * y + z * z
+
+
 @jit
 def _near(edges, source, sink, reach):
     """Silhouette edges near a path: detours [m] (at most `reach`, shortest first), points on the
     edges, directions away from what they bound."""
-    start, span, wings, middle, halves = edges
+    start, span, wings, middle, halves, blocks, centre, radius = edges
     ahead = sink - source
     length = np.sqrt((ahead**2).sum())
     ahead = ahead / length
@@ -140,20 +164,17 @@ def _near(edges, source, sink, reach):
         np.sqrt(reach * (reach + 2 * length)) / 2
     )  # half the width of the ellipsoid of all points within reach
     detours, which, where = [0.0 for _ in range(0)], [0 for _ in range(0)], [0.0 for _ in range(0)]
-    for i in range(start.shape[0]):
-        mx = middle[i, 0] - source[0]
-        my = middle[i, 1] - source[1]
-        mz = middle[i, 2] - source[2]
+    near = [0 for _ in range(0)]
+    for b in range(blocks.shape[0]):
+        if _off(centre[b], source, ahead, length) <= (radius[b] + aside + reach) ** 2:
+            for i in blocks[b]:
+                if (
+                    i >= 0
+                    and _off(middle[i], source, ahead, length) <= (halves[i] + aside + reach) ** 2
+                ):
+                    near.append(i)
+    for i in sorted(near):
         half = halves[i]
-        along = mx * ahead[0] + my * ahead[1] + mz * ahead[2]
-        along = min(max(along, 0.0), length)
-        off = (
-            (mx - along * ahead[0]) ** 2
-            + (my - along * ahead[1]) ** 2
-            + (mz - along * ahead[2]) ** 2
-        )
-        if off > (half + aside + reach) ** 2:
-            continue
         unit = span[i] / (2 * half)
         a, b = source - start[i], sink - start[i]
         sa, sb = (a * unit).sum(), (b * unit).sum()

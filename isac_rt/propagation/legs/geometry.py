@@ -36,7 +36,9 @@ class Legs:
 
     def select(self, which: np.ndarray | slice) -> Legs:
         """The legs that an index array or a slice chooses."""
-        return Legs(*(array[which] for array in vars(self).values()))
+        if isinstance(which, slice):
+            return Legs(*(array[which] for array in vars(self).values()))
+        return Legs(*(array.take(which, axis=0) for array in vars(self).values()))
 
 
 def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> Legs:

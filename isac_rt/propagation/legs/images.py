@@ -118,14 +118,7 @@ def _sides(flat: np.ndarray) -> np.ndarray:
 def _face_at(mirrors, plane, x, y, z):
     """The face of a plane that holds a point of it, the first in the order of the faces; -1 where
     there is none."""
-    m = mirrors
-    if not (
-        m.low[plane, 0] <= x <= m.high[plane, 0]
-        and m.low[plane, 1] <= y <= m.high[plane, 1]
-        and m.low[plane, 2] <= z <= m.high[plane, 2]
-    ):
-        return -1
-    place = (x, y, z)
+    m, place = mirrors, (x, y, z)
     u, v = place[m.axes[plane, 0]], place[m.axes[plane, 1]]
     low, high = m.first[plane], m.first[plane + 1]
     left = u - m.widest[plane] - WIDER
@@ -156,15 +149,18 @@ def reflected(chains, mirrors, depth, start, ends):
     -------
     number of the place (K,), faces (K, depth) in order, -1 where a chain is shorter
     """
-    count = chains.plane.size
+    planes, parents = chains.plane, chains.parent
+    # an array that is taken out of a tuple within the loop is counted there, at 10 ns each
+    normals, offsets, low, high = mirrors.normals, mirrors.offsets, mirrors.low, mirrors.high
+    count = planes.size
     image, behind = np.empty((count, 3)), np.empty(count)
     met = np.empty(depth, np.int64)
     found = [0 for _ in range(0)]
     for k in range(count):
-        plane, parent = chains.plane[k], chains.parent[k]
-        n = mirrors.normals[plane]
+        plane, parent = planes[k], parents[k]
+        n = normals[plane]
         source = start if parent < 0 else image[parent]
-        height = n[0] * source[0] + n[1] * source[1] + n[2] * source[2] - mirrors.offsets[plane]
+        height = n[0] * source[0] + n[1] * source[1] + n[2] * source[2] - offsets[plane]
         for i in range(3):
             image[k, i] = source[i] - 2 * height * n[i]
         behind[k] = -height
@@ -172,12 +168,12 @@ def reflected(chains, mirrors, depth, start, ends):
             x, y, z = ends[s, 0], ends[s, 1], ends[s, 2]
             row, bounces = k, 0
             while row >= 0:
-                plane = chains.plane[row]
+                plane = planes[row]
                 above = (
-                    mirrors.normals[plane, 0] * x
-                    + mirrors.normals[plane, 1] * y
-                    + mirrors.normals[plane, 2] * z
-                    - mirrors.offsets[plane]
+                    normals[plane, 0] * x
+                    + normals[plane, 1] * y
+                    + normals[plane, 2] * z
+                    - offsets[plane]
                 )
                 if not above * behind[row] < 0:
                     break
@@ -185,11 +181,17 @@ def reflected(chains, mirrors, depth, start, ends):
                 x = image[row, 0] + share * (x - image[row, 0])
                 y = image[row, 1] + share * (y - image[row, 1])
                 z = image[row, 2] + share * (z - image[row, 2])
+                if not (
+                    low[plane, 0] <= x <= high[plane, 0]
+                    and low[plane, 1] <= y <= high[plane, 1]
+                    and low[plane, 2] <= z <= high[plane, 2]
+                ):
+                    break
                 met[bounces] = _face_at(mirrors, plane, x, y, z)
                 if met[bounces] < 0:
                     break
                 bounces += 1
-                row = chains.parent[row]
+                row = parents[row]
             if row < 0:
                 found.append(s)
                 for b in range(depth):
