@@ -221,8 +221,8 @@ OF_CASES = {
     ),
     "speckle of range doppler cells": Bug(
         "propagation/clutter/cells.py",
-        "np.sqrt(-np.log(uniform[2])) *",
-        "np.ones_like(uniform[2]) *",
+        "np.sqrt(-np.log(uniform[0])) *",
+        "np.ones_like(uniform[0]) *",
     ),
     "doppler of range cells": Bug(
         "propagation/clutter/field.py",

@@ -124,7 +124,7 @@ def test_cells_of_a_long_flight_are_those_of_plain_recursion(density):
     """Area and order of all cells of a street beside 133 places of a bent flight, by recursion with
     no shortcut; the second time in quarters near the flight. Planted bugs: boxes begin one place
     late; a box's distance with its corners swapped; the second half begins at the other end of the
-    edge; quarters everywhere."""
+    edge; quarters everywhere; a centroid is taken to move by a fifth of its way."""
     city = canyon()
     t = np.linspace(0, 1, 133)[:, None]
     places = np.hstack([3.1 * np.sin(5 * t), 71 * t - 30, 6 + 9 * t])
@@ -192,6 +192,35 @@ def test_hash_of_cells_is_splitmix64():
     assert randomness.splitmix64(states, words).tolist() == [
         splitmix64(int(s), int(w)) for s, w in zip(states, words, strict=True)
     ]
+
+
+def test_points_are_hashed_from_the_state_of_their_face_and_the_code_of_their_cell():
+    """In whole numbers of Python, uniform in the triangle to which the code leads; of cells that
+    are wanted the same as of all. Planted bugs: the root taken twice, a shift by another number, faces in
+    another order than points."""
+    city = canyon()
+    every = all_cells(city)
+    chosen = np.random.default_rng(4).random(len(every)) < 0.02
+    args = city, np.ones(city.num_faces, bool), PLACES - city.origin, DENSITY, 3
+    cells = cut(*args, wanted=lambda points, face: chosen & (points[:, 2] > 0.1))
+    kept = every.select(np.flatnonzero(chosen & (every.points[:, 2] > 0.1)))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(vars(cells).values(), vars(kept).values(), strict=True)
+    )
+    assert 0 < len(cells) < chosen.sum()
+    for face, code, point in zip(cells.face, cells.code, cells.points, strict=True):
+        corners = city.corners[face][np.lexsort(city.corners[face].T[::-1])]
+        start = clutter_cells._face_state(corners[None] + city.origin, 3)[0]
+        for bit in f"{int(code):b}"[1:]:
+            edges = [np.linalg.norm(corners[(k + 1) % 3] - corners[k]) for k in range(3)]
+            k = next(k for k in range(3) if edges[k] > max(edges) * (1 - 1e-9))
+            p, q, r = (corners[(k + n) % 3] for n in range(3))
+            corners = np.array([p, (p + q) / 2, r] if bit == "0" else [(p + q) / 2, q, r])
+        state = splitmix64(int(start), int(code))
+        one, share = (((splitmix64(state, k) >> 11) + 0.5) / 2**53 for k in range(2))
+        a, b, c = corners
+        expected = a + np.sqrt(one) * (b - a + share * (c - b))
+        assert point == pytest.approx(expected, abs=1e-12)
 
 
 def test_phase_of_a_scatterer_is_a_hash_of_its_place():

@@ -10,6 +10,7 @@ scatterer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -115,9 +116,14 @@ class Cells:
 
 
 def cut(
-    city: CityMesh, scattering: np.ndarray, places: np.ndarray, density: Density, seed: int
+    city: CityMesh,
+    scattering: np.ndarray,
+    places: np.ndarray,
+    density: Density,
+    seed: int,
+    wanted: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Cells:
-    """All scatterers of a city.
+    """The scatterers of a city.
 
     Parameters
     ----------
@@ -126,6 +132,8 @@ def cut(
     places : (K, 3) points along the flights of the whole run, local coordinates [m]
     density : Density
     seed : of the scenario
+    wanted : says of the points (N, 3) of all scatterers and their faces (N,) which are, (N,) bool;
+        None: all
 
     Returns
     -------
@@ -139,9 +147,12 @@ def cut(
     corners = _sorted_corners(city.corners[face])
     order = np.lexsort(corners.reshape(-1, 9).T[::-1])
     face, corners = face[order], corners[order]
-    state = _face_state(corners + city.origin, seed)
     count, *leaves = _leaves(
-        corners, city.areas[face], places, _boxes(places), astuple(density), MOST_CELLS
+        (corners, city.areas[face], _face_state(corners + city.origin, seed)),
+        places,
+        _boxes(places),
+        astuple(density),
+        MOST_CELLS,
     )
     if count > MOST_CELLS:
         raise ValueError(
@@ -149,10 +160,14 @@ def cut(
             "or cell_area_per_metre_m) cuts "
             f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
         )
-    rows, codes, areas, triangles = (part[:count] for part in leaves)
-    point, amplitude, clock = _draw(splitmix64(state[rows], codes), triangles)
+    rows, *leaves = (part[:count] for part in leaves)
     own = face[rows].astype(np.int32)
-    return Cells(point, areas.astype(np.float32), amplitude, own, codes, clock / areas)
+    if wanted is not None:
+        some = np.flatnonzero(wanted(leaves[-1], own))
+        own, *leaves = (part[some] for part in (own, *leaves))
+    codes, areas, states, points = leaves
+    amplitude, clock = _draw(states)
+    return Cells(points, areas.astype(np.float32), amplitude, own, codes, clock / areas)
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:
@@ -168,85 +183,131 @@ def _boxes(places: np.ndarray) -> np.ndarray:
 
 
 @jit
-def _leaves(corners, area, places, boxes, density, most):
-    """Cells of faces (F, 3, 3) that are cut no further: how many, then the row of the face, code,
-    area and corners, in the order of row and code. Ends early where there are more than `most`."""
+def _leaves(faces, places, boxes, density, most):
+    """Cells of faces, their corners (F, 3, 3), areas and states, that are cut no further: how many,
+    then the row of the face, code, area, state and point, in the order of row and code. Ends early
+    where there are more than `most`."""
+    corners, area, face_states = faces
     per_metre, smallest, near = density
     room = max(2 * area.size, 1024)
     rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
-    areas, cells = np.empty(room), np.empty((room, 3, 3))
+    areas, states, points = np.empty(room), np.empty(room, np.uint64), np.empty((room, 3))
     line_codes, line_areas = np.empty(64, np.uint64), np.empty(64)
     line = np.empty((64, 3, 3))  # cells of one face that wait, those of few halvings first
+    spans = np.empty((64, 2))  # their distances to the nearest place lie between these
     count = 0
     for row in range(area.size):
         line_codes[0], line_areas[0], line[0] = 1, area[row], corners[row]
+        spans[0, 0], spans[0, 1] = 0.0, np.inf
         first, last = 0, 1
         while first < last:
             if count + last - first > most:
-                return most + 1, rows, codes, areas, cells
+                return most + 1, rows, codes, areas, states, points
             size = line_areas[first]
             reach = size / per_metre if size > smallest else 0.0
             if FINER * size > smallest:
                 reach = max(reach, min(FINER * size / per_metre, near))
-            if reach == 0 or not _near(line[first], reach, places, boxes):
+            if reach == 0 or not _near(line[first], reach, places, boxes, spans[first]):
                 if count == rows.size:
                     rows, codes = np.append(rows, rows), np.append(codes, codes)
-                    areas, cells = np.append(areas, areas), np.concatenate((cells, cells))
-                rows[count], codes[count] = row, line_codes[first]
-                areas[count], cells[count] = line_areas[first], line[first]
+                    areas, states = np.append(areas, areas), np.append(states, states)
+                    points = np.concatenate((points, points))
+                rows[count], codes[count], areas[count] = row, line_codes[first], size
+                states[count] = _hashed(face_states[row], line_codes[first])
+                _place(line[first], states[count], points[count])
                 count, first = count + 1, first + 1
                 continue
             if last + 2 > line_areas.size:
                 line_codes = np.append(line_codes[first:last], line_codes)
                 line_areas = np.append(line_areas[first:last], line_areas)
                 line = np.concatenate((line[first:last], line))
+                spans = np.concatenate((spans[first:last], spans))
                 first, last = 0, last - first
-            _halve(line[first], line[last], line[last + 1])
+            apart = _halve(line[first], line[last], line[last + 1]) / 6  # of a half's centroid
             for half in range(2):
                 line_codes[last + half] = line_codes[first] * np.uint64(2) + np.uint64(half)
                 line_areas[last + half] = line_areas[first] / 2
+                spans[last + half, 0] = spans[first, 0] - apart
+                spans[last + half, 1] = spans[first, 1] + apart
             first, last = first + 1, last + 2
-    return count, rows, codes, areas, cells
-
-
-@jit
-def _near(corners, limit, places, boxes):
-    """Whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a sphere
-    about its centroid that holds it."""
-    middle = (corners[0] + corners[1] + corners[2]) / 3
-    reach = 0.0
-    for corner in corners:
-        reach = max(reach, _distance(corner, middle))
-    for number, (low, high) in enumerate(boxes):
-        within = np.minimum(np.maximum(middle, low), high)
-        if _distance(within, middle) > (1 + ALIKE) * (limit + reach):
-            continue
-        for place in places[number * BOX : (number + 1) * BOX]:
-            if max(_distance(place, middle) - reach, 0.0) < limit:
-                return True
-    return False
+    return count, rows, codes, areas, states, points
 
 
 @jit(inline=True)
-def _distance(a, b):
-    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-    return np.sqrt(x * x + y * y + z * z)
+def _hashed(state, word):
+    """`splitmix64` of one."""
+    state = state + (word + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))
+
+
+@jit
+def _place(corners, state, point):
+    """A point, uniform in a triangle (3, 3)."""
+    root = np.sqrt((np.float64(_hashed(state, np.uint64(0)) >> np.uint64(11)) + 0.5) / 2**53)
+    share = (np.float64(_hashed(state, np.uint64(1)) >> np.uint64(11)) + 0.5) / 2**53
+    for axis in range(3):
+        a, b, c = corners[0, axis], corners[1, axis], corners[2, axis]
+        point[axis] = (1 - root) * a + root * ((1 - share) * b + share * c)
+
+
+@jit
+def _near(corners, limit, places, boxes, span):
+    """Whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a sphere
+    about its centroid that holds it. Places are asked only where `span`, between which the distance
+    from the centroid to the nearest place lies, leaves it open; it is then known."""
+    x, y, z = _middle(corners, 0), _middle(corners, 1), _middle(corners, 2)
+    reach = 0.0
+    for k in range(3):
+        reach = max(reach, _square(corners[k, 0] - x, corners[k, 1] - y, corners[k, 2] - z))
+    reach = np.sqrt(reach)
+    if span[1] < (1 - ALIKE) * (limit + reach):
+        return True
+    if span[0] > (1 + ALIKE) * (limit + reach):
+        return False
+    least = (1 + ALIKE) * span[1] ** 2
+    for b in range(len(boxes)):
+        dx = max(boxes[b, 0, 0] - x, x - boxes[b, 1, 0], 0.0)
+        dy = max(boxes[b, 0, 1] - y, y - boxes[b, 1, 1], 0.0)
+        dz = max(boxes[b, 0, 2] - z, z - boxes[b, 1, 2], 0.0)
+        if _square(dx, dy, dz) > (1 + ALIKE) * least:
+            continue
+        for k in range(b * BOX, min((b + 1) * BOX, len(places))):
+            least = min(least, _square(places[k, 0] - x, places[k, 1] - y, places[k, 2] - z))
+    span[0] = span[1] = np.sqrt(least)
+    return max(span[0] - reach, 0.0) < limit
+
+
+@jit(inline=True)
+def _middle(corners, axis):
+    return (corners[0, axis] + corners[1, axis] + corners[2, axis]) / 3
+
+
+@jit(inline=True)
+def _square(x, y, z):
+    return x * x + y * y + z * z
 
 
 @jit
 def _halve(corners, one, other):
-    """Cut a triangle (3, 3) from the middle of its longest edge into two."""
-    edges = np.empty(3)
-    for k in range(3):
-        edges[k] = _distance(corners[(k + 1) % 3], corners[k])
-    first, least = 0, edges.max() * (1 - ALIKE)
-    while edges[first] < least:
-        first += 1
+    """Cut a triangle (3, 3) from the middle of its longest edge into two; that edge's length."""
+    edges = _edge(corners, 0), _edge(corners, 1), _edge(corners, 2)
+    longest = max(edges)
+    least = longest * (1 - ALIKE)
+    first = 0 if edges[0] >= least else 1 if edges[1] >= least else 2
     for axis in range(3):
         a, b = corners[first, axis], corners[(first + 1) % 3, axis]
         middle = (a + b) / 2
         one[0, axis], one[1, axis], one[2, axis] = a, middle, corners[(first + 2) % 3, axis]
         other[0, axis], other[1, axis], other[2, axis] = middle, b, corners[(first + 2) % 3, axis]
+    return longest
+
+
+@jit(inline=True)
+def _edge(corners, k):
+    a, b = corners[k], corners[(k + 1) % 3]
+    return np.sqrt(_square(b[0] - a[0], b[1] - a[1], b[2] - a[2]))
 
 
 def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
@@ -259,13 +320,9 @@ def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
     return state
 
 
-def _draw(state: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A point, uniform in each triangle (N, 3, 3), a complex Gaussian amplitude of unit power, and
-    an exponential of unit mean."""
-    words = np.arange(5, dtype=np.uint64)[:, None]
+def _draw(state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A complex Gaussian amplitude of unit power, and an exponential of unit mean."""
+    words = np.arange(2, 5, dtype=np.uint64)[:, None]
     uniform = ((splitmix64(state, words) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
-    root, share = np.sqrt(uniform[0])[:, None], uniform[1][:, None]
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    point = (1 - root) * a + root * ((1 - share) * b + share * c)
-    amplitude = np.sqrt(-np.log(uniform[2])) * np.exp(2j * np.pi * uniform[3])
-    return point, amplitude.astype(np.complex64), -np.log(uniform[4])
+    amplitude = np.sqrt(-np.log(uniform[0])) * np.exp(2j * np.pi * uniform[1])
+    return amplitude.astype(np.complex64), -np.log(uniform[2])

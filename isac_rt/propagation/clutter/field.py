@@ -179,9 +179,15 @@ class ClutterField:
         lookouts = _kept_places([flights[name] for name in swarm.transmitters])
 
         def found() -> dict[str, Any]:
-            every = cut(city, scatters, places, density, seed)
-            seen = shadows.ever_sees(lookouts, every.points, city.normals[every.face])
-            return {"cells": vars(every.select(np.flatnonzero(seen))), "of": len(every)}
+            of = 0
+
+            def in_sight(points: np.ndarray, face: np.ndarray) -> np.ndarray:
+                nonlocal of
+                of = len(face)
+                return shadows.ever_sees(lookouts, points, city.normals[face])
+
+            cells = cut(city, scatters, places, density, seed, in_sight)
+            return {"cells": vars(cells), "of": of}
 
         depends_on = [city.plain(), places, lookouts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
