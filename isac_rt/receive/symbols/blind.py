@@ -27,6 +27,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.symbols.beams import rate_error, transitions_of
 from isac_rt.receive.symbols.powers import Symbols, known_cycles, nearest_symbols
@@ -141,7 +142,7 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
     fast = np.arange(size)
     halves = [np.exp(-1j * np.pi * h * fast / size) for h in (0, 1)]
     factors = [np.broadcast_to(h.astype(np.complex64), (chirps, size)) for h in halves]
-    spectra = np.empty((2, num_rx, size, chirps), np.complex64)
+    spectra = new_memory((2, num_rx, size, chirps))
     cells, places = np.empty((groups, chirps, PEAKS)), np.empty((groups, chirps, PEAKS), np.int64)
     values = np.empty((groups, chirps, PEAKS, num_rx), np.complex64)
     noise = np.empty(groups)

@@ -19,6 +19,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform
@@ -114,7 +115,7 @@ def demodulate(
     raw, sure = np.empty(shape, np.int64), np.empty(shape)
     picked = np.empty((shape[0], cube.samples.shape[1], shape[1]), np.complex128)
     cells = symbol_cells(w)
-    spectra = np.empty((picked.shape[1], cells.size, shape[1]), np.complex64)
+    spectra = new_memory((picked.shape[1], cells.size, shape[1]))
     for m in range(shape[0]):
         turn = tones(-beats[m] / w.num_samples, w.num_samples)
         power = np.zeros(turn.shape, np.float32)
