@@ -196,8 +196,8 @@ def test_hash_of_cells_is_splitmix64():
 
 def test_points_are_hashed_from_the_state_of_their_face_and_the_code_of_their_cell():
     """In whole numbers of Python, uniform in the triangle to which the code leads; of cells that
-    are wanted the same as of all. Planted bugs: the root taken twice, a shift by another number, faces in
-    another order than points."""
+    are wanted the same as of all. Planted bugs: the root taken twice, a shift by another
+    number, faces in another order than points."""
     city = canyon()
     every = all_cells(city)
     chosen = np.random.default_rng(4).random(len(every)) < 0.02

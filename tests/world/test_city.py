@@ -280,6 +280,32 @@ def test_faces_of_one_wall_share_a_plane_whichever_way_they_face():
     assert np.abs(residual).max() < ROUNDING
 
 
+def test_planes_of_many_faces_are_those_of_the_rule():
+    """Of 900 triangles in 150 planes, some wide of their own plane by more or less than what is
+    allowed: the largest founds a plane and takes in all that lie in it, then the next. Planted
+    bugs: what is left keeps the corners of others; the last faces of a batch are not asked."""
+    rng = np.random.default_rng(12)
+    normal = rng.normal(size=(150, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    which, wide = rng.integers(150, size=900), rng.choice([0.0, 0.6e-3, 3e-3], size=(900, 3, 1))
+    corners = rng.uniform(-40, 40, (900, 3, 3))
+    n = normal[which, None]
+    corners += (which[:, None, None] / 9 - (corners * n).sum(2, keepdims=True) + wide) * n
+    faces = np.arange(2700, dtype=np.int32).reshape(900, 3)
+    city = CityMesh(
+        "planes", corners.reshape(-1, 3), faces, np.zeros(900, np.int16), (), np.zeros(3), (), 1e-3
+    )
+    expected = np.full(900, -1)
+    for number, face in enumerate(np.argsort(-city.areas, kind="stable")):
+        if expected[face] < 0:
+            off = np.abs(city.corners @ city.normals[face] - city.plane_offsets[face])
+            expected[(expected < 0) & (off <= 1e-3).all(axis=1)] = number
+            expected[face] = number
+    _, expected = np.unique(expected, return_inverse=True)
+    assert np.array_equal(city.plane_of_face, expected)
+    assert 200 < expected.max() < 800
+
+
 def test_float32_files_get_their_own_plane_tolerance():
     city = load_city(node(source="builtin", name="box"), ".", F_C, ORIGIN)
     assert city.plane_of_face.max() + 1 == 6

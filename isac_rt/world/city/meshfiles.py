@@ -80,15 +80,15 @@ def _plain_triangles(data: bytes) -> tuple[NDArray, NDArray] | None:
 
 def _polygons(path: Path) -> Iterator[Piece]:
     """PLY: plain triangles are read here, of all else trimesh takes the numbers."""
-    from trimesh.exchange.ply import load_ply
-    from trimesh.geometry import triangulate_quads
-
     data = read_bytes(path)
     plain = _plain_triangles(data)
     if plain is not None:
         vertices, faces = plain
         yield Piece(vertices.astype(np.float64), faces.astype(np.int64), (path.name,))
         return
+    from trimesh.exchange.ply import load_ply
+    from trimesh.geometry import triangulate_quads
+
     if data.count(b"property", 0, data.find(b"end_header")) > _MAX_PROPERTIES:
         raise ValueError(f"more than {_MAX_PROPERTIES} properties")
     with warnings.catch_warnings():
