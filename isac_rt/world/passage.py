@@ -41,26 +41,31 @@ def first_passage(city: CityMesh, way: np.ndarray) -> Passage | None:
     city : CityMesh
     way : (T, 3) corners of a polyline, local [m]
     """
-    return _first(city.corners, np.arange(city.num_faces), way, 0)
+    return _first(city, np.arange(city.num_faces), way, 0)
 
 
-def _first(corners: np.ndarray, faces: np.ndarray, way: np.ndarray, begin: int) -> Passage | None:
+def _beside(city: CityMesh, way: np.ndarray, faces: np.ndarray | slice) -> np.ndarray:
+    """(N,) which of some faces have boxes that meet that of a way (T, 3)."""
+    low, high = city.boxes
+    inside = (low[faces] <= way.max(axis=0)) & (high[faces] >= way.min(axis=0))
+    return np.asarray(inside.all(axis=1))
+
+
+def _first(city: CityMesh, faces: np.ndarray, way: np.ndarray, begin: int) -> Passage | None:
     """By halves: only faces whose boxes meet that of a part of the way are looked at again."""
-    near = corners[faces]
-    inside = (near.min(axis=1) <= way.max(axis=0)) & (near.max(axis=1) >= way.min(axis=0))
-    faces = faces[inside.all(axis=1)]
+    faces = faces[_beside(city, way, faces)]
     if not faces.size or len(way) < 2:
         return None
     if len(way) == 2:
-        hit, share = hits(corners[faces], way[0], way[1])
+        hit, share = hits(city.corners[faces], way[0], way[1])
         return (
             Passage(begin, float(share.min()), int(faces[hit[share.argmin()]]))
             if hit.size
             else None
         )
     half = len(way) // 2
-    return _first(corners, faces, way[: half + 1], begin) or _first(
-        corners, faces, way[half:], begin + half
+    return _first(city, faces, way[: half + 1], begin) or _first(
+        city, faces, way[half:], begin + half
     )
 
 
@@ -99,7 +104,9 @@ def enclosed(city: CityMesh, place: np.ndarray) -> bool:
     def count(elevation: float, azimuth: float) -> int:
         level = np.cos(elevation)
         towards = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        return len(hits(city.corners, place, place + reach * np.array(towards))[0])
+        end = place + reach * np.array(towards)
+        near = city.corners[_beside(city, np.stack([place, end]), slice(None))]
+        return len(hits(near, place, end)[0])
 
     # no direction is along an edge of what people build: an edge would count twice
     above = count(np.pi / 2 - 1e-4, 0.37)

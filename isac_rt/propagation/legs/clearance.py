@@ -24,14 +24,13 @@ class Clearance:
 
     def __init__(self, city: CityMesh) -> None:
         self._city = city
-        self._box = city.corners.min(axis=1), city.corners.max(axis=1)
         self._warned: set[str] = set()
 
     def check(self, places: Mapping[str, np.ndarray], time: float) -> None:
         """Warn of bodies at local positions (3,)."""
         city, names = self._city, [name for name in places if name not in self._warned]
         every = np.array([places[name] for name in names]).reshape(-1, 3)
-        body, face = _beside(city.normals, city.plane_offsets, *self._box, every, CLEARANCE)
+        body, face = _beside(city.normals, city.plane_offsets, *city.boxes, every, CLEARANCE)
         for number in np.unique(body):
             name, near = names[number], face[body == number]
             apart = float(distance_to_triangles(city.corners[near], places[name]).min())

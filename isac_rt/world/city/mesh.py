@@ -106,6 +106,13 @@ class CityMesh:
         return _read_only(self.vertices[self.faces])
 
     @cached_property
+    def boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(F, 3) lowest and (F, 3) highest coordinates of the faces, local. [m]"""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        return _read_only(low), _read_only(high)
+
+    @cached_property
     def _cross(self) -> NDArray[np.float64]:
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return np.cross(b - a, c - a)
