@@ -85,13 +85,15 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         from isac_rt.simulation import simulate
         from isac_rt.simulation.resume import Resume
         from isac_rt.simulation.setup import link_budgets, prepare
+        from isac_rt.world.area import city_digest
 
-    resume = Resume(folder, run_content(loaded, snapshots))
+        city = city_digest(loaded.city, loaded.folder)
+    resume = Resume(folder, run_content(loaded, snapshots, city))
     if restart:
         resume.remove()
     resume.check()
     with working("setting up"):
-        setup = prepare(loaded)
+        setup = prepare(loaded, digest=city)
         budget = link_budgets(setup)
     _say_city(setup.city.notes)
     _say_coverage(asdict(setup.coverage))

@@ -402,13 +402,14 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
     return rows
 
 
-def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
+def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | None = None) -> Setup:
     """Load and build everything that the frames of a run share.
 
     Parameters
     ----------
     scenario : Scenario
     store : where traced paths are looked up first and kept
+    digest : `city_digest`, where it is known already
 
     Raises
     ------
@@ -434,7 +435,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None) -> Setup:
     # the blocks, and with them the reach, are found out in the run where links are established
     radius = np.inf if scenario.access.establish else plan.mesh_radius(swarm.middle)
     carrier = waveform.carrier_frequency
-    digest = city_digest(scenario.city, scenario.folder)
+    digest = city_digest(scenario.city, scenario.folder) if digest is None else digest
     about = swarm.middle, scenario.city, scenario.folder, carrier
     city = city_about(*about, radius, digest)
     check_passage(swarm, timetable, city_about(*about, digest=digest))
