@@ -275,9 +275,7 @@ def _group_planes(
 
 
 @jit(fast=True)
-def _count_near(
-    x: NDArray, y: NDArray, z: NDArray, nx: float, ny: float, nz: float, d: float, most: float
-) -> int:
+def _count_near(x, y, z, nx, ny, nz, d, most):
     """How many points are near a plane, but for rounding; the compiler takes many at once."""
     count = 0
     for i in range(x.size):
