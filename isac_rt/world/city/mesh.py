@@ -274,8 +274,10 @@ def _group_planes(
     return plane
 
 
-@jit(fast=True)
-def _count_near(x, y, z, nx, ny, nz, d, most):
+@jit(fast=True)  # type: ignore[untyped-decorator]
+def _count_near(
+    x: NDArray, y: NDArray, z: NDArray, nx: float, ny: float, nz: float, d: float, most: float
+) -> int:
     """How many points are near a plane, but for rounding; the compiler takes many at once."""
     count = 0
     for i in range(x.size):
