@@ -15,7 +15,7 @@ from typing import Any
 from isac_rt.scenario.file import ScenarioWarning, to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.storage import program_fingerprint, versions
-from isac_rt.world.area import file_digest
+from isac_rt.world.area import city_digest, file_digest
 
 
 def versions_in_use() -> dict[str, str]:
@@ -100,8 +100,10 @@ def _without_front_end(node: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in node.items() if key not in ("front_end", "calibration")}
 
 
-def run_content(scenario: Scenario, snapshots: int, city: str) -> str:
-    """All that the results of a run depend on, as text; `city`: digest of the city's files."""
+def run_content(scenario: Scenario, snapshots: int, city: str | None = None) -> str:
+    """All that the results of a run depend on, as text; `city`: `city_digest`, where it is known
+    already."""
+    city = city_digest(scenario.city, scenario.folder) if city is None else city
     named = scenario.cost_model_path(), scenario.calibration_path()
     files = [city, *("" if file is None else file_digest(file) for file in named)]
     return json.dumps(

@@ -598,7 +598,7 @@ def keys(folder: Path) -> dict[str, str]:
     return {
         "city": city_digest(read.city, folder),
         "paths": path_content(read.model_dump(mode="json"), city_digest(read.city, folder)),
-        "run": run_content(read, 0, city_digest(read.city, folder)),
+        "run": run_content(read, 0),
         "point": point.key,
         "paths of a point": str(point.paths_key),
     }
