@@ -15,6 +15,7 @@ from test_diffraction import chopped
 from isac_rt import scenario
 from isac_rt.frame.link import Link
 from isac_rt.propagation import PathKind
+from isac_rt.propagation.legs import edges as edges_of_cities
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
 from isac_rt.propagation.legs.edges import MOST_TRIED, Edges, _near
@@ -255,29 +256,31 @@ def test_clutter_behind_a_body_is_in_its_shadow():
         assert ratio.min() < 0.2
 
 
-def test_no_edge_near_a_path_is_passed_over():
-    """Triangles strewn over 300 m, edges of 1 to 60 m: the shortest detours of paths against a
+@pytest.mark.parametrize("together", [2, 32])
+def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
+    """Triangles strewn over 200 m, edges of 1 to 60 m: the shortest detours of paths against a
     search along every edge, by thirds. Planted bugs: balls about blocks that hold the middles of
     their edges alone; a last block without its edges."""
+    monkeypatch.setattr(edges_of_cities, "TOGETHER", together)
     rng = np.random.default_rng(5)
-    size = 10 ** rng.uniform(0, 1.5, (700, 1, 1))
-    corners = rng.uniform(-150, 150, (700, 1, 3)) + size * rng.uniform(-1, 1, (700, 3, 3))
-    vertices, faces = corners.reshape(-1, 3), np.arange(2100, dtype=np.int32).reshape(-1, 3)
+    size = 10 ** rng.uniform(0, 1.5, (333, 1, 1))
+    corners = rng.uniform(-100, 100, (333, 1, 3)) + size * rng.uniform(-1, 1, (333, 3, 3))
+    vertices, faces = corners.reshape(-1, 3), np.arange(999, dtype=np.int32).reshape(-1, 3)
     origin = np.zeros(3)
-    city = CityMesh("strewn", vertices, faces, np.zeros(700, np.int16), (METAL,), origin)
+    city = CityMesh("strewn", vertices, faces, np.zeros(333, np.int16), (METAL,), origin)
     edges, found = Edges.of(city), 0
     a, b = corners, np.roll(corners, -1, axis=1)
-    for _ in range(40):
-        source, sink = rng.uniform(-150, 150, (2, 3))
+    for _ in range(100):
+        ends = source, sink = rng.uniform(-100, 100, (2, 3))
         reach = 10 ** rng.uniform(-1, 0.5)
-        low, high = np.zeros((700, 3, 1)), np.ones((700, 3, 1))
+        low, high = np.zeros((333, 3, 1)), np.ones((333, 3, 1))
 
-        def detour(share, ends=(source, sink)):
+        def detour(share, ends=ends):
             at = a + share * (b - a)
             ways = [np.linalg.norm(at - end, axis=2, keepdims=True) for end in ends]
             return ways[0] + ways[1] - np.linalg.norm(ends[0] - ends[1])
 
-        for _ in range(90):
+        for _ in range(60):
             one, other = low + (high - low) / 3, high - (high - low) / 3
             left = detour(one) < detour(other)
             low, high = np.where(left, low, one), np.where(left, other, high)
@@ -285,4 +288,4 @@ def test_no_edge_near_a_path_is_passed_over():
         every = every[every < reach][:MOST_TRIED]
         assert _near(edges, source, sink, reach)[0] == pytest.approx(every, abs=1e-9)
         found += every.size
-    assert found > 150
+    assert found > 300
