@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Required, TypedDict, Unpack
 
 import numpy as np
@@ -124,7 +125,7 @@ class PathSet:
         """Who hears whom."""
         return Link(self.tx, self.rx)
 
-    @property
+    @cached_property
     def power(self) -> np.ndarray:
         """(K,) ``|gain|^2``."""
         return np.abs(self.gain) ** 2
@@ -143,7 +144,8 @@ class PathSet:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The columns by name."""
-        return {name: a for name, a in vars(self).items() if isinstance(a, np.ndarray)}
+        every = vars(self).items()
+        return {n: a for n, a in every if isinstance(a, np.ndarray) and n != "power"}
 
     def counts(self) -> dict[str, int]:
         """Number of paths of each kind, by the kind's name in lower case."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.cfar import hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
@@ -118,14 +119,6 @@ class Aim(NamedTuple):
     direction: np.ndarray
     beam: np.ndarray
 
-    def select(self, rows: np.ndarray) -> Aim:
-        """That of some paths."""
-        return self._replace(direction=self.direction[rows])
-
-    def off(self, direction: np.ndarray) -> np.ndarray:
-        """(K,) how many beams each path lies off a direction (2,); NaN where it is not known."""
-        return np.asarray((np.abs(self.direction - direction) / self.beam).max(axis=1))
-
 
 def explain(
     detections: Detections,
@@ -152,58 +145,92 @@ def explain(
     """
     places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
     diffuse = paths.kind == PathKind.DIFFUSE
-    others, field_rows = np.flatnonzero(~diffuse), np.flatnonzero(diffuse)
-    field_rows = field_rows[np.argsort(places.range[field_rows], kind="stable")]
-    ranges = places.range[field_rows]
-    beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
-    count = len(detections)
+    others = np.flatnonzero(~diffuse)
     apart = places.select(others).apart(detections.range[:, None], detections.velocity[:, None])
     shares = reach(apart[0]) * np.minimum(reach(apart[1]) + UNION_FLOOR, 1.0)
     close = (apart[0] <= 1) & (apart[1] <= 1)
+    if aim is None:
+        aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
+    cause, near = _causes(
+        (detections.range, detections.velocity, detections.direction),
+        (places.range, places.velocity, aim.direction),
+        (*places.cells, places.span, *aim.beam),
+        power,
+        np.flatnonzero(diffuse),
+        others,
+        shares,
+        close,
+    )
+    found = np.flatnonzero(cause >= 0)
+    rows, count = cause[found], len(detections)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
     )
-    out = Explanation(kinds, targets, orders, faces, np.zeros(count, bool))
-    for q in range(count):
-        at = detections.range[q]
-        first, last = np.searchsorted(ranges, [at - beside, at + beside])
-        around = np.sort(field_rows[first:last])
-        some = np.sort(np.concatenate([others, around]))
-        field, own = diffuse[some], power[some]
-        rows, bins = places.select(around).apart(at, detections.velocity[q])
-        near = np.zeros(some.size, bool)
-        near[field], near[~field] = (rows <= 1) & (bins <= 1), close[q]
-        here = np.where(field, 0.0, own)
-        here[~field] *= shares[q]
-        clutter = np.where(near & field, own, 0.0)
-        best = -1
-        if aim is not None:
-            off = aim.select(some).off(detections.direction[q])
-            towards = off <= 1
-            best = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
-            if best >= 0 and not near[best]:
-                towards &= near & (off < off[best])
-                best = _strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
+    kinds[found], targets[found], orders[found] = (
+        column[rows] for column in (paths.kind, paths.target, paths.bounces)
+    )
+    met = np.append(paths.faces[rows], np.full((len(rows), 1), -1), axis=1)
+    faces[found] = met[np.arange(len(rows)), (met >= 0).argmax(axis=1)]
+    return Explanation(kinds, targets, orders, faces, (cause >= 0) & ~near)
+
+
+@jit
+def _causes(detections, paths, scales, power, field, others, shares, close):
+    """Row of the path that caused each of Q detections (range, velocity and direction), -1 for
+    none, and whether it lies within a cell of it; `shares` and `close` (Q, M) are of the paths
+    `others`, and `scales` the two cells, the span of velocities and the two beams."""
+    (ranges, velocities, directions), (at, rate, towards) = detections, paths
+    row_cell, bin_cell, span, wide, high = scales
+    cause, beside = np.full(ranges.size, -1), np.zeros(ranges.size, np.bool_)
+    most = field.size + others.size
+    rows, near, able = np.empty(most, np.int64), np.empty(most, np.bool_), np.empty(most, np.bool_)
+    here, clutter, off = np.empty(most), np.empty(most), np.empty(most)
+    for q in range(ranges.size):
+        count = 0
+        for j in range(others.size):
+            rows[count], near[count] = others[j], close[q, j]
+            here[count], clutter[count] = power[others[j]] * shares[q, j], 0.0
+            count += 1
+        for i in field:
+            if abs(ranges[q] - at[i]) / row_cell <= 1:
+                slower = velocities[q] - rate[i]
+                slower -= span * np.round(slower / span)
+                if abs(slower) / bin_cell <= 1:
+                    rows[count], near[count] = i, True
+                    here[count], clutter[count] = 0.0, power[i]
+                    count += 1
+        for c in range(count):
+            x = abs(towards[rows[c], 0] - directions[q, 0]) / wide
+            z = abs(towards[rows[c], 1] - directions[q, 1]) / high
+            off[c] = max(x, z) if x + z >= 0 else np.nan
+            able[c] = off[c] <= 1
+        best = _strongest(here, clutter, able, count)
+        if best >= 0 and not near[best]:
+            for c in range(count):
+                able[c] &= near[c] and off[c] < off[best]
+            best = _strongest(here, clutter, able, count)
         if best < 0 or not near[best]:
-            best = _strongest(here, clutter)
-        if best < 0:
-            continue
-        cause = some[best]
-        out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
-        out.order[q], out.skirt[q] = paths.bounces[cause], not near[best]
-        met = paths.faces[cause][paths.faces[cause] >= 0]
-        out.face[q] = met[0] if met.size else -1
-    return out
+            able[:] = True
+            best = _strongest(here, clutter, able, count)
+        if best >= 0:
+            cause[q], beside[q] = rows[best], near[best]
+    return cause, beside
 
 
-def _strongest(power: np.ndarray, clutter: np.ndarray) -> int:
-    """The path of most power, -1 if none explains anything; all clutter counts as its strongest.
-
-    Parameters
-    ----------
-    power, clutter : (K,) of single paths, and of those that count together
-    """
-    power = power.copy()
-    if clutter.any():
-        power[np.argmax(clutter)] = clutter.sum()
-    return int(np.argmax(power)) if power.size and power.max() >= EXPLAINS else -1
+@jit
+def _strongest(power, clutter, able, count):
+    """Of the first `count` paths the one of most power that is `able`, -1 if none explains
+    anything; all clutter counts as its strongest. `power` is of single paths, `clutter` of those
+    that count together."""
+    first, total = -1, 0.0
+    for c in range(count):
+        if able[c] and clutter[c] > 0:
+            total += clutter[c]
+            if first < 0 or clutter[c] > clutter[first]:
+                first = c
+    best, most = -1, 0.0
+    for c in range(count):
+        mine = total if c == first else power[c]
+        if able[c] and mine >= EXPLAINS and mine > most:
+            best, most = c, mine
+    return best

@@ -153,18 +153,24 @@ class Chance:
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
         doppler = places.velocity[own] / places.cells[1]
         off_grid = hann_response(np.array([beat - round(beat), doppler - round(doppler)])).prod()
-        rows, bins = places.apart(places.range[own], places.velocity[own])
-        diffuse = paths.kind == PathKind.DIFFUSE
+        mine, rule, at = power[own], sees.rule, (places.range[own], places.velocity[own])
+        # most scatterers are farther off than all that is asked below
+        most = max(rule.guard[0] + rule.training[0] + 1, 2) * places.cells[0]
+        near = (np.abs(places.range - at[0]) < most) | (paths.kind != PathKind.DIFFUSE)
+        some = np.flatnonzero(near)
+        places, power = places.select(some), power[some]
+        diffuse = paths.kind[some] == PathKind.DIFFUSE
+        rows, bins = places.apart(*at)
         near = diffuse & (rows < 2) & (bins < 2)
         clutter = power[near] @ (hann_response(rows[near]) * hann_response(bins[near]))
-        others = ~diffuse & (power > power[own])
+        others = ~diffuse & (power > mine)
         lobes = hann_envelope(rows[others]) * (hann_envelope(bins[others]) + UNION_FLOOR)
-        covers = SIDELOBE_MARGIN * power[others] * lobes >= power[own] * off_grid
+        covers = SIDELOBE_MARGIN * power[others] * lobes >= mine * off_grid
         return cls(
-            float(sees.matched * life * power[own]),
-            float(sees.cell * life**2 * power[own] * off_grid),
+            float(sees.matched * life * mine),
+            float(sees.cell * life**2 * mine * off_grid),
             float(sees.cell * clutter),
-            _background(sees.cell * power, places.range[own] < places.range, rows, bins, sees.rule),
+            _background(sees.cell * power, at[0] < places.range, rows, bins, rule),
             bool(covers.any()),
         )
 

@@ -187,11 +187,13 @@ class Scorer:
         inside = np.array(
             [name != rx and within_view(self._antennas, own, active, poses[name]) for name in names]
         )
-        straight = np.where(paths.bent, -1, owners(paths.kind, paths.target, paths, names))
+        straight = owners(paths.kind, paths.target, paths, names)
+        some = np.flatnonzero(straight >= 0)
+        straight[some[paths.select(some).bent]] = -1
         direct = np.isin(np.arange(len(names)), straight)
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         everyone = np.array([poses[name].position - own.position for name in names])
-        directions = own.to_body(paths.arrival)[:, [0, 2]]
+        directions = own.to_body(paths.arrival)[:, ::2]
         return _View(
             truth, inside, direct, straight, seen, everyone[list(seen)], everyone, directions
         )
@@ -296,10 +298,10 @@ class Scorer:
         if self._passes == 1:
             return out
         half = self._timetable.waveform.frame_duration / 2
+        paths = paths.select((paths.kind == PathKind.GHOST) & (paths.bounces == 2))
         life = np.minimum(paths.end, half) - np.maximum(paths.begin, -half)
         matched = sees.matched * np.maximum(life, 0) / (2 * half) * paths.power
-        twice = (paths.kind == PathKind.GHOST) & (paths.bounces == 2)
-        twice &= matched >= 10 ** (MATCHED_DB / 10)
+        twice = matched >= 10 ** (MATCHED_DB / 10)
         # the same way there and back is over one wall
         twice &= (np.abs(paths.departure - paths.arrival) < SAME_WAY).all(axis=1)
         index = [list(self._swarm.uavs).index(name) for name in paths.target_names]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +101,8 @@ class Trajectory:
         self._fixed_boresight = (
             None if uav.boresight == "velocity" else np.array(uav.boresight, float)
         )
+        # tracing, plan, receivers and scores ask for the same instants of the frames at work
+        self._latest = lru_cache(maxsize=16)(self._pose)
         self._mount = None if not any(uav.mount_deg) else turned(uav.mount_deg).as_matrix()
         self._attitude: RotationSpline | None = None
         if uav.waypoints is None:
@@ -129,7 +131,10 @@ class Trajectory:
         return self._spline(inside) + (times - inside)[:, None] * self._spline(inside, 1)
 
     def pose(self, time: float) -> Pose:
-        """Pose at `time` [s]."""
+        """Pose at `time` [s]; the same object again for one of the latest."""
+        return self._latest(time)
+
+    def _pose(self, time: float) -> Pose:
         if self._spline is None:
             position, velocity, acceleration = (
                 self._start + time * self._velocity,
