@@ -175,7 +175,16 @@ def explain(
 
 
 @jit
-def _causes(detections, paths, scales, power, field, others, shares, close):
+def _causes(
+    detections: tuple[np.ndarray, ...],
+    paths: tuple[np.ndarray, ...],
+    scales: tuple[float, ...],
+    power: np.ndarray,
+    field: np.ndarray,
+    others: np.ndarray,
+    shares: np.ndarray,
+    close: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Row of the path that caused each of Q detections (range, velocity and direction), -1 for
     none, and whether it lies within a cell of it; `shares` and `close` (Q, M) are of the paths
     `others`, and `scales` the two cells, the span of velocities and the two beams."""
@@ -218,7 +227,7 @@ def _causes(detections, paths, scales, power, field, others, shares, close):
 
 
 @jit
-def _strongest(power, clutter, able, count):
+def _strongest(power: np.ndarray, clutter: np.ndarray, able: np.ndarray, count: int) -> int:
     """Of the first `count` paths the one of most power that is `able`, -1 if none explains
     anything; all clutter counts as its strongest. `power` is of single paths, `clutter` of those
     that count together."""
