@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from receiver_cubes import ANTENNAS
 
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.arms import all_channels
+from isac_rt.receive.clutter import bistatic
+from isac_rt.receive.clutter.coherent import Search, denominators
 from isac_rt.receive.clutter.scan import line_bounds, search_by_power, search_coherent
+from isac_rt.receive.known import Known
 
 GRID = 32
 ROUNDING = 1e-5  # float32
@@ -59,3 +67,23 @@ def test_the_search_by_power_finds_the_largest(scales: int):
     power = ((np.abs(x[..., None] + z[:, :, None]) ** 2).sum(axis=1) * scale).reshape(9, -1)
     np.testing.assert_allclose(peak, power.max(axis=1), rtol=ROUNDING)
     assert np.array_equal(place @ [GRID, 1], power.argmax(axis=1))
+
+
+@pytest.mark.parametrize("antennas", [ANTENNAS, replace(ANTENNAS, rx_x=5, rx_z=6)])
+@pytest.mark.parametrize("one_way", [False, True])
+def test_denominators_are_the_quadratic_forms_of_the_steering_vectors(antennas, one_way: bool):
+    """Every direction of the grid, 18 matrices. Planted bugs: what couples both axes once and not
+    twice; turns of two lines not conjugated; channels in another order; the last matrices left
+    out."""
+    known = Known.unmodulated(Waveform(), np.zeros((1, 120), int), antennas, 2)
+    limit = antennas.view_limit
+    search = bistatic.search_of(antennas, 30.0) if one_way else None
+    search = search or Search.of(all_channels(antennas), known.wavenumber, limit)
+    rng, size = np.random.default_rng(4), len(search.channels)
+    mixed = noise(rng, 18, size, size)
+    Q = np.eye(size) + mixed @ mixed.conj().transpose(0, 2, 1)
+    u = np.stack(np.meshgrid(search.cosines, search.cosines, indexing="ij"), axis=-1)
+    a = search.steering(u.reshape(-1, 2)).astype(complex)
+    expected = np.einsum("gi,sij,gj->sg", a.conj(), Q, a, optimize=True).real
+    found = denominators(Q, search).reshape(18, -1)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * expected.mean())

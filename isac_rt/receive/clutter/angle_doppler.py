@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.clutter.adaptive import scanned, threshold_of
@@ -91,7 +92,7 @@ class AngleDoppler(ClutterDetector):
         cell = cell[found.peak > PRUNED * limits[1][0]]
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
         note(search_white(heard(cell, everything), R, cell, everything, 0.0), limits[0])
-        inverses = dict(zip(cell.tolist(), np.linalg.inv(R), strict=True))
+        inverse = dict(zip(cell.tolist(), inverses(R), strict=True))
         for gate in self._gates(known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
             whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
@@ -106,9 +107,7 @@ class AngleDoppler(ClutterDetector):
         ]
         held_up = self._unexplained(power / (noise + expected), shown[0])
         half = bins // 2
-        whiteners = {
-            (c // bins, (c % bins + half) % bins): inverse for c, inverse in inverses.items()
-        }
+        whiteners = {(c // bins, (c % bins + half) % bins): one for c, one in inverse.items()}
         passed = shown[0] / held_up, shown[1] / held_up
         return Judged(*passed, noise + expected, shown[2], whiteners)
 

@@ -25,6 +25,7 @@ import numpy as np
 from scipy import ndimage, optimize, special
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
 from isac_rt.receive.clutter.adaptive import scanned
@@ -269,7 +270,7 @@ def search_white(
     R : (S, L_rx, L_rx) covariances in units of the noise
     cell : (S,) their numbers
     """
-    inverse = np.linalg.inv(R)
+    inverse = inverses(R)
     y = np.matmul(x, inverse.transpose(0, 2, 1))
     peak, cosines = _best(y, 1 / denominators(inverse, search), search)
     common = np.ones(len(x))

@@ -21,16 +21,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.hermitian import inverses
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.receive.arms import Channels, all_channels, both_arms
 from isac_rt.receive.clutter.power import REACH, Taper, cells_of, range_power, slow_power
-from isac_rt.receive.clutter.scan import line_bounds, search_coherent
+from isac_rt.receive.clutter.scan import Axis, line_bounds, quadratic_forms, search_coherent
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 
@@ -38,6 +40,8 @@ DIRECTIONS = 32
 """Values of each direction cosine that are searched; the peak between them is sought from there."""
 CLIMBED = 0.3, 0.12
 """Steps, in those of the grid, by which the peak between them is climbed."""
+TOGETHER = 8
+"""Scatterers that are added to a covariance at once."""
 FINE = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
@@ -108,6 +112,19 @@ class Search:
     def steering(self, cosines: np.ndarray) -> np.ndarray:
         """(..., L) complex64 exp(-j k v.u) of directions (..., 2)."""
         return turned(-self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T))
+
+    @cached_property
+    def axes(self) -> tuple[np.ndarray, Axis, Axis]:
+        """Numbers of the channels line by line, first those along X, and both axes' lines."""
+        axes = []
+        for lines in (self.along_x, self.along_z):
+            ends = np.cumsum([0, *(len(m) for m in lines.members)])
+            spectra = np.concatenate([np.zeros((DIRECTIONS, 0), np.complex64), *lines.spectra], 1)
+            cosines, sines = np.stack([spectra.real, spectra.imag])
+            turns = np.stack([lines.turns.real, lines.turns.imag])
+            axes.append(Axis(ends, cosines, sines, turns))
+        order = np.concatenate([*self.along_x.members, *self.along_z.members])
+        return order, axes[0], axes[1]
 
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
@@ -204,11 +221,12 @@ def search_white(
     R : (S, L, L) covariances in units of the noise
     cell : (S,) their numbers
     """
-    y = np.linalg.solve(R, x[..., None])[..., 0]
+    inverse = inverses(R)
+    y = np.matmul(inverse, x[..., None])[..., 0]
     # a^H R^-1 a is L^2 / a^H R a at least, by Cauchy and Schwarz
     peak, cosines = _whitened(y, denominators(R, search) / len(search.channels) ** 2, search)
     some = np.flatnonzero(peak >= least)
-    inverse = np.linalg.inv(R[some])
+    inverse = inverse[some]
     peak[some], cosines[some] = _whitened(y[some], 1 / denominators(inverse, search), search)
 
     def statistic(a: np.ndarray) -> np.ndarray:
@@ -252,31 +270,10 @@ def _whitened(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndar
 
 
 def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:
-    """a^H Q a of all directions: (S, G, G) from matrices Q (S, L, L).
-
-    Within the lines along an axis it depends on one cosine alone; what couples an X with a Z line
-    is a product of both spectra.
-    """
-    X, Z = search.along_x, search.along_z
-    out = np.zeros((len(matrix), DIRECTIONS, DIRECTIONS), np.float32)
-    for lines, axis in ((X, 2), (Z, 1)):
-        for i, (m, a) in enumerate(zip(lines.members, lines.spectra, strict=True)):
-            for j, (n, b) in enumerate(zip(lines.members, lines.spectra, strict=True)):
-                block = np.einsum(
-                    "gm,smn,gn->sg", a, matrix[:, m][:, :, n], b.conj(), optimize=True
-                )
-                block = np.expand_dims(block, axis)
-                if i == j:  # its turn is one
-                    out += block.real
-                    continue
-                turn = lines.turns[i] * lines.turns[j].conj()
-                out += (block * (turn if axis == 2 else turn[:, None])).real
-    for m, a, turn_z in zip(X.members, X.spectra, X.turns, strict=True):
-        for n, b, turn_x in zip(Z.members, Z.spectra, Z.turns, strict=True):
-            near = np.ascontiguousarray(a * turn_x.conj()[:, None])
-            far = 2 * (b.conj() * turn_z[:, None]).T
-            out += ((near @ matrix[:, m][:, :, n]) @ far).real
-    return np.maximum(out, 1e-6)
+    """a^H Q a of all directions: (S, G, G) float32 from Hermitian matrices Q (S, L, L)."""
+    out = np.empty((len(matrix), DIRECTIONS, DIRECTIONS), np.float32)
+    quadratic_forms(np.ascontiguousarray(matrix, np.complex64), *search.axes, out)
+    return out
 
 
 def _best(
@@ -285,9 +282,9 @@ def _best(
     """The largest statistic over the directions and where, interpolated."""
     peak = np.zeros(len(along_x), np.float32)
     place = np.zeros((len(along_x), 2), np.float32)
-    turns = (np.stack([t.real, t.imag]) for t in (search.along_x.turns, search.along_z.turns))
+    _, x, z = search.axes
     inside = search.inside.ravel().astype(np.float32)
-    search_coherent(along_x, along_z, *turns, inside, scale, peak, place)
+    search_coherent(along_x, along_z, x.turns, z.turns, inside, scale, peak, place)
     u = search.cosines
     return peak, u[0] + place * (u[1] - u[0])
 
@@ -298,7 +295,8 @@ class Bucketed:
 
     Attributes
     ----------
-    start : where those of each cell (row, bin) begin; the rows begin `REACH` before the first
+    start : where those of each cell (row, bin) begin, the strongest first; the rows begin `REACH`
+        before the first
     beat, doppler : of each scatterer, off the middle of its cell
     power : over the noise of a cell of one channel, before the responses
     steer : (K, L) complex64
@@ -331,13 +329,15 @@ class Bucketed:
         clutter, beat, doppler, row = clutter.select(heard), beat[heard], doppler[heard], row[heard]
         column = np.round(doppler).astype(np.int64)
         bucket = row * w.num_chirps + column % w.num_chirps
-        order = np.argsort(bucket, kind="stable")
+        share = (clutter.power / noise).astype(np.float32)
+        # by bucket, then by falling power, whose bits grow as it does
+        order = np.argsort((bucket << 32) - share.view(np.int32))
         places = search.channels.places
         return cls(
             np.searchsorted(bucket[order], np.arange(rows * w.num_chirps + 1)),
             (beat - row + REACH)[order].astype(np.float32),
             (doppler - column)[order].astype(np.float32),
-            (clutter.power / noise)[order].astype(np.float32),
+            share[order],
             turned(-known.wavenumber * (clutter.arrival[order] @ places.T)),
             tables,
             search.spread(taper.cosine),
@@ -353,10 +353,11 @@ class Bucketed:
         """(S, L, L) complex64 of noise and clutter in cells, Doppler in FFT order, in units of the
         noise."""
         size = self.steer.shape[1]
-        parts = np.zeros((2, rows.size, size, size), np.float32)
+        out = np.empty((rows.size, size, size), np.complex64)
         scatterers = self.start, self.beat, self.doppler, self.power, self.steer
-        _covariances(rows + REACH, bins, scatterers, self.tables, self.num_bins, parts)
-        return (parts[0] + 1j * parts[1]) * self.shape + np.eye(size, dtype=np.float32)
+        cells = rows + REACH, bins, self.num_bins
+        _covariances(cells, scatterers, self.tables, self.shape, out)
+        return out
 
 
 @lru_cache(maxsize=8)
@@ -370,19 +371,34 @@ def _tables(waveform: Waveform, taper: Taper) -> tuple[np.ndarray, np.ndarray]:
 
 
 @jit(fast=True)
-def _covariances(rows, bins, scatterers, tables, num_bins, parts):
-    """Sum of the scatterers about each cell, real and imaginary part."""
+def _covariances(cells, scatterers, tables, shape, out):
+    """`Bucketed.covariances`: the scatterers about each cell are added `TOGETHER` at a time."""
+    rows, bins, num_bins = cells
     start, beat, doppler, power, steer = scatterers
     size = steer.shape[1]
-    re, im = np.empty(size, np.float32), np.empty(size, np.float32)
+    width = size + -size % LANES
+    most = np.zeros((2, REACH + 1), np.float32)  # of a response, so many cells off
+    for axis in range(2):
+        for k in range(REACH * FINE + FINE // 2 + 1):
+            cell = (k + FINE // 2) // FINE
+            most[axis, cell] = max(most[axis, cell], tables[axis][k])
+            if k % FINE == FINE // 2:  # between two cells
+                most[axis, cell - 1] = max(most[axis, cell - 1], tables[axis][k])
+    # what lies beyond the channels stays zero
+    re, im = np.zeros(TOGETHER * width, np.float32), np.zeros(TOGETHER * width, np.float32)
+    sums = np.zeros((2, size, width), np.float32)
     for c in range(rows.size):
+        sums[:], count = 0.0, 0
         for i in range(-REACH, REACH + 1):
             row = rows[c] + i
             if row < 0 or row >= (start.size - 1) // num_bins:
                 continue
             for j in range(-REACH, REACH + 1):
                 bucket = row * num_bins + (bins[c] + j) % num_bins
+                least = LEAST_WEIGHT / (most[0, abs(i)] * most[1, abs(j)])
                 for s in range(start[bucket], start[bucket + 1]):
+                    if power[s] < least:
+                        break  # the strongest stand first
                     at_r = abs(i + beat[s]) * FINE
                     at_d = abs(j + doppler[s]) * FINE
                     weight = power[s] * tables[0][int(at_r + 0.5)] * tables[1][int(at_d + 0.5)]
@@ -390,12 +406,31 @@ def _covariances(rows, bins, scatterers, tables, num_bins, parts):
                         continue
                     root = np.sqrt(weight)
                     for k in range(size):
-                        re[k], im[k] = steer[s, k].real * root, steer[s, k].imag * root
-                    for k in range(size):
-                        a, b = re[k], im[k]
-                        for m in range(k + 1):
-                            parts[0, c, k, m] += a * re[m] + b * im[m]
-                            parts[1, c, k, m] += b * re[m] - a * im[m]
+                        re[count * width + k] = steer[s, k].real * root
+                        im[count * width + k] = steer[s, k].imag * root
+                    count += 1
+                    if count == TOGETHER:
+                        _add_products(re, im, count, size, sums)
+                        count = 0
+        _add_products(re, im, count, size, sums)
         for k in range(size):
             for m in range(k):
-                parts[0, c, m, k], parts[1, c, m, k] = parts[0, c, k, m], -parts[1, c, k, m]
+                value = complex(sums[0, k, m], sums[1, k, m]) * shape[k, m]
+                out[c, k, m], out[c, m, k] = value, value.conjugate()
+            out[c, k, k] = 1.0 + sums[0, k, k] * shape[k, k]
+
+
+@jit(fast=True)
+def _add_products(re, im, count, size, sums):
+    """sums[k, m] += x[q, k] x[q, m]^* over q < `count`, for m <= k, and some that no one reads."""
+    width, flat = sums.shape[2], sums.reshape(-1)
+    for k in range(size):
+        for m in range(0, k + 1, LANES):
+            at, other = k * width + m, (size + k) * width + m
+            c, d = load(flat, at), load(flat, other)
+            for q in range(0, count * width, width):
+                a, b = splat(re[q + k]), splat(im[q + k])
+                x, y = load(re, q + m), load(im, q + m)
+                c, d = c + a * x + b * y, d + b * x - a * y
+            store(flat, at, c)
+            store(flat, other, d)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.clutter.adaptive import expected_count, scanned_within
 from isac_rt.receive.clutter.coherent import Found, Search
 from isac_rt.receive.known import Known
@@ -94,7 +95,7 @@ def seek(
     if covariances is None:
         values = np.abs(x @ a.conj().T) ** 2 / len(search.channels)
     else:
-        inverse = np.linalg.inv(covariances)
+        inverse = inverses(covariances)
         y = np.einsum("sij,sj->si", inverse, x)
         norm = np.einsum("di,sij,dj->sd", a.conj(), inverse, a, optimize=True).real
         values = np.abs(y @ a.conj().T) ** 2 / np.maximum(norm, 1e-6)

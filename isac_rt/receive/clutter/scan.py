@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store
+from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store, transpose
 
 
 def line_bounds(maps: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> np.ndarray:
@@ -167,3 +169,106 @@ def _between(before, middle, after, s, axis, peak, place):
         peak[s] *= np.exp(
             np.float32(0.5) * (high - low) * offset + np.float32(0.5) * curve * offset * offset
         )
+
+
+class Axis(NamedTuple):
+    """The channels of an array's lines along an axis, line by line.
+
+    Attributes
+    ----------
+    ends : (lines + 1,) where the channels of each line begin and end
+    cosines, sines : (G, n) of exp(+j k v u) along the lines
+    turns : (2, lines, G), the same of the lines' places on the other axis
+    """
+
+    ends: np.ndarray
+    cosines: np.ndarray
+    sines: np.ndarray
+    turns: np.ndarray
+
+
+@jit(fast=True)
+def quadratic_forms(matrices, order, x, z, out):
+    """a^H Q a of all directions, out (S, G, G), from Hermitian matrices Q (S, L, L) of channels
+    which `order` sorts: those of `x`, an `Axis`, then those of `z`.
+
+    Within the lines along an axis it depends on one cosine alone; what couples an X with a Z line
+    is a product of both spectra.
+    """
+    count, size, pair = order.size, x.cosines.shape[0], 2 * LANES
+    num_x, num_z = x.cosines.shape[1], z.cosines.shape[1]
+    two, least = np.float32(2), splat(np.float32(1e-6))
+    heard = np.empty(count * count * pair, np.float32)
+    total = np.empty(size * size * LANES, np.float32)
+    near, flat = np.empty(num_z * pair, np.float32), out.reshape(-1)
+    far = np.empty((2, x.ends.size - 1, size, num_z), np.float32)
+    for p in range(x.ends.size - 1):
+        for j in range(size):
+            c, d = x.turns[0, p, j], x.turns[1, p, j]
+            for n in range(num_z):
+                far[0, p, j, n] = c * z.cosines[j, n] + d * z.sines[j, n]
+                far[1, p, j, n] = d * z.cosines[j, n] - c * z.sines[j, n]
+    for first in range(0, len(matrices), LANES):
+        here = min(LANES, len(matrices) - first)
+        for s in range(LANES):  # a place without a matrix repeats the last one
+            matrix = matrices[first + min(s, here - 1)]
+            for m in range(count):
+                for n in range(count):
+                    value, at = matrix[order[m], order[n]], (n * count + m) * pair + s
+                    heard[at], heard[at + LANES] = value.real, value.imag
+        total[:] = 0.0
+        _within(heard, count, 0, x, total, size, 1)
+        _within(heard, count, num_x, z, total, 1, size)
+        for i in range(size):
+            for p in range(x.ends.size - 1):
+                for r in range(z.ends.size - 1):
+                    c, d = splat(two * z.turns[0, r, i]), splat(two * z.turns[1, r, i])
+                    for n in range(z.ends[r], z.ends[r + 1]):
+                        re, im = _sum(heard, count, num_x + n, x, p, 0, i)
+                        store(near, n * pair, re * c + im * d)
+                        store(near, n * pair + LANES, im * c - re * d)
+                for j in range(size):
+                    at = (i * size + j) * LANES
+                    value = load(total, at)
+                    for n in range(num_z):
+                        a, b = load(near, n * pair), load(near, n * pair + LANES)
+                        value = value + a * splat(far[0, p, j, n]) - b * splat(far[1, p, j, n])
+                    store(total, at, value)
+        for at in range(0, size * size, LANES):
+            transpose(total, at * LANES)
+            for s in range(here):
+                value = larger(load(total, (at + s) * LANES), least)
+                store(flat, (first + s) * size * size + at, value)
+
+
+@jit(fast=True)
+def _sum(heard, count, n, lines, p, begin, g):
+    """Sum over the channels m of line p of conj(a_m) Q_mn, real and imaginary part."""
+    re, im = splat(np.float32(0)), splat(np.float32(0))
+    for m in range(lines.ends[p], lines.ends[p + 1]):
+        at = (n * count + begin + m) * 2 * LANES
+        a, b = load(heard, at), load(heard, at + LANES)
+        c, d = splat(lines.cosines[g, m]), splat(lines.sines[g, m])
+        re, im = re + a * c - b * d, im + b * c + a * d
+    return re, im
+
+
+@jit(fast=True)
+def _within(heard, count, begin, lines, total, step, other):
+    """Add what an axis' own lines, whose channels begin at `begin`, have of `quadratic_forms`;
+    `step` and `other` are those from one of their own directions to the next, and across."""
+    size = lines.cosines.shape[0]
+    for g in range(size):
+        for p in range(lines.ends.size - 1):
+            for q in range(lines.ends.size - 1):
+                re, im = splat(np.float32(0)), splat(np.float32(0))
+                for n in range(lines.ends[q], lines.ends[q + 1]):
+                    a, b = _sum(heard, count, begin + n, lines, p, begin, g)
+                    c, d = splat(lines.cosines[g, n]), splat(lines.sines[g, n])
+                    re, im = re + a * c + b * d, im + b * c - a * d
+                for h in range(size):
+                    a, b = lines.turns[0, p, h], lines.turns[1, p, h]
+                    c, d = lines.turns[0, q, h], lines.turns[1, q, h]
+                    at = (g * step + h * other) * LANES
+                    turned = re * splat(a * c + b * d) - im * splat(b * c - a * d)
+                    store(total, at, load(total, at) + turned)
