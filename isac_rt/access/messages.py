@@ -250,7 +250,8 @@ class Notes:
         for body in fused:
             for key in body.members:
                 report, via = self.reports[key]
-                self.reports[key] = replace(report, name=body.name), via
+                if report.name != body.name:
+                    self.reports[key] = replace(report, name=body.name), via
         return fused
 
     def _counts(self, report: Report, time: float) -> bool:

@@ -11,15 +11,15 @@ it is.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
-from scipy.optimize import brentq
 from scipy.special import gammaincinv
 
+from isac_rt.kernels.jit import jit
 from isac_rt.terminal.filter import Gaussian, normalised, singer
 from isac_rt.terminal.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
@@ -127,7 +127,7 @@ class Report:
     def at(self, time: float, acceleration_std: float) -> Report:
         """The same at another time [s]."""
         state, lever = Told(self.state, self.lever).after(time - self.time, acceleration_std)
-        return replace(self, time=time, state=state, lever=lever)
+        return Report(self.key, self.since, self.name, time, state, lever)
 
     def memory(self) -> list[Any]:
         """As plain numbers and arrays, for `of_memory`."""
@@ -172,11 +172,16 @@ def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussi
     told: it is zero with `acceleration_std` [m/s^2] per axis."""
     if interval == 0:
         return state
+    F, Q = _coasting(interval, acceleration_std)
+    return Gaussian(F @ state.mean, F @ state.covariance @ F.T + Q)
+
+
+@lru_cache(maxsize=64)
+def _coasting(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.ndarray]:
+    """Transition (6, 6) of `advance`, and what it adds to the covariance."""
     F, Q = singer(interval, acceleration_std)
-    P = np.zeros((9, 9))
-    P[:SIZE, :SIZE] = state.covariance
-    P[SIZE:, SIZE:] = acceleration_std**2 * np.eye(3)
-    return Gaussian(F[:SIZE, :SIZE] @ state.mean, (F @ P @ F.T + Q)[:SIZE, :SIZE])
+    unknown = acceleration_std * F[:SIZE, SIZE:]
+    return F[:SIZE, :SIZE].copy(), Q[:SIZE, :SIZE] + unknown @ unknown.T
 
 
 def in_world(
@@ -187,47 +192,66 @@ def in_world(
     which turns place and motion about the terminal, and of its clock (`clock_std`, the speed of
     light times the deviation of what is left of its offset [m]). Its own covariance has what the
     line of sight pulls, by the `cell` of ranges [m]."""
-    offset, motion = np.split(tracks.mean[row], 2)
-    lever = np.zeros((SIZE, ERRORS))
-    lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
-    lever[:3, 6:9], lever[3:, 6:9] = -ATTITUDE_STD * cross(offset), -ATTITUDE_STD * cross(motion)
-    lever[:3, 9] = clock_std * _by_clock(tracks, row)
+    baseline = np.zeros(0)
+    if not tracks.is_reference[row] and tracks.is_reference.any():
+        baseline = tracks.mean[tracks.is_reference.argmax(), :3]
+    pulled, lever = _levers(tracks.mean[row], baseline, clock_std, cell)
     mean = tracks.mean[row] + np.concatenate([own.position, own.velocity])
-    pulled = np.zeros(SIZE)
-    pulled[:3] = PULL * cell * _by_length(tracks, row, MASKED_CELLS * cell)
     return Told(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
 
 
-def _by_length(tracks: TrackSet, row: int, masked: float) -> np.ndarray:
+@jit
+def _levers(
+    mean: np.ndarray, baseline: np.ndarray, clock_std: float, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the line of sight does to a track (6,) and what its terminal's errors do, (6, `ERRORS`);
+    `baseline` (3,) is to a passive terminal's transmitter, (0,) where the track does not depend on
+    it."""
+    lever, pulled = np.zeros((SIZE, ERRORS)), np.zeros(SIZE)
+    lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
+    lever[:3, 6:9], lever[3:, 6:9] = (
+        -ATTITUDE_STD * cross(mean[:3]),
+        -ATTITUDE_STD * cross(mean[3:]),
+    )
+    lever[:3, 9] = clock_std * _by_clock(mean[:3], baseline)
+    pulled[:3] = PULL * cell * _by_length(mean[:3], baseline, MASKED_CELLS * cell)
+    return pulled, lever
+
+
+@jit
+def _size(x: np.ndarray) -> float:
+    return np.sqrt(np.sum(x * x))
+
+
+@jit
+def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.ndarray:
     """What a metre more of path length does to the place of a passive terminal's body (3,).
 
     It moves along its direction. Zero if the way is more than `masked` [m] longer than the line of
     sight, and at an active terminal.
     """
-    if tracks.is_reference[row] or not tracks.is_reference.any():
+    if not baseline.size:
         return np.zeros(3)
-    offset, baseline = tracks.mean[row, :3], tracks.mean[tracks.is_reference][0, :3]
-    rho = float(np.linalg.norm(offset))
-    length = rho + float(np.linalg.norm(offset - baseline))
-    if length - np.linalg.norm(baseline) > masked:
+    rho = _size(offset)
+    length = rho + _size(offset - baseline)
+    if length - _size(baseline) > masked:
         return np.zeros(3)
     u = offset / rho
     # of rho = (L^2 - d^2) / (2 (L - d.u)) by L; on the line of sight L = d.u
-    room = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
-    out: np.ndarray = u * (length - rho) / room
-    return out
+    room = max(length - np.sum(baseline * u), (length - rho) / MOST_PULLED, SAME_M)
+    return u * (length - rho) / room
 
 
-def _by_clock(tracks: TrackSet, row: int) -> np.ndarray:
+@jit
+def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
     """How far a body moves for each metre that a terminal's clock adds to its ranges (3,): along
     its direction, by its path length and its reference's, which are both too long."""
-    offset = tracks.mean[row, :3]
-    rho = float(np.linalg.norm(offset))
-    if tracks.is_reference[row] or not tracks.is_reference.any():
-        return offset / rho
-    baseline = tracks.mean[tracks.is_reference][0, :3]
-    d, u = float(np.linalg.norm(baseline)), offset / rho
-    length, ahead = rho + float(np.linalg.norm(offset - baseline)), float(baseline @ u)
+    rho = _size(offset)
+    u = offset / rho
+    if not baseline.size:
+        return u
+    d = _size(baseline)
+    length, ahead = rho + _size(offset - baseline), np.sum(baseline * u)
     if length - ahead < SAME_M:  # on the line of sight
         return u * (rho / d) ** 2
     # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
@@ -277,26 +301,34 @@ def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
     >>> fused.mean.round(6).tolist(), fused.covariance.round(6).tolist()
     ([0.9, 1.8], [[1.8, 0.0], [0.0, 1.8]])
     """
-    return _intersection(a, b)[0]
+    mean, P, _ = _intersection(*a, *b)
+    return Gaussian(mean, P)
 
 
-def _intersection(a: Gaussian, b: Gaussian) -> tuple[Gaussian, float]:
-    """And the weight w of the first."""
-    A, B = np.linalg.inv(a.covariance), np.linalg.inv(b.covariance)
-    values, V = eigh((A + A.T) / 2, (B + B.T) / 2)
+@jit
+def _intersection(
+    a: np.ndarray, of_a: np.ndarray, b: np.ndarray, of_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean and covariance, of two, and the weight w of the first."""
+    A, B = np.linalg.inv(of_a), np.linalg.inv(of_b)
+    root = np.linalg.inv(np.linalg.cholesky((B + B.T) / 2))
+    values, U = np.linalg.eigh(root @ ((A + A.T) / 2) @ root.T)
+    V = root.T @ U
     lengths = np.sum(V**2, axis=0)
-
-    def slope(w: float) -> float:
-        return float(np.sum(lengths * (values - 1) / (w * values + 1 - w) ** 2))
-
-    if slope(0.0) <= 0:
-        w = 0.0
-    elif slope(1.0) >= 0:
-        w = 1.0
-    else:
-        w = float(brentq(slope, 0.0, 1.0))
+    low, high = 0.0, 1.0
+    if np.sum(lengths * (values - 1)) <= 0:
+        high = 0.0
+    elif np.sum(lengths * (values - 1) / values**2) >= 0:
+        low = 1.0
+    while high - low > 1e-15:
+        w = (low + high) / 2
+        if np.sum(lengths * (values - 1) / (w * values + 1 - w) ** 2) > 0:
+            low = w
+        else:
+            high = w
+    w = (low + high) / 2
     P = (V / (w * values + 1 - w)) @ V.T
-    return Gaussian(P @ (w * A @ a.mean + (1 - w) * B @ b.mean), P), w
+    return P @ (w * (A @ a) + (1 - w) * (B @ b)), P, w
 
 
 def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
@@ -308,10 +340,11 @@ def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
     """And the weight of each in it."""
     if len(states) == 1:
         return states[0], np.ones(1)
-    order = sorted(range(len(states)), key=lambda k: float(np.trace(states[k].covariance)))
+    order = sorted(range(len(states)), key=lambda k: float(states[k].covariance.trace()))
     fused, weights = states[order[0]], np.ones(len(states))
     for at, k in enumerate(order[1:], 1):
-        fused, w = _intersection(fused, states[k])
+        mean, P, w = _intersection(*fused, *states[k])
+        fused = Gaussian(mean, P)
         weights[order[:at]] *= w
         weights[k] = 1 - w
     return fused, weights
@@ -366,31 +399,55 @@ def _solved(
     words : a body's number, the numbers of the errors in what is told of it (`num_errors`: one that
         is in none), what is told, and its weight
     """
-    numbers, errors = np.array([w[0] for w in words]), np.array([w[1] for w in words])
-    covariances = np.stack([told.state.covariance for _, _, told, _ in words])
-    levers = np.stack([told.lever for _, _, told, _ in words])
-    A = np.concatenate([np.broadcast_to(np.eye(SIZE), covariances.shape), levers], axis=2)
-    weights = np.array([w[3] for w in words])[:, None, None]
-    gain = weights * np.linalg.solve(covariances, A).swapaxes(1, 2)
-    each = gain @ A
-    more = (gain @ np.stack([told.state.mean for _, _, told, _ in words])[..., None])[..., 0]
+    numbers, errors, told, weights = zip(*words, strict=True)
+    given = [np.array(numbers), np.array(errors), np.array(weights, float)]
+    states = [[t.state.mean for t in told], [t.state.covariance for t in told]]
+    arrays = [np.array(of) for of in (*states, [t.lever for t in told])]
+    every = _solution(num_bodies, num_errors + 1, *given, *arrays)
+    return [Gaussian(m, p) for m, p in zip(*every, strict=True)]
 
+
+@jit
+def _solution(
+    num_bodies: int,
+    num_errors: int,
+    numbers: np.ndarray,
+    errors: np.ndarray,
+    weights: np.ndarray,
+    means: np.ndarray,
+    covariances: np.ndarray,
+    levers: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means and covariances of the bodies from W words, of which the last error is in none."""
     B, b = np.zeros((num_bodies, SIZE, SIZE)), np.zeros((num_bodies, SIZE))
-    C = np.zeros((num_bodies, SIZE, num_errors + 1))
-    E, e = np.eye(num_errors + 1), np.zeros(num_errors + 1)
-    np.add.at(B, numbers, each[:, :SIZE, :SIZE])
-    np.add.at(b, numbers, more[:, :SIZE])
-    at = numbers[:, None, None], np.arange(SIZE)[:, None], errors[:, None]
-    np.add.at(C, at, each[:, :SIZE, SIZE:])
-    np.add.at(E, (errors[:, :, None], errors[:, None]), each[:, SIZE:, SIZE:])
-    np.add.at(e, errors, more[:, SIZE:])
-
-    D, d = np.linalg.solve(B, C), np.linalg.solve(B, b[..., None])
-    rest = np.linalg.inv(E - np.einsum("kij,kil->jl", C, D))
-    error = rest @ (e - np.einsum("kij,ki->j", C, d[..., 0]))
-    means = d[..., 0] - D @ error
-    P = np.linalg.inv(B) + D @ rest @ D.swapaxes(1, 2)
-    return [Gaussian(m, (p + p.T) / 2) for m, p in zip(means, P, strict=True)]
+    C = np.zeros((num_bodies, SIZE, num_errors))
+    E, e = np.eye(num_errors), np.zeros(num_errors)
+    A = np.zeros((SIZE, SIZE + ERRORS))
+    A[:, :SIZE] = np.eye(SIZE)
+    for k in range(numbers.size):
+        n, at = numbers[k], errors[k]
+        A[:, SIZE:] = levers[k]
+        gain = weights[k] * np.linalg.solve(covariances[k], A).T
+        each, more = gain @ A, gain @ means[k]
+        B[n] += each[:SIZE, :SIZE]
+        b[n] += more[:SIZE]
+        for j in range(ERRORS):
+            e[at[j]] += more[SIZE + j]
+            C[n, :, at[j]] += each[:SIZE, SIZE + j]
+            for i in range(ERRORS):
+                E[at[i], at[j]] += each[SIZE + i, SIZE + j]
+    D, d = np.empty_like(C), np.empty_like(b)
+    for n in range(num_bodies):
+        D[n], d[n] = np.linalg.solve(B[n], C[n]), np.linalg.solve(B[n], b[n])
+        E -= C[n].T @ D[n]
+        e -= C[n].T @ d[n]
+    rest = np.linalg.inv(E)
+    error = rest @ e
+    for n in range(num_bodies):
+        b[n] = d[n] - D[n] @ error
+        P = np.linalg.inv(B[n]) + D[n] @ rest @ D[n].T
+        B[n] = (P + P.T) / 2
+    return b, B
 
 
 def _teller(key: Key) -> str:
@@ -406,13 +463,14 @@ def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray,
     """
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
-    means = [np.stack([g.mean for g in of]) for of in (a, b)]
-    covariances = [np.stack([g.covariance for g in of]) for of in (a, b)]
+    means = [np.array([g.mean for g in of]) for of in (a, b)]
+    covariances = [np.array([g.covariance for g in of]) for of in (a, b)]
     residual = means[0][:, None] - means[1][None]
     S = covariances[0][:, None] + covariances[1][None]
     return normalised(residual, S)
 
 
+@jit
 def cross(e: np.ndarray) -> np.ndarray:
     """(3, 3) matrix of the cross product with e from the left."""
     x, y, z = e
@@ -509,6 +567,8 @@ class Picture:
         for origin in dict.fromkeys(key.origin for key in sorted(whole)):
             single = [b for b in self._bodies if len(b.members) == 1 and origin in b.origins()]
             others = [b for b in self._bodies if origin not in b.origins()]
+            if not single:
+                continue
             d2, log_det = distances(
                 [intersection_of([whole[k] for k in b.members]) for b in others],
                 [whole[b.members[0]] for b in single],
