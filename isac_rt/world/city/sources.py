@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from isac_rt import scenario
-from isac_rt.world.city.footprints import footprints
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
-from isac_rt.world.city.parametric import blocks, canyon
 from isac_rt.world.city.place import Place
-from isac_rt.world.city.tables import table_files
 
 
 def _path(city: scenario.City, folder: Path) -> Path:
@@ -63,6 +60,8 @@ def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
         return []
     path = _path(city, folder)
     if city.source == "footprints":
+        from isac_rt.world.city.tables import table_files
+
         terrain = _terrain(city, folder)
         return [*table_files(path), *([] if terrain is None else [terrain])]
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
@@ -71,13 +70,16 @@ def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
 def _surfaces(
     city: scenario.City, folder: Path
 ) -> tuple[str, list[Surface], list[str], Place | None]:
-    if city.source == "canyon":
-        return city.name or "canyon", canyon(city), [], None
-    if city.source == "blocks":
-        return city.name or "blocks", blocks(city), [], None
+    if city.source in ("canyon", "blocks"):  # shapely is loaded for cities that are extruded
+        from isac_rt.world.city import parametric
+
+        made = parametric.canyon if city.source == "canyon" else parametric.blocks
+        return city.name or city.source, made(city), [], None
     path = _path(city, folder)
     name = city.name or path.name
     if city.source == "footprints":
+        from isac_rt.world.city.footprints import footprints
+
         return name, *footprints(city, path, _terrain(city, folder))
     return name, *(mesh_file if city.source == "mesh" else mitsuba_file)(city, path), None
 
