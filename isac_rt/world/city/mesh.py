@@ -274,7 +274,7 @@ def _group_planes(
     return plane
 
 
-@jit(fast=True)  # type: ignore[untyped-decorator]
+@jit(fast=True)  # type: ignore[untyped-decorator]  # numba has no types
 def _count_near(
     x: NDArray, y: NDArray, z: NDArray, nx: float, ny: float, nz: float, d: float, most: float
 ) -> int:
