@@ -199,10 +199,10 @@ def make_paths(
     """A PathSet from what is known; the rest gets its neutral value. Arrays are copied."""
     given: dict[str, Any] = {name: v for name, v in columns.items() if v is not None}
     count = np.asarray(given["delay"]).shape[0]
-    flat: dict[str, Any] = {
-        name: np.array(np.broadcast_to(given.get(name, neutral), (count,)), dtype=dtype)
-        for name, (dtype, neutral) in _NEUTRAL.items()
-    }
+    flat: dict[str, Any] = {}
+    for name, (dtype, neutral) in _NEUTRAL.items():
+        flat[name] = np.empty(count, dtype)
+        flat[name][:] = given.get(name, neutral)
     return PathSet(
         **flat,
         departure=np.array(given["departure"], np.float64).reshape(count, 3),

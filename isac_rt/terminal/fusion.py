@@ -333,7 +333,7 @@ def _intersection(
 
 def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
     """Covariance intersection of one or more, one after the other, the surest first."""
-    return _intersected(states)[0]
+    return states[0] if len(states) == 1 else _intersected(states)[0]
 
 
 def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
