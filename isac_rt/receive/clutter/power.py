@@ -18,7 +18,6 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.fft
-from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.estimate import hann_response
@@ -114,19 +113,21 @@ class Response:
         left = np.floor(doppler * FINE_DOPPLER)
         share = (doppler * FINE_DOPPLER - left)[inside]
         at = [(line * fine + (left.astype(np.int64) + side) % fine)[inside] for side in (0, 1)]
-        out = []
-        for number in range(1 + slope.shape[1]):
+        where, size = np.concatenate(at), self.waveform.num_chirps
+        out = np.zeros((1 + slope.shape[1], self.rows, size))
+        for number, made in enumerate(out):
             weight = (power if number == 0 else power * slope[:, number - 1])[inside]
-            grid = np.zeros(lines * fine)
-            for where, part in zip(at, (1 - share, share), strict=True):
-                grid += np.bincount(where, weight * part, lines * fine)
-            kernel = along if number == 0 else -along * turn
-            turned = scipy.fft.irfft(scipy.fft.rfft(grid.reshape(lines, fine)) * kernel, fine)[
-                :, ::FINE_DOPPLER
-            ]
-            spread = ndimage.convolve1d(turned, across, axis=0, mode="constant")
-            out.append(np.fft.fftshift(spread[REACH * FINE_BEAT :: FINE_BEAT][: self.rows], axes=1))
-        return np.array(out)
+            parts = np.concatenate([weight * (1 - share), weight * share])
+            grid = np.bincount(where, parts, lines * fine).reshape(lines, fine)
+            spectrum = scipy.fft.rfft(grid) * (along if number == 0 else -along * turn)
+            # every third place alone is wanted: the three parts of the spectrum fall together
+            half = size // 2 + 1
+            folded = spectrum[:, :half] + spectrum[:, size : size + half]
+            folded += spectrum[:, size : size - half : -1].conj()
+            turned = scipy.fft.irfft(folded, size) / FINE_DOPPLER
+            for first, weight_of_row in enumerate(across):
+                made += weight_of_row * turned[first::FINE_BEAT][: self.rows]
+        return np.fft.fftshift(out, axes=2)
 
 
 def expected_power(
