@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, larger, load, splat, store
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import LatinUnion, Levels
 
@@ -143,9 +144,9 @@ def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: 
     """What `omp` finds; parameters likewise."""
     bins = np.arange(num_chirps)
     atoms = np.exp(2j * np.pi * np.outer(chosen, bins) / num_chirps)
-    # of an atom and the one k bins on; twice, so that no stretch of P ends at the edge
-    gram = np.tile(atoms.sum(axis=0), 2)
-    first = vectors @ atoms.conj()
+    # of an atom and the one k bins on; three times, so that no stretch of P ends at the edge
+    gram = np.tile(atoms.sum(axis=0), 3)
+    first = np.asarray(vectors, np.complex64) @ atoms.conj().astype(np.complex64)
     support = np.empty((len(vectors), sparsity), np.int64)
     amplitude = np.empty((len(vectors), sparsity), np.complex128)
     _pursue(first, gram.real.copy(), gram.imag.copy(), support, amplitude)
@@ -157,37 +158,35 @@ def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: 
 @jit
 def _pursue(first, gram_re, gram_im, support, amplitude):
     """Fill `support` and `amplitude` from the correlations `first` (V, P); `gram` is that of an
-    atom and the one k bins on, for k in [0, 2 P)."""
+    atom and the one k bins on, for k in [0, 3 P). Atoms are chosen in float32."""
     num_chirps, sparsity = first.shape[1], support.shape[1]
-    re, im, power = np.empty(num_chirps), np.empty(num_chirps), np.empty(num_chirps)
+    width = num_chirps + -num_chirps % LANES
+    own_re, own_im, power = np.zeros((3, width), np.float32)
+    short_re, short_im = gram_re.astype(np.float32), gram_im.astype(np.float32)
     lower = np.empty((sparsity, sparsity), np.complex128)
-    forward = np.empty(sparsity, np.complex128)
+    forward, lanes = np.empty(sparsity, np.complex128), np.empty(LANES, np.float32)
     for v in range(first.shape[0]):
         chosen, x = support[v], amplitude[v]
+        for p in range(num_chirps):
+            own_re[p], own_im[p] = first[v, p].real, first[v, p].imag
         for k in range(sparsity):
-            for p in range(num_chirps):
-                re[p], im[p] = first[v, p].real, first[v, p].imag
-            for i in range(k):
-                _take_out(re, im, x[i], chosen[i], gram_re, gram_im)
-            for p in range(num_chirps):
-                power[p] = re[p] * re[p] + im[p] * im[p]
-            power[chosen[:k]] = -1.0
-            best = 0
-            for p in range(num_chirps):
-                if power[p] > power[best]:
-                    best = p
-            chosen[k] = best
+            for p in range(0, width, LANES):
+                re, im = load(own_re, p), load(own_im, p)
+                for i in range(k):  # the correlation with bin p is the Gram's conjugate
+                    a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
+                    at = num_chirps - chosen[i] + p
+                    c, d = load(short_re, at), load(short_im, at)
+                    re, im = re - a * c - b * d, im - b * c + a * d
+                store(power, p, re * re + im * im)
+            power[chosen[:k]], power[num_chirps:] = -1.0, -1.0
+            most = load(power, 0)
+            for p in range(LANES, width, LANES):
+                most = larger(most, load(power, p))
+            store(lanes, 0, most)
+            chosen[k], highest = 0, lanes.max()
+            while power[chosen[k]] < highest:
+                chosen[k] += 1
             _fit(first[v], chosen[: k + 1], gram_re, gram_im, lower, forward, x)
-
-
-@jit
-def _take_out(re, im, amplitude, atom, gram_re, gram_im):
-    """Take an atom out of correlations."""
-    a, b = amplitude.real, amplitude.imag
-    c, d = gram_re[re.size - atom :], gram_im[re.size - atom :]
-    for p in range(re.size):  # the correlation with bin p is the Gram's conjugate
-        re[p] -= a * c[p] + b * d[p]
-        im[p] -= b * c[p] - a * d[p]
 
 
 @jit
