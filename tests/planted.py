@@ -355,8 +355,8 @@ OF_CASES = {
     ),
     "orthogonal matching pursuit": Bug(
         "receive/omp.py",
-        "re[p] -= a * c[p] + b * d[p]\n        im[p] -= b * c[p] - a * d[p]",
-        "re[p] -= a * c[p] - b * d[p]\n        im[p] -= b * c[p] + a * d[p]",
+        "re, im = re - a * c - b * d, im - b * c + a * d",
+        "re, im = re - a * c + b * d, im - b * c - a * d",
     ),
     "false alarm factor": Bug(
         "receive/cfar.py",

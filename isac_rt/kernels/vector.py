@@ -156,6 +156,14 @@ _add = _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST))
 _sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST))
 _mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST))
 larger = _two(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+# 1 in lanes that are not above the other's, else 0
+not_above = _two(
+    lambda builder, a, b: builder.select(
+        builder.fcmp_ordered("<=", a, b),
+        ir.Constant(a.type, [1.0] * LANES),
+        ir.Constant(a.type, [0.0] * LANES),
+    )
+)
 zip_low = _two(
     lambda builder, a, b: builder.shuffle_vector(
         a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))

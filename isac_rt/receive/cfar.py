@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import optimize, special
 
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.order import median
 from isac_rt.scenario.receivers import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
@@ -117,21 +118,10 @@ class CfarRule:
         """The greater of the means over the kept cells of the training blocks before and behind
         each cell in range; Doppler wraps. Where one holds too few cells the other, infinite where
         both do."""
-        guard = self.guard[0]
-        width = 2 * (self.guard[1] + self.training[1]) + 1
-        total, held = _summed(np.where(keep, power, 0.0), width), _summed(keep, width)
-        index, count = np.arange(len(power)), self.side_rows(len(power))
-        means = []
-        for rows, first in zip(
-            count.T, (index - guard - count[:, 0], index + guard + 1), strict=True
-        ):
-            start = np.where(rows == 0, 0, first)
-            cells = np.round(held[start + rows] - held[start])
-            enough = (rows[:, None] > 0) & (cells >= LEAST_KEPT * rows[:, None] * width)
-            mean = (total[start + rows] - total[start]) / np.maximum(cells, 1)
-            means.append(np.where(enough, mean, np.nan))
-        level = np.fmax(*means)
-        return np.where(np.isnan(level), np.inf, level)
+        out = np.empty(power.shape)
+        half = self.guard[1] + self.training[1]
+        _background(power, keep, self.side_rows(len(power)), self.guard[0], half, out)
+        return out
 
     def side_rows(self, rows: int) -> np.ndarray:
         """(rows, 2) training rows before and behind each row; a side with less than half of them is
@@ -195,10 +185,38 @@ def greatest_of_factor(
     return float(optimize.brentq(excess, 0.5, 1000.0, xtol=1e-6))
 
 
-def _summed(values: np.ndarray, width: int) -> np.ndarray:
-    """(rows + 1, P) sums of the first 0, 1, ... rows over `width` bins about each."""
-    across = ndimage.uniform_filter1d(values.astype(np.float64), width, axis=1, mode="wrap") * width
-    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(across, axis=0)])
+@jit
+def _background(power, keep, sides, guard, half, out):
+    """`CfarRule.background`, with `half` a block's bins on each side."""
+    num_rows, num_bins = power.shape
+    # sums of the first 0, 1, ... rows over the bins about each
+    total = np.zeros((num_rows + 1, num_bins))
+    held = np.zeros((num_rows + 1, num_bins), np.int64)
+    for r in range(num_rows):
+        value, count = 0.0, 0
+        for p in range(-half, num_bins + half):
+            if keep[r, p % num_bins]:
+                value += power[r, p % num_bins]
+                count += 1
+            if p >= half:
+                total[r + 1, p - half] = total[r, p - half] + value
+                held[r + 1, p - half] = held[r, p - half] + count
+                last = (p - 2 * half) % num_bins
+                if keep[r, last]:
+                    value -= power[r, last]
+                    count -= 1
+    for r in range(num_rows):
+        for p in range(num_bins):
+            level = -np.inf
+            for side in range(2):
+                rows = sides[r, side]
+                first = r + guard + 1 if side else r - guard - rows
+                if rows > 0:
+                    cells = held[first + rows, p] - held[first, p]
+                    if cells >= LEAST_KEPT * rows * (2 * half + 1):
+                        mean = (total[first + rows, p] - total[first, p]) / max(cells, 1)
+                        level = max(level, mean)
+            out[r, p] = level if level > -np.inf else np.inf
 
 
 def strong_lobes(power: np.ndarray) -> np.ndarray:
@@ -207,7 +225,7 @@ def strong_lobes(power: np.ndarray) -> np.ndarray:
     A line of sight 60 dB over the noise would otherwise raise the background of every target within
     the training block. A row is allowed for migration.
     """
-    noise = float(np.median(power))
+    noise = median(power)
     rows, bins = peaks(power, power > STRONG * noise, (8, 8))
     reached = np.zeros(power.shape, bool)
     for row, column in zip(rows[:MAX_STRONG], bins[:MAX_STRONG], strict=True):

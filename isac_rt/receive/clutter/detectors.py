@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isac_rt.kernels.order import median
 from isac_rt.receive.arms import Channels, all_channels, arm, both_arms
 from isac_rt.receive.cfar import first_row, strongest_peaks, without_sidelobes
 from isac_rt.receive.clutter.adaptive import Beams, Scan, beams_of, scan_threshold
@@ -255,4 +256,4 @@ def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> f
     The median of a mean of n exponentials is (1 - 1/(9 n))^3 of its mean (Wilson and Hilferty).
     """
     some = power if expected is None else power[expected <= np.quantile(expected, QUIET)]
-    return float(np.median(some)) / (1 - 1 / (9 * looks)) ** 3
+    return median(some) / (1 - 1 / (9 * looks)) ** 3
