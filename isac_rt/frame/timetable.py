@@ -35,6 +35,7 @@ class Timetable:
     seed : of the data
     role_changes : in rising order of their frames
     refused : links that were not established before the data
+    begins : frame with which the acquisition frames of the start begin
     """
 
     waveform: Waveform
@@ -48,6 +49,7 @@ class Timetable:
     seed: int = 1
     role_changes: tuple[RoleChange, ...] = ()
     refused: frozenset[Link] = frozenset()
+    begins: int = 0
 
     def start_time(self, frame: int, active: str | None = None) -> float:
         """Start of a frame's first slot, or of the first chirp of an active terminal, whose block
@@ -66,7 +68,8 @@ class Timetable:
         pilot = every is not None and frame % every == 0
         if not self.waveform.carries_data:
             return False
-        since = frame - max((c.frame for c in self.role_changes if c.frame <= frame), default=0)
+        starts = [self.begins, *(c.frame for c in self.role_changes if c.frame <= frame)]
+        since = frame - max(starts)
         return since >= self.modulation.acquisition_frames and not pilot
 
     @cached_property

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -53,7 +53,7 @@ Jobs = dict[Link, Future[list[Heard]]]
 
 
 MOST_EARLY = 16
-"""First frames at the most that show what passive terminals take."""
+"""Frames in a row at the most that show what passive terminals take."""
 FILLING = 6
 """Frames in which the pictures of terminals that cooperate go on to fill, once tracks are told."""
 
@@ -403,31 +403,35 @@ def stage_seconds(
     """Processor seconds of synthesis and, if asked for, reception and scoring, as some frames of
     the run show them.
 
-    Passive terminals read what they have acquired, so that they hear the first frames of the run
-    one after the other; active ones hear `frames` too. What is scored and told is that of the last
-    two of the first frames, when tracks are confirmed. Sets of receivers that are compared count.
+    Passive terminals read what they have acquired, so that they hear frames one after the other, of
+    a run that begins in the middle of the flight: there it shows more of what it is on average than
+    at its start. Active ones hear `frames` too. What is scored and told is that of the last two of
+    the frames in a row, when tracks are confirmed. Sets of receivers that are compared count.
 
     Returns
     -------
     per_frame : by link and stage, for one frame of the run on average; None for what is of no link
     once : by stage what the first frame takes beyond that: machine code and tables are loaded
     """
-    timetable, sets = setup.timetable, _standard(setup)
-    early = range(_first_frames(setup.scenario) if receive else 0)
+    timetable, count = setup.timetable, _first_frames(setup.scenario) if receive else 0
+    begins = (timetable.frames - count) // 2
+    midway = replace(setup, timetable=replace(timetable, begins=begins))
+    in_a_row, sets = range(begins, begins + count), _standard(midway)
     first: dict[tuple[Link | None, str], float] = {}
     spent: dict[tuple[Link | None, str], dict[bool, list[float]]] = {}
-    for i, number in enumerate([frames[0], *dict.fromkeys([*early, *frames])]):
-        fresh, whole = not i or number not in early, receive and (not i or number in early)
-        frame = setup.frame(number)
+    for i, number in enumerate([frames[0], *dict.fromkeys([*in_a_row, *frames])]):
+        fresh, whole = not i or number not in in_a_row, receive and (not i or number in in_a_row)
+        of_run = setup if fresh else midway
+        frame = of_run.frame(number)
         took = _seconds_of(frame, _standard(setup) if fresh else sets, whole, receive)
         if not i:
             first = took
             continue
-        if number in early[:-2]:
+        if number in in_a_row[:-2]:
             del took[None, "track"]
         for of, seconds in took.items():
             by_kind = spent.setdefault(of, {})
-            by_kind.setdefault(timetable.modulated(number), []).append(seconds)
+            by_kind.setdefault(of_run.timetable.modulated(number), []).append(seconds)
     per_frame: dict[Link | None, dict[str, float]] = {}
     once: dict[str, float] = {}
     heard = Counter(
@@ -436,13 +440,13 @@ def stage_seconds(
         for link in (None, *timetable.links(f))
     )
     for (link, stage), by_kind in spent.items():
-        count = [heard[link, kind] for kind in (False, True)]
+        counts = [heard[link, kind] for kind in (False, True)]
         each = [
             float(np.mean(by_kind.get(kind) or [*chain(*by_kind.values())]))
             for kind in (False, True)
         ]
-        per_frame.setdefault(link, {})[stage] = float(np.dot(count, each)) / timetable.frames
-        mean = float(np.average(each, weights=count))
+        per_frame.setdefault(link, {})[stage] = float(np.dot(counts, each)) / timetable.frames
+        mean = float(np.average(each, weights=counts))
         beyond = max(first.get((link, stage), 0.0) - mean, 0.0)
         once[stage] = once.get(stage, 0.0) + beyond
     return per_frame, once

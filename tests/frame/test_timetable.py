@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,17 @@ def test_when_frames_begin():
     assert t.start_time(7, "B") == pytest.approx(0.35 + later, abs=1e-15)
     assert t.epoch(7, "B") == pytest.approx(0.35 + later + half, abs=1e-15)
     assert t.epoch(7) == pytest.approx(0.35 + half, abs=1e-15)
+
+
+def test_acquisition_frames_follow_the_beginning_and_each_change():
+    """Three without data from frame 9 on, where a part of the run begins, and from the change in
+    frame 20 on. Planted bugs: counted from frame 0; from the beginning where a change came
+    after."""
+    change = RoleChange(frame=20, from_uav="AT", to_uav="PT1")
+    no_pilots = Modulation(pilot_every_frames=None)
+    t = replace(timetable(role_changes=[change], modulation=no_pilots), begins=9)
+    without = {9, 10, 11, 20, 21, 22}
+    assert [t.modulated(f) for f in range(9, 40)] == [f not in without for f in range(9, 40)]
 
 
 def test_snapshots_are_spread_from_the_first_to_the_last():
