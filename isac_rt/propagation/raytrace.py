@@ -354,10 +354,9 @@ class RayTracer:
     ) -> PathSet:
         link, antennas = state.link, self._free.antennas
         parts = [self._by_the_city(state, legs[link])]
-        for name in self._free.names:
-            if name not in link:
-                there, back = legs[Link(link.tx, name)], legs[Link(link.rx, name)]
-                parts.append(self._by_way_of(state, name, local[name], there, back))
+        others = [name for name in self._free.names if name not in link]
+        if others:
+            parts.append(self._by_way_of(state, {name: local[name] for name in others}, legs))
         if link in hits:
             parts.append(self._scattered(state, *hits[link]))
         if self.field is not None:
@@ -396,28 +395,35 @@ class RayTracer:
         )
 
     def _by_way_of(
-        self, state: LinkState, name: str, body: Pose, there: LegSet, back: LegSet
+        self, state: LinkState, bodies: dict[str, Pose], legs: dict[Link, LegSet]
     ) -> PathSet:
-        """Echo and ghosts of one UAV: every leg to it with every leg from it, up to the bounces
+        """Echoes and ghosts of UAVs: every leg to one with every leg from it, up to the bounces
         allowed."""
-        i, j = (a.ravel() for a in np.indices((there.amplitude.size, back.amplitude.size)))
-        bounces = there.bounces[i] + back.bounces[j]
-        allowed = bounces <= (self._propagation.max_bounces if self._propagation.ghosts else 0)
-        there, back, bounces = there.select(i[allowed]), back.select(j[allowed]), bounces[allowed]
-        a, b, count = there.legs, back.legs, bounces.size
-        section = self._free.sections[name].square_metres(
-            body.to_body(a.arrival), body.to_body(b.arrival)
-        )
-        scatter = np.sqrt(4 * np.pi * section) / self._free.wavelength
+        most = self._propagation.max_bounces if self._propagation.ghosts else 0
+        sent, heard, sections, numbers = [], [], [], []
+        for name, body in bodies.items():
+            to, on = legs[Link(state.link.tx, name)], legs[Link(state.link.rx, name)]
+            i, j = np.divmod(np.arange(len(to) * len(on)), max(len(on), 1))
+            allowed = np.flatnonzero(to.bounces[i] + on.bounces[j] <= most)
+            to, on = to.select(i[allowed]), on.select(j[allowed])
+            aspects = body.to_body(to.legs.arrival), body.to_body(on.legs.arrival)
+            sections.append(self._free.sections[name].square_metres(*aspects))
+            numbers.append(np.full(len(to), self._free.names.index(name)))
+            sent.append(to)
+            heard.append(on)
+        there, back, target = LegSet.joined(sent), LegSet.joined(heard), np.concatenate(numbers)
+        a, b, bounces = there.legs, back.legs, there.bounces + back.bounces
+        scatter = np.sqrt(4 * np.pi * np.concatenate(sections)) / self._free.wavelength
         ways = Ways.over(a, b)
         elements = state.elements(self._free.antennas, ways)
-        middle = np.broadcast_to(body.position, (count, 1, 3))
-        chain = [there.faces, np.full((count, 1), -1), back.faces[:, ::-1]]
+        places = [body.position for body in bodies.values()]
+        middle = np.repeat(places, [len(to) for to in sent], axis=0)[:, None]
+        chain = [there.faces, np.full((len(there), 1), -1), back.faces[:, ::-1]]
         return state.paths(
             ways,
             there.amplitude * back.amplitude * scatter * elements,
             np.where(bounces > 0, PathKind.GHOST, PathKind.TARGET),
-            target=self._free.names.index(name),
+            target=target,
             bounces=bounces,
             points=np.concatenate([a.points, middle, b.points[:, ::-1]], axis=1),
             faces=np.concatenate(chain, axis=1),

@@ -190,6 +190,7 @@ def _causes(
     `others`, and `scales` the two cells, the span of velocities and the two beams."""
     (ranges, velocities, directions), (at, rate, towards) = detections, paths
     row_cell, bin_cell, span, wide, high = scales
+    close_by = row_cell * (1 + 1e-9)
     cause, beside = np.full(ranges.size, -1), np.zeros(ranges.size, np.bool_)
     most = field.size + others.size
     rows, near, able = np.empty(most, np.int64), np.empty(most, np.bool_), np.empty(most, np.bool_)
@@ -201,6 +202,8 @@ def _causes(
             here[count], clutter[count] = power[others[j]] * shares[q, j], 0.0
             count += 1
         for i in field:
+            if abs(ranges[q] - at[i]) > close_by:  # most are, which no division needs to tell
+                continue
             if abs(ranges[q] - at[i]) / row_cell <= 1:
                 slower = velocities[q] - rate[i]
                 slower -= span * np.round(slower / span)

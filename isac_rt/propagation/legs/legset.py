@@ -36,6 +36,17 @@ class LegSet:
         """(K,) of each chain."""
         return (self.faces >= 0).sum(axis=1)
 
+    def __len__(self) -> int:
+        return self.amplitude.size
+
+    @classmethod
+    def joined(cls, sets: list[LegSet]) -> LegSet:
+        """All legs of some sets."""
+        amplitude, legs, faces, planes = zip(*(vars(one).values() for one in sets), strict=True)
+        columns = map(np.concatenate, zip(*(vars(one).values() for one in legs), strict=True))
+        every = Legs(*columns)
+        return cls(np.concatenate(amplitude), every, np.concatenate(faces), np.concatenate(planes))
+
     def select(self, which: np.ndarray) -> LegSet:
         """The legs that an index array chooses."""
         legs = self.legs.select(which)
