@@ -75,8 +75,8 @@ class Frame:
     paths : of every link from an active terminal to a receiver, interference between active
         terminals included; what the plan leaves out is not there
     sent : by every active terminal
-    expected : clutter that each active terminal expects of its own link, from the mesh; empty where
-        no receiver asks for it
+    expected : clutter that each active terminal expects of its own link, from the mesh, in frames
+        that it processes; empty where no receiver asks for it
     uses : what the plan kept of the paths of each link
     dropped : traced paths that the float64 geometry contradicted
 
@@ -327,7 +327,7 @@ class Setup:
             poses,
             {link: paths for link, (paths, _) in kept.items()},
             {name: self.transmission(name, number, poses[name]) for name in active},
-            self._expected_clutter(number, active),
+            self._expected_clutter(number),
             {link: use for link, (_, use) in kept.items()},
             dropped,
             self,
@@ -363,11 +363,11 @@ class Setup:
             codes=codes_of(self.waveform),
         )
 
-    def _expected_clutter(self, frame: int, active: list[str]) -> dict[str, ExpectedClutter]:
+    def _expected_clutter(self, frame: int) -> dict[str, ExpectedClutter]:
         if self.expectation is None:
             return {}
         out = {}
-        for name in active:
+        for name in (link.tx for link in self.timetable.links(frame) if link.own):
             when = self.timetable.epoch(frame, name)
             pose = self.believed(self.swarm.trajectories[name].pose(when))
             out[name] = self.expectation.clutter(

@@ -120,8 +120,10 @@ class MeshExpectation:
             velocity=pose.velocity + np.array(wrong.velocity),
         )
 
-    def _errors(self, wrong: Mistakes) -> np.ndarray:
-        """Of each face along its normal [m]."""
+    def _errors(self, wrong: Mistakes) -> np.ndarray | None:
+        """Of each face along its normal [m]; None where the mesh is right."""
+        if not wrong.mesh_std:
+            return None
         drawn = generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
         return wrong.mesh_std * drawn
 
@@ -163,7 +165,11 @@ class MeshExpectation:
         return ExpectedClutter.joined(parts)
 
     def _ways(
-        self, once: Seen, face: np.ndarray, mirrored: Sequence[SeenByMirror], error: np.ndarray
+        self,
+        once: Seen,
+        face: np.ndarray,
+        mirrored: Sequence[SeenByMirror],
+        error: np.ndarray | None,
     ) -> Iterator[_Way]:
         """Ways of one bounce by cells on faces (N,), and by way of mirrors, whose faces are in
         error along their normals."""
@@ -173,17 +179,19 @@ class MeshExpectation:
             met = s.departure if part.before else s.arrival
             turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
-            moved = 2 * error[part.mirror.faces[0]] * (met @ n)
+            moved = 0.0 if error is None else 2 * error[part.mirror.faces[0]] * (met @ n)
             yield _Way(s, self._field.cells.face[s.index], there, back, moved)
 
     def _expected(
-        self, part: _Way, error: np.ndarray, amplitude: np.ndarray, axes: Pose
+        self, part: _Way, error: np.ndarray | None, amplitude: np.ndarray, axes: Pose
     ) -> ExpectedClutter:
         """Clutter of amplitudes (K,) where antennas were isotropic, on faces that are each in
         error; directions in the body's axes of a pose."""
         seen = part.seen
-        slopes = (self._city.normals[part.face] * (part.there + part.back)).sum(axis=1)
-        length = seen.length + part.moved + error[part.face] * slopes
+        length = seen.length + part.moved
+        if error is not None:
+            slopes = (self._city.normals[part.face] * (part.there + part.back)).sum(axis=1)
+            length += error[part.face] * slopes
         power = (amplitude * seen.magnitude) ** 2
         some = power > 0
         return ExpectedClutter(
