@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.legs.diffraction import knife_edge
-from isac_rt.propagation.legs.rays import LIFT, rays
+from isac_rt.propagation.legs.rays import LIFT, Triangles, rays
 
 HALVINGS = 6
 """Of the flight between two knots; what is left is 8 mm of half a metre."""
@@ -53,32 +53,6 @@ _REAL, _IMAG = _tables()
 def penumbra(units: np.ndarray) -> np.ndarray:
     """(N,) complex factor of an edge; `units` (N,) from the edge of the shadow into the light."""
     return np.interp(units, _UNITS, _REAL) + 1j * np.interp(units, _UNITS, _IMAG)
-
-
-class Triangles:
-    """All triangles of a scene, and which of them a ray has hit. Asking the scene's meshes at each
-    hit takes as long as a million rays."""
-
-    def __init__(self, scene: mi.Scene) -> None:
-        self.scene, parts = scene, [np.zeros((0, 3, 3), np.float32)]
-        self._first: dict[int, int] = {}
-        for shape in scene.shapes():
-            values = mi.traverse(shape)
-            place = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
-            number = int(np.asarray(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
-            self._first[number] = sum(map(len, parts))
-            parts.append(place[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
-        self.corners = np.concatenate(parts)
-        """(T, 3, 3) float32"""
-
-    def rows(self, hit: mi.PreliminaryIntersection3f) -> np.ndarray:
-        """(K,) int64 into `corners`, -1 where nothing was hit."""
-        shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
-        prim, out = np.asarray(hit.prim_index, np.int64), np.full(shape.size, -1)
-        for number, first in self._first.items():
-            here = shape == number
-            out[here] = first + prim[here]
-        return out
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
-from isac_rt.propagation.clutter.penumbra import Crossings, Facets, Triangles, crossings, penumbra
+from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
@@ -131,7 +131,6 @@ class Sight:
         self._content = ""
         self._stretches: dict[tuple[str, int], _Stretch] = {}
         self._nearby: dict[str, _Nearby] = {}
-        self._triangles: Triangles | None = None
 
     @property
     def nbytes(self) -> int:
@@ -215,9 +214,7 @@ class Sight:
 
     def _crossings(self, knots: np.ndarray, seen: np.ndarray) -> Crossings:
         """What crosses an edge between two knots (2, 3), seen (2, N) from either."""
-        if self._triangles is None:
-            self._triangles = Triangles(self.shadows.scene)
-        return crossings(self._triangles, knots, seen, self._facets, self._wavelength)
+        return crossings(self.shadows.triangles, knots, seen, self._facets, self._wavelength)
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,21 @@ Import only after `isac_rt.runtime.activate()`.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from isac_rt.kernels.jit import jit
 
 LIFT = 2e-3
 """Rays start this far from the surface and end as far before the viewer [m]; float32 corners and
 rays are good to a tenth of it."""
 CHUNK = 1 << 20
+SURE, GRAZING = 1e-2, 2e-2
+"""A triangle surely stops a ray that meets it this far inside [m] and at this sine or more: in
+float32 rays are good to 0.05 mm in a city."""
 
 
 def rays(starts: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> mi.Ray3f:
@@ -26,6 +33,47 @@ def rays(starts: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> mi.Ra
 def _columns(*rows: np.ndarray) -> list[mi.Float64]:
     """Every column of some arrays (N, 3) as a variable of the back end."""
     return [mi.Float64(np.ascontiguousarray(axis)) for part in rows for axis in part.T]
+
+
+class Triangles:
+    """All triangles of a scene, and which of them a ray has hit. Asking the scene's meshes at each
+    hit takes as long as a million rays."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self.scene, parts = scene, [np.zeros((0, 3, 3), np.float32)]
+        self._first: dict[int, int] = {}
+        for shape in scene.shapes():
+            values = mi.traverse(shape)
+            place = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
+            number = int(np.asarray(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
+            self._first[number] = sum(map(len, parts))
+            parts.append(place[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
+        self.corners = np.concatenate(parts)
+        """(T, 3, 3) float32"""
+
+    @cached_property
+    def sides(self) -> np.ndarray:
+        """(T, 4, 4): the planes of the triangles, then the planes across them through their sides,
+        as a unit vector, inward for sides, and how far along it they lie."""
+        corners = self.corners.astype(np.float64)
+        span = np.roll(corners, -1, axis=1) - corners
+        normal = np.cross(span[:, 0], span[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):  # what is not a number hides nothing
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            inward = np.cross(normal[:, None], span)
+            inward /= np.linalg.norm(inward, axis=2, keepdims=True)
+        vectors = np.concatenate([normal[:, None], inward], axis=1)
+        along = (vectors * np.concatenate([corners[:, :1], corners], axis=1)).sum(2, keepdims=True)
+        return np.concatenate([vectors, along], axis=2)
+
+    def rows(self, hit: mi.PreliminaryIntersection3f) -> np.ndarray:
+        """(K,) int64 into `corners`, -1 where nothing was hit."""
+        shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
+        prim, out = np.asarray(hit.prim_index, np.int64), np.full(shape.size, -1)
+        for number, first in self._first.items():
+            here = shape == number
+            out[here] = first + prim[here]
+        return out
 
 
 class Shadows:
@@ -50,24 +98,44 @@ class Shadows:
             out[part] = ~np.asarray(self.scene.ray_test(ray))
         return out
 
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Of the scene."""
+        return Triangles(self.scene)
+
     def ever_sees(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(N,) whether any of `places` (K, 3) `sees` points: each is tested until one does, in one
-        kernel."""
+        kernel; but for those that a single triangle surely hides from all."""
         count = dr.opaque(mi.UInt32, len(places))  # else each number of places compiles anew
-        view, out = _columns(places), np.empty(len(points), bool)
-        for first in range(0, len(points), CHUNK):
-            part = slice(first, first + CHUNK)
+        view, out = _columns(places), np.zeros(len(points), bool)
+        left = np.flatnonzero(~self._hidden(places, points, normals))
+        for first in range(0, left.size, CHUNK):
+            part = left[first : first + CHUNK]
             facet = _columns(points[part], normals[part])
 
             def blocked(number: mi.UInt32, facet: list[mi.Float64] = facet) -> mi.Bool:
                 return self._blocked([dr.gather(mi.Float64, axis, number) for axis in view], facet)
 
             dark, _ = dr.while_loop(
-                (dr.full(mi.Bool, True, len(points[part])), mi.UInt32(0)),
+                (dr.full(mi.Bool, True, part.size), mi.UInt32(0)),
                 lambda dark, number: dark & (number < count),
                 lambda dark, number: (blocked(number), number + 1),
             )
             out[part] = ~np.asarray(dark)
+        return out
+
+    def _hidden(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(N,) of which points the triangle that hides them from the middle one of `places` surely
+        hides them from all."""
+        out = np.zeros(len(points), bool)
+        for first in range(0, len(points) if len(places) > 1 else 0, CHUNK):
+            part = slice(first, first + CHUNK)
+            view = np.broadcast_to(places[len(places) // 2], points[part].shape)
+            ray = _ray(_columns(view), _columns(points[part], normals[part]))
+            hit = self.scene.ray_intersect_preliminary(ray)
+            dr.eval(hit)
+            row = self.triangles.rows(hit)
+            out[part] = _hides(self.triangles.sides, row, places, points[part], normals[part])
         return out
 
     def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -86,21 +154,7 @@ class Shadows:
         return out
 
     def _blocked(self, place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Bool:
-        """Line by line as `sees` has it, so that both agree to the last bit; a facet's point, then
-        its normal."""
-        (x, y, z), (px, py, pz, nx, ny, nz) = place, facet
-        side = dr.select((x - px) * nx + (y - py) * ny + (z - pz) * nz < 0, -LIFT, LIFT)
-        sx, sy, sz = px + side * nx, py + side * ny, pz + side * nz
-        dx, dy, dz = x - sx, y - sy, z - sz
-        length = dr.sqrt(dx * dx + dy * dy + dz * dz)
-        size = dr.maximum(length, LIFT)
-        ray = mi.Ray3f(
-            mi.Point3f(mi.Float(sx), mi.Float(sy), mi.Float(sz)),
-            mi.Vector3f(mi.Float(dx / size), mi.Float(dy / size), mi.Float(dz / size)),
-        )
-        reach = mi.Float(dr.maximum(length - LIFT, 0.0))
-        ray.maxt = reach  # type: ignore[assignment]  # stub: scalars
-        return mi.Bool(self.scene.ray_test(ray))
+        return mi.Bool(self.scene.ray_test(_ray(place, facet)))
 
     def clear(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """(N,) whether nothing stands between points (N, 3) and points (N, 3)."""
@@ -110,3 +164,58 @@ class Shadows:
         length = np.linalg.norm(span, axis=1)
         ray = rays(starts, span / np.maximum(length, 1e-9)[:, None], length)
         return ~np.asarray(self.scene.ray_test(ray))
+
+
+def _ray(place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
+    """From a facet, its point, then its normal, to a place: line by line as `Shadows.sees` has it,
+    so that both agree to the last bit."""
+    (x, y, z), (px, py, pz, nx, ny, nz) = place, facet
+    side = dr.select((x - px) * nx + (y - py) * ny + (z - pz) * nz < 0, -LIFT, LIFT)
+    sx, sy, sz = px + side * nx, py + side * ny, pz + side * nz
+    dx, dy, dz = x - sx, y - sy, z - sz
+    length = dr.sqrt(dx * dx + dy * dy + dz * dz)
+    size = dr.maximum(length, LIFT)
+    ray = mi.Ray3f(
+        mi.Point3f(mi.Float(sx), mi.Float(sy), mi.Float(sz)),
+        mi.Vector3f(mi.Float(dx / size), mi.Float(dy / size), mi.Float(dz / size)),
+    )
+    reach = mi.Float(dr.maximum(length - LIFT, 0.0))
+    ray.maxt = reach  # type: ignore[assignment]  # stub: scalars
+    return ray
+
+
+@jit
+def _hides(sides, row, places, points, normals):
+    """Whether the triangle of each point (N, 3), -1: none, surely hides it from all places: their
+    rays meet it farther than `SURE` inside its sides and from both ends, and not grazing."""
+    out = np.zeros(row.size, np.bool_)
+    for k in range(row.size):
+        if row[k] < 0:
+            continue
+        x, y, z = points[k]
+        nx, ny, nz = normals[k]
+        level = x * nx + y * ny + z * nz
+        (ax, ay, az, a), (bx, by, bz, b), (cx, cy, cz, c), (dx, dy, dz, d) = sides[row[k]]
+        hidden = True
+        for n in range(-1, len(places) - 1):  # both ends of a flight first
+            px, py, pz = places[n]
+            height = px * nx + py * ny + pz * nz - level
+            lift = -LIFT if height < 0 else LIFT
+            sx, sy, sz = x + lift * nx, y + lift * ny, z + lift * nz
+            before = sx * ax + sy * ay + sz * az - a
+            after = px * ax + py * ay + pz * az - a
+            share = before / (before - after)
+            mx, my, mz = sx + share * (px - sx), sy + share * (py - sy), sz + share * (pz - sz)
+            length = np.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
+            hidden = (
+                abs(height) > SURE**2
+                and abs(before - after) > GRAZING * length
+                and SURE < share * length < length - LIFT - SURE
+                and mx * bx + my * by + mz * bz > b + SURE
+                and mx * cx + my * cy + mz * cz > c + SURE
+                and mx * dx + my * dy + mz * dz > d + SURE
+            )
+            if not hidden:
+                break
+        out[k] = hidden
+    return out
