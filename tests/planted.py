@@ -149,8 +149,8 @@ OF_CASES = {
     ),
     "ghosts over a conducting wall": Bug(
         "propagation/raytrace.py",
-        "scatter = np.sqrt(4 * np.pi * section) / self._free.wavelength",
-        "scatter = np.sqrt(4 * np.pi * section)",
+        "np.concatenate(sections)) / self._free.wavelength",
+        "np.concatenate(sections))",
     ),
     "lambertian wall": Bug(
         "propagation/clutter/field.py", "power *= abs(back) / np.pi", "power *= 1 / np.pi"
@@ -483,8 +483,8 @@ OF_CASES = {
     ),
     "echoes against sionna": Bug(
         "propagation/raytrace.py",
-        "allowed = bounces <= (self._propagation.max_bounces",
-        "allowed = bounces < (self._propagation.max_bounces",
+        "on.bounces[j] <= most",
+        "on.bounces[j] < most",
     ),
     "cube against mmwrt": Bug(
         "signal/direct.py",
