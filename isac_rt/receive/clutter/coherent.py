@@ -204,7 +204,7 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     y = y[some]
 
     def statistic(a: np.ndarray) -> np.ndarray:
-        return scale * np.abs((a.conj() * y[:, None]).sum(axis=-1)) ** 2
+        return scale * np.abs(np.matmul(a, y.conj()[..., None])[..., 0]) ** 2
 
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
@@ -231,7 +231,7 @@ def search_white(
 
     def statistic(a: np.ndarray) -> np.ndarray:
         norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
-        return np.abs((a.conj() * y[some, None]).sum(axis=-1)) ** 2 / norm
+        return np.abs(np.matmul(a, y[some].conj()[..., None])[..., 0]) ** 2 / norm
 
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)

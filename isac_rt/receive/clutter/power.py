@@ -20,6 +20,7 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -124,10 +125,17 @@ class Response:
             half = size // 2 + 1
             folded = spectrum[:, :half] + spectrum[:, size : size + half]
             folded += spectrum[:, size : size - half : -1].conj()
-            turned = scipy.fft.irfft(folded, size) / FINE_DOPPLER
-            for first, weight_of_row in enumerate(across):
-                made += weight_of_row * turned[first::FINE_BEAT][: self.rows]
+            _add_lines(scipy.fft.irfft(folded, size), across / FINE_DOPPLER, made)
         return np.fft.fftshift(out, axes=2)
+
+
+@jit
+def _add_lines(lines, weights, rows):
+    """Add to each row the weighted lines about it."""
+    for r in range(rows.shape[0]):
+        for k in range(weights.size):
+            for p in range(rows.shape[1]):
+                rows[r, p] += weights[k] * lines[FINE_BEAT * r + k, p]
 
 
 def expected_power(
