@@ -301,11 +301,13 @@ def _best(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray,
     """The largest statistic over the grid of directions, and where, of cells (S, L_tx, L_rx)."""
     X, Z = search.along_x, search.along_z
     each = y.reshape(-1, y.shape[2])
-    along_x, along_z = (
-        ((each[:, one.members[0]] @ one.spectra[0].T) * other.turns[0].conj()).reshape(
-            *y.shape[:2], DIRECTIONS
-        )
+    turned = (  # either arm's turn at the other's place is taken out of both
+        (one.members[0], one.spectra[0] * other.turns[0].conj()[:, None])
         for one, other in ((X, Z), (Z, X))
+    )
+    along_x, along_z = (
+        (each[:, members] @ spectra.T).reshape(*y.shape[:2], DIRECTIONS)
+        for members, spectra in turned
     )
     peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.int64)
     scale = np.where(search.inside, scale, 0).astype(np.float32)
