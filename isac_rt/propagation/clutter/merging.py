@@ -88,7 +88,7 @@ def allowed_area(
     Parameters
     ----------
     power : (K,) mean power over the noise of a range-Doppler cell
-    cell : (K,) int in which each is seen
+    cell : (K,) int from 0 in which each is seen
     area : (K,) that each stands for [m^2]
     finest : (K,) to which the surface is cut there [m^2]
     error : of noise plus clutter that is allowed, as a share
@@ -97,8 +97,7 @@ def allowed_area(
     -------
     area : (K,) [m^2]
     """
-    _, number = np.unique(cell, return_inverse=True)
-    clutter = np.bincount(number, power)[number]
+    clutter = np.bincount(cell, power)[cell]
     over = (1 + clutter) / clutter
     most = error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)
     most = np.where(clutter > 1, np.minimum(most, clutter / FEWEST), most)
