@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
@@ -112,7 +111,8 @@ class Track:
         """A body that others say there is, with position and velocity (6,): a track that was never
         born."""
         mean = np.concatenate([body.mean, np.zeros(3)])
-        covariance = block_diag(body.covariance, acceleration_std**2 * np.eye(3))
+        covariance = np.diag([0.0] * 6 + [acceleration_std**2] * 3)
+        covariance[:6, :6] = body.covariance
         return cls(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=time)
 
     def memory(self) -> dict[str, Any]:
