@@ -120,10 +120,9 @@ class IFCube:
         shape = f"{groups} groups x {antennas} antennas x {chirps} chirps x {size} samples"
         return f"<IFCube {shape} at {self.start_time:.4f} s, RMS {rms:.2e} sqrt(W)>"
 
-    @cached_property
-    def made(self) -> dict[str, Any]:
-        """What a receiver has made of the samples, for the next one that needs the same."""
-        return {}
+    def shared(self) -> SharedCube:
+        """The same samples, which must not change any more, for several receivers."""
+        return SharedCube(**vars(self))
 
     def of_groups(self, groups: Sequence[int]) -> IFCube:
         """What a receiver of these groups alone has."""
@@ -134,6 +133,15 @@ class IFCube:
             schedule=self.schedule[chosen],
             start_time=self.start_time,
         )
+
+
+class SharedCube(IFCube):
+    """A cube that several receivers hear: what one has made of it the next one need not make."""
+
+    @cached_property
+    def made(self) -> dict[str, Any]:
+        """By name."""
+        return {}
 
 
 @dataclass(frozen=True, kw_only=True)

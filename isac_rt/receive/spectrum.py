@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.frame.cube import IFCube
+from isac_rt.frame.cube import IFCube, SharedCube
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.known import Known
@@ -104,8 +104,10 @@ def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> n
 
 
 def cleaned(cube: IFCube, known: Known) -> tuple[np.ndarray, Known]:
-    """`clean_spectrum`, made once for all receivers of a cube that read the same data, and what the
-    first of them knew. Whoever changes the spectra changes a copy."""
+    """`clean_spectrum`, made once for all receivers of a shared cube that read the same data, and
+    what the first of them knew. Whoever changes the spectra changes a copy."""
+    if not isinstance(cube, SharedCube):
+        return clean_spectrum(cube, known), known
     kept = cube.made.get("cleaned")
     if kept is None or not kept[1].alike(known):
         kept = cube.made["cleaned"] = clean_spectrum(cube, known), known

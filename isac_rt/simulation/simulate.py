@@ -474,7 +474,7 @@ def _seconds_of(
     heard: list[dict[Link, Heard]] = [{} for _ in sets]
     for link in sets[0].recorder.timetable.links(frame.number):
         begun = time.thread_time()
-        cube = frame.heard(link)
+        cube = _shared(frame.heard(link))
         count(link, "synthesis", begun)
         if whole or (receive and link.own):
             begun = time.thread_time()
@@ -487,6 +487,11 @@ def _seconds_of(
             one.record(frame, by_link, False)
         count(None, "track", begun)
     return out
+
+
+def _shared(heard: IFCube | RangeProfiles) -> IFCube | RangeProfiles:
+    """What a link's receivers of all sets are given."""
+    return heard.shared() if isinstance(heard, IFCube) else heard
 
 
 def _standard(setup: Setup) -> list[_Listeners]:
@@ -610,7 +615,7 @@ class _Run:
         The frame `before` is one that the pool began earlier, so that waiting for it ends.
         """
         with self.stopwatch.stage("synthesis"):
-            cube = frame.heard(link)
+            cube = _shared(frame.heard(link))
         if before is not None:
             before.result()
         with self.stopwatch.stage("receive"):

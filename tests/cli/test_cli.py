@@ -99,7 +99,7 @@ def simulation(monkeypatch):
     """A stand-in for the simulation: it reports progress and hands back made-up results."""
     fake = types.ModuleType("isac_rt.simulation.simulate")
 
-    def prepare(scenario):
+    def prepare(scenario, **_):
         from isac_rt.world.city.mesh import empty_city
 
         return types.SimpleNamespace(
@@ -235,7 +235,7 @@ def test_anything_else_ends_with_1_and_says_how_to_look(
 def test_a_runtime_problem_ends_with_2(scenario_file, simulation, capsys, tmp_path):
     from isac_rt.runtime import RuntimeProblem
 
-    def refuse(scenario):
+    def refuse(scenario, **_):
         raise RuntimeProblem("no usable LLVM; install libllvm19")
 
     simulation.setup.prepare = refuse
@@ -417,7 +417,7 @@ def native():
     while time.time() < end:  # a native call that goes on: sleep itself returns on a signal
         try: libc.sleep(60)
         except KeyboardInterrupt: pass
-def prepare(scenario):
+def prepare(scenario, **_):
     with isac_rt.storage._beside(pathlib.Path({str(tmp_path / "o")!r}, "results.nc")) as half:
         half[1].write(b"half")
         print("ready", flush=True)

@@ -58,7 +58,7 @@ from isac_rt.simulation.setup import swarm_of
 from isac_rt.world.city.mesh import empty_city
 import isac_rt.simulation.setup as setup
 fake = types.ModuleType("isac_rt.simulation.simulate")
-setup.prepare = lambda s: types.SimpleNamespace(
+setup.prepare = lambda s, **_: types.SimpleNamespace(
     city=empty_city("none", np.zeros(3)),
     swarm=swarm_of(s),
     timetable=types.SimpleNamespace(epoch=lambda f: 0.043 * f),

@@ -15,7 +15,7 @@ def test_receivers_of_one_cube_share_what_they_clean_and_hear_what_they_hear_alo
     """Planted bugs: the filter works on the shared spectra (the second receiver hears what the
     first one left); spectra are kept whatever data were read."""
     w, schedule, payload = frame()
-    heard = cube(w, schedule, payload, [Path(60.0, 0.0), Path(82.0, 14.0)])
+    heard = cube(w, schedule, payload, [Path(60.0, 0.0), Path(82.0, 14.0)]).shared()
     filtering = Receivers(clutter_filter="zero_doppler")
     made = []
 
@@ -37,3 +37,14 @@ def test_receivers_of_one_cube_share_what_they_clean_and_hear_what_they_hear_alo
     assert len(made) == 2
     ranges(heard, Receivers(), other)
     assert len(made) == 3
+
+
+def test_samples_that_change_are_received_as_they_are():
+    """Planted bug: every cube keeps what was made of it, so that noise added later is not heard."""
+    w, schedule, payload = frame()
+    heard = cube(w, schedule, payload, [Path(60.0, 0.0)])
+    before = receive_active(heard, payload, ANTENNAS, Receivers()).detections
+    heard.samples[:] *= 0
+    after = receive_active(heard, payload, ANTENNAS, Receivers()).detections
+    assert len(before) == 1
+    assert len(after) == 0

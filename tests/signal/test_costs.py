@@ -46,7 +46,8 @@ def decide(count: int, **more):
 
 @pytest.mark.parametrize("size", [2, 40, 400])
 def test_what_is_predicted_twice_as_dear_is_dearer(size):
-    """Direct and every setting, medians of three. Planted bug: the elements left out of the direct
+    """Direct and every setting, least of five: new memory takes a machine 6 ms now and then, as long
+    as a job. Planted bug: the elements left out of the direct
     method's cost."""
     job, model = Job(12), read(SHIPPED)
     links, shape = job.paths(size), (3, 15, 12, 1024)
@@ -58,7 +59,7 @@ def test_what_is_predicted_twice_as_dear_is_dearer(size):
         if c.setting.faint
     }
     works[DIRECT] = lambda: job.samples(links, Direct())
-    measured = {name: cpu_seconds(work, 3) for name, work in works.items()}
+    measured = {n: min(cpu_seconds(work, 1) for _ in range(5)) for n, work in works.items()}
     clear = [(a, b) for a, b in itertools.permutations(NAMES, 2) if predicted[a] > 2 * predicted[b]]
     assert clear or size == 2
     assert [(a, b) for a, b in clear if measured[a] <= measured[b]] == []
