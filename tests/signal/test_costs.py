@@ -46,7 +46,7 @@ def decide(count: int, **more):
 
 @pytest.mark.parametrize("size", [2, 40, 400])
 def test_what_is_predicted_twice_as_dear_is_dearer(size):
-    """Direct and every setting, least of five: new memory takes 6 ms now and then, as long as a job.
+    """Direct and every setting, least of five: new memory takes 6 ms at times, as long as a job.
     Planted bug: the elements left out of the direct method's cost."""
     job, model = Job(12), read(SHIPPED)
     links, shape = job.paths(size), (3, 15, 12, 1024)
