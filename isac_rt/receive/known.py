@@ -84,7 +84,8 @@ class Known:
         return []
 
     def mapped(self, spectra: np.ndarray, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The power map of spectra, made once for all receivers that look at them."""
+        """The power map of spectra, made once for all receivers that look at them; whoever changes
+        them changes a copy."""
         for of, power in self._maps:
             if of() is spectra:
                 return power

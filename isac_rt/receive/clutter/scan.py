@@ -81,10 +81,7 @@ def search_coherent(along_x, along_z, turns_z, turns_x, inside, scale, peak, pla
     sine = turns_z.shape[1] * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
-        for k in range(lines):
-            for j in range(size):
-                heard[k * size + j] = along_z[s, k, j].real
-                heard[(lines + k) * size + j] = along_z[s, k, j].imag
+        _apart(along_z[s], heard)
         for i in range(size):
             for j in range(0, size, LANES):
                 re, im = zero, zero
@@ -124,10 +121,7 @@ def search_by_power(along_x, along_z, scale, peak, place):
     heard = np.empty(2 * looks * size, np.float32)
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
-        for t in range(looks):
-            for j in range(size):
-                heard[t * size + j] = along_z[s, t, j].real
-                heard[(looks + t) * size + j] = along_z[s, t, j].imag
+        _apart(along_z[s], heard)
         for i in range(size):
             for j in range(0, size, LANES):
                 total = zero
@@ -139,6 +133,15 @@ def search_by_power(along_x, along_z, scale, peak, place):
                 store(power, at, total * load(each, norm + at))
         best = _largest(power, every)
         peak[s], place[s, 0], place[s, 1] = power[best], best // size, best % size
+
+
+@jit
+def _apart(lines, out):
+    """All real parts of the lines, then all imaginary ones."""
+    count, size = lines.shape
+    for k in range(count):
+        for j in range(size):
+            out[k * size + j], out[(count + k) * size + j] = lines[k, j].real, lines[k, j].imag
 
 
 @jit
