@@ -20,6 +20,7 @@ NEAR = 256
 """Rows that stay in the first-level cache (32 KB)."""
 _C3 = np.float32(np.cos(2 * np.pi / 3))
 _S3 = np.float32(np.sin(2 * np.pi / 3))
+_C8 = np.float32(np.sqrt(0.5))
 _C5, _D5 = np.float32(np.cos(2 * np.pi / 5)), np.float32(np.cos(4 * np.pi / 5))
 _S5, _T5 = np.float32(np.sin(2 * np.pi / 5)), np.float32(np.sin(4 * np.pi / 5))
 
@@ -36,12 +37,15 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     order : (size,) int64, the row that holds output k
     """
     left, radices = size, []
-    for r in (5, 3, 4, 2):
+    for r in (5, 3):
         while left % r == 0:
             radices.append(r)
             left //= r
-    if left != 1:
+    twos = left.bit_length() - 1
+    if left != 1 << twos:
         raise ValueError(f"a lane transform of {size} rows: only factors 2, 3 and 5 can be done")
+    fours = -twos % 3
+    radices += [2] if twos == 1 else [4] * fours + [8] * ((twos - 2 * fours) // 3)
     parts, order, length, rest = (
         [np.zeros(0, np.complex64)],
         np.zeros(size, np.int64),
@@ -64,7 +68,7 @@ def _put(table, at, re, im, twiddles, t):
     store(table, at + 16, re * s + im * c)
 
 
-@jit
+@jit(inline=True)
 def _two(table, at, step, twiddles, t):
     ar, ai, br, bi = (
         load(table, at),
@@ -77,7 +81,7 @@ def _two(table, at, step, twiddles, t):
     _put(table, at + step, ar - br, ai - bi, twiddles, t)
 
 
-@jit
+@jit(inline=True)
 def _three(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -90,7 +94,7 @@ def _three(table, at, step, twiddles, t):
     _put(table, at + 2 * step, mr + di, mi - dr, twiddles, t + 2)
 
 
-@jit
+@jit(inline=True)
 def _four(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -105,7 +109,46 @@ def _four(table, at, step, twiddles, t):
     _put(table, at + 3 * step, mr + ni, mi - nr, twiddles, t + 4)
 
 
-@jit
+@jit(inline=True)
+def _quarters(ar, ai, br, bi, cr, ci, dr, di):
+    """Outputs 0, 2, 1 and 3 of a transform of four rows."""
+    pr, pi, mr, mi = ar + cr, ai + ci, ar - cr, ai - ci
+    qr, qi, nr, ni = br + dr, bi + di, br - dr, bi - di
+    return pr + qr, pi + qi, pr - qr, pi - qi, mr - ni, mi + nr, mr + ni, mi - nr
+
+
+@jit(inline=True)
+def _eight(table, at, step, twiddles, t):
+    ar, ai = load(table, at), load(table, at + 16)
+    br, bi = load(table, at + step), load(table, at + step + 16)
+    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
+    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
+    er, ei = load(table, at + 4 * step), load(table, at + 4 * step + 16)
+    fr, fi = load(table, at + 5 * step), load(table, at + 5 * step + 16)
+    gr, gi = load(table, at + 6 * step), load(table, at + 6 * step + 16)
+    hr, hi = load(table, at + 7 * step), load(table, at + 7 * step + 16)
+    ar, ai, er, ei = ar + er, ai + ei, ar - er, ai - ei
+    br, bi, fr, fi = br + fr, bi + fi, br - fr, bi - fi
+    cr, ci, gr, gi = cr + gr, ci + gi, cr - gr, ci - gi
+    dr, di, hr, hi = dr + hr, di + hi, dr - hr, di - hi
+    ar, ai, cr, ci, br, bi, dr, di = _quarters(ar, ai, br, bi, cr, ci, dr, di)
+    store(table, at, ar)
+    store(table, at + 16, ai)
+    _put(table, at + 2 * step, br, bi, twiddles, t + 2)
+    _put(table, at + 4 * step, cr, ci, twiddles, t + 6)
+    _put(table, at + 6 * step, dr, di, twiddles, t + 10)
+    half, zero = splat(_C8), splat(np.float32(0))
+    fr, fi = half * (fr - fi), half * (fr + fi)  # an eighth of a turn
+    gr, gi = zero - gi, gr
+    hr, hi = zero - half * (hr + hi), half * (hr - hi)
+    er, ei, gr, gi, fr, fi, hr, hi = _quarters(er, ei, fr, fi, gr, gi, hr, hi)
+    _put(table, at + step, er, ei, twiddles, t)
+    _put(table, at + 3 * step, fr, fi, twiddles, t + 4)
+    _put(table, at + 5 * step, gr, gi, twiddles, t + 8)
+    _put(table, at + 7 * step, hr, hi, twiddles, t + 12)
+
+
+@jit(inline=True)
 def _five(table, at, step, twiddles, t):
     ar, ai = load(table, at), load(table, at + 16)
     br, bi = load(table, at + step), load(table, at + step + 16)
@@ -128,18 +171,27 @@ def _five(table, at, step, twiddles, t):
 @jit
 def _stage(table, first, length, radix, twiddles, t):
     """One stage of the transform of `length` rows from float `first`."""
-    rows = length // radix
-    step = rows * ROW
-    for at in range(first, first + step, ROW):
-        if radix == 4:
+    step = length // radix * ROW
+    if radix == 8:
+        for at in range(first, first + step, ROW):
+            _eight(table, at, step, twiddles, t)
+            t += 14
+    elif radix == 4:
+        for at in range(first, first + step, ROW):
             _four(table, at, step, twiddles, t)
-        elif radix == 2:
+            t += 6
+    elif radix == 2:
+        for at in range(first, first + step, ROW):
             _two(table, at, step, twiddles, t)
-        elif radix == 5:
+            t += 2
+    elif radix == 5:
+        for at in range(first, first + step, ROW):
             _five(table, at, step, twiddles, t)
-        else:
+            t += 8
+    else:
+        for at in range(first, first + step, ROW):
             _three(table, at, step, twiddles, t)
-        t += 2 * (radix - 1)
+            t += 4
 
 
 @jit
