@@ -34,13 +34,16 @@ TOGETHER = 12
 MOVED = 0.5
 """Lines that paths may move by until the lines beside them are sought anew, where that takes longer
 than a batch of chirps."""
+TAPS = 4
+"""Grid points that a line is spread on."""
 FLOOR = 2e-3
 """Error of a path on a line: four weights, to which twelve are fitted besides."""
 EXTRA = 2
 """Degree of the weights' polynomials above the width."""
 _ACROSS = 3  # chirps whose sums stay in registers, with the same shares
 _Z = 2 * LANES * TOGETHER  # float32 of 16 paths' amplitudes in these chirps
-_SUMS = 4 * LANES  # float32 of a chirp's sums for two lines
+_SUM = 2 * LANES  # float32 of a line's sums in a chirp
+_BLOCK = 64  # lines whose sums in a few chirps stay in the first-level cache
 _ONE, _HALF = np.float32(1), np.float32(0.5)
 
 
@@ -96,14 +99,13 @@ class Sheet(NamedTuple):
     size : grid points a turn
     more : by which a path's shares f and 1 - f are raised, over f (1 - f)
     stride, inner : float32 from grid to grid, and from a path's first row to a line's
-    taps, poly : one 0 for each row of a line, and `weights` of these
+    poly : `weights` of the `TAPS` rows of a line
     """
 
     size: int
     more: float
     stride: int
     inner: int
-    taps: tuple[int, ...]
     poly: np.ndarray
 
 
@@ -113,10 +115,11 @@ class Desk(NamedTuple):
     Attributes
     ----------
     z, share : of each path the amplitudes in the chirps of a batch, and the upper line's share
-    sums : of a line and the next one in each chirp
-    work, weights, factor, rows : places of 16 lines within a grid step; of every chirp their
-        weights, factors and first rows
-    lines, begin, end : 16 lines and the paths above each
+    sums, rest : of each line in a few chirps, and of the line after the last in every chirp
+    place, weights, shift : within a grid step, of the `LINES` lines in one; in every chirp the
+        weights of these, and the whole lines that its data move all lines by
+    factor : of each line in every chirp
+    lines, begin, end : a block of lines and the paths above each
     sent, times, antenna : of each chirp what is sent, its time and its data's delay, and by which
         element; -1: nothing
     """
@@ -124,10 +127,11 @@ class Desk(NamedTuple):
     z: np.ndarray
     share: np.ndarray
     sums: np.ndarray
-    work: np.ndarray
+    rest: np.ndarray
+    place: np.ndarray
     weights: np.ndarray
+    shift: np.ndarray
     factor: np.ndarray
-    rows: np.ndarray
     lines: np.ndarray
     begin: np.ndarray
     end: np.ndarray
@@ -160,20 +164,21 @@ def no_paths(num_tx: int) -> Covered:
     )
 
 
-def desk(paths: Covered, width: int) -> Desk:
+def desk(paths: Covered) -> Desk:
     """Room for the sums of these paths."""
     blocks = paths.turn.size // LANES
     return Desk(
         aligned(blocks * _Z),
         aligned(blocks * LANES * (TOGETHER // _ACROSS)),
-        aligned(TOGETHER * _SUMS),
-        aligned(LANES),
-        aligned(TOGETHER * width * LANES),
-        aligned(TOGETHER * 2 * LANES),
-        np.zeros(TOGETHER * LANES),
-        np.zeros(LANES),
-        np.zeros(LANES, np.int64),
-        np.zeros(LANES, np.int64),
+        aligned(_BLOCK * _ACROSS * _SUM),
+        aligned(TOGETHER * _SUM),
+        np.arange(LANES) / LINES - 0.5,
+        aligned(TOGETHER * TAPS * LANES),
+        np.zeros(TOGETHER, np.int64),
+        aligned(TOGETHER * 2 * _BLOCK),
+        np.zeros(_BLOCK),
+        np.zeros(_BLOCK, np.int64),
+        np.zeros(_BLOCK, np.int64),
         np.zeros(TOGETHER, np.complex128),
         np.zeros((TOGETHER, 2)),
         np.zeros(TOGETHER, np.int64),
@@ -395,105 +400,133 @@ def _one(z, j, sr, si, ar, ai):
 
 
 @jit(fast=True)
-def _weigh(desk, c, poly, taps):
-    """Weights on the grid points of 16 lines in a chirp."""
-    r, width, degree = load(desk.work, 0), len(taps), len(taps) + EXTRA
-    at = c * width * LANES
-    for j in range(width):
-        v = splat(poly[j])
-        for d in range(1, degree + 1):
-            v = v * r + splat(poly[d * width + j])
-        store(desk.weights, at + LANES * j, v)
+def _weigh(desk, antenna, w, sheet):
+    """Where the data of the chirps that an antenna sends move all lines: by whole lines, and the
+    weights of the `LINES` places within a grid step that are left."""
+    for c in range(TOGETHER):
+        if desk.antenna[c] != antenna:
+            continue
+        moved = w.slope * w.step * sheet.size * LINES * desk.times[c, 1]
+        desk.shift[c] = int(np.floor(moved))
+        r = narrow(load(desk.place, 0) + splat((moved - np.floor(moved)) / LINES))
+        for j in range(TAPS):
+            v = splat(sheet.poly[j])
+            for d in range(1, TAPS + EXTRA + 1):
+                v = v * r + splat(sheet.poly[d * TAPS + j])
+            store(desk.weights, (c * TAPS + j) * LANES, v)
 
 
 @jit(fast=True)
-def _place(desk, count, antenna, w, sheet):
-    """Rows, weights and factors of `count` lines in the chirps that an antenna sends."""
-    to_beat, size = 1 / (LINES * w.step * sheet.size), float(sheet.size)
+def _factors(desk, count, antenna, w, sheet):
+    """Factors of `count` lines in the chirps that an antenna sends."""
+    to_beat = 1 / (LINES * w.step * sheet.size)
     low, high = desk.lines[0] * to_beat, desk.lines[count - 1] * to_beat
     for c in range(TOGETHER):
         if desk.antenna[c] != antenna:
             continue
         data, sent = desk.times[c, 1], desk.sent[c]
-        lines = load(desk.lines, 0)
-        turned = lines * splat(-to_beat * data)
-        x, y = cos_sin(narrow(turned - floor(turned + splat(0.5))))
         re, im = splat(np.float32(sent.real)), splat(np.float32(sent.imag))
-        store(desk.factor, c * 2 * LANES, x * re - y * im)
-        store(desk.factor, c * 2 * LANES + LANES, x * im + y * re)
-        place = lines * splat(1 / LINES) + splat(w.slope * w.step * size * data)
-        place = place - splat(size) * floor(place * splat(1 / size))
-        row = floor(place)
-        store(desk.rows, c * LANES, row)
-        store(desk.work, 0, narrow(place - row) - splat(_HALF))
-        _weigh(desk, c, sheet.poly, sheet.taps)
+        own = c * 2 * _BLOCK
+        for b in range(0, count, LANES):
+            turned = load(desk.lines, b) * splat(-to_beat * data)
+            x, y = cos_sin(narrow(turned - floor(turned + splat(0.5))))
+            store(desk.factor, own + b, x * re - y * im)
+            store(desk.factor, own + _BLOCK + b, x * im + y * re)
         if low + w.slope * data < 0 or high + w.slope * data > w.rate:
-            for i in range(count):
-                gain = np.float32(passed(w, desk.lines[i] * to_beat / w.slope + data))
-                desk.factor[c * 2 * LANES + i] *= gain
-                desk.factor[c * 2 * LANES + LANES + i] *= gain
+            for b in range(count):
+                gain = np.float32(passed(w, desk.lines[b] * to_beat / w.slope + data))
+                desk.factor[own + b] *= gain
+                desk.factor[own + _BLOCK + b] *= gain
 
 
 @jit(fast=True)
-def _add_lines(grids, desk, count, antenna, sheet, paths, order, used):
-    """Sum the paths beside each of `count` lines in the `used` chirps of the batch, and spread
-    them. What the last paths leave to the next line stays in `desk.sums`."""
-    steer, z, sums, zero, width = (
-        paths.steer,
-        desk.z,
-        desk.sums,
-        splat(np.float32(0)),
-        len(sheet.taps),
-    )
+def _sum(desk, count, sheet, paths, order, first):
+    """Sum the paths beside each of `count` lines in a few chirps from `first` on. What the last
+    paths leave to the next line stays in `desk.rest`."""
+    steer, z, sums, rest, zero = paths.steer, desk.z, desk.sums, desk.rest, splat(np.float32(0))
+    own, to = first // _ACROSS * paths.turn.shape[0], _SUM * first
+    ar, ai = load(rest, to), load(rest, to + 16)
+    cr, ci = load(rest, to + 32), load(rest, to + 48)
+    er, ei = load(rest, to + 64), load(rest, to + 80)
     for b in range(count):
-        for half in range(0, used, _ACROSS):
-            at, own = _SUMS * half, half // _ACROSS * paths.turn.shape[0]
-            ar, ai = load(sums, at + 32), load(sums, at + 48)
-            cr, ci = load(sums, at + 96), load(sums, at + 112)
-            er, ei = load(sums, at + 160), load(sums, at + 176)
-            br, bi, dr, di, fr, fi = zero, zero, zero, zero, zero, zero
-            for i in range(desk.begin[b], desk.end[b]):
-                n = order[i]
-                k, j = 48 * n, n // LANES * _Z + n % LANES + 2 * LANES * half
-                share = load(steer, k + 32) + splat(desk.share[own + n])
-                rest = splat(_ONE) - share
-                more = splat(_ONE) + share * rest * splat(np.float32(sheet.more))
-                share, rest = share * more, rest * more
-                sr, si = load(steer, k), load(steer, k + 16)
-                tr, ti = sr * share, si * share
-                sr, si = sr * rest, si * rest
-                ar, ai = _one(z, j, sr, si, ar, ai)
-                br, bi = _one(z, j, tr, ti, br, bi)
-                cr, ci = _one(z, j + 32, sr, si, cr, ci)
-                dr, di = _one(z, j + 32, tr, ti, dr, di)
-                er, ei = _one(z, j + 64, sr, si, er, ei)
-                fr, fi = _one(z, j + 64, tr, ti, fr, fi)
-            _keep(sums, at, ar, ai, br, bi)
-            _keep(sums, at + _SUMS, cr, ci, dr, di)
-            _keep(sums, at + 2 * _SUMS, er, ei, fr, fi)
-        for c in range(TOGETHER):
-            if desk.antenna[c] != antenna:
-                continue
-            row, at, k = int(desk.rows[c * LANES + b]), _SUMS * c, c * 2 * LANES + b
-            ar, ai = load(sums, at), load(sums, at + 16)
-            x, y = splat(desk.factor[k]), splat(desk.factor[k + LANES])
-            ar, ai = x * ar - y * ai, x * ai + y * ar
-            to, j = c * sheet.stride + sheet.inner + row * ROW, c * width * LANES + b
-            for _tap in range(width):
-                u = splat(desk.weights[j])
-                store(grids, to, load(grids, to) + u * ar)
-                store(grids, to + 16, load(grids, to + 16) + u * ai)
-                to += ROW
-                j += LANES
+        br, bi, dr, di, fr, fi = zero, zero, zero, zero, zero, zero
+        for i in range(desk.begin[b], desk.end[b]):
+            n = order[i]
+            k, j = 48 * n, n // LANES * _Z + n % LANES + 2 * LANES * first
+            share = load(steer, k + 32) + splat(desk.share[own + n])
+            under = splat(_ONE) - share
+            more = splat(_ONE) + share * under * splat(np.float32(sheet.more))
+            share, under = share * more, under * more
+            sr, si = load(steer, k), load(steer, k + 16)
+            tr, ti = sr * share, si * share
+            sr, si = sr * under, si * under
+            ar, ai = _one(z, j, sr, si, ar, ai)
+            br, bi = _one(z, j, tr, ti, br, bi)
+            cr, ci = _one(z, j + 32, sr, si, cr, ci)
+            dr, di = _one(z, j + 32, tr, ti, dr, di)
+            er, ei = _one(z, j + 64, sr, si, er, ei)
+            fr, fi = _one(z, j + 64, tr, ti, fr, fi)
+        _keep(sums, _ACROSS * _SUM * b, ar, ai, cr, ci, er, ei)
+        ar, ai, cr, ci, er, ei = br, bi, dr, di, fr, fi
+    _keep(rest, to, ar, ai, cr, ci, er, ei)
 
 
 @jit(inline=True)
-def _keep(sums, at, ar, ai, br, bi):
-    """Write a chirp's sums for the lower line and the upper one."""
+def _keep(sums, at, ar, ai, cr, ci, er, ei):
+    """Write a line's sums in a few chirps."""
     store(sums, at, ar)
     store(sums, at + 16, ai)
-    store(sums, at + 32, br)
-    store(sums, at + 48, bi)
+    store(sums, at + 32, cr)
+    store(sums, at + 48, ci)
+    store(sums, at + 64, er)
+    store(sums, at + 80, ei)
+
+
+@jit(inline=True)
+def _add(grids, to, re, im):
+    """Add to a row of the grids."""
+    store(grids, to, load(grids, to) + re)
+    store(grids, to + 16, load(grids, to + 16) + im)
+
+
+@jit(fast=True)
+def _spread(grids, desk, count, c, sheet):
+    """Spread the sums of `count` lines in chirp c. Lines of one grid step are added together in
+    registers before the grid is written."""
+    zero, shift, size, weights = splat(np.float32(0)), desk.shift[c], sheet.size, desk.weights
+    base, at, k = c * sheet.stride + sheet.inner, c % _ACROSS * _SUM, c * 2 * _BLOCK
+    last = (int(desk.lines[0]) + shift) // LINES
+    row = last % size
+    ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
+    for b in range(count):
+        place = int(desk.lines[b]) + shift
+        steps = place // LINES - last
+        if steps > 0:
+            to = base + row * ROW
+            _add(grids, to, ar, ai)
+            if steps == 1:
+                ar, ai, br, bi, cr, ci, dr, di = br, bi, cr, ci, dr, di, zero, zero
+            else:
+                _add(grids, to + ROW, br, bi)
+                _add(grids, to + 2 * ROW, cr, ci)
+                _add(grids, to + 3 * ROW, dr, di)
+                ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
+            last += steps
+            row = last % size
+        x, y = splat(desk.factor[k + b]), splat(desk.factor[k + _BLOCK + b])
+        sr, si = load(desk.sums, at), load(desk.sums, at + 16)
+        sr, si = x * sr - y * si, x * si + y * sr
+        j = c * TAPS * LANES + place % LINES
+        u, v = splat(weights[j]), splat(weights[j + LANES])
+        p, q = splat(weights[j + 2 * LANES]), splat(weights[j + 3 * LANES])
+        ar, ai, br, bi = ar + u * sr, ai + u * si, br + v * sr, bi + v * si
+        cr, ci, dr, di = cr + p * sr, ci + p * si, dr + q * sr, di + q * si
+        at += _ACROSS * _SUM
+    to = base + row * ROW
+    _add(grids, to, ar, ai)
+    _add(grids, to + ROW, br, bi)
+    _add(grids, to + 2 * ROW, cr, ci)
+    _add(grids, to + 3 * ROW, dr, di)
 
 
 @jit(fast=True)
@@ -517,7 +550,7 @@ def _send(desk, chirps, link, offset, t, w):
 
 @jit(fast=True)
 def _gather(desk, order, below, i, stop, line, pending):
-    """The next lines, up to 16, and which paths lie above each, from place i of the `order` on;
+    """The next lines, a block at most, and which paths lie above each, from place i of `order` on;
     `pending` : whether paths above `line` have a share in the next.
 
     Returns
@@ -525,7 +558,7 @@ def _gather(desk, order, below, i, stop, line, pending):
     Their number; i, line and pending for the next call
     """
     count = 0
-    while count < LANES and (pending or i < stop):
+    while count < _BLOCK and (pending or i < stop):
         line = line + 1.0 if pending else below[order[i]]
         desk.lines[count], desk.begin[count] = line, i
         while i < stop and below[order[i]] == line:
@@ -551,11 +584,15 @@ def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
             last = first + (end - first + LANES - 1) // LANES * LANES
             _shares(desk, paths, first, last, antenna, segment)
             _amplitudes(desk, paths, first, last, antenna)
-            desk.sums[:] = np.float32(0)
+            _weigh(desk, antenna, w, sheet)
+            desk.rest[:] = np.float32(0)
             i, line, pending = begin, 0.0, False
             while pending or i < stop:
                 count, i, line, pending = _gather(desk, order, below, i, stop, line, pending)
-                _place(desk, count, antenna, w, sheet)
-                used = chirps.shape[0]
-                _add_lines(grids, desk, count, antenna, sheet, paths, order, used)
+                _factors(desk, count, antenna, w, sheet)
+                for few in range(0, chirps.shape[0], _ACROSS):
+                    _sum(desk, count, sheet, paths, order, few)
+                    for c in range(few, few + _ACROSS):
+                        if desk.antenna[c] == antenna:
+                            _spread(grids, desk, count, c, sheet)
         begin = stop

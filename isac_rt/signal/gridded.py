@@ -49,6 +49,7 @@ from isac_rt.kernels.vector import (
 )
 from isac_rt.signal.covered import (
     EXTRA,
+    TAPS,
     Batches,
     Covered,
     Desk,
@@ -81,9 +82,9 @@ class Setting:
     wideband : delays of the receive elements applied to the whole chirp (to second order), not to
         its middle alone
     cubic : the third order in x too, of a wideband setting
-    faint : grid points per line between which paths that noise covers are shared
-        (`isac_rt.signal.covered`), to which the division by the kernel's response is fitted then.
-        0: no path is treated so
+    faint : grid points per line between which paths that noise covers are shared, `TAPS` of
+        `isac_rt.signal.covered`, to which the division by the kernel's response is fitted then. 0:
+        no path is treated so
     """
 
     oversampling: float
@@ -104,7 +105,7 @@ ACCURATE = Setting(1.5, 8, True, True)
 """Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square
 of the speed."""
 ACCURATE_ERROR = 5e-6
-COVERING = Setting(1.5, 12, True, faint=4)
+COVERING = Setting(1.5, 12, True, faint=TAPS)
 """Error below `GRIDDED_ERROR`; of paths that noise covers below
 `isac_rt.signal.covered.covered_error`."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
@@ -836,7 +837,6 @@ def _synthesise(
         line_turn(kernel.grid, g.half) ** 2 * g.centre / 2,
         stride,
         (setting.width - setting.faint) // 2 * ROW,
-        (0,) * (setting.faint or COVERING.faint),
         kernel.faint.ravel(),
     )
     grids = aligned(int(order.parts[:, 1].max()) * stride)
@@ -849,7 +849,7 @@ def _synthesise(
         if apart.any():
             steering = partial(_turned_steering, w, rx, first, kernel.grid)
             paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
-        weakest = _Faint(paths, sheet, desk(paths, setting.faint))
+        weakest = _Faint(paths, sheet, desk(paths))
         heard = _Heard(b, steer, weakest)
         _chirps(flat, shape, first, shared, views, g, heard, t, band, room, fresh)
     return True

@@ -18,7 +18,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.signal.covered import TOGETHER, batches, covered_error
+from isac_rt.signal.covered import LINES, TOGETHER, batches, covered_error
 from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
 from isac_rt.signal.gridded import (
@@ -35,7 +35,7 @@ from isac_rt.signal.tones import tones_of
 from isac_rt.world.swarm import Pose
 
 
-@pytest.mark.parametrize("size", [1280, 1536, 2048, 90, 4])
+@pytest.mark.parametrize("size", [1024, 1280, 1536, 2048, 90, 4])
 def test_transform_of_rows(size):
     rng = np.random.default_rng(size)
     rows = (rng.normal(size=(size, 16)) + 1j * rng.normal(size=(size, 16))).astype(np.complex64)
@@ -272,6 +272,20 @@ def test_error_of_the_others_beside_what_noise_covers(speed):
     four weights alone, without the further ones fitted to it."""
     w, tones = scene(14, np.random.default_rng(23), speed=speed)
     assert relative(gridded(w, tones, COVERING), exact(w, tones)) < GRIDDED_ERROR
+
+
+def test_covered_paths_near_each_other_and_far_apart():
+    """Lines on one grid step, on neighbouring ones, some steps apart and beyond a block of them.
+    Planted bugs: lines two steps apart taken for neighbours; weights of the next place in a step;
+    what the last paths of a block leave to the next one lost."""
+    count = 400
+    w, t = scene(count, np.random.default_rng(28), speed=3.0, num_chirps=3)
+    size = grid_size(w.num_samples, COVERING.oversampling, COVERING.width)
+    line = 1 / (w.slope * w.sample_interval * size * LINES)
+    gaps = line * 10 ** np.random.default_rng(29).uniform(-1.0, 1.7, count)
+    t = t._replace(delay=0.05 * w.max_delay + gaps.cumsum(), begin=np.full(count, -np.inf))
+    bound = covered_error(w, t, size).max()
+    assert relative(gridded(w, t, COVERING, np.ones(count, bool)), exact(w, t)) < bound
 
 
 def test_covered_paths_of_two_senders_and_of_the_group_before():
