@@ -91,8 +91,9 @@ def _minus_log(word):
     """-ln of the uniform (word + 1/2) / 2^32, float32; at most 22.9 (an amplitude of 6.8 sigma)."""
     u = np.float32(word) * _UNIT + _HALF * _UNIT
     bits = np.float32(u).view(np.int32)
-    exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)  # mantissa in [sqrt(1/2), sqrt(2))
-    mantissa = np.int32(bits - (exponent << np.int32(23))).view(np.float32)
+    above = np.int32(bits - np.int32(0x3F3504F3))  # mantissa in [sqrt(1/2), sqrt(2))
+    exponent = np.int32(above >> np.int32(23))
+    mantissa = np.int32(bits - np.int32(exponent << np.int32(23))).view(np.float32)
     s = (mantissa - _ONE) / (mantissa + _ONE)
     q = s * s
     log = s * (_LOG[0] + q * (_LOG[1] + q * (_LOG[2] + q * (_LOG[3] + q * _LOG[4]))))
@@ -108,8 +109,8 @@ def _cos_sin(word):
     q = x * x
     s = x * (_SIN[0] + q * (_SIN[1] + q * (_SIN[2] + q * (_SIN[3] + q * _SIN[4]))))
     c = _COS[0] + q * (_COS[1] + q * (_COS[2] + q * (_COS[3] + q * _COS[4])))
-    turn = np.int32(quarter) & np.int32(3)
-    swap = turn & np.int32(1)
+    turn = np.int32(np.int32(quarter) & np.int32(3))
+    swap = np.int32(turn & np.int32(1))
     cosine, sine = (s if swap else c), (c if swap else s)
     if turn == 1 or turn == 2:
         cosine = -cosine
@@ -118,16 +119,33 @@ def _cos_sin(word):
     return cosine, sine
 
 
+@jit(inline=True)
+def _gaussian(low, high, i, power, key0, key1):
+    """Real and imaginary part of sample i from the one with counter (low, high) on."""
+    counter = uint32(low + uint32(i))
+    carry = uint32(1) if counter < low else uint32(0)
+    a, b = _threefry(counter, uint32(high + carry), key0, key1)
+    r = np.sqrt(power * _minus_log(a))
+    c, s = _cos_sin(b)
+    return r * c, r * s
+
+
 @jit(fast=True)
 def add_stream(out, power, key0, key1, first):
-    """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1])."""
-    for i in range(out.shape[0] // 2):
-        index = first + np.uint64(i)
-        a, b = _threefry(uint32(index), uint32(index >> np.uint64(32)), key0, key1)
-        r = np.sqrt(power * _minus_log(a))
-        c, s = _cos_sin(b)
-        out[2 * i] += r * c
-        out[2 * i + 1] += r * s
+    """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1]), fewer than 2^32."""
+    half, low, high = out.shape[0] // 4, uint32(first), uint32(first >> np.uint64(32))
+    for i in range(half):  # two samples at once, for the operations of one wait for each other
+        j = i + half
+        x, y = _gaussian(low, high, i, power, key0, key1)
+        u, v = _gaussian(low, high, j, power, key0, key1)
+        out[2 * i] += x
+        out[2 * i + 1] += y
+        out[2 * j] += u
+        out[2 * j + 1] += v
+    for i in range(2 * half, out.shape[0] // 2):
+        x, y = _gaussian(low, high, i, power, key0, key1)
+        out[2 * i] += x
+        out[2 * i + 1] += y
 
 
 @jit

@@ -139,11 +139,15 @@ def test_parts_make_the_whole():
 
 
 def test_counters_beyond_32_bits():
+    """Planted bug: no carry to the upper word."""
     low, high = np.zeros(64, np.complex64), np.zeros(64, np.complex64)
     key = np.array([1, 2], np.uint32)
     add_white_noise(low, 1.0, key, 0)
     add_white_noise(high, 1.0, key, 1 << 32)
     assert not np.array_equal(low, high)
+    across = np.zeros(64, np.complex64)
+    add_white_noise(across, 1.0, key, (1 << 32) - 40)
+    np.testing.assert_array_equal(across[40:], high[:24])
 
 
 def test_noise_is_added_to_the_samples_of_a_cube():
