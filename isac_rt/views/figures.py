@@ -137,7 +137,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
     low, high = position[..., :2].min((0, 1)), position[..., :2].max((0, 1))
     margin = 0.35 * max(*(high - low), 40.0)
     if city is not None and city.num_faces:
-        _footprints(ax, city)
+        _footprints(ax, city, low - margin, high + margin)
     for u, name in enumerate(dataset.uav.values):
         x, y = position[:, u, 0], position[:, u, 1]
         role, colour = str(dataset.role.values[u]), colour_of(u)
@@ -181,12 +181,15 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
     return ax
 
 
-def _footprints(ax: Axes, city: CityMesh) -> None:
+def _footprints(ax: Axes, city: CityMesh, low: np.ndarray, high: np.ndarray) -> None:
+    """The faces between two places, shaded by their height among those of the whole city."""
     corners = city.corners + city.origin
     up = np.abs(city.normals[:, 2]) > 0.2
     triangles = corners[up]
     height = triangles[:, :, 2].mean(axis=1)
-    order = np.argsort(height, kind="stable")
+    first, last = triangles[:, :, :2].min(axis=1), triangles[:, :, :2].max(axis=1)
+    seen = np.flatnonzero(((last >= low) & (first <= high)).all(axis=1))
+    order = seen[np.argsort(height[seen], kind="stable")]
     top = max(float(np.quantile(height, 0.98) - height.min()), 1.0)
     shade = 0.96 - 0.42 * np.clip((height - height.min()) / top, 0, 1)
     colours = np.repeat(shade[:, None], 3, axis=1)
