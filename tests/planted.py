@@ -387,8 +387,8 @@ OF_CASES = {
     ),
     "scatter of range and velocity": Bug(
         "receive/estimate.py",
-        "rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)",
-        "rate_unit = w.delay_step, 30.0 / (w.frame_duration * w.effective_carrier)",
+        "rate = 1.0 / (w.frame_duration * w.effective_carrier)",
+        "rate = 30.0 / (w.frame_duration * w.effective_carrier)",
     ),
     "scatter of directions": Bug(
         "receive/estimate.py",
@@ -567,8 +567,8 @@ OF_TESTS = (
         "test_hard_signal::test_whole_and_half_cells",
         Bug(
             "receive/estimate.py",
-            "return float(offset if after >= before else -offset)",
-            "return float(-offset if after >= before else offset)",
+            "np.where(after >= before, offset, -offset)",
+            "np.where(after >= before, -offset, offset)",
         ),
     ),
     (

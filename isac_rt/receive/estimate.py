@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import copysign
+from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -81,58 +81,27 @@ class LocalSpectra:
         row: int,
         *,
         separate: bool = False,
+        beam: np.ndarray | None = None,
+        in_phase: bool = False,
     ) -> None:
         """`separate`: the groups are not added coherently, as where the velocity is known up to
-        aliases only."""
-        w, low = known.waveform, max(row - HALF_WIDTH, 0)
-        self._sets = w.num_groups if separate else 1
-        self.waveform = w
-        rows = spectra[:, :, low : row + HALF_WIDTH + 1]
-        # the window begins at sample 0 and its transform is real about its middle: the turn from
-        # row to row is taken out here
-        turn = np.exp(
-            2j * np.pi * (low + np.arange(rows.shape[2])) * (w.window_length / 2 / w.num_samples)
-        )
-        own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
-        chirps, self._num_rx = known.schedule.size, rows.shape[1]
-        data = np.zeros((chirps, rows.shape[2], -(-self._num_rx // LANES), 2, LANES), np.float32)
-        _gather(rows, turn, data)
-        weight, time = np.zeros((2, chirps + -chirps % LANES))
-        weight.reshape(-1)[:chirps].reshape(w.num_groups, -1)[:] = slow_window(w)
-        time[:chirps] = known.times.ravel()
-        self._chirps = _Chirps(
-            data.ravel(),
-            data.shape[1],
-            data.shape[2],
-            weight,
-            time,
-            np.ascontiguousarray((known.schedule + own).ravel()),
-        )
-        self._axis = _Axis(
-            w.carrier_frequency,
-            w.slope,
-            w.window_middle,
-            w.sampled_duration,
-            w.window_length,
-            w.window_length / w.num_samples,
-            float(low),
-        )
+        aliases only. `beam` (L_tx, L_rx): only the responses' power times it counts, added over the
+        receivers, and over the transmit antennas in phase or in power."""
+        self.waveform, self._sent = known.waveform, _sent(known, separate)
+        self._beam, self._in_phase = _NO_BEAM if beam is None else beam, in_phase
+        low, count = _rows_about(row, spectra.shape[2])
+        self._axis = _axis(known.waveform)._replace(first=float(low))
+        self._num_rx, blocks = spectra.shape[1], -(-spectra.shape[1] // LANES)
+        data = np.zeros(self._sent.tx.size * count * blocks * 2 * LANES, np.float32)
+        _gather(spectra, low, count, self._axis.share, data)
+        self._chirps = _Chirps(data, count, blocks, *self._sent[:3])
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
         amplitude; of separate groups the mean, each antenna turned into the phase that it has in
         the first one."""
-        sets = self._match(delay, delay_rate)
-        turn = np.exp(-1j * np.angle((sets * sets[0].conj()).sum(axis=2, keepdims=True)))
-        return (sets * turn).mean(axis=0)
-
-    def _match(self, delay: float, delay_rate: float) -> np.ndarray:
-        """Responses (sets, L_tx, L_rx)."""
-        out, energy = _match(self._chirps, self._axis, delay, delay_rate, self._antennas)
-        parts = out.reshape(self._antennas, -1, 2, LANES)
-        values = (parts[:, :, 0] + 1j * parts[:, :, 1]).reshape(self._antennas, -1)
-        values = values[:, : self._num_rx] / np.maximum(energy, 1e-30)[:, None]
-        return values.reshape(self._sets, self.waveform.num_tx, -1)
+        out, energy = _match(self._chirps, self._axis, delay, delay_rate, self._sent.antennas)
+        return _responses(out[None], energy[None], self._num_rx, self.waveform.num_tx)[0]
 
     def modes(self, delay: float, delay_rate: float) -> np.ndarray:
         """(MODES, L_tx, L_rx) amplitudes of a path by polynomials over the chirp: the least squares
@@ -148,8 +117,8 @@ class LocalSpectra:
         shapes = a.length / 2 * mode_shapes(near * a.share)
         shapes = shapes * np.exp(2j * np.pi * cycles)[:, None]
         weight = c.weight.ravel()[:size]
-        out = np.empty((MODES, self._antennas, self._num_rx), complex)
-        for antenna in range(self._antennas):
+        out = np.empty((MODES, self._sent.antennas, self._num_rx), complex)
+        for antenna in range(self._sent.antennas):
             sent = c.tx == antenna
             template = shapes[:, sent].reshape(MODES, -1)
             weighted = (template * np.repeat(weight[sent], rows)).conj()
@@ -160,23 +129,49 @@ class LocalSpectra:
             out[:, antenna] = np.linalg.solve(energy, found[:, : self._num_rx])
         return out
 
-    @property
-    def _antennas(self) -> int:
-        """Transmit antennas, in every set anew."""
-        return self._sets * self.waveform.num_tx
-
     def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
-        """Energies (K,) that templates explain, summed over the virtual channels: what the estimate
-        maximises. At the ends of the range axis part of a template lies outside, so that the
-        amplitude alone would draw the estimate out."""
-        return _powers(self._chirps, self._axis, delays, delay_rates, self._antennas)
+        """Energies (K,) that templates explain, summed over the virtual channels, or powers of the
+        beam: what the estimate maximises. At the ends of the range axis part of a template lies
+        outside, so that the amplitude alone would draw the estimate out."""
+        how = self._sent.antennas, self._beam, self._in_phase
+        return _powers(self._chirps, self._axis, delays, delay_rates, *how)
 
-    def beam_powers(
-        self, delays: np.ndarray, delay_rates: np.ndarray, beam: np.ndarray, *, in_phase: bool
-    ) -> np.ndarray:
-        """Powers (K,) of the responses, times a `beam` (L_tx, L_rx) and added over the receivers;
-        over the transmit antennas in phase, or in power."""
-        return _beam_powers(self._chirps, self._axis, delays, delay_rates, beam, in_phase)
+    def climb(self, delay: float, delay_rate: float, steps: np.ndarray) -> tuple[float, float]:
+        """As `refine`."""
+        how = self._sent.antennas, self._beam, self._in_phase
+        units = _units(self.waveform)
+        return _climb(self._chirps, self._axis, delay, delay_rate, steps, units, *how)
+
+
+_NO_BEAM = np.zeros((0, 0), complex)
+
+
+class _Sent(NamedTuple):
+    """Of each chirp its weight, time [s] and antenna, the first two filled up to a multiple of
+    sixteen, and the number of antennas; in every separate group they count anew."""
+
+    weight: np.ndarray
+    time: np.ndarray
+    tx: np.ndarray
+    antennas: int
+
+
+@lru_cache(maxsize=8)
+def _sent(known: Known, separate: bool) -> _Sent:
+    w, chirps = known.waveform, known.schedule.size
+    own = np.arange(w.num_groups)[:, None] * w.num_tx if separate else 0
+    weight, time = np.zeros((2, chirps + -chirps % LANES))
+    weight[:chirps].reshape(w.num_groups, -1)[:] = slow_window(w)
+    time[:chirps] = known.times.ravel()
+    tx = np.ascontiguousarray((known.schedule + own).ravel())
+    return _Sent(weight, time, tx, w.num_tx * (w.num_groups if separate else 1))
+
+
+@jit
+def _rows_about(row: int, rows: int) -> tuple[int, int]:
+    """The first range row about a peak, and how many there are of so many rows."""
+    low = max(row - HALF_WIDTH, 0)
+    return low, min(row + HALF_WIDTH + 1, rows) - low
 
 
 class _Chirps(NamedTuple):
@@ -205,17 +200,33 @@ class _Axis(NamedTuple):
     first: float
 
 
+def _axis(waveform: Waveform) -> _Axis:
+    """Of all rows."""
+    w = waveform
+    share = w.window_length / w.num_samples
+    window = w.window_middle, w.sampled_duration, w.window_length, share
+    return _Axis(w.carrier_frequency, w.slope, *window, 0.0)
+
+
 @jit
-def _gather(rows, turn, out):
-    """out[m P + p, i, :, :, :] = rows[m, :, i, p] turn[i]."""
-    groups, num_rx, count, num_chirps = rows.shape
+def _gather(spectra, low, count, share, out):
+    """Fill the `data` of `_Chirps` with `count` rows from `low`. The window begins at sample 0 and
+    its transform is real about its middle: the turn from row to row is taken out here. Eight chirps
+    of all receivers at a time, which the nearest cache holds."""
+    groups, num_rx, _, num_chirps = spectra.shape
+    line, turns = 2 * LANES * (-(-num_rx // LANES)), np.empty(count, np.complex128)
+    for i in range(count):
+        turns[i] = np.exp(2j * np.pi * (low + i) * (share / 2))
     for m in range(groups):
-        for r in range(num_rx):
+        for begin in range(0, num_chirps, 8):
             for i in range(count):
-                for p in range(num_chirps):
-                    value, at = rows[m, r, i, p] * turn[i], m * num_chirps + p
-                    out[at, i, r // LANES, 0, r % LANES] = value.real
-                    out[at, i, r // LANES, 1, r % LANES] = value.imag
+                for r in range(num_rx):
+                    at = ((m * num_chirps + begin) * count + i) * line
+                    at += r // LANES * 2 * LANES + r % LANES
+                    for p in range(begin, min(begin + 8, num_chirps)):
+                        value = spectra[m, r, low + i, p] * turns[i]
+                        out[at], out[at + LANES] = value.real, value.imag
+                        at += count * line
 
 
 @jit
@@ -282,27 +293,19 @@ def _match(chirps, axis, delay, delay_rate, antennas):
 
 
 @jit
-def _powers(chirps, axis, delays, delay_rates, antennas):
-    """`LocalSpectra.powers`."""
-    total = np.zeros(delays.size)
+def _powers(chirps, axis, delays, delay_rates, antennas, beam, in_phase):
+    """`LocalSpectra.powers`; `beam` (0, 0): there is none."""
+    total, added = np.zeros(delays.size), np.empty(beam.shape[0], np.complex128)
     for j in range(delays.size):
         out, energy = _match(chirps, axis, delays[j], delay_rates[j], antennas)
         line = out.size // antennas
-        for t in range(antennas):
-            square = 0.0
-            for c in range(t * line, (t + 1) * line):
-                square += np.float64(out[c]) ** 2
-            total[j] += square / max(energy[t], 1e-30)
-    return total
-
-
-@jit
-def _beam_powers(chirps, axis, delays, delay_rates, beam, in_phase):
-    """`LocalSpectra.beam_powers`."""
-    total, added = np.zeros(delays.size), np.empty(beam.shape[0], np.complex128)
-    for j in range(delays.size):
-        out, energy = _match(chirps, axis, delays[j], delay_rates[j], beam.shape[0])
-        line = out.size // beam.shape[0]
+        if not beam.size:
+            for t in range(antennas):
+                square = 0.0
+                for c in range(t * line, (t + 1) * line):
+                    square += np.float64(out[c]) ** 2
+                total[j] += square / max(energy[t], 1e-30)
+            continue
         added[:] = 0.0
         for t in range(beam.shape[0]):
             for r in range(beam.shape[1]):
@@ -316,22 +319,35 @@ def _beam_powers(chirps, axis, delays, delay_rates, beam, in_phase):
     return total
 
 
-def start_point(
-    spectra_power: np.ndarray, row: int, column: int, waveform: Waveform
-) -> tuple[float, float]:
-    """Delay and delay rate of a peak of the centred map, by Hann's two-cell ratio on both axes.
+def _responses(out: np.ndarray, energy: np.ndarray, num_rx: int, num_tx: int) -> np.ndarray:
+    """(Q, L_tx, L_rx) `LocalSpectra.respond`, from Q results of `_match`."""
+    blocks = -(-num_rx // LANES)
+    parts = out.reshape(*energy.shape, blocks, 2, LANES)
+    values = (parts[..., 0, :] + 1j * parts[..., 1, :]).reshape(*energy.shape, blocks * LANES)
+    values = values[..., :num_rx] / np.maximum(energy, 1e-30)[..., None]
+    if energy.shape[1] == num_tx:
+        return values
+    sets = values.reshape(len(out), energy.shape[1] // num_tx, num_tx, num_rx)
+    turn = np.exp(-1j * np.angle((sets * sets[:, :1].conj()).sum(axis=3, keepdims=True)))
+    return (sets * turn).mean(axis=1)
+
+
+def start_point(spectra_power: np.ndarray, row: T, column: T, waveform: Waveform) -> tuple[T, T]:
+    """Delay and delay rate of peaks of the centred map, by Hann's two-cell ratio on both axes.
 
     Exact for a tone that does not migrate; within a tenth of a cell otherwise.
     """
     rows, num_bins = spectra_power.shape
-    line = np.sqrt(spectra_power[[max(row - 1, 0), row, min(row + 1, rows - 1)], column])
-    line[[0, 2]] *= [row > 0, row < rows - 1]  # a neighbour that is not there decides nothing
-    across = np.sqrt(spectra_power[row, [(column - 1) % num_bins, column, (column + 1) % num_bins]])
+    near = np.arange(-1, 2)
+    i, j = np.asarray(row)[..., None] + near, np.asarray(column)[..., None] + near
+    line = np.sqrt(spectra_power[np.clip(i, 0, rows - 1), j[..., 1:2]])
+    line[(i < 0) | (i >= rows)] = 0  # a neighbour that is not there decides nothing
+    across = np.sqrt(spectra_power[i[..., 1:2], j % num_bins])
     cell, doppler = row + _hann_ratio(line), column - num_bins // 2 + _hann_ratio(across)
     return to_delay(cell, doppler, waveform)
 
 
-def to_delay(cell: float, doppler_bin: float, waveform: Waveform) -> tuple[float, float]:
+def to_delay(cell: T, doppler_bin: T, waveform: Waveform) -> tuple[T, T]:
     """Delay and delay rate at mid-frame of a beat (cells) and a Doppler bin (receding is
     positive)."""
     w = waveform
@@ -339,50 +355,79 @@ def to_delay(cell: float, doppler_bin: float, waveform: Waveform) -> tuple[float
     return (cell / w.sampled_duration - rate * w.effective_carrier) / w.slope, rate
 
 
-def _hann_ratio(three: np.ndarray) -> float:
-    before, peak, after = three
-    if peak <= 0:
-        return 0.0
-    ratio = max(before, after) / peak
-    offset = np.clip((2 * ratio - 1) / (1 + ratio), -0.5, 0.5)
-    return float(offset if after >= before else -offset)
+def _hann_ratio(three: np.ndarray) -> np.ndarray:
+    before, peak, after = np.moveaxis(three, -1, 0)
+    ratio = np.maximum(before, after) / np.where(peak > 0, peak, 1)
+    offset = np.clip((2 * ratio - 1) / (1 + ratio), -0.5, 0.5).astype(float)
+    return np.where(peak > 0, np.where(after >= before, offset, -offset), 0.0)[()]
 
 
 def refine(
     local: LocalSpectra, delay: float, delay_rate: float, steps: Sequence[float] = STENCILS
 ) -> Estimate:
-    """Maximise the summed power by fitted paraboloids on shrinking stencils (cells and Doppler
-    bins)."""
-    w = local.waveform
-    delay_unit, rate_unit = w.delay_step, 1.0 / (w.frame_duration * w.effective_carrier)
-    # coordinates: beat at mid-frame and Doppler, which decouple; the beat holds the coupling
-    coupling = w.sampled_duration / w.frame_duration
-    beat = delay / delay_unit + delay_rate / rate_unit * coupling
-    doppler = delay_rate / rate_unit
-
-    def split(b: T, d: T) -> tuple[T, T]:
-        return (b - d * coupling) * delay_unit, d * rate_unit
-
-    hxy = 0.0
-    for number, step in enumerate(steps):
-        count = 5 if number else len(_STENCIL)
-        down, across = step * _STENCIL[:count].T
-        powers = local.powers(*split(beat + down, doppler + across))
-        g = np.log(np.maximum(powers, 1e-300)).tolist()
-        gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
-        hxx = (g[2] - 2 * g[0] + g[1]) / step**2
-        hyy = (g[4] - 2 * g[0] + g[3]) / step**2
-        if not number:  # small in these coordinates: what the first stencil says is good enough
-            hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2)
-        det = hxx * hyy - hxy**2
-        if hxx < 0 and det > 0:
-            move = (hyy * gx - hxy * gy) / -det, (hxx * gy - hxy * gx) / -det
-        else:
-            move = copysign(step, gx), copysign(step, gy)
-        beat += min(max(move[0], -3 * step), 3 * step)
-        doppler += min(max(move[1], -3 * step), 3 * step)
-    delay, delay_rate = split(beat, doppler)
+    """Maximise the power by fitted paraboloids on shrinking stencils (cells and Doppler bins)."""
+    delay, delay_rate = local.climb(delay, delay_rate, np.array(steps))
     return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
+
+
+def _units(waveform: Waveform) -> tuple[float, float, float]:
+    """Delay of a cell [s], rate of a Doppler bin, and cells that a bin's motion adds to the beat at
+    mid-frame."""
+    w = waveform
+    rate = 1.0 / (w.frame_duration * w.effective_carrier)
+    return w.delay_step, rate, w.sampled_duration / w.frame_duration
+
+
+@jit
+def _climb(chirps, axis, delay, delay_rate, steps, units, antennas, beam, in_phase):
+    """`refine`, in the coordinates beat at mid-frame and Doppler, which decouple; the beat holds
+    the coupling."""
+    delay_unit, rate_unit, coupling = units
+    beat = delay / delay_unit + delay_rate / rate_unit * coupling
+    doppler, mixed = delay_rate / rate_unit, 0.0
+    for number in range(steps.size):
+        count = 5 if number else len(_STENCIL)
+        across = doppler + steps[number] * _STENCIL[:count, 1]
+        delays = (beat + steps[number] * _STENCIL[:count, 0] - across * coupling) * delay_unit
+        args = delays, across * rate_unit, antennas, beam, in_phase
+        down, up, mixed = _newton(_powers(chirps, axis, *args), steps[number], mixed)
+        beat, doppler = beat + down, doppler + up
+    return (beat - doppler * coupling) * delay_unit, doppler * rate_unit
+
+
+@jit
+def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float, float]:
+    """Move down and across to the top of a paraboloid through the logarithms of the powers on a
+    stencil of a half width, and its mixed derivative, which a stencil without corners is told: it
+    is small in these coordinates, so that what the first says is good enough."""
+    g = np.log(np.maximum(powers, 1e-300))
+    gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
+    hxx = (g[2] - 2 * g[0] + g[1]) / step**2
+    hyy = (g[4] - 2 * g[0] + g[3]) / step**2
+    hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2) if g.size > 5 else mixed
+    det = hxx * hyy - hxy**2
+    down, across = np.copysign(step, gx), np.copysign(step, gy)
+    if hxx < 0 and det > 0:
+        down, across = (hyy * gx - hxy * gy) / -det, (hxx * gy - hxy * gx) / -det
+    most = 3 * step
+    return min(max(down, -most), most), min(max(across, -most), most), hxy
+
+
+@jit
+def _estimated(spectra, sent, axis, rows, delays, delay_rates, steps, units, out, energy):
+    """`LocalSpectra` about each of Q rows, its `climb` from delays and rates, in place, and
+    `_match` there, (Q, ...) floats and energies."""
+    weight, time, tx, antennas = sent
+    blocks = -(-spectra.shape[1] // LANES)
+    data = np.zeros(tx.size * (2 * HALF_WIDTH + 1) * blocks * 2 * LANES, np.float32)
+    for q in range(rows.size):
+        low, count = _rows_about(rows[q], spectra.shape[2])
+        _gather(spectra, low, count, axis.share, data)
+        chirps = _Chirps(data, count, blocks, weight, time, tx)
+        here = _Axis(*axis[:-1], np.float64(low))
+        way = delays[q], delay_rates[q], steps, units, antennas, np.zeros((0, 0), np.complex128)
+        delays[q], delay_rates[q] = _climb(chirps, here, *way, False)
+        out[q], energy[q] = _match(chirps, here, delays[q], delay_rates[q], antennas)
 
 
 @dataclass(frozen=True)
@@ -394,11 +439,39 @@ class Estimator:
 
     def at(self, local: LocalSpectra, power: np.ndarray, row: int, column: int) -> Estimate:
         """The estimate of a peak of the centred map `power`."""
+        begun, steps = self._begun(power, row, column, local.waveform)
+        return refine(local, *begun, steps)
+
+    def at_peaks(
+        self,
+        spectra: np.ndarray,
+        known: Known,
+        power: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        *,
+        separate: bool = False,
+    ) -> list[Estimate]:
+        """Those of all peaks (Q,) in spectra; `separate` as in `LocalSpectra`."""
+        w, sent, num_rx = known.waveform, _sent(known, separate), spectra.shape[1]
+        (delays, rates), steps = self._begun(power, rows, columns, w)
+        energy = np.empty((len(rows), sent.antennas))
+        line = 2 * LANES * -(-num_rx // LANES)
+        out = np.empty((len(rows), sent.antennas * line), np.float32)
+        args = rows, delays, rates, np.array(steps), _units(w), out, energy
+        _estimated(spectra, sent, _axis(w), *args)
+        channels = _responses(out, energy, num_rx, w.num_tx)
+        return [
+            Estimate(*one) for one in zip(delays.tolist(), rates.tolist(), channels, strict=True)
+        ]
+
+    def _begun(
+        self, power: np.ndarray, row: T, column: T, waveform: Waveform
+    ) -> tuple[tuple[T, T], Sequence[float]]:
+        """Where the search of peaks begins, and its stencils."""
         if not self.on_grid:
-            return refine(local, *start_point(power, row, column, local.waveform))
-        w = local.waveform
-        delay, rate = to_delay(row, column - w.num_chirps // 2, w)
-        return Estimate(delay, rate, local.respond(delay, rate))
+            return start_point(power, row, column, waveform), STENCILS
+        return to_delay(row, column - waveform.num_chirps // 2, waveform), ()
 
 
 OFF_GRID = Estimator()

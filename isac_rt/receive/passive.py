@@ -275,11 +275,13 @@ class PassiveReceiver:
         columns = (np.arange(-GATE_BINS, GATE_BINS + 1) + column) % w.num_chirps
         gate = power[np.ix_(rows, columns)]
         i, j = np.unravel_index(gate.argmax(), gate.shape)
-        row, column = int(rows[i]), int(columns[j])
+        row, column = rows[i], columns[j]
         snr = power[row, column] / found.level[row, column]
         if not snr > self.detector.rule(known).factors(len(power))[row]:
             return no_detections(), None
-        estimate = self.detector.estimate(spectra, known, power, row, column)
+        estimate = self.detector.estimates(
+            spectra, known, power, rows[i : i + 1], columns[j : j + 1]
+        )[0]
         on_grid = self.detector.estimator.on_grid
         reference = describe([estimate], np.array([snr]), known, on_grid=on_grid)
         d = found.detections

@@ -93,12 +93,17 @@ class Cfar:
         groups = len(known.schedule) if self.way(known).separate else 1
         return CfarRule.of(self.settings, groups * known.channels)
 
-    def estimate(
-        self, spectra: np.ndarray, known: Known, power: np.ndarray, row: int, column: int
-    ) -> Estimate:
-        """The path at a peak of the map."""
-        local = LocalSpectra(spectra, known, row, separate=self.way(known).separate)
-        return self.estimator.at(local, power, row, column)
+    def estimates(
+        self,
+        spectra: np.ndarray,
+        known: Known,
+        power: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+    ) -> list[Estimate]:
+        """The paths at peaks (Q,) of the map."""
+        separate = self.way(known).separate
+        return self.estimator.at_peaks(spectra, known, power, rows, columns, separate=separate)
 
     def sense(
         self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
@@ -116,10 +121,7 @@ class Cfar:
             sparse, recovered = advise(spectra, rows, noise, known)
         above = way.keep(above, Levels(power, level, recovered), known)
         rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
-        estimates = [
-            self.estimate(spectra, known, power, row, column)
-            for row, column in zip(rows.tolist(), bins.tolist(), strict=True)
-        ]
+        estimates = self.estimates(spectra, known, power, rows, bins)
         snr = power[rows, bins] / level[rows, bins]
         found = describe(estimates, snr, known, on_grid=self.estimator.on_grid)
         return Sensed(estimates, found, power, level, sparse)

@@ -130,7 +130,7 @@ def test_a_strong_path_starts_a_track_where_there_is_no_city():
 def test_the_beam_alone_says_where_a_weak_path_is():
     """Two equal paths half a cell and half a bin apart, from directions in which the array hears
     little of the other: towards each the beam finds its own place, all channels together find
-    neither. Planted bug: `_Beam` without its own `powers`."""
+    neither. Planted bug: `_Beam` without its beam."""
     w, schedule, _ = frame(waveform=W)
     cell, bin_ = w.range_cell(1), w.velocity_cell(1)
     first = Path(20.2 * cell, 2.2 * bin_, 1.0, (0.1, -0.05), (-0.4, -0.3))

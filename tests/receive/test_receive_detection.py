@@ -26,7 +26,10 @@ from isac_rt.receive.cfar import (
 )
 from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.estimate import (
+    STENCILS,
+    Estimator,
     LocalSpectra,
+    _newton,
     direction_cosine,
     directions,
     excess,
@@ -146,9 +149,9 @@ def test_power_of_a_beam_is_that_of_the_responses(in_phase: bool):
     rng, sent = np.random.default_rng(4), known(w, schedule, payload)
     spectra = (rng.standard_normal((3, 17, 20, 36, 2)) @ [1, 1j]).astype(np.complex64)
     beam = rng.standard_normal((w.num_tx, 17, 2)) @ [1, 1j]
-    local = LocalSpectra(spectra, sent, 9)
+    local = LocalSpectra(spectra, sent, 9, beam=beam, in_phase=in_phase)
     delays, rates = np.array([8.8, 9.3]) * w.delay_step, np.array([1.1e-8, -2.3e-8])
-    got = local.beam_powers(delays, rates, beam, in_phase=in_phase)
+    got = local.powers(delays, rates)
     for power, delay, rate in zip(got, delays, rates, strict=True):
         towards = (beam * local.respond(delay, rate)).sum(axis=1)
         expected = abs(towards.sum()) ** 2 if in_phase else np.linalg.norm(towards) ** 2
@@ -694,54 +697,91 @@ def test_start_point_is_near_and_refinement_moves_to_the_truth():
     assert np.abs(np.abs(found.channels) - 1).max() < 2e-3  # the amplitude of a sample
 
 
-class Hill:
-    """In place of `LocalSpectra`: the logarithm of the power is a paraboloid over beat [cells] and
-    Doppler [bins] at mid-frame."""
+def climbed(local: LocalSpectra, delay: float, delay_rate: float) -> tuple[float, float]:
+    """`refine` by numpy, with a solver for the top of the paraboloid."""
+    w = local.waveform
+    units = np.array([w.delay_step, 1 / (w.frame_duration * w.effective_carrier)])
+    coupling = np.array([[1.0, -w.sampled_duration / w.frame_duration], [0.0, 1.0]])
+    place, hxy = np.linalg.solve(coupling, np.array([delay, delay_rate]) / units), None
+    offsets = np.array(
+        [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]]
+    )
+    for step in STENCILS:
+        tried = (place + step * offsets) @ coupling.T * units
+        g = np.log(local.powers(*np.ascontiguousarray(tried.T)))
+        gradient = np.array([g[2] - g[1], g[4] - g[3]]) / (2 * step)
+        hxx, hyy = g[2] - 2 * g[0] + g[1], g[4] - 2 * g[0] + g[3]
+        hxy = (g[8] - g[7] - g[6] + g[5]) / 4 / step**2 if hxy is None else hxy
+        bend = np.array([[hxx / step**2, hxy], [hxy, hyy / step**2]])
+        up = np.linalg.eigvalsh(bend).max() < 0
+        move = -np.linalg.solve(bend, gradient) if up else np.copysign(step, gradient)
+        place = place + np.clip(move, -3 * step, 3 * step)
+    return tuple((coupling @ place * units).tolist())
 
-    def __init__(self, w: Waveform, top: tuple[float, float], bend: np.ndarray) -> None:
-        self.waveform, self._top, self._bend = w, np.array(top), bend
 
-    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
-        w = self.waveform
-        doppler = delay_rates * w.effective_carrier * w.frame_duration
-        beat = (w.slope * delays + delay_rates * w.effective_carrier) * w.sampled_duration
-        off = np.stack([beat, doppler], axis=-1) - self._top
-        return np.exp(-np.einsum("...i,ij,...j", off, self._bend, off) / 2)
+@pytest.mark.parametrize("beam", [None, True, False])
+def test_refinement_is_that_of_plain_numpy(beam: bool | None):
+    """Paths near the ends of the range axis and within, in noise, by all channels or by a beam in
+    phase or not. Planted bugs: the mixed derivative of the last stencil; no limit of the move."""
+    w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
+    rng, sent = np.random.default_rng(5), known(w, schedule, payload, FEW)
+    paths = [Path(2 * r * w.range_cell(2), 3.1, 1.0) for r in (1.3, 60.4, 125.6)]
+    spectra = clean_spectrum(cube(w, schedule, payload, paths, FEW, noise=0.3, seed=2), sent)
+    towards = None if beam is None else rng.standard_normal((w.num_tx, 3, 2)) @ [1, 1j]
+    for row in (1, 60, 126):
+        local = LocalSpectra(spectra, sent, row, beam=towards, in_phase=bool(beam))
+        start = (row + 0.4) * w.delay_step, 2e-8
+        found, expected = refine(local, *start), climbed(local, *start)
+        # rounding of logarithms over the squared step
+        assert (found.delay, found.delay_rate) == pytest.approx(expected, rel=1e-9, abs=1e-18)
+        assert np.array_equal(found.channels, local.respond(found.delay, found.delay_rate))
 
-    def respond(self, delay: float, delay_rate: float) -> np.ndarray:
-        return np.array([[delay, delay_rate]])
+
+@pytest.mark.parametrize("separate", [False, True])
+@pytest.mark.parametrize("on_grid", [False, True])
+def test_peaks_of_a_frame_are_estimated_as_each_alone(on_grid: bool, separate: bool):
+    """To the last bit, also at the ends of the axis, where rows are fewer. Planted bug: places from
+    the axis's first row for the peak's."""
+    w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
+    spectra = clean_spectrum(white(w, schedule, 17, 3), known(w, schedule, payload))
+    wide = replace(ANTENNAS, rx_x=9, rx_z=9)
+    sent = known(w, schedule, payload, wide)
+    power = np.random.default_rng(1).random((128, 36), np.float32)
+    rows, bins = np.array([64, 0, 127, 31]), np.array([0, 35, 17, 3])
+    estimator = Estimator(on_grid)
+    every = estimator.at_peaks(spectra, sent, power, rows, bins, separate=separate)
+    for one, row, column in zip(every, rows.tolist(), bins.tolist(), strict=True):
+        local = LocalSpectra(spectra, sent, row, separate=separate)
+        alone = estimator.at(local, power, row, column)
+        assert (one.delay, one.delay_rate) == (alone.delay, alone.delay_rate)
+        assert np.array_equal(one.channels, alone.channels)
 
 
 @pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
 def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a
-    half of it; the gradient over a step for over two; the coupling of beat and Doppler left out;
-    one end of the reach left open. Where the paraboloid is none the step is up, and a far top is
-    come near by no more than three times the stencil, for the power is no paraboloid as far as
-    that."""
-    w = Waveform()
-    rate_unit = 1 / (w.frame_duration * w.effective_carrier)
-    start = 101.3 * w.delay_step, 7.7 * rate_unit
-    beat = 101.3 + 7.7 * w.sampled_duration / w.frame_duration
-    for off in ([0.31, -0.22], [-0.17, -0.35]):
-        hill = Hill(w, (beat + off[0], 7.7 + off[1]), np.array(bend))
-        found = refine(hill, *start, steps=(0.2,))
-        assert found.delay_rate / rate_unit == pytest.approx(7.7 + off[1], abs=1e-6)
-        there = (
-            w.slope * found.delay + found.delay_rate * w.effective_carrier
-        ) * w.sampled_duration
-        assert there == pytest.approx(beat + off[0], abs=1e-6)
-        assert found.channels.tolist() == [[found.delay, found.delay_rate]]
-    valley = Hill(w, (beat + 0.3, 7.7 - 0.3), -np.eye(2))
-    found = refine(valley, *start, steps=(0.2,))
-    assert valley.powers(found.delay, found.delay_rate) > valley.powers(*start)
-    for far in ([4.3, -5.1], [-2.9, 3.7]):
-        found = refine(Hill(w, (beat + far[0], 7.7 + far[1]), np.eye(2)), *start, steps=(0.2,))
-        there = (
-            w.slope * found.delay + found.delay_rate * w.effective_carrier
-        ) * w.sampled_duration
-        moved = there - beat, found.delay_rate / rate_unit - 7.7
-        assert moved == pytest.approx(0.6 * np.sign(far), abs=1e-6)  # three times the stencil
+    half of it; the gradient over a step for over two; one end of the reach left open. Where the
+    paraboloid is none the step is up, and a far top is come near by no more than three times the
+    stencil, for the power is no paraboloid as far as that."""
+    stencil = np.array(
+        [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]]
+    )
+
+    def moved(
+        top: tuple[float, float], bend: np.ndarray, mixed: float | None = None
+    ) -> list[float]:
+        off = 0.2 * stencil[: 9 if mixed is None else 5] - top
+        powers = np.exp(-np.einsum("ki,ij,kj->k", off, bend, off) / 2)
+        down, across, found = _newton(powers, 0.2, 0.0 if mixed is None else mixed)
+        assert found == pytest.approx(-bend[0][1], abs=1e-9)
+        return [down, across]
+
+    for top in ((0.31, -0.22), (-0.17, -0.35)):
+        assert moved(top, np.array(bend)) == pytest.approx(top, abs=1e-9)
+        assert moved(top, np.array(bend), -bend[0][1]) == pytest.approx(top, abs=1e-9)
+    assert moved((0.3, -0.3), -np.eye(2)) == [-0.2, 0.2]  # of a valley
+    for far in ((4.3, -5.1), (-2.9, 3.7)):
+        assert moved(far, np.eye(2)) == pytest.approx(0.6 * np.sign(far), abs=1e-9)
 
 
 def test_two_cells_of_a_hann_tone_give_its_place():

@@ -319,13 +319,9 @@ class _Beam(LocalSpectra):
     """The rows around a peak, of which only the power towards one direction counts."""
 
     def __init__(self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray) -> None:
-        super().__init__(spectra, known, row)
         towards = search_of(known.antennas, known.wavenumber).steering(cosines).conj()
-        self._beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
-
-    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
-        """Powers (K,) of the beam: what the estimate maximises."""
-        return self.beam_powers(delays, delay_rates, self._beam, in_phase=False)
+        beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
+        super().__init__(spectra, known, row, beam=beam)
 
 
 def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:

@@ -188,12 +188,7 @@ class BeamSpectra(LocalSpectra):
     """The rows around a peak, of which only one beam's power counts."""
 
     def __init__(self, spectra: np.ndarray, known: Known, row: int, weights: np.ndarray) -> None:
-        super().__init__(spectra, known, row)
-        self._beam = weights.conj()
-
-    def powers(self, delays: np.ndarray, delay_rates: np.ndarray) -> np.ndarray:
-        """Powers (K,) of the beam: what the estimate maximises."""
-        return self.beam_powers(delays, delay_rates, self._beam, in_phase=True)
+        super().__init__(spectra, known, row, beam=weights.conj(), in_phase=True)
 
 
 def beam_weights(
