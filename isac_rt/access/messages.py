@@ -16,7 +16,17 @@ from typing import Any
 import numpy as np
 
 from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import Fused, Key, Name, Picture, Report, Told, advance, its_word
+from isac_rt.terminal.fusion import (
+    Fused,
+    Key,
+    Name,
+    Picture,
+    Report,
+    Told,
+    advance,
+    at_once,
+    its_word,
+)
 from isac_rt.terminal.pool import Look, PooledTracker
 from isac_rt.terminal.retrospect import BATCH
 
@@ -241,7 +251,7 @@ class Notes:
         self.reports = {k: r for k, r in self.reports.items() if self._counts(r[0], time)}
         self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
         fused = self.picture.update(
-            [report.at(time, acceleration_std) for report, _ in self.reports.values()],
+            at_once((report for report, _ in self.reports.values()), time, acceleration_std),
             {
                 name: its_word(said.state).after(time - said.time, acceleration_std)
                 for name, said in self.terminals.items()

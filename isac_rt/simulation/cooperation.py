@@ -22,6 +22,7 @@ from isac_rt.terminal.fusion import (
     KnownBody,
     Picture,
     advance,
+    at_once,
     in_world,
     its_word,
     of_itself,
@@ -139,7 +140,7 @@ class Cooperation:
             if not via
         ]
         words = {name: its_word(said) for name, said in known.items()}
-        return self._swarm.update([r.at(time, self._acceleration) for r in own], words)
+        return self._swarm.update(at_once(own, time, self._acceleration), words)
 
     def _see(self, frame: int, link: Link, heard: Heard) -> None:
         """A terminal takes down what one of its links shows: its confirmed tracks, or what its

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.special import gammaincinv
 
 from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import Waveform
@@ -212,8 +213,15 @@ def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     """A track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
     if interval == 0:  # the same time again; the powers of the interval in `singer` have no limit
         return g
-    F, Q = singer(interval, acceleration_std)
-    return Gaussian(F @ g.mean, _symmetric(F @ g.covariance @ F.T + Q))
+    return Gaussian(*_carried(*g, *singer(interval, acceleration_std)))
+
+
+@jit
+def _carried(
+    mean: np.ndarray, P: np.ndarray, F: np.ndarray, Q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    P = F @ P @ F.T + Q
+    return F @ mean, (P + P.T) / 2
 
 
 @jit
@@ -226,7 +234,7 @@ def _unfold(measured: np.ndarray, off: float, ambiguity: tuple[float, float]) ->
 
 
 @jit
-def _settled(
+def _updated(
     mean: np.ndarray,
     P: np.ndarray,
     measurement: np.ndarray,
@@ -235,9 +243,9 @@ def _settled(
     own: np.ndarray,
     transmitter: np.ndarray,
     ambiguity: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, gain K and derivative H at which the iterated update of `rows` of a measurement
-    stands."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """`update` by some `rows` of a measurement: mean and covariance."""
+    R = R[rows][:, rows].copy()
     x, deviation = mean, np.sqrt(np.diag(P))
     for _ in range(_ITERATIONS):
         z, full = _linearised(x, own, transmitter)
@@ -250,7 +258,9 @@ def _settled(
         x = new
         if settled:
             break
-    return x, K, H
+    A = np.eye(x.size) - K @ H
+    P = A @ P @ A.T + K @ R @ K.T
+    return x, (P + P.T) / 2
 
 
 def update(
@@ -271,11 +281,8 @@ def update(
     counts.
     """
     rows = np.flatnonzero(np.isfinite(measurement))
-    R = R[np.ix_(rows, rows)]
-    P = g.covariance
-    x, K, H = _settled(g.mean, P, measurement, R, rows, *_terms(own, transmitter), tuple(ambiguity))
-    A = np.eye(len(x)) - K @ H
-    return Gaussian(x, _symmetric(A @ P @ A.T + K @ R @ K.T))
+    terms = *_terms(own, transmitter), tuple(ambiguity)
+    return Gaussian(*_updated(*g, measurement, R, rows, *terms))
 
 
 def expected(
@@ -306,16 +313,32 @@ def reported(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What `measure` says of bodies (K, 4), and its standard deviations (K, 4) by their covariances
     and, bistatic, the transmitter's."""
-    z, std = np.zeros((len(states), 4)), np.zeros((len(states), 4))
+    if not states:
+        return np.zeros((0, 4)), np.zeros((0, 4))
+    means, covariances = (np.array(of) for of in zip(*states, strict=True))
     terms = _terms(own, None if transmitter is None else transmitter.mean)
-    for k, (mean, covariance) in enumerate(states):
-        z[k], H = _linearised(mean, *terms)
-        variance = np.sum(H @ covariance * H, axis=1)
-        if transmitter is not None:
-            J = transmitter_jacobian(mean, transmitter.mean)
-            variance += np.sum(J @ transmitter.covariance * J, axis=1)
-        std[k] = np.sqrt(variance)
-    return z, std
+    doubt = np.zeros((0, 0)) if transmitter is None else transmitter.covariance
+    z, variance = _reported(means, covariances, *terms, doubt)
+    return z, np.sqrt(variance)
+
+
+@jit
+def _reported(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    own: np.ndarray,
+    transmitter: np.ndarray,
+    doubt: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """And the variances (K, 4); `doubt` is the transmitter's covariance."""
+    z, variance = np.empty((len(means), 4)), np.empty((len(means), 4))
+    for k in range(len(means)):
+        z[k], H = _linearised(means[k], own, transmitter)
+        variance[k] = np.sum((H @ covariances[k]) * H, axis=1)
+        if transmitter.size:
+            J = _transmitter_jacobians(means[k : k + 1], transmitter)[0]
+            variance[k] += np.sum((J @ doubt) * J, axis=1)
+    return z, variance
 
 
 def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
@@ -412,11 +435,8 @@ def _born(
     for i in range(3, 6):
         P[i, i], P[i + 3, i + 3] = BIRTH_SPEED_STD**2, acceleration_std**2
     P = (P + P.T) / 2
-    rate, variance = np.array([1]), R[1:2, 1:2].copy()
-    x, K, h = _settled(mean, P, read, variance, rate, own, transmitter, (np.inf, 0.0))
-    A = np.eye(9) - K @ h
-    P = A @ P @ A.T + K @ variance @ K.T
-    return True, x, (P + P.T) / 2
+    rate = np.array([1])
+    return True, *_updated(mean, P, read, R, rate, own, transmitter, (np.inf, 0.0))
 
 
 @jit
@@ -434,56 +454,73 @@ def _resting(measurement: np.ndarray, own: np.ndarray, transmitter: np.ndarray) 
     return out
 
 
-def mahalanobis(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distance and ln det S of residuals (..., 4) over their finite components, S (..., 4,
-    4).
+def costs(
+    z: np.ndarray,
+    std: np.ndarray,
+    mean: np.ndarray,
+    S: np.ndarray,
+    ambiguity: Ambiguity,
+    probability: float,
+) -> np.ndarray:
+    """(K, Q) d^2 + ln det S of detections (Q, 4) with deviations against what is `expected` of K
+    tracks, minus twice the log likelihood but for a constant; inf outside the gate in which a
+    detection of the track lies with a `probability`. Components that are NaN were not measured."""
+    residual = wrapped(z[None] - mean[:, None], ambiguity)
+    out: np.ndarray = _costs(residual, np.fmax(std, STD_FLOOR) ** 2, S, _gates(probability))
+    return out
 
-    A missing component is given a unit variance of its own and a residual of zero.
-    """
-    found = np.isfinite(residual)
-    both = found[..., :, None] & found[..., None, :]
-    return normalised(np.where(found, residual, 0.0), np.where(both, S, np.eye(4)))
 
-
-def normalised(residual: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """y^T S^-1 y and ln det S of residuals (..., n) with covariances S (..., n, n); infinity both
-    where S is no covariance."""
-    shape, n = residual.shape[:-1], residual.shape[-1]
-    y, every = residual.reshape(-1, n), S.reshape(-1, n, n)
-    d2, log_det = _normalised(np.ascontiguousarray(y), np.ascontiguousarray(every))
-    return d2.reshape(shape), log_det.reshape(shape)
+@lru_cache(maxsize=8)
+def _gates(probability: float) -> np.ndarray:
+    """(5,) squared distances by the number of components."""
+    return 2 * gammaincinv(np.arange(5) / 2, probability)
 
 
 @jit
-def _normalised(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By Cholesky's factors L of each S: the square of L^-1 y, and twice the logarithms of L's
-    diagonal."""
-    count, n = y.shape
-    d2, log_det = np.zeros(count), np.zeros(count)
-    L, w = np.empty((n, n)), np.empty(n)
-    for k in range(count):
-        for i in range(n):
-            for j in range(i + 1):
-                left = S[k, i, j]
-                for m in range(j):
-                    left -= L[i, m] * L[j, m]
-                if j < i:
-                    L[i, j] = left / L[j, j]
-                else:
-                    L[i, i] = np.sqrt(left) if left > 0 else np.nan
-            left = y[k, i]
-            for m in range(i):
-                left -= L[i, m] * w[m]
-            w[i] = left / L[i, i]
-            d2[k] += w[i] ** 2
-            log_det[k] += 2 * np.log(L[i, i])
-        if np.isnan(log_det[k]):
-            d2[k], log_det[k] = np.inf, np.inf
+def _costs(
+    residual: np.ndarray, variance: np.ndarray, S: np.ndarray, gates: np.ndarray
+) -> np.ndarray:
+    tracks, detections, _ = residual.shape
+    out, y = np.full((tracks, detections), np.inf), np.empty(4)
+    A, work = np.empty((4, 4)), np.empty((5, 4))
+    for k in range(tracks):
+        for q in range(detections):
+            found = np.flatnonzero(np.isfinite(residual[k, q]))
+            for i in range(found.size):
+                y[i] = residual[k, q, found[i]]
+                for j in range(i + 1):
+                    A[i, j] = S[k, found[i], found[j]]
+                A[i, i] += variance[q, found[i]]
+            d2, log_det = distance(y[: found.size], A, work)
+            if d2 <= gates[found.size]:
+                out[k, q] = d2 + log_det
+    return out
+
+
+@jit
+def distance(y: np.ndarray, S: np.ndarray, work: np.ndarray) -> tuple[float, float]:
+    """y^T S^-1 y and ln det S of a residual (n,) by Cholesky's factor L of the covariance, of which
+    the lower half is read: the square of L^-1 y, and twice the logarithms of L's diagonal. Infinity
+    both where S is no covariance; `work` (n + 1, n)."""
+    d2, log_det, L, w = 0.0, 0.0, work[1:], work[0]
+    for i in range(y.size):
+        for j in range(i + 1):
+            left = S[i, j]
+            for m in range(j):
+                left -= L[i, m] * L[j, m]
+            if j < i:
+                L[i, j] = left / L[j, j]
+            elif left > 0:
+                L[i, i] = np.sqrt(left)
+            else:
+                return np.inf, np.inf
+        left = y[i]
+        for m in range(i):
+            left -= L[i, m] * w[m]
+        w[i] = left / L[i, i]
+        d2 += w[i] ** 2
+        log_det += 2 * np.log(L[i, i])
     return d2, log_det
-
-
-def _symmetric(P: np.ndarray) -> np.ndarray:
-    return (P + P.T) / 2
 
 
 def reflected(plane: np.ndarray, state: Gaussian) -> Gaussian:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from isac_rt.kernels.jit import jit
-from isac_rt.terminal.filter import Gaussian, normalised, singer
+from isac_rt.terminal.filter import Gaussian, distance, singer
 from isac_rt.terminal.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
 
@@ -119,15 +119,10 @@ class Report:
         """The name that the track alone would give."""
         return Name(self.since, *self.key)
 
-    @property
+    @cached_property
     def whole(self) -> Gaussian:
         """The state with the errors of who tells."""
         return Told(self.state, self.lever).whole
-
-    def at(self, time: float, acceleration_std: float) -> Report:
-        """The same at another time [s]."""
-        state, lever = Told(self.state, self.lever).after(time - self.time, acceleration_std)
-        return Report(self.key, self.since, self.name, time, state, lever)
 
     def memory(self) -> list[Any]:
         """As plain numbers and arrays, for `of_memory`."""
@@ -139,6 +134,46 @@ class Report:
         """The report that gave a `memory`."""
         key, since, name, time, state, lever = memory
         return cls(Key(*key), since, Name(*name), time, Gaussian(*state), lever)
+
+
+def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> list[Report]:
+    """Reports at one time [s]: `Told.after` of each, with its `whole`."""
+    some = list(reports)
+    if not some:
+        return []
+    intervals = [time - report.time for report in some]
+    still = np.eye(SIZE), np.zeros((SIZE, SIZE))
+    moved = [_coasting(t, acceleration_std) if t else still for t in intervals]
+    each = [(*r.state, r.lever, *of) for r, of in zip(some, moved, strict=True)]
+    means, covariances, levers, *model = (np.array(of) for of in zip(*each, strict=True))
+    wholes = _carried(means, covariances, levers, np.array(intervals), *model)
+    out = []
+    for r, *state, lever, whole in zip(some, means, covariances, levers, wholes, strict=True):
+        report = Report(r.key, r.since, r.name, time, Gaussian(*state), lever)
+        vars(report)["whole"] = Gaussian(state[0], whole)
+        out.append(report)
+    return out
+
+
+@jit
+def _carried(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    levers: np.ndarray,
+    intervals: np.ndarray,
+    F: np.ndarray,
+    Q: np.ndarray,
+) -> np.ndarray:
+    """Bring R reports on by intervals [s] of the models F and Q (R, 6, 6), in place; their
+    covariances with the errors of who tells."""
+    wholes = np.empty_like(covariances)
+    for k in range(len(means)):
+        levers[k, :3] += intervals[k] * levers[k, 3:]
+        if intervals[k]:
+            means[k] = F[k] @ means[k]
+            covariances[k] = F[k] @ covariances[k] @ F[k].T + Q[k]
+        wholes[k] = covariances[k] + levers[k] @ levers[k].T
+    return wholes
 
 
 @dataclass(frozen=True)
@@ -455,8 +490,11 @@ def _teller(key: Key) -> str:
     return key.origin.rpartition("->")[2]
 
 
-def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray, np.ndarray]:
-    """(len(a), len(b)) squared Mahalanobis distances and ln det S, S = A + B.
+def distances(
+    a: Sequence[Gaussian], b: Sequence[Gaussian], probability: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(len(a), len(b)) squared Mahalanobis distances and ln det S, S = A + B; infinite both where
+    the distance is outside the `gate`.
 
     What the errors have in common makes the true S smaller, so that this gate lets in more than
     its share.
@@ -465,9 +503,25 @@ def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> tuple[np.ndarray,
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
     means = [np.array([g.mean for g in of]) for of in (a, b)]
     covariances = [np.array([g.covariance for g in of]) for of in (a, b)]
-    residual = means[0][:, None] - means[1][None]
-    S = covariances[0][:, None] + covariances[1][None]
-    return normalised(residual, S)
+    d2, log_det = _distances(*means, *covariances, gate(probability))
+    return d2, log_det
+
+
+@jit
+def _distances(
+    a: np.ndarray, b: np.ndarray, of_a: np.ndarray, of_b: np.ndarray, most: float
+) -> tuple[np.ndarray, np.ndarray]:
+    d2, log_det = np.full((len(a), len(b)), np.inf), np.full((len(a), len(b)), np.inf)
+    work = np.empty((SIZE + 1, SIZE))
+    for i in range(len(a)):
+        for j in range(len(b)):
+            y, S = a[i] - b[j], of_a[i] + of_b[j]
+            if np.sum(y * y) > most * np.trace(S):  # no variance is larger than the trace
+                continue
+            here = distance(y, S, work)
+            if here[0] <= most:
+                d2[i, j], log_det[i, j] = here
+    return d2, log_det
 
 
 @jit
@@ -477,6 +531,7 @@ def cross(e: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+@lru_cache(maxsize=8)
 def gate(probability: float) -> float:
     """Squared distance within which two estimates of one body lie with a probability."""
     return float(2 * gammaincinv(SIZE / 2, probability))
@@ -513,7 +568,7 @@ class Picture:
 
         Parameters
         ----------
-        reports : all of that instant (`Report.at`), one per track
+        reports : all of that instant (`at_once`), one per track
         known : what terminals say of themselves (`its_word`), likewise
         """
         by_key = {report.key: report for report in reports}
@@ -548,13 +603,14 @@ class Picture:
                 del alone[members[0]]
                 continue
             members.sort(key=lambda k: float(np.trace(whole[k].covariance)))
-            d2, _ = distances([whole[members[0]]], [whole[k] for k in members])
+            surely = SPLIT_PROBABILITY
+            d2, _ = distances([whole[members[0]]], [whole[k] for k in members], surely)
             surest = {k.origin: k for k in reversed(members)}
             gaps = [_gap(whole[k], whole[surest[k.origin]]) for k in members]
             body.members = [
                 k
                 for k, d, gap in zip(members, d2[0], gaps, strict=True)
-                if d <= gate(SPLIT_PROBABILITY) and gap <= 2 * LEAST_APART
+                if np.isfinite(d) and gap <= 2 * LEAST_APART
             ]
             kept.append(body)
             for key in body.members:
@@ -572,9 +628,9 @@ class Picture:
             d2, log_det = distances(
                 [intersection_of([whole[k] for k in b.members]) for b in others],
                 [whole[b.members[0]] for b in single],
+                JOIN_PROBABILITY,
             )
-            cost = np.where(d2 <= gate(JOIN_PROBABILITY), d2 + log_det, np.inf)
-            for i, j in assign(cost):
+            for i, j in assign(d2 + log_det):
                 others[i].members += single[j].members
                 others[i].name = min(others[i].name, single[j].name)
                 self._bodies.remove(single[j])
@@ -582,9 +638,9 @@ class Picture:
     def _unite(self, whole: Mapping[Key, Gaussian]) -> None:
         """Bodies of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
         states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
-        d2, _ = distances(states, states)
+        d2, _ = distances(states, states, JOIN_PROBABILITY)
         gone: set[int] = set()
-        for i, j in np.argwhere(np.tril(d2 <= gate(JOIN_PROBABILITY), -1)).tolist():
+        for i, j in np.argwhere(np.tril(np.isfinite(d2), -1)).tolist():
             if {i, j} & gone:
                 continue
             body, other = self._bodies[i], self._bodies[j]
@@ -620,7 +676,7 @@ def recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list
     """The terminal that each body is, by what terminals say of themselves."""
     whose: list[str | None] = [None] * len(states)
     names = list(known)
-    d2, log_det = distances(list(known.values()), states)
-    for i, j in assign(np.where(d2 <= gate(JOIN_PROBABILITY), d2 + log_det, np.inf)):
+    d2, log_det = distances(list(known.values()), states, JOIN_PROBABILITY)
+    for i, j in assign(d2 + log_det):
         whose[j] = names[i]
     return whose

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
 
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
@@ -24,9 +23,9 @@ from isac_rt.terminal.filter import (
     Ambiguity,
     Gaussian,
     birth,
+    costs,
     expected,
     jacobian,
-    mahalanobis,
     measure,
     singer,
     transmitter_jacobian,
@@ -396,13 +395,12 @@ class PooledTracker:
     def _costs(
         self, pool: Pool, view: _View, rows: Sequence[int], free: Sequence[int]
     ) -> np.ndarray:
-        """(rows, free) d^2 + ln det S; inf outside the gate."""
+        """(rows, free) `costs`."""
         cost = np.full((len(rows), len(free)), np.inf)
         if not len(rows) or not len(free):
             return cost
         own, sender = view.corrected(pool.mean)
         z = view.look.z[free]
-        R = np.fmax(view.look.std[free], STD_FLOOR)[:, :, None] ** 2 * np.eye(4)
         states = [self._marginal(pool, k) for k in rows]
         known = None if sender is None else Gaussian(sender, np.zeros((SIZE, SIZE)))
         means = np.stack([m for m, _ in states])
@@ -412,11 +410,8 @@ class PooledTracker:
             H = np.zeros((4, len(pool.mean)))
             view.errors_into(H, means[i], own, sender)
             S[i] += H @ pool.covariance @ H.T
-        residual = wrapped(z[None] - z_mean[:, None], self._ambiguity(view))
-        d2, log_det = mahalanobis(residual, S[:, None] + R[None])
-        freedom = np.isfinite(residual).sum(axis=-1)
-        limit = 2 * gammaincinv(freedom / 2, self._settings.gate_probability)
-        return np.where(d2 <= limit, d2 + log_det, np.inf)
+        probability = self._settings.gate_probability
+        return costs(z, view.look.std[free], z_mean, S, self._ambiguity(view), probability)
 
     def _ambiguity(self, view: _View) -> Ambiguity:
         return self._ambiguities[0 if view.transmitter is None else 1]

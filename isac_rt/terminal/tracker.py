@@ -13,23 +13,20 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.special import gammaincinv
 
 from isac_rt.receive.types import Detections, Prediction
 from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
-    STD_FLOOR,
     Ambiguity,
     Gaussian,
     birth,
+    costs,
     expected,
-    mahalanobis,
     measurement_covariance,
     predict,
     reflected,
     reported,
     update,
-    wrapped,
 )
 from isac_rt.world.swarm import Pose
 
@@ -346,19 +343,13 @@ class Tracker:
     def _costs(
         self, z: np.ndarray, std: np.ndarray, own: Pose, transmitter: Gaussian | None
     ) -> np.ndarray:
-        """(tracks, detections) d^2 + ln det S, minus twice the log likelihood but for a constant;
-        inf outside the gate."""
+        """(tracks, detections) `costs`."""
         if not self.tracks or not len(z):
             return np.full((len(self.tracks), len(z)), np.inf)
         mean = np.stack([t.state.mean for t in self.tracks])
         covariance = np.stack([t.state.covariance for t in self.tracks])
         z_mean, S = expected(mean, covariance, own, transmitter)
-        R = np.fmax(std, STD_FLOOR)[:, :, None] ** 2 * np.eye(4)
-        residual = wrapped(z[None] - z_mean[:, None], self.ambiguity)
-        d2, log_det = mahalanobis(residual, S[:, None] + R[None])
-        freedom = np.isfinite(residual).sum(axis=-1)  # of chi squared
-        gate = 2 * gammaincinv(freedom / 2, self.settings.gate_probability)
-        return np.where(d2 <= gate, d2 + log_det, np.inf)
+        return costs(z, std, z_mean, S, self.ambiguity, self.settings.gate_probability)
 
     def _live(self, track: Track, hit: bool) -> None:
         s = self.settings

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from oracles import slopes, what_is_measured
 from scipy.optimize import brentq
+from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Tracking
-from isac_rt.terminal.filter import Ambiguity, Gaussian, mahalanobis
+from isac_rt.terminal.filter import STD_FLOOR, UNAMBIGUOUS, Ambiguity, Gaussian, costs
 from isac_rt.terminal.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 
@@ -53,16 +54,37 @@ def gate(freedom):
 
 
 def test_the_distance_is_that_of_what_was_measured():
-    """Every pattern of missing components against the density of the others alone. Planted bugs:
-    the determinant left out; covariances with missing components kept."""
+    """Every pattern of missing components against the density of the others alone, of three
+    detections and two tracks, one of them nowhere near. Planted bugs: the determinant left out;
+    covariances with missing components kept; the deviation of another detection; the gate of four
+    components for all."""
     rng = np.random.default_rng(2)
     root = rng.normal(size=(4, 4)) * [[0.3], [2.0], [0.01], [0.02]]
-    S, y = root @ root.T, root @ rng.normal(size=4)
+    S, std = root @ root.T, np.abs(root[:3]) + STD_FLOOR
+    mean = np.array([[30.0, 4.0, 0.2, 0.1], [3000.0, 4.0, 0.2, 0.1]])
+    y = (2 * rng.normal(size=(3, 4))) @ root.T
+    inside = 0
     for there in product([True, False], repeat=4):
         some = np.flatnonzero(there)
-        d2, log_det = mahalanobis(np.where(there, y, np.nan), S)
-        expected = distance_and_log_det(y[some], S[np.ix_(some, some)])
-        assert (d2, log_det) == pytest.approx(tuple(map(float, expected)), rel=1e-9, abs=1e-12)
+        z = np.where(there, mean[0] + y, np.nan)
+        found = costs(z, std, mean, np.array([S, S]), UNAMBIGUOUS, GATE)
+        for q in range(3):
+            R = np.diag(std[q] ** 2)
+            d2, log_det = distance_and_log_det(y[q, some], (S + R)[np.ix_(some, some)])
+            if some.size and d2 <= chi2.ppf(GATE, some.size):
+                assert found[0, q] == pytest.approx(float(d2 + log_det), rel=1e-9)
+                inside += 1
+            else:
+                assert found[0, q] == np.inf
+        assert np.isinf(found[1]).all() or not there[0]
+    assert 5 < inside < 43
+
+
+def test_a_small_deviation_is_not_believed():
+    """Planted bug: the floor left out."""
+    z, nothing = np.array([[2e-3, 0.0, 0.0, 0.0]]), np.zeros((1, 4, 4))
+    found = costs(z, np.full((1, 4), 1e-9), np.zeros((1, 4)), nothing, UNAMBIGUOUS, GATE)
+    assert found[0, 0] == pytest.approx(4 + 2 * np.log(STD_FLOOR).sum())
 
 
 def clutter_of(rng, states, sender, std):

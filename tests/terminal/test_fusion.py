@@ -4,11 +4,13 @@ picture."""
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from isac_rt.terminal.filter import Gaussian, bistatic_distance, predict
 from isac_rt.terminal.fusion import (
@@ -21,8 +23,11 @@ from isac_rt.terminal.fusion import (
     Name,
     Picture,
     Report,
+    Told,
     _intersected,
     advance,
+    at_once,
+    distances,
     in_world,
     intersection,
     intersection_of,
@@ -249,6 +254,49 @@ def test_a_state_told_goes_on_as_the_tracks_do():
     assert np.allclose(found.mean[:3], mean[:3] + 0.37 * mean[3:])
 
 
+def test_reports_are_brought_to_one_time():
+    """Of several ages, one of the instant itself, against each state and lever alone. Planted bugs:
+    the lever of a place without that of its motion; the state of before in the whole."""
+    rng = np.random.default_rng(21)
+    told_of = [
+        Told(Gaussian(rng.normal(size=6), covariance(rng)), rng.normal(size=(6, ERRORS)))
+        for _ in range(3)
+    ]
+    reports = [
+        Report(Key("A->B", k), 0.0, Name(0.0, "A->B", k), time, *told_of[k])
+        for k, time in enumerate((0.3, 0.7, 0.41))
+    ]
+    for report, before in zip(at_once(reports, 0.7, 1.5), reports, strict=True):
+        alone = Told(before.state, before.lever).after(0.7 - before.time, 1.5)
+        assert (report.key, report.name, report.time) == (before.key, before.name, 0.7)
+        assert np.allclose(report.state.mean, alone.state.mean, rtol=1e-12)
+        assert np.allclose(report.state.covariance, alone.state.covariance, rtol=1e-12)
+        assert np.allclose(report.lever, alone.lever, rtol=1e-12)
+        assert np.allclose(report.whole.covariance, alone.whole.covariance, rtol=1e-12)
+    assert at_once([], 0.7, 1.5) == []
+
+
+def test_distances_within_the_gate():
+    """Pairs near and far against the inverse and the determinant. Planted bugs: one variance for
+    the trace; one covariance alone."""
+    rng = np.random.default_rng(22)
+    a, b = (
+        [Gaussian(spread * rng.normal(size=6), covariance(rng)) for _ in range(9)]
+        for spread in (0.3, 4.0)
+    )
+    d2, log_det = distances(a, b, 0.99)
+    inside = np.zeros((9, 9), bool)
+    for i, j in product(range(9), repeat=2):
+        S, y = a[i].covariance + b[j].covariance, a[i].mean - b[j].mean
+        expected = y @ np.linalg.solve(S, y)
+        inside[i, j] = expected <= chi2.ppf(0.99, 6)
+        if inside[i, j]:
+            both = expected, np.linalg.slogdet(S)[1]
+            assert (d2[i, j], log_det[i, j]) == pytest.approx(both, rel=1e-9)
+    assert np.array_equal(np.isfinite(d2), inside) and np.array_equal(np.isfinite(log_det), inside)
+    assert 5 < inside.sum() < 76
+
+
 def tracked(*rows, reference=None):
     """Tracks at places and motions (6,) relative to their terminal, known to a decimetre or two."""
     mean = np.array(rows, float)
@@ -283,7 +331,7 @@ def test_what_is_told_holds_the_errors_of_who_tells():
         np.diag(report.whole.covariance - said.state.covariance)[:3],
         [across + pose, pose + clock, across + pose],
     )
-    later = report.at(0.2, 1.0)
+    (later,) = at_once([report], 0.2, 1.0)
     assert np.allclose(later.lever[:3, 3:6], 0.2 * POSE_STD[1] * np.eye(3))
 
 
