@@ -237,7 +237,8 @@ def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
     w, t, rate = waveform, tones, np.abs(tones.rate)
     half, lines = w.num_samples / 2, _lines(waveform, size)
     moved = np.maximum(rate * TOGETHER * w.slot_duration * lines, MOVED) / 2
-    beyond = moved + lines * sum(np.abs(d).max(axis=1) for d in (t.tx_delay, t.rx_delay))
+    late = (np.ascontiguousarray(d.T) for d in (t.tx_delay, t.rx_delay))  # rows are short
+    beyond = moved + lines * sum(np.abs(d).max(axis=0) for d in late)
     # most of f (1 - f), f between the lines, or on one of them and evenly that far to both sides
     between = np.maximum(0.25, np.sqrt(beyond**2 / 3 + beyond**4 / 5))
     turn = line_turn(size, half)
