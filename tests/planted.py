@@ -331,7 +331,7 @@ OF_CASES = {
         "signal/noise.py", "c = _COS[0] + q * (", "c = _COS[0] + np.float32(0.9) * q * ("
     ),
     "noise does not know the order of work": Bug(
-        "signal/noise.py", "index = first + np.uint64(i)", "index = np.uint64(i)"
+        "signal/noise.py", "counter = uint32(low + uint32(i))", "counter = uint32(i)"
     ),
     "dpsk symbol errors": Bug(
         "receive/symbols/powers.py",
