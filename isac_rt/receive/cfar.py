@@ -314,17 +314,27 @@ def without_sidelobes(
     floor : share of a path's power that may lie in any Doppler bin of its range row
     margin : power factor above the bound
     """
-    keep = np.zeros(rows.size, bool)
-    values = power[rows, bins]
+    kept: np.ndarray = _stand_out(rows, bins, power[rows, bins], num_bins, floor, margin)
+    return kept
+
+
+@jit
+def _stand_out(rows, bins, values, num_bins, floor, margin):
+    """`without_sidelobes`."""
+    keep = np.ones(rows.size, np.bool_)
     for i in range(rows.size):
-        stronger = np.flatnonzero(keep[:i])
-        across = np.abs(bins[i] - bins[stronger])
-        across = np.minimum(across, num_bins - across)
-        bound = (
-            margin
-            * values[stronger]
-            * hann_envelope(rows[i] - rows[stronger])
-            * (hann_envelope(across) + floor)
-        )
-        keep[i] = not np.any(values[i] <= bound)
+        for k in range(i):
+            if keep[k]:
+                across = abs(bins[i] - bins[k])
+                across = min(across, num_bins - across)
+                bound = margin * values[k] * _envelope(abs(rows[i] - rows[k]))
+                if values[i] <= bound * (_envelope(across) + floor):
+                    keep[i] = False
+                    break
     return keep
+
+
+@jit
+def _envelope(d):
+    """`hann_envelope` of one distance."""
+    return 1.0 if d < 2 else 1.0 / (np.pi * d * (d * d - 1.0)) ** 2

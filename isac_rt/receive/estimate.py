@@ -502,8 +502,17 @@ def _along(channels: np.ndarray, known: Known, axis: int, *, on_grid: bool) -> n
     # the receivers stand alike for every transmitter
     apart = known.wavenumber * line.places[: values.shape[2], axis]
     count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
-    best = np.array([_strongest(one, apart, limit, count, not on_grid) for one in values], float)
+    best: np.ndarray = _all_strongest(values, apart, limit, count, not on_grid)
     return np.where(np.abs(best) <= 1, best, np.nan)
+
+
+@jit
+def _all_strongest(values, apart, limit, count, fine):
+    """`_strongest` of each of `values` (Q, T, L)."""
+    out = np.empty(len(values))
+    for q in range(out.size):
+        out[q] = _strongest(values[q], apart, limit, count, fine)
+    return out
 
 
 @jit

@@ -235,8 +235,22 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
     """
     p = np.arange(waveform.num_chirps)
     grid = p + (times - np.floor(times)).mean()
-    resample = np.linalg.solve(np.sinc(times[:, None] - times), np.sinc(times[:, None] - grid)).T
+    resample = np.linalg.solve(_sincs(times, times), _sincs(times, grid)).T
     return np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
+
+
+@jit
+def _sincs(a, b):
+    """(A, B) `numpy.sinc` of the differences of places, by sines and cosines of each place."""
+    out = np.empty((a.size, b.size))
+    sine, cosine = np.sin(np.pi * b), np.cos(np.pi * b)
+    for i in range(a.size):
+        s, c = np.sin(np.pi * a[i]), np.cos(np.pi * a[i])
+        for j in range(b.size):
+            x = np.pi * (a[i] - b[j])
+            near = 1 - x * x / 6 * (1 - x * x / 20)
+            out[i, j] = near if abs(x) < 1e-3 else (s * cosine[j] - c * sine[j]) / x
+    return out
 
 
 @jit

@@ -16,11 +16,24 @@ count tau_D to the chirp's time.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from isac_rt.frame.cube import IFCube, SharedCube
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import new_memory
+from isac_rt.kernels.vector import (
+    LANES,
+    cos_sin_double,
+    floor,
+    load,
+    narrow,
+    new_memory,
+    splat,
+    store,
+    zip_high,
+    zip_low,
+)
 from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
 
@@ -31,15 +44,16 @@ def _factors(
     """Hann's window at sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D
     to k: (P, N) complex64."""
     out = np.empty((len(starts), num_samples), np.complex64)
-    _fill_factors(
-        np.asarray(delay_symbols, np.int64) % num_samples,
-        starts.astype(np.float64),
-        length,
-        np.exp(2j * np.pi / length * np.arange(num_samples)),
-        np.exp(-2j * np.pi / num_samples * np.arange(num_samples)),
-        out,
-    )
+    symbols = np.asarray(delay_symbols, np.int64) % num_samples
+    _fill_factors(symbols, starts.astype(np.float64), length, *_phasors(num_samples, length), out)
     return out
+
+
+@lru_cache(maxsize=8)
+def _phasors(num_samples: int, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of the window and of the transform, at every sample."""
+    n = np.arange(num_samples)
+    return np.exp(2j * np.pi / length * n), np.exp(-2j * np.pi / num_samples * n)
 
 
 @jit
@@ -58,22 +72,24 @@ def _fill_factors(symbols, starts, length, places, roots, out):
 
 
 def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
-    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, each a
-    product of two phasors reduced in float64."""
-    coarse, fine = np.arange(0, num_samples, 32), np.arange(32)
-    start, step = (
-        np.exp(2j * np.pi * (np.asarray(frequency)[:, None] * n % 1.0)) for n in (coarse, fine)
-    )
-    out = np.empty((len(start), num_samples), np.complex64)
-    _fill_tones(start, step, out)
-    return out
+    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, with phases
+    in float64."""
+    places = np.arange(num_samples + -num_samples % LANES, dtype=float)
+    out = np.empty((len(frequency), places.size), np.complex64)
+    _fill_tones(np.asarray(frequency, float), places, out.view(np.float32).reshape(-1))
+    return np.ascontiguousarray(out[:, :num_samples])
 
 
 @jit
-def _fill_tones(start, step, out):
-    for p in range(out.shape[0]):
-        for n in range(out.shape[1]):
-            out[p, n] = start[p, n // 32] * step[p, n % 32]
+def _fill_tones(frequency, places, out):
+    at = 0
+    for p in range(frequency.size):
+        for n in range(0, places.size, LANES):
+            cycles = splat(frequency[p]) * load(places, n)
+            c, s = cos_sin_double(cycles - floor(cycles + splat(0.5)))
+            store(out, at, zip_low(narrow(c), narrow(s)))
+            store(out, at + LANES, zip_high(narrow(c), narrow(s)))
+            at += 2 * LANES
 
 
 def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> np.ndarray:

@@ -42,6 +42,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import (
     Conventional,
     LatinUnion,
+    _sincs,
     accumulate,
     channel_maps,
     correlation_operator,
@@ -68,6 +69,15 @@ def white(w: Waveform, schedule: np.ndarray, num_rx: int, seed: int) -> IFCube:
 
 
 # --- Doppler
+
+
+def test_sincs_of_differences_are_numpys():
+    """Also of places that are equal, or all but equal. Planted bug: sine and cosine the other way
+    round."""
+    places = np.arange(120) + 0.2 * np.random.default_rng(3).random(120)
+    for others in (places, np.arange(120) + 0.11, places + 1e-7, places + 3e-4):
+        expected = np.sinc(places[:, None] - others)
+        assert np.abs(_sincs(places, others) - expected).max() < 1e-11  # 1e-14 over 1e-3
 
 
 @pytest.mark.parametrize(
@@ -352,6 +362,26 @@ def test_sidelobes_lie_round_the_ends_of_the_doppler_axis():
         at = (bins + turn) % size
         power[rows, at] = [1e6, 2e6 * hann_envelope(3.0) ** 2, 1.9e6 * hann_envelope(3.0) ** 2]
         assert without_sidelobes(rows, at, power, size, 1e-9).tolist() == [True, False, True]
+
+
+def test_peaks_that_lobes_explain_are_those_of_plain_numpy():
+    """Planted bugs: the lobes of peaks that are none; bins apart not counted round the end; the
+    floor left out."""
+    rng = np.random.default_rng(8)
+    rows, bins = rng.integers(0, 40, 200), rng.integers(0, 120, 200)
+    power = np.zeros((40, 120), np.float32)
+    power[rows, bins] = 10 ** rng.uniform(-6, 0, 200)
+    order = np.argsort(-power[rows, bins], kind="stable")
+    rows, bins = rows[order], bins[order]
+    keep = np.zeros(200, bool)
+    for i in range(200):
+        some = np.flatnonzero(keep[:i])
+        across = np.abs(bins[i] - bins[some])
+        lobes = hann_envelope(np.minimum(across, 120 - across)) + 1e-5
+        bound = 4 * power[rows, bins][some] * hann_envelope(rows[i] - rows[some]) * lobes
+        keep[i] = not (power[rows[i], bins[i]] <= bound).any()
+    assert 50 < keep.sum() < 150
+    assert without_sidelobes(rows, bins, power, 120, 1e-5).tolist() == keep.tolist()
 
 
 def test_compiled_match_is_the_template():
