@@ -37,7 +37,8 @@ def pseudo_random_schedule(
 def is_latin(schedule: Schedule, num_tx: int) -> bool:
     """Whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups samples
     every antenna in every slot)."""
-    return all(len(set(column)) == len(column) for column in schedule.T) and schedule.max() < num_tx
+    ordered = np.sort(schedule, axis=0)
+    return bool((ordered[1:] > ordered[:-1]).all() and schedule.max() < num_tx)
 
 
 def schedule_of(kind: str, waveform: Waveform, rng: np.random.Generator) -> Schedule:

@@ -327,14 +327,14 @@ def _stand_out(rows, bins, values, num_bins, floor, margin):
             if keep[k]:
                 across = abs(bins[i] - bins[k])
                 across = min(across, num_bins - across)
-                bound = margin * values[k] * _envelope(abs(rows[i] - rows[k]))
-                if values[i] <= bound * (_envelope(across) + floor):
+                bound = margin * values[k] * lobe_bound(abs(rows[i] - rows[k]))
+                if values[i] <= bound * (lobe_bound(across) + floor):
                     keep[i] = False
                     break
     return keep
 
 
 @jit
-def _envelope(d):
-    """`hann_envelope` of one distance."""
+def lobe_bound(d: float) -> float:
+    """`hann_envelope` of one distance of 0 or more."""
     return 1.0 if d < 2 else 1.0 / (np.pi * d * (d * d - 1.0)) ** 2

@@ -9,7 +9,7 @@ import numpy as np
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.receive.cfar import hann_envelope
+from isac_rt.receive.cfar import lobe_bound
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.types import Detections
 
@@ -45,25 +45,31 @@ def owners(kind: np.ndarray, target: np.ndarray, paths: PathSet, names: list[str
     kind, target : (Q,) of `paths` themselves or of what they explain
     """
     index = np.array([names.index(name) for name in paths.target_names] + [-1])
-    out = np.where(kind == PathKind.TARGET, index[target], -1)
+    out, echoes = np.full(len(kind), -1), kind == PathKind.TARGET  # of many paths a few
+    out[echoes] = index[target[echoes]]
     if paths.tx != paths.rx:
         out[kind == PathKind.LINE_OF_SIGHT] = names.index(paths.tx)
     return out
 
 
-def hann_response(distance: np.ndarray) -> np.ndarray:
-    """Power of a Hann-windowed tone at a distance in cells, relative to its peak."""
-    d = np.abs(distance)
-    apart = np.where(d == 1, np.nan, 1 - d * d)
-    return np.where(d == 1, 0.25, (np.sinc(d) / apart) ** 2)
+@jit
+def hann_response(distance: float) -> float:
+    """Power of a Hann-windowed tone at a distance of 0 or more cells, relative to its peak."""
+    if distance == 0 or distance == 1:
+        return 1.0 if distance == 0 else 0.25
+    x = np.pi * distance
+    return (np.sin(x) / x / (1 - distance * distance)) ** 2
 
 
-def reach(distance: np.ndarray) -> np.ndarray:
+@jit
+def reach(distance: float) -> float:
     """Share of a path's power that is counted at a distance in cells: all within one cell, then
     what the Hann window passes at most."""
-    d = np.abs(distance)
-    flank = np.where(d < 2, hann_response(d), 0.0)
-    return np.where(d <= 1, 1.0, np.maximum(flank, hann_envelope(np.maximum(d, 2.0))))
+    if distance <= 1:
+        return 1.0
+    if distance < 2:
+        return max(hann_response(distance), lobe_bound(2.0))
+    return lobe_bound(distance)
 
 
 class Places(NamedTuple):
@@ -93,10 +99,6 @@ class Places(NamedTuple):
         cells = waveform.range_cell(passes), waveform.velocity_cell(passes)
         return cls(range, velocity, cells, 2 * waveform.max_velocity(passes))
 
-    def select(self, rows: np.ndarray) -> Places:
-        """Those of some rows."""
-        return self._replace(range=self.range[rows], velocity=self.velocity[rows])
-
     def apart(
         self, range: float | np.ndarray, velocity: float | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -105,6 +107,15 @@ class Places(NamedTuple):
         off = velocity - self.velocity
         off -= self.span * np.round(off / self.span)
         return np.abs(range - self.range) / self.cells[0], np.abs(off) / self.cells[1]
+
+
+@jit
+def cells_apart(
+    range: float, velocity: float, cells: tuple[float, float], span: float
+) -> tuple[float, float]:
+    """`Places.apart` of one place, from the differences of range and velocity."""
+    velocity -= span * np.round(velocity / span)
+    return abs(range) / cells[0], abs(velocity) / cells[1]
 
 
 class Aim(NamedTuple):
@@ -145,21 +156,15 @@ def explain(
     """
     places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
     diffuse = paths.kind == PathKind.DIFFUSE
-    others = np.flatnonzero(~diffuse)
-    apart = places.select(others).apart(detections.range[:, None], detections.velocity[:, None])
-    shares = reach(apart[0]) * np.minimum(reach(apart[1]) + UNION_FLOOR, 1.0)
-    close = (apart[0] <= 1) & (apart[1] <= 1)
     if aim is None:
         aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
     cause, near = _causes(
         (detections.range, detections.velocity, detections.direction),
         (places.range, places.velocity, aim.direction),
-        (*places.cells, places.span, *aim.beam),
+        (places.cells, places.span, tuple(aim.beam)),
         power,
         np.flatnonzero(diffuse),
-        others,
-        shares,
-        close,
+        np.flatnonzero(~diffuse),
     )
     found = np.flatnonzero(cause >= 0)
     rows, count = cause[found], len(detections)
@@ -178,39 +183,37 @@ def explain(
 def _causes(
     detections: tuple[np.ndarray, ...],
     paths: tuple[np.ndarray, ...],
-    scales: tuple[float, ...],
+    scales: tuple[tuple[float, float], float, tuple[float, float]],
     power: np.ndarray,
     field: np.ndarray,
     others: np.ndarray,
-    shares: np.ndarray,
-    close: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Row of the path that caused each of Q detections (range, velocity and direction), -1 for
-    none, and whether it lies within a cell of it; `shares` and `close` (Q, M) are of the paths
-    `others`, and `scales` the two cells, the span of velocities and the two beams."""
+    none, and whether it lies within a cell of it; `scales` are the two cells, the span of
+    velocities and the two beams."""
     (ranges, velocities, directions), (at, rate, towards) = detections, paths
-    row_cell, bin_cell, span, wide, high = scales
-    close_by = row_cell * (1 + 1e-9)
+    cells, span, (wide, high) = scales
+    close_by = cells[0] * (1 + 1e-9)
     cause, beside = np.full(ranges.size, -1), np.zeros(ranges.size, np.bool_)
     most = field.size + others.size
     rows, near, able = np.empty(most, np.int64), np.empty(most, np.bool_), np.empty(most, np.bool_)
     here, clutter, off = np.empty(most), np.empty(most), np.empty(most)
     for q in range(ranges.size):
         count = 0
-        for j in range(others.size):
-            rows[count], near[count] = others[j], close[q, j]
-            here[count], clutter[count] = power[others[j]] * shares[q, j], 0.0
+        for i in others:
+            row, column = cells_apart(ranges[q] - at[i], velocities[q] - rate[i], cells, span)
+            share = reach(row) * min(reach(column) + UNION_FLOOR, 1.0)
+            rows[count], near[count] = i, row <= 1 and column <= 1
+            here[count], clutter[count] = power[i] * share, 0.0
             count += 1
         for i in field:
             if abs(ranges[q] - at[i]) > close_by:  # most are, which no division needs to tell
                 continue
-            if abs(ranges[q] - at[i]) / row_cell <= 1:
-                slower = velocities[q] - rate[i]
-                slower -= span * np.round(slower / span)
-                if abs(slower) / bin_cell <= 1:
-                    rows[count], near[count] = i, True
-                    here[count], clutter[count] = 0.0, power[i]
-                    count += 1
+            row, column = cells_apart(ranges[q] - at[i], velocities[q] - rate[i], cells, span)
+            if row <= 1 and column <= 1:
+                rows[count], near[count] = i, True
+                here[count], clutter[count] = 0.0, power[i]
+                count += 1
         for c in range(count):
             x = abs(towards[rows[c], 0] - directions[q, 0]) / wide
             z = abs(towards[rows[c], 1] - directions[q, 1]) / high

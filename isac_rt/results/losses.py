@@ -12,10 +12,11 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.schedule import is_latin
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
+from isac_rt.receive.cfar import STRONG, CfarRule, lobe_bound
 from isac_rt.receive.maps import UNION_FLOOR
-from isac_rt.results.labels import Places, hann_response
+from isac_rt.results.labels import Places, cells_apart, hann_response
 from isac_rt.scenario.receivers import Receivers
 
 MATCHED_DB = 13.0
@@ -152,46 +153,67 @@ class Chance:
         life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
         doppler = places.velocity[own] / places.cells[1]
-        off_grid = hann_response(np.array([beat - round(beat), doppler - round(doppler)])).prod()
-        mine, rule, at = power[own], sees.rule, (places.range[own], places.velocity[own])
-        # most scatterers are farther off than all that is asked below
-        most = max(rule.guard[0] + rule.training[0] + 1, 2) * places.cells[0]
-        near = (np.abs(places.range - at[0]) < most) | (paths.kind != PathKind.DIFFUSE)
-        some = np.flatnonzero(near)
-        places, power = places.select(some), power[some]
-        diffuse = paths.kind[some] == PathKind.DIFFUSE
-        rows, bins = places.apart(*at)
-        near = diffuse & (rows < 2) & (bins < 2)
-        clutter = power[near] @ (hann_response(rows[near]) * hann_response(bins[near]))
-        others = ~diffuse & (power > mine)
-        lobes = hann_envelope(rows[others]) * (hann_envelope(bins[others]) + UNION_FLOOR)
-        covers = SIDELOBE_MARGIN * power[others] * lobes >= mine * off_grid
+        off_grid = hann_response(abs(beat - round(beat))) * hann_response(
+            abs(doppler - round(doppler))
+        )
+        mine = power[own]
+        clutter, background, masked = _around(
+            (places.range - places.range[own], places.velocity - places.velocity[own]),
+            (places.cells, places.span),
+            power,
+            paths.kind == PathKind.DIFFUSE,
+            (mine, mine * off_grid, sees.cell),
+            (sees.rule.guard, sees.rule.training),
+        )
         return cls(
             float(sees.matched * life * mine),
             float(sees.cell * life**2 * mine * off_grid),
-            float(sees.cell * clutter),
-            _background(sees.cell * power, at[0] < places.range, rows, bins, rule),
-            bool(covers.any()),
+            sees.cell * clutter,
+            background,
+            masked,
         )
 
 
-def _background(
-    power: np.ndarray, behind: np.ndarray, rows: np.ndarray, bins: np.ndarray, rule: CfarRule
-) -> float:
-    """What paths add to the greater of the means before and behind a cell, over the noise.
+@jit
+def _around(
+    off: tuple[np.ndarray, np.ndarray],
+    scales: tuple[tuple[float, float], float],
+    power: np.ndarray,
+    diffuse: np.ndarray,
+    levels: tuple[float, float, float],
+    blocks: tuple[tuple[int, int], tuple[int, int]],
+) -> tuple[float, float, bool]:
+    """Power of the clutter in a path's cell; what K paths add to the greater of the means before
+    and behind it, over the noise; and whether a stronger one covers it.
 
     Parameters
     ----------
-    power : (K,) in a cell, over the noise; what is over `STRONG` is kept out of the training
-    behind : (K,) bool, farther than the cell
-    rows, bins : (K,) distances in cells
+    off : (K,) ranges and velocities beyond the path's
+    scales : cells of both and the span of velocities
+    power : (K,); what is over `STRONG` is kept out of the training
+    levels : the path's power, that in its cell, and what makes SNR of power in a cell
+    blocks : guard and training cells
     """
-    width = rule.guard[1] + rule.training[1] + 0.5
-    along = rows - rule.guard[0] - 0.5
-    trains = (along > 0) & (along <= rule.training[0]) & (bins <= width) & (power < STRONG)
-    cells = rule.training[0] * 2 * width
-    sides = (power[trains & side].sum() for side in (behind, ~behind))
-    return float(max(sides) * HANN_LOSS**2 / cells)
+    (cells, span), (mine, in_cell, gain), (guard, training) = scales, levels, blocks
+    width = guard[1] + training[1] + 0.5
+    clutter, before, behind, masked = 0.0, 0.0, 0.0, False
+    most = max(guard[0] + training[0] + 1, 2) * cells[0]
+    for i in range(power.size):
+        if diffuse[i] and abs(off[0][i]) >= most:  # of most it is this that is asked alone
+            continue
+        row, column = cells_apart(off[0][i], off[1][i], cells, span)
+        if diffuse[i] and row < 2 and column < 2:
+            clutter += power[i] * hann_response(row) * hann_response(column)
+        if not diffuse[i] and power[i] > mine:
+            lobes = lobe_bound(row) * (lobe_bound(column) + UNION_FLOOR)
+            masked |= SIDELOBE_MARGIN * power[i] * lobes >= in_cell
+        along = row - guard[0] - 0.5
+        if 0 < along <= training[0] and column <= width and gain * power[i] < STRONG:
+            if off[0][i] > 0:
+                behind += gain * power[i]
+            else:
+                before += gain * power[i]
+    return clutter, max(before, behind) * HANN_LOSS**2 / (training[0] * 2 * width), masked
 
 
 def cause_of(

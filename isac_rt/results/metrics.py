@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import asin, atan2, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -40,16 +41,17 @@ def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
     arrival, over the whole sphere.
     """
     offset = uav.position - observer.position
-    distance = float(np.linalg.norm(offset))
+    distance = sqrt(offset @ offset)
     velocity = float(offset @ (uav.velocity - observer.velocity)) / distance
     body = observer.to_body(offset / distance)
     length = distance
     if at is not None:
         outward = uav.position - at.position
-        length += float(np.linalg.norm(outward))
-        velocity += float(outward @ (uav.velocity - at.velocity)) / float(np.linalg.norm(outward))
-    azimuth, elevation = np.arctan2(body[0], body[1]), np.arcsin(np.clip(body[2], -1, 1))
-    return Truth(length, velocity, float(body[0]), float(body[2]), float(azimuth), float(elevation))
+        further = sqrt(outward @ outward)
+        length += further
+        velocity += float(outward @ (uav.velocity - at.velocity)) / further
+    right, ahead, up = body.tolist()
+    return Truth(length, velocity, right, up, atan2(right, ahead), asin(min(max(up, -1.0), 1.0)))
 
 
 @dataclass(frozen=True)

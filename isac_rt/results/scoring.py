@@ -187,10 +187,12 @@ class Scorer:
         inside = np.array(
             [name != rx and within_view(self._antennas, own, active, poses[name]) for name in names]
         )
-        straight = owners(paths.kind, paths.target, paths, names)
-        some = np.flatnonzero(straight >= 0)
-        straight[some[paths.select(some).bent]] = -1
-        direct = np.isin(np.arange(len(names)), straight)
+        own_paths = owners(paths.kind, paths.target, paths, names)
+        some = np.flatnonzero(own_paths >= 0)
+        some = some[~paths.select(some).bent]
+        straight = np.full(len(paths), -1)
+        straight[some] = own_paths[some]
+        direct = np.isin(np.arange(len(names)), straight[some])
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         everyone = np.array([poses[name].position - own.position for name in names])
         directions = own.to_body(paths.arrival)[:, ::2]

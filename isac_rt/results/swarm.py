@@ -20,7 +20,7 @@ from isac_rt.results.dataset import Columns
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
 from isac_rt.results.records import ObserverRecord, PictureRecord
 from isac_rt.results.sensing import gospa_block
-from isac_rt.terminal.fusion import Fused, Key, Name
+from isac_rt.terminal.fusion import Fused, Key
 from isac_rt.world.swarm import Pose
 
 SWARM = "swarm"
@@ -75,6 +75,7 @@ class SwarmScorer:
 
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
+        self._origins = [str(link) for link in timetable.labels]
         self._seen: dict[Link, np.ndarray] = {}
         self._fed: dict[Key, int] = {}
 
@@ -121,6 +122,7 @@ class SwarmScorer:
         names, bodies = list(poses), view.bodies
         truth = np.array([np.concatenate([p.position, p.velocity]) for p in poses.values()])
         mean = np.array([b.state.mean for b in bodies]).reshape(-1, 6)
+        covariance = np.array([b.state.covariance for b in bodies]).reshape(-1, 6, 6)
         strange = np.array([b.terminal is None for b in bodies], bool)
         nearest = np.linalg.norm(mean[:, None, :3] - truth[None, :, :3], axis=-1)
         pairs = _paired(nearest[np.ix_(strange, seen)])
@@ -155,19 +157,16 @@ class SwarmScorer:
             reports=len(view.ages),
             age=float(np.mean(view.ages)) if view.ages else np.nan,
             **vars(view.traffic),
-            origin=np.array([self._origin(b.name) for b in bodies], int),
+            origin=np.array([self._origins.index(b.name.origin) for b in bodies], int),
             number=np.array([b.name.number for b in bodies], int),
             mean=mean,
-            std=np.array([np.sqrt(np.diag(b.state.covariance)) for b in bodies]).reshape(-1, 6),
+            std=np.sqrt(covariance.diagonal(axis1=1, axis2=2)),
             members=np.array([len(b.members) for b in bodies], int),
             terminal=np.array(
                 [-1 if b.terminal is None else names.index(b.terminal) for b in bodies], int
             ),
             uav=follows,
         )
-
-    def _origin(self, name: Name) -> int:
-        return [str(link) for link in self._timetable.labels].index(name.origin)
 
 
 def _paired(distance: np.ndarray) -> list[tuple[int, int]]:

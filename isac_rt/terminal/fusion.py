@@ -515,10 +515,11 @@ def _distances(
     work = np.empty((SIZE + 1, SIZE))
     for i in range(len(a)):
         for j in range(len(b)):
-            y, S = a[i] - b[j], of_a[i] + of_b[j]
-            if np.sum(y * y) > most * np.trace(S):  # no variance is larger than the trace
+            y = a[i] - b[j]
+            trace = np.trace(of_a[i]) + np.trace(of_b[j])
+            if np.sum(y * y) > most * trace:  # no variance is larger
                 continue
-            here = distance(y, S, work)
+            here = distance(y, of_a[i] + of_b[j], work)
             if here[0] <= most:
                 d2[i, j], log_det[i, j] = here
     return d2, log_det

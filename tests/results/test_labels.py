@@ -192,14 +192,15 @@ def test_response_is_that_of_the_window():
     d = np.concatenate([np.linspace(0, 9, 181), [0.31, 1.0, 1.5]])
     truth = np.array([abs(window @ np.exp(2j * np.pi * x * n / size)) ** 2 for x in d])
     truth /= window.sum() ** 2
-    assert hann_response(d) == pytest.approx(truth, abs=1e-6)
-    assert (reach(d) >= truth - 1e-6).all()
-    assert reach(np.array([0.7, 1.0])).tolist() == [1.0, 1.0]
-    assert reach(np.array([1.5]))[0] == pytest.approx(truth[-1], abs=1e-6)
+    responses, reached = np.vectorize(hann_response)(d), np.vectorize(reach)(d)
+    assert responses == pytest.approx(truth, abs=1e-6)
+    assert (reached >= truth - 1e-6).all()
+    assert reach(0.7) == reach(1.0) == 1.0
+    assert reach(1.5) == pytest.approx(truth[-1], abs=1e-6)
     for lobe in (3, 4, 7):
         inside = (d > lobe) & (d < lobe + 1)
         # the amplitude falls within a lobe, so that its peak lies under the bound of its middle
-        assert reach(np.array([lobe + 0.5]))[0] == pytest.approx(truth[inside].max(), rel=0.1)
+        assert reach(lobe + 0.5) == pytest.approx(truth[inside].max(), rel=0.1)
 
 
 def test_whose_path_it_is():
@@ -218,6 +219,10 @@ def test_whose_path_it_is():
     assert owners(at_at.kind, at_at.target, at_at, names).tolist() == [4, -1, -1, 1]
 
 
+def rows_of(places, rows):
+    return places._replace(range=places.range[rows], velocity=places.velocity[rows])
+
+
 def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explanation:
     """`explain` detection by detection, with arrays."""
     places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
@@ -227,8 +232,9 @@ def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explana
     ranges = places.range[field_rows]
     beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
     count = len(detections)
-    apart = places.select(others).apart(detections.range[:, None], detections.velocity[:, None])
-    shares = reach(apart[0]) * np.minimum(reach(apart[1]) + UNION_FLOOR, 1.0)
+    apart = rows_of(places, others).apart(detections.range[:, None], detections.velocity[:, None])
+    along, across = (np.vectorize(reach)(d) for d in apart)
+    shares = along * np.minimum(across + UNION_FLOOR, 1.0)
     close = (apart[0] <= 1) & (apart[1] <= 1)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
@@ -240,7 +246,7 @@ def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explana
         around = np.sort(field_rows[first:last])
         some = np.sort(np.concatenate([others, around]))
         field, own = diffuse[some], power[some]
-        rows, bins = places.select(around).apart(at, detections.velocity[q])
+        rows, bins = rows_of(places, around).apart(at, detections.velocity[q])
         near = np.zeros(some.size, bool)
         near[field], near[~field] = (rows <= 1) & (bins <= 1), close[q]
         here = np.where(field, 0.0, own)
