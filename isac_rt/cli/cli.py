@@ -35,6 +35,10 @@ LINEAR_ALGEBRA = "OPENBLAS_NUM_THREADS", "1"
 """Frames work in threads of their own. Those of numpy's library have nothing to do, but look for
 work at first, both of the two copies that come with numpy and scipy: 0.2 s, more on a busy machine;
 they are begun when numpy is loaded, after this is set."""
+SWITCH_S = 2e-4
+"""Time after which a thread that waits for the interpreter is given it. With Python's 5 ms a thread
+that comes out of a kernel waits that long for one that has small things to do, and its core with
+it."""
 COMMANDS: dict[Callable[..., None], str] = {
     simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
     simulation.demo: "demo --out first_look",
@@ -118,6 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str]) -> int:
     gc.set_threshold(COLLECT)
+    sys.setswitchinterval(SWITCH_S)
     os.environ.setdefault(*LINEAR_ALGEBRA)
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
     try:
