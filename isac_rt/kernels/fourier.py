@@ -95,26 +95,25 @@ def _three(table, at, step, twiddles, t):
 
 
 @jit(inline=True)
-def _four(table, at, step, twiddles, t):
-    ar, ai = load(table, at), load(table, at + 16)
-    br, bi = load(table, at + step), load(table, at + step + 16)
-    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
-    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
-    pr, pi, mr, mi = ar + cr, ai + ci, ar - cr, ai - ci
-    qr, qi, nr, ni = br + dr, bi + di, br - dr, bi - di
-    store(table, at, pr + qr)
-    store(table, at + 16, pi + qi)
-    _put(table, at + step, mr - ni, mi + nr, twiddles, t)
-    _put(table, at + 2 * step, pr - qr, pi - qi, twiddles, t + 2)
-    _put(table, at + 3 * step, mr + ni, mi - nr, twiddles, t + 4)
-
-
-@jit(inline=True)
 def _quarters(ar, ai, br, bi, cr, ci, dr, di):
     """Outputs 0, 2, 1 and 3 of a transform of four rows."""
     pr, pi, mr, mi = ar + cr, ai + ci, ar - cr, ai - ci
     qr, qi, nr, ni = br + dr, bi + di, br - dr, bi - di
     return pr + qr, pi + qi, pr - qr, pi - qi, mr - ni, mi + nr, mr + ni, mi - nr
+
+
+@jit(inline=True)
+def _four(table, at, step, twiddles, t):
+    ar, ai = load(table, at), load(table, at + 16)
+    br, bi = load(table, at + step), load(table, at + step + 16)
+    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
+    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
+    ar, ai, cr, ci, br, bi, dr, di = _quarters(ar, ai, br, bi, cr, ci, dr, di)
+    store(table, at, ar)
+    store(table, at + 16, ai)
+    _put(table, at + step, br, bi, twiddles, t)
+    _put(table, at + 2 * step, cr, ci, twiddles, t + 2)
+    _put(table, at + 3 * step, dr, di, twiddles, t + 4)
 
 
 @jit(inline=True)

@@ -490,6 +490,15 @@ def _add(grids, to, re, im):
     store(grids, to + 16, load(grids, to + 16) + im)
 
 
+@jit(inline=True)
+def _add_four(grids, to, ar, ai, br, bi, cr, ci, dr, di):
+    """`_add` to this row and the three after it."""
+    _add(grids, to, ar, ai)
+    _add(grids, to + ROW, br, bi)
+    _add(grids, to + 2 * ROW, cr, ci)
+    _add(grids, to + 3 * ROW, dr, di)
+
+
 @jit(fast=True)
 def _spread(grids, desk, count, c, sheet):
     """Spread the sums of `count` lines in chirp c. Lines of one grid step are added together in
@@ -504,13 +513,11 @@ def _spread(grids, desk, count, c, sheet):
         steps = place // LINES - last
         if steps > 0:
             to = base + row * ROW
-            _add(grids, to, ar, ai)
             if steps == 1:
+                _add(grids, to, ar, ai)
                 ar, ai, br, bi, cr, ci, dr, di = br, bi, cr, ci, dr, di, zero, zero
             else:
-                _add(grids, to + ROW, br, bi)
-                _add(grids, to + 2 * ROW, cr, ci)
-                _add(grids, to + 3 * ROW, dr, di)
+                _add_four(grids, to, ar, ai, br, bi, cr, ci, dr, di)
                 ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
             last += steps
             row = last % size
@@ -523,11 +530,7 @@ def _spread(grids, desk, count, c, sheet):
         ar, ai, br, bi = ar + u * sr, ai + u * si, br + v * sr, bi + v * si
         cr, ci, dr, di = cr + p * sr, ci + p * si, dr + q * sr, di + q * si
         at += _ACROSS * _SUM
-    to = base + row * ROW
-    _add(grids, to, ar, ai)
-    _add(grids, to + ROW, br, bi)
-    _add(grids, to + 2 * ROW, cr, ci)
-    _add(grids, to + 3 * ROW, dr, di)
+    _add_four(grids, base + row * ROW, ar, ai, br, bi, cr, ci, dr, di)
 
 
 @jit(fast=True)

@@ -82,16 +82,15 @@ class Setting:
     wideband : delays of the receive elements applied to the whole chirp (to second order), not to
         its middle alone
     cubic : the third order in x too, of a wideband setting
-    faint : grid points per line between which paths that noise covers are shared, `TAPS` of
-        `isac_rt.signal.covered`, to which the division by the kernel's response is fitted then. 0:
-        no path is treated so
+    faint : paths that noise covers are shared between lines (`isac_rt.signal.covered`), to whose
+        `TAPS` grid points the division by the kernel's response is fitted then
     """
 
     oversampling: float
     width: int
     wideband: bool
     cubic: bool = False
-    faint: int = 0
+    faint: bool = False
 
 
 DEFAULT = Setting(1.5, 6, True)
@@ -105,7 +104,7 @@ ACCURATE = Setting(1.5, 8, True, True)
 """Error below `ACCURATE_ERROR` of the full model up to 15 m/s and |u| = 0.87; grows with the square
 of the speed."""
 ACCURATE_ERROR = 5e-6
-COVERING = Setting(1.5, 12, True, faint=TAPS)
+COVERING = Setting(1.5, 12, True, faint=True)
 """Error below `GRIDDED_ERROR`; of paths that noise covers below
 `isac_rt.signal.covered.covered_error`."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
@@ -812,7 +811,8 @@ def _synthesise(
     if path.size == 0 and band.turn.size == 0:
         return False
     num_samples = len(band.window) or w.num_samples
-    kernel = weights(num_samples, setting.oversampling, setting.width, setting.faint)
+    taps = TAPS if setting.faint else 0
+    kernel = weights(num_samples, setting.oversampling, setting.width, taps)
     b = _blocks(w, t, path[~apart], offset[~apart])
     weak, order = (path[apart], offset[apart]), plain_batches(views.share.size, 1)
     if b.path.size > _MANY:
@@ -836,7 +836,7 @@ def _synthesise(
         kernel.grid,
         line_turn(kernel.grid, g.half) ** 2 * g.centre / 2,
         stride,
-        (setting.width - setting.faint) // 2 * ROW,
+        (setting.width - taps) // 2 * ROW,
         kernel.faint.ravel(),
     )
     grids = aligned(int(order.parts[:, 1].max()) * stride)

@@ -137,7 +137,7 @@ class Report:
 
 
 def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> list[Report]:
-    """Reports at one time [s]: `Told.after` of each, with its `whole`."""
+    """Reports at one time [s]: `Told.after` of each."""
     some = list(reports)
     if not some:
         return []
@@ -146,34 +146,28 @@ def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> 
     moved = [_coasting(t, acceleration_std) if t else still for t in intervals]
     each = [(*r.state, r.lever, *of) for r, of in zip(some, moved, strict=True)]
     means, covariances, levers, *model = (np.array(of) for of in zip(*each, strict=True))
-    wholes = _carried(means, covariances, levers, np.array(intervals), *model)
-    out = []
-    for r, *state, lever, whole in zip(some, means, covariances, levers, wholes, strict=True):
-        report = Report(r.key, r.since, r.name, time, Gaussian(*state), lever)
-        vars(report)["whole"] = Gaussian(state[0], whole)
-        out.append(report)
-    return out
+    _bring_on(means, covariances, levers, np.array(intervals), *model)
+    return [
+        Report(r.key, r.since, r.name, time, Gaussian(*state), lever)
+        for r, *state, lever in zip(some, means, covariances, levers, strict=True)
+    ]
 
 
 @jit
-def _carried(
+def _bring_on(
     means: np.ndarray,
     covariances: np.ndarray,
     levers: np.ndarray,
     intervals: np.ndarray,
     F: np.ndarray,
     Q: np.ndarray,
-) -> np.ndarray:
-    """Bring R reports on by intervals [s] of the models F and Q (R, 6, 6), in place; their
-    covariances with the errors of who tells."""
-    wholes = np.empty_like(covariances)
+) -> None:
+    """Bring R reports on by intervals [s] of the models F and Q (R, 6, 6), in place."""
     for k in range(len(means)):
         levers[k, :3] += intervals[k] * levers[k, 3:]
         if intervals[k]:
             means[k] = F[k] @ means[k]
             covariances[k] = F[k] @ covariances[k] @ F[k].T + Q[k]
-        wholes[k] = covariances[k] + levers[k] @ levers[k].T
-    return wholes
 
 
 @dataclass(frozen=True)
