@@ -71,23 +71,36 @@ def digest(module: str) -> str:
     """Of the source of all that a module's machine code depends on; it and what it calls."""
     root = Path(__file__).parents[1]
     chosen = [root.joinpath(*module.split(".")[1:]).with_suffix(".py")]
-    sources: dict[Path, bytes] = {}
     for path in chosen:  # grows while it is read
-        sources[path] = path.read_bytes()
-        if not _COMPILES.search(sources[path]) and path != chosen[0]:
-            continue  # only its constants count
-        for name, imported in _IMPORT.findall(sources[path]):
-            source = root.joinpath(*name.decode().split("."))
-            inside = [source / f"{word.decode()}.py" for word in _WORD.findall(imported)]
-            for file in (source.with_suffix(".py"), *inside):
-                if file in chosen or not file.exists():
-                    continue
-                if _CONSTANT.search(imported) or _COMPILES.search(file.read_bytes()):
-                    chosen.append(file)
+        if _compiles(path) or path == chosen[0]:  # of others only constants count
+            chosen += [file for file in _needed(path) if file not in chosen]
     found = hashlib.sha256()
-    for path in sorted(sources):
-        found.update(f"{path.relative_to(root)}:{len(sources[path])}:".encode() + sources[path])
+    for path in sorted(chosen):
+        source = _source(path)
+        found.update(f"{path.relative_to(root)}:{len(source)}:".encode() + source)
     return found.hexdigest()[:16]
+
+
+_source = cache(Path.read_bytes)
+
+
+@cache
+def _compiles(path: Path) -> bool:
+    """Whether a file has compiled functions."""
+    return _COMPILES.search(_source(path)) is not None
+
+
+@cache
+def _needed(path: Path) -> list[Path]:
+    """The files of this package from which a file imports constants or compiled functions."""
+    root, found = Path(__file__).parents[1], dict[Path, None]()
+    for name, imported in _IMPORT.findall(_source(path)):
+        source = root.joinpath(*name.decode().split("."))
+        inside = [source / f"{word.decode()}.py" for word in _WORD.findall(imported)]
+        some = [file for file in (source.with_suffix(".py"), *inside) if file.exists()]
+        constants = _CONSTANT.search(imported) is not None
+        found |= dict.fromkeys(file for file in some if constants or _compiles(file))
+    return list(found)
 
 
 @lru_cache

@@ -724,7 +724,7 @@ def test_what_a_triangle_hides_from_all_places_each_ray_meets():
     middle = points + rng.uniform(-0.1, 1.1, (900, 1)) * (places[6] - points)
     corners = (middle[:, None] + size * rng.normal(0, 1, (900, 3, 3))).astype(np.float32)
     triangles.corners = corners
-    hidden = rays._hides(triangles.sides, np.arange(900), places, points, normals)
+    hidden = rays._hides(triangles.sides, np.arange(900), rays._box(places), places, points)
     a, b, c = np.moveaxis(corners.astype(float), 1, 0)[:, :, None]
     side = np.sign(((places - points[:, None]) * normals[:, None]).sum(2, keepdims=True))
     start = points[:, None] + side * rays.LIFT * normals[:, None]

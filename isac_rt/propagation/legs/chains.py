@@ -24,15 +24,16 @@ import numpy as np
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.rays import LIFT, rays
-from isac_rt.storage import kept
+from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import CityScenes
 from isac_rt.world.swarm import Pose
 
 AROUND = 2
 """Knots on each side of the nearest one whose chains are pooled."""
-TOGETHER = 8
-"""Knots whose chains are sought, and kept for later runs, at once."""
+TOGETHER = AROUND + 1
+"""Knots whose chains are sought, and kept for later runs, at once: the first frame needs no more than
+two such groups."""
 FAR = 1e6
 """Reach of the rays [m]."""
 _TURN, _SHIFT = 0.5698402909980532, 0.7548776662466927
@@ -79,6 +80,7 @@ class Search:
         self._scenes, self._city = scenes, city
         self._num_rays, self._depth, self._flights = num_rays, depth, flights
         self._normals = city.normals
+        self._mesh = ""
         self._kept: dict[tuple[str, int], Chains] = {}
         self._pools: dict[str, tuple[int, Chains]] = {}
         self._share: int | None = None
@@ -121,8 +123,9 @@ class Search:
 
             city = self._city
             mesh = [city.vertices, city.faces, city.plane_of_face]
+            self._mesh = self._mesh or checksum(*pack(mesh))
             search = [places, [*near], self._num_rays, self._depth, mi.variant()]
-            for n, tree in zip(near, kept("chains", [*mesh, *search], found), strict=True):
+            for n, tree in zip(near, kept("chains", [self._mesh, *search], found), strict=True):
                 self._kept[name, n] = Chains(*tree)
         return self._kept[name, number]
 

@@ -41,15 +41,17 @@ class Triangles:
 
     def __init__(self, scene: mi.Scene) -> None:
         self.scene, parts = scene, [np.zeros((0, 3, 3), np.float32)]
-        self._first: dict[int, int] = {}
+        first: dict[int, int] = {0: 0}  # by the number of a shape; 0 is none
         for shape in scene.shapes():
             values = mi.traverse(shape)
             place = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
             number = int(np.asarray(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
-            self._first[number] = sum(map(len, parts))
+            first[number] = sum(map(len, parts))
             parts.append(place[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
         self.corners = np.concatenate(parts)
         """(T, 3, 3) float32"""
+        self._first = np.zeros(max(first) + 1, np.int64)
+        self._first[list(first)] = list(first.values())
 
     @cached_property
     def sides(self) -> np.ndarray:
@@ -69,11 +71,8 @@ class Triangles:
     def rows(self, hit: mi.PreliminaryIntersection3f) -> np.ndarray:
         """(K,) int64 into `corners`, -1 where nothing was hit."""
         shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
-        prim, out = np.asarray(hit.prim_index, np.int64), np.full(shape.size, -1)
-        for number, first in self._first.items():
-            here = shape == number
-            out[here] = first + prim[here]
-        return out
+        prim = np.asarray(hit.prim_index, np.int64)
+        return np.where(shape == 0, -1, self._first[shape] + prim)
 
 
 class Shadows:
@@ -127,7 +126,7 @@ class Shadows:
     def _hidden(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(N,) of which points the triangle that hides them from the middle one of `places` surely
         hides them from all."""
-        out = np.zeros(len(points), bool)
+        out, box = np.zeros(len(points), bool), _box(places)
         for first in range(0, len(points) if len(places) > 1 else 0, CHUNK):
             part = slice(first, first + CHUNK)
             view = np.broadcast_to(places[len(places) // 2], points[part].shape)
@@ -135,7 +134,7 @@ class Shadows:
             hit = self.scene.ray_intersect_preliminary(ray)
             dr.eval(hit)
             row = self.triangles.rows(hit)
-            out[part] = _hides(self.triangles.sides, row, places, points[part], normals[part])
+            out[part] = _hides(self.triangles.sides, row, box, places, points[part])
         return out
 
     def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -184,38 +183,52 @@ def _ray(place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
     return ray
 
 
+def _box(places: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of the box about places (K, 3)."""
+    ends = np.stack([places.min(axis=0), places.max(axis=0)])
+    return np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
+
+
 @jit
-def _hides(sides, row, places, points, normals):
-    """Whether the triangle of each point (N, 3), -1: none, surely hides it from all places: their
-    rays meet it farther than `SURE` inside its sides and from both ends, and not grazing."""
+def _hides(sides, row, box, places, points):
+    """Whether the triangle of each point (N, 3), -1: none, surely hides it from all places: from
+    the corners of the box (8, 3) about them, and so from all within, or else from one by one."""
     out = np.zeros(row.size, np.bool_)
     for k in range(row.size):
-        if row[k] < 0:
-            continue
-        x, y, z = points[k]
-        nx, ny, nz = normals[k]
-        level = x * nx + y * ny + z * nz
-        (ax, ay, az, a), (bx, by, bz, b), (cx, cy, cz, c), (dx, dy, dz, d) = sides[row[k]]
-        hidden = True
-        for n in range(-1, len(places) - 1):  # both ends of a flight first
-            px, py, pz = places[n]
-            height = px * nx + py * ny + pz * nz - level
-            lift = -LIFT if height < 0 else LIFT
-            sx, sy, sz = x + lift * nx, y + lift * ny, z + lift * nz
-            before = sx * ax + sy * ay + sz * az - a
-            after = px * ax + py * ay + pz * az - a
-            share = before / (before - after)
-            mx, my, mz = sx + share * (px - sx), sy + share * (py - sy), sz + share * (pz - sz)
-            length = np.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
-            hidden = (
-                abs(height) > SURE**2
-                and abs(before - after) > GRAZING * length
-                and SURE < share * length < length - LIFT - SURE
-                and mx * bx + my * by + mz * bz > b + SURE
-                and mx * cx + my * cy + mz * cz > c + SURE
-                and mx * dx + my * dy + mz * dz > d + SURE
-            )
-            if not hidden:
-                break
-        out[k] = hidden
+        if row[k] >= 0:
+            side = sides[row[k]]
+            out[k] = _hidden_from(side, points[k], box) or _hidden_from(side, points[k], places)
     return out
+
+
+@jit(inline=True)
+def _hidden_from(side, point, places):
+    """Whether a triangle surely hides a point from all places: their rays do not graze it, and meet
+    it farther than `SURE` inside its sides and from both ends, even if they leave the point
+    `LIFT` aside. All this is linear or convex in the place, so it holds between those where it
+    holds."""
+    x, y, z = point
+    (ax, ay, az, a), (bx, by, bz, b), (cx, cy, cz, c), (dx, dy, dz, d) = side
+    level = x * ax + y * ay + z * az - a
+    across, before = -np.sign(level), abs(level)
+    one, two, three = (
+        x * bx + y * by + z * bz - b,
+        x * cx + y * cy + z * cz - c,
+        x * dx + y * dy + z * dz - d,
+    )
+    hidden = before > SURE
+    for n in range(len(places)):
+        if not hidden:
+            break
+        px, py, pz = places[n]
+        after = across * (px * ax + py * ay + pz * az - a)
+        length = np.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2)
+        least = SURE * (before + after) + LIFT * length
+        hidden = (
+            after > LIFT + SURE
+            and before + after > GRAZING * length
+            and one * after + (px * bx + py * by + pz * bz - b) * before > least
+            and two * after + (px * cx + py * cy + pz * cz - c) * before > least
+            and three * after + (px * dx + py * dy + pz * dz - d) * before > least
+        )
+    return hidden
