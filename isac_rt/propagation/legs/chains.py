@@ -32,8 +32,8 @@ from isac_rt.world.swarm import Pose
 AROUND = 2
 """Knots on each side of the nearest one whose chains are pooled."""
 TOGETHER = AROUND + 1
-"""Knots whose chains are sought, and kept for later runs, at once: the first frame needs no more than
-two such groups."""
+"""Knots whose chains are sought, and kept for later runs, at once: no more than the first frame
+needs."""
 FAR = 1e6
 """Reach of the rays [m]."""
 _TURN, _SHIFT = 0.5698402909980532, 0.7548776662466927
