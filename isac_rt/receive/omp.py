@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -83,13 +84,14 @@ def advise(
     for part, chosen in _sparse_samples(spectra, rows, known):
         vectors, limit = part.reshape(-1, chosen.size), recovery_limit(chosen.size, w.num_chirps)
         found = pursued(vectors, chosen, w.num_chirps, limit)
-        power = (np.abs(part) ** 2).sum(axis=(0, 2))
+        power = (part.real**2 + part.imag**2).sum(axis=(0, 2))
         total += power
         left += power - found.explained.reshape(part.shape[:2]).sum(axis=0)
         if limit != SPARSITY:
             found = pursued(vectors, chosen, w.num_chirps, SPARSITY)
         found.add_power(recovered)
-    power = np.mean(np.abs(spectra[:, :, rows]) ** 2, axis=(0, 1, 3))
+    some = spectra[:, :, rows]
+    power = np.mean(some.real**2 + some.imag**2, axis=(0, 1, 3))
     above = np.maximum(power - noise, 1e-3 * noise)
     size = w.num_chirps // w.num_tx
     # of the noise: each atom takes one dimension
@@ -142,17 +144,23 @@ class Pursued(NamedTuple):
 
 def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> Pursued:
     """What `omp` finds; parameters likewise."""
-    bins = np.arange(num_chirps)
-    atoms = np.exp(2j * np.pi * np.outer(chosen, bins) / num_chirps)
-    # of an atom and the one k bins on; three times, so that no stretch of P ends at the edge
-    gram = np.tile(atoms.sum(axis=0), 3)
-    first = np.asarray(vectors, np.complex64) @ atoms.conj().astype(np.complex64)
+    analysis, gram = _dictionary(tuple(chosen.tolist()), num_chirps)
+    first = np.asarray(vectors, np.complex64) @ analysis
     support = np.empty((len(vectors), sparsity), np.int64)
     amplitude = np.empty((len(vectors), sparsity), np.complex128)
-    _pursue(first, gram.real.copy(), gram.imag.copy(), support, amplitude)
+    _pursue(first, *gram, support, amplitude)
     matched = np.take_along_axis(first, support, axis=1)
     explained = (matched.conj() * amplitude).real.sum(axis=1)
     return Pursued(support, amplitude * chosen.size, explained)
+
+
+@lru_cache(maxsize=32)
+def _dictionary(chosen: tuple[int, ...], num_chirps: int) -> tuple[np.ndarray, np.ndarray]:
+    """The atoms' conjugates (S, P) complex64, and real and imaginary part of the products of an
+    atom and the one k bins on (2, 3 P): three times, so that no stretch of P ends at the edge."""
+    atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
+    gram = np.tile(atoms.sum(axis=0), 3)
+    return atoms.conj().astype(np.complex64), np.stack([gram.real, gram.imag])
 
 
 @jit

@@ -19,7 +19,17 @@ import scipy.fft
 from isac_rt.kernels import fourier as lanefft
 from isac_rt.kernels.fourier import ROW
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, aligned, load, store, stream, transpose, zip_high, zip_low
+from isac_rt.kernels.vector import (
+    LANES,
+    aligned,
+    load,
+    splat,
+    store,
+    stream,
+    transpose,
+    zip_high,
+    zip_low,
+)
 
 
 def transform(
@@ -30,6 +40,7 @@ def transform(
     *,
     turn: np.ndarray | None = None,
     power: np.ndarray | None = None,
+    tapered: np.ndarray | None = None,
 ) -> None:
     """Cells of the range spectra of one group (module docstring).
 
@@ -42,6 +53,8 @@ def transform(
         (`isac_rt.kernels.vector.new_memory`)
     turn : (rows, P) complex64, g; None: 1
     power : (P, N) float32, to which sum_r |spectrum|^2 is added over all cells, without g
+    tapered : likewise of the samples under Hann's window, which takes half of a cell less a quarter
+        of both neighbours
     """
     size = samples.shape[-1]
     try:
@@ -49,17 +62,18 @@ def transform(
     except ValueError:
         size = 0
     if size == 0 or size % 8:
-        transform_plain(samples, factor, cells, out, turn=turn, power=power)
+        transform_plain(samples, factor, cells, out, turn=turn, power=power, tapered=tapered)
         return
     place = order[-np.arange(size) % size] * ROW  # the lane transform turns the other way
     turns = np.zeros((0, 1), np.complex64) if turn is None else turn
-    wanted = np.zeros((0, size), np.float32) if power is None else power
-    sizes = size, size, len(turns), len(wanted) and size // 2
+    none = np.zeros((0, size), np.float32)
+    powers = none if power is None else power, none if tapered is None else tapered
+    sizes = size, size, len(turns), *(len(wanted) and size // 2 for wanted in powers)
     _transform(
         _floats(samples),
         _floats(factor),
         _floats(turns),
-        wanted,
+        powers,
         out.view(np.float32),
         radices,
         twiddles,
@@ -70,12 +84,13 @@ def transform(
 
 
 class _Tables(NamedTuple):
-    """Work space: sixteen chirps, their factors h, their factors g, and their power."""
+    """Work space: sixteen chirps, their factors h, their factors g, and their powers."""
 
     table: np.ndarray
     factors: np.ndarray
     turns: np.ndarray
     added: np.ndarray
+    tapered: np.ndarray
 
 
 def _floats(values: np.ndarray) -> np.ndarray:
@@ -91,54 +106,59 @@ def transform_plain(
     *,
     turn: np.ndarray | None = None,
     power: np.ndarray | None = None,
+    tapered: np.ndarray | None = None,
 ) -> None:
     """`transform` with `scipy.fft`, for any N."""
     for r, one in enumerate(samples):
         spectrum = scipy.fft.fft(one * factor, axis=1, workers=1, overwrite_x=True)
         if power is not None:
             power += spectrum.real**2 + spectrum.imag**2
+        if tapered is not None:
+            beside = np.roll(spectrum, 1, axis=1) + np.roll(spectrum, -1, axis=1)
+            tapered += np.abs(spectrum / 2 - beside / 4) ** 2
         out[r] = spectrum[:, np.asarray(cells) % samples.shape[-1]].T
         if turn is not None:
             out[r] *= turn
 
 
 @jit
-def _transform(samples, factor, turn, power, out, radices, twiddles, place, at, work):
+def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at, work):
     """`transform`; complex arrays as `_floats`."""
-    table, factors, turns, added = work
+    table, factors, turns, added, tapered = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
     lines = samples.reshape(num_rx * num_chirps, 2 * size)
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
-        _fill(factor, 0, first, count, factors)
+        fill(factor, first, 1, count, factors)
         for i in range(turns.size // ROW):
             for lane in range(count):
                 turns[i * ROW + lane], turns[i * ROW + LANES + lane] = (
                     turn[i, 2 * (first + lane)],
                     turn[i, 2 * (first + lane) + 1],
                 )
-        added[:] = 0.0
+        added[:], tapered[:] = 0.0, 0.0
         for r in range(num_rx):
-            _fill(lines, r * num_chirps, first, count, table)
+            fill(lines, r * num_chirps + first, 1, count, table)
             _multiply(table, factors)
             lanefft.transform(table, 0, size, radices, twiddles)
             if added.size:
                 _add_power(table, place, added)
+            if tapered.size:
+                _add_tapered(table, place, tapered)
             _write(table, at, turns, first, count, out[r])
-        for k in range(power.shape[1] if added.size else 0):
-            for lane in range(count):
-                power[first + lane, k] += added[k * LANES + lane]
+        _unload(added, first, count, powers[0])
+        _unload(tapered, first, count, powers[1])
 
 
 @jit
-def _fill(lines, offset, first, count, table):
-    """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
-    chirps are turned over at a time."""
-    lanes = lines.shape[1]
+def fill(lines, first, step, count, table):
+    """Row n of the table: sample n of so many `lines`, real and imaginary parts in turn, of which
+    every `step` counts from the `first` on; 16 numbers of 16 lines are turned over at a time."""
+    length = lines.shape[1]
     flat = lines.reshape(-1)
-    for n in range(0, lanes, LANES):
+    for n in range(0, length, LANES):
         for lane in range(count):
-            store(table, (n + lane) * LANES, load(flat, (offset + first + lane) * lanes + n))
+            store(table, (n + lane) * LANES, load(flat, (first + lane * step) * length + n))
         for lane in range(count, LANES):
             table[(n + lane) * LANES : (n + lane + 1) * LANES] = 0.0
         transpose(table, n * LANES)
@@ -162,6 +182,28 @@ def _add_power(table, place, added):
     for k in range(place.size):
         a, b = load(table, place[k]), load(table, place[k] + LANES)
         store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
+
+
+@jit
+def _add_tapered(table, place, added):
+    half, quarter, last = splat(np.float32(0.5)), splat(np.float32(0.25)), place[-1]
+    before, before_im = load(table, last), load(table, last + LANES)
+    a, b = load(table, place[0]), load(table, place[0] + LANES)
+    for k in range(place.size):
+        after = place[k + 1] if k + 1 < place.size else place[0]
+        c, d = load(table, after), load(table, after + LANES)
+        re = half * a - quarter * (before + c)
+        im = half * b - quarter * (before_im + d)
+        store(added, k * LANES, load(added, k * LANES) + (re * re + im * im))
+        before, before_im, a, b = a, b, c, d
+
+
+@jit
+def _unload(added, first, count, power):
+    """Add what chirps `first` to `first + count` have to their `power`."""
+    for k in range(added.size // LANES):
+        for lane in range(count):
+            power[first + lane, k] += added[k * LANES + lane]
 
 
 @jit

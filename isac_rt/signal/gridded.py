@@ -36,8 +36,8 @@ from isac_rt.kernels.vector import (
     aligned,
     cos_sin,
     cos_sin_exact,
-    cube_memory,
     floor,
+    lent_memory,
     load,
     narrow,
     splat,
@@ -767,7 +767,7 @@ def range_cells(
     middle = start + length / 2 - w.num_samples // 2
     one = np.ones(start.size)
     shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
-    out = cube_memory((*shape[:2], num_cells, w.num_chirps))
+    out = lent_memory((*shape[:2], num_cells, w.num_chirps))
     cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(
         w.data_phase(delay_symbols)
     )

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.vector import cube_memory
+from isac_rt.kernels.vector import lent_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, Cover, read
 from isac_rt.signal.covered import covered_error, summed_share
@@ -208,7 +208,7 @@ def _cover(waveform: Waveform, tones: Tones) -> Cover:
 
 def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:
     """Samples with some paths made one by one, the others through a grid."""
-    samples = cube_memory(_shape(waveform, tones))
+    samples = lent_memory(_shape(waveform, tones))
     setting, alone, faint = choice
     if not alone.all():
         rest = tones.select(~alone)

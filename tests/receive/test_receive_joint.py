@@ -17,7 +17,7 @@ from isac_rt.receive import Prediction, receive_active, receive_passive
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
-from isac_rt.receive.joint.moments import Moments
+from isac_rt.receive.joint.moments import Moments, _weights
 from isac_rt.receive.joint.neighbours import (
     _beams,
     _earlier_reference,
@@ -655,6 +655,24 @@ def test_moments_are_the_sums_over_the_samples(size: int):
     again = moments.read_by(silent).of(tones, weights)[0, :, 0].reshape(sums.shape)
     assert again == pytest.approx(sums * payload.phases[..., None], rel=1e-9)  # rounding
     assert moments.noise == pytest.approx(2.0, rel=0.1)  # the median of 24 chirps
+
+
+@pytest.mark.parametrize(("receivers", "length"), [(18, 40), (3, 30)])
+def test_the_spectrum_of_any_number_of_receivers(receivers: int, length: int):
+    """Two blocks of sixteen side by side, and a length for which there is only scipy; float64's
+    transform is the truth. Planted bugs: the second block's receivers in the first one's place; the
+    chirps of a receiver not N apart."""
+    rng = np.random.default_rng(length)
+    shape = 2, receivers, 3, length
+    samples_ = (rng.standard_normal((*shape, 2)) @ [1, 1j]).astype(np.complex64)
+    found = Moments(samples_, known(*frame(), FEW)).spectrum
+    size = found.shape[2]
+    padded = np.zeros((*shape[:3], size), complex)
+    padded[..., :length] = samples_ * _weights(length, size)
+    truth = np.fft.fft(np.roll(padded, -(length // 2), axis=3), axis=3).transpose(0, 2, 3, 1)
+    # complex64: a few units of the last place of the largest
+    assert np.abs(found[..., :receivers] - truth).max() < 5e-7 * np.abs(truth).max()
+    assert not found[..., receivers:].any() and found.shape[3] % 16 == 0
 
 
 def drawn(rng: np.random.Generator, count: int, cells: float, bins: float) -> np.ndarray:

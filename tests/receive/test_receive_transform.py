@@ -30,24 +30,32 @@ def test_transform_is_the_sum(size: int, chirps: int, plain: bool):
     """Blocks of sixteen chirps that are full and not; sizes with a factor 5, 3, 7 (scipy's) and one
     that is no multiple of 8.
 
-    Planted bug: the cells of the lane transform read at k instead of -k, which turns the other way.
+    Planted bugs: the cells of the lane transform read at k instead of -k, which turns the other
+    way; under Hann's window the first cell's neighbour is the one before the last.
     """
     rng = np.random.default_rng(size)
     samples, factor = drawn(rng, 2, chirps, size), drawn(rng, chirps, size)
     cells = np.array([-3, 0, 5, size // 2 + 1, size - 3])  # the first and the last are one
-    turn, power, out = (
+    turn, power, tapered, out = (
         drawn(rng, cells.size, chirps),
         np.full((chirps, size), 0.37, np.float32),
+        np.full((chirps, size), 0.21, np.float32),
         np.empty((2, 5, chirps), np.complex64),
     )
-    (transform_plain if plain else transform)(samples, factor, cells, out, turn=turn, power=power)
+    method = transform_plain if plain else transform
+    method(samples, factor, cells, out, turn=turn, power=power, tapered=tapered)
     wave = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
     every = np.einsum("kn,rpn->rpk", wave, samples.astype(complex) * factor)
     expected = every[:, :, cells % size].transpose(0, 2, 1) * turn
     assert np.linalg.norm(out - expected) < ROUNDING * np.linalg.norm(expected)
     added = (np.abs(every) ** 2).sum(axis=0)
     assert np.linalg.norm(power - 0.37 - added) < ROUNDING * np.linalg.norm(added)
+    window = (1 - np.cos(2 * np.pi * np.arange(size) / size)) / 2
+    every = np.einsum("kn,rpn->rpk", wave, window * samples.astype(complex) * factor)
+    added = (np.abs(every) ** 2).sum(axis=0)
+    assert np.linalg.norm(tapered - 0.21 - added) < ROUNDING * np.linalg.norm(added)
     transform(samples, factor, cells, out)
+    every = np.einsum("kn,rpn->rpk", wave, samples.astype(complex) * factor)
     expected = every[:, :, cells % size].transpose(0, 2, 1)
     assert np.linalg.norm(out - expected) < ROUNDING * np.linalg.norm(expected)
 

@@ -16,7 +16,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
-from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, cube_memory, load, store
+from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, lent_memory, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.covered import LINES, TOGETHER, batches, covered_error
 from isac_rt.signal.direct import add_direct
@@ -93,14 +93,14 @@ def test_cosine_and_sine_for_the_direct_method():
 def test_memory_is_lent_again_only_when_nothing_refers_to_it():
     """Planted bug: memory kept for the next when the first array goes, whatever views are left."""
     shape = (2, 3, 5, 7)
-    first = cube_memory(shape)
+    first = lent_memory(shape)
     where, view = first.ctypes.data, first[1]
     del first
-    second = cube_memory(shape)
+    second = lent_memory(shape)
     assert second.ctypes.data != where
     del view
-    assert cube_memory(shape).ctypes.data == where
-    assert cube_memory((2, 3, 5, 8)).shape == (2, 3, 5, 8)
+    assert lent_memory(shape).ctypes.data == where
+    assert lent_memory((2, 3, 5, 8)).shape == (2, 3, 5, 8)
 
 
 def scene(count, rng, speed=15.0, view=60.0, **change):

@@ -21,7 +21,6 @@ import numpy as np
 from scipy import special
 
 from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import hann
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.order import medians
 from isac_rt.receive.transform import transform
@@ -134,9 +133,8 @@ def chirp_runs(samples: np.ndarray, turn: np.ndarray, least: int) -> np.ndarray:
     -------
     inside : (P, N) bool
     """
-    num_rx, num_chirps, num_samples = samples.shape
-    window = (turn * hann(np.arange(num_samples), num_samples)).astype(np.complex64)
+    num_rx, num_chirps = samples.shape[:2]
     power = np.zeros(samples.shape[1:], np.float32)
     none = np.zeros(0, int), np.empty((num_rx, 0, num_chirps), np.complex64)
-    transform(samples, window, *none, power=power)
+    transform(samples, turn, *none, tapered=power)
     return runs(power / num_rx, num_rx, least)

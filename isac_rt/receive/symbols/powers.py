@@ -20,7 +20,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
-from isac_rt.receive.clutter.filter import chirp_runs
+from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Detections, Prediction
@@ -118,10 +118,11 @@ def demodulate(
     spectra = new_memory((picked.shape[1], cells.size, shape[1]))
     for m in range(shape[0]):
         turn = tones(-beats[m] / w.num_samples, w.num_samples)
-        power = np.zeros(turn.shape, np.float32)
-        transform(cube.samples[m], turn, cells, spectra, power=power)
+        power, tapered = np.zeros((2, *turn.shape), np.float32)
+        wanted = None if run_cells is None else tapered
+        transform(cube.samples[m], turn, cells, spectra, power=power, tapered=wanted)
         if run_cells is not None:
-            power[chirp_runs(cube.samples[m], turn, run_cells)] = 0
+            power[runs(tapered / len(spectra), len(spectra), run_cells)] = 0
         raw[m], sure[m] = (decision or decide)(power, [(g, o[m]) for g, o in others], w)
         picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
