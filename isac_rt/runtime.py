@@ -12,8 +12,10 @@ the standard library.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import functools
+import gc
 import importlib.metadata
 import os
 import re
@@ -42,6 +44,22 @@ _INSTALL_LLVM = (
     "install LLVM 19 (Debian 12 and later, Ubuntu 24.04 and later: apt install libllvm19)"
 )
 
+COLLECT = 20_000
+"""Objects made until garbage is looked for among them: what commands import stays, and looking
+through it after each 700 takes over a second. Older ones are looked through as often as ever: what
+runs leave, figures above all, would pile up in a command of many runs."""
+LINEAR_ALGEBRA = "OPENBLAS_NUM_THREADS", "1"
+"""Frames work in threads of their own. Those of numpy's library have nothing to do, but look for
+work at first, both of the two copies that come with numpy and scipy: 0.2 s, more on a busy machine;
+they are begun when numpy is loaded, after this is set."""
+SWITCH_S = 2e-4
+"""Time after which a thread that waits for the interpreter is given it. With Python's 5 ms a thread
+that comes out of a kernel waits that long for one that has small things to do, and its core with
+it."""
+FREED_IS_KEPT = {-8: 1, -3: 1 << 30, -1: (1 << 31) - 1}
+"""M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of glibc's mallopt: memory that one array has
+left is there for the next, in whatever thread, and does not go back to the system, which clears
+pages before it gives them out (2 % of a run's processor time)."""
 _OF_THE_NAME = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
 """Numbers of errors that are of the file which was asked for, and not of the machine."""
 _NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
@@ -51,6 +69,23 @@ _NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
 def shortly(problem: BaseException) -> str:
     """What a library says of a bad file, in one line of at most 300 characters."""
     return " ".join(str(problem).split())[:300]
+
+
+def settle_process() -> None:
+    """Set the interpreter and the C library for the work of a command, before numpy is loaded; for
+    a process of its own."""
+    gc.set_threshold(COLLECT)
+    sys.setswitchinterval(SWITCH_S)
+    os.environ.setdefault(*LINEAR_ALGEBRA)
+    for parameter, value in FREED_IS_KEPT.items():
+        _ask_glibc("mallopt", parameter, value)
+
+
+def _ask_glibc(function: str, *arguments: int) -> None:
+    """Call a function of glibc; nothing with another C library."""
+    found = getattr(ctypes.CDLL(None), function, None)
+    if found is not None:
+        found(*arguments)
 
 
 class UserError(Exception):
@@ -410,6 +445,7 @@ def _number_in(path: str) -> float | None:
 def available_memory() -> float | None:
     """Memory that this process may still take: the machine's or its control group's, whichever is
     less. [bytes]"""
+    _ask_glibc("malloc_trim", 0)  # what was kept for the next array goes back
     try:
         match = re.search(
             r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE

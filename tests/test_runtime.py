@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -188,3 +189,34 @@ def test_rays_are_traced_in_one_thread_for_a_while(ends):
         assert drjit.thread_count() == 3
     finally:
         drjit.set_thread_count(before)
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="is not glibc")
+def test_memory_that_an_array_has_left_is_there_for_the_next():
+    """Of 64 MB that a thread frees nothing goes back until it is asked how much there is. Planted
+    bugs: nothing is said to glibc; nothing is given back."""
+    code = """
+import resource, threading
+from pathlib import Path
+from isac_rt.runtime import available_memory, settle_process
+settle_process()
+import numpy as np
+
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+def work():
+    array = np.ones(8 << 20)
+    before = resident()
+    del array
+    print(before - resident())
+    available_memory()
+    print(before - resident())
+
+worker = threading.Thread(target=work)
+worker.start()
+worker.join()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    kept, gone = map(int, done.stdout.split())
+    assert abs(kept) < 8e6 < 56e6 < gone, done.stderr

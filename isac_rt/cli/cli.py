@@ -8,7 +8,6 @@ else.
 from __future__ import annotations
 
 import atexit
-import gc
 import os
 import sys
 import traceback
@@ -24,21 +23,9 @@ import isac_rt
 from isac_rt.cli import captures, setting_up, simulation, studies, sweeps
 from isac_rt.cli.console import err
 from isac_rt.cli.interruption import Terminated, say_interrupted
-from isac_rt.runtime import UserError, of_machine
+from isac_rt.runtime import UserError, of_machine, settle_process
 
 DEBUG = "ISAC_RT_DEBUG"
-COLLECT = 20_000
-"""Objects made until garbage is looked for among them: what commands import stays, and looking
-through it after each 700 takes over a second. Older ones are looked through as often as ever: what
-runs leave, figures above all, would pile up in a command of many runs."""
-LINEAR_ALGEBRA = "OPENBLAS_NUM_THREADS", "1"
-"""Frames work in threads of their own. Those of numpy's library have nothing to do, but look for
-work at first, both of the two copies that come with numpy and scipy: 0.2 s, more on a busy machine;
-they are begun when numpy is loaded, after this is set."""
-SWITCH_S = 2e-4
-"""Time after which a thread that waits for the interpreter is given it. With Python's 5 ms a thread
-that comes out of a kernel waits that long for one that has small things to do, and its core with
-it."""
 COMMANDS: dict[Callable[..., None], str] = {
     simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
     simulation.demo: "demo --out first_look",
@@ -121,9 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    gc.set_threshold(COLLECT)
-    sys.setswitchinterval(SWITCH_S)
-    os.environ.setdefault(*LINEAR_ALGEBRA)
+    settle_process()
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
     try:
         status = app(

@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from isac_rt.runtime import settle_process
 from isac_rt.studies import scene_file
 
 _LOG = logging.getLogger(__name__)
@@ -109,6 +110,7 @@ class _Parts:
 def run(file: str, changes: list[str], begun: float) -> dict[str, Any]:
     """Do what the command does and say where its time went."""
     parts = _Parts(begun)
+    settle_process()
     import isac_rt as irt
 
     scenario = irt.load(scene_file(file), changes)
