@@ -349,7 +349,8 @@ def run(
     scenario : Scenario
     progress : called with the frames done and the frames in all
     setup : from `prepare`, if it is there already
-    threads : receivers at work at once; None: as many as the machine has cores
+    threads : receivers at work at once; None: one more than the machine has cores, since now and
+        then one waits for the interpreter
     snapshots : frames, spread over those that the active terminals process, of which maps and path
         ledger are kept
     terminal : makes the receiver of a link: any object with `receive`, which is given what
@@ -582,7 +583,7 @@ class _Run:
         with (
             threadpool_limits(limits=1),
             tracing_in_one_thread(),
-            ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1) as pool,
+            ThreadPoolExecutor(max_workers=threads or (os.cpu_count() or 1) + 1) as pool,
         ):
             _LOG.info("tracing and receiving the first frame")
             for number in range(self.restore(resume) if resume else 0, frames):

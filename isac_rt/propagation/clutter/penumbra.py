@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.legs.diffraction import knife_edge
-from isac_rt.propagation.legs.rays import LIFT, Triangles, rays
+from isac_rt.propagation.legs.rays import LIFT, Triangles, computed, rays
 
 HALVINGS = 6
 """Of the flight between two knots; what is left is 8 mm of half a metre."""
@@ -97,7 +97,7 @@ def crossings(
     for _ in range(HALVINGS if index.size else 0):
         middle = (low + high) / 2
         ray = _rays(some, _between(knots, middle))
-        now = ~np.asarray(triangles.scene.ray_test(ray))
+        now = ~computed(triangles.scene.ray_test(ray))
         after = now == gained
         low, high = np.where(after, low, middle), np.where(after, middle, high)
     where = (low + high) / 2

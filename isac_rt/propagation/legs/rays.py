@@ -6,6 +6,7 @@ Import only after `isac_rt.runtime.activate()`.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +29,13 @@ def rays(starts: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> mi.Ra
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*towards))
     ray.maxt = mi.Float(reach.astype(np.float32))  # type: ignore[assignment]  # stub: scalars
     return ray
+
+
+def computed(value: Any) -> np.ndarray:
+    """A variable of the back end as an array. Other threads have the interpreter meanwhile: numpy
+    would wait with it."""
+    dr.eval(value)
+    return np.asarray(value)
 
 
 def _columns(*rows: np.ndarray) -> list[mi.Float64]:
@@ -94,7 +102,7 @@ class Shadows:
             length = np.linalg.norm(span, axis=1)
             span /= np.maximum(length, LIFT)[:, None]
             ray = rays(start, span, np.maximum(length - LIFT, 0.0))
-            out[part] = ~np.asarray(self.scene.ray_test(ray))
+            out[part] = ~computed(self.scene.ray_test(ray))
         return out
 
     @cached_property
@@ -120,7 +128,7 @@ class Shadows:
                 lambda dark, number: dark & (number < count),
                 lambda dark, number: (blocked(number), number + 1),
             )
-            out[part] = ~np.asarray(dark)
+            out[part] = ~computed(dark)
         return out
 
     def _hidden(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -149,7 +157,7 @@ class Shadows:
             at = [dr.gather(mi.Float64, axis, number) for axis in view]
             column = row - number * dr.opaque(mi.UInt32, width)
             here = [dr.gather(mi.Float64, axis, column) for axis in facet]
-            some[:] = ~np.asarray(self._blocked(at, here)).reshape(some.shape)
+            some[:] = ~computed(self._blocked(at, here)).reshape(some.shape)
         return out
 
     def _blocked(self, place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Bool:
@@ -162,7 +170,7 @@ class Shadows:
         span = ends - starts
         length = np.linalg.norm(span, axis=1)
         ray = rays(starts, span / np.maximum(length, 1e-9)[:, None], length)
-        return ~np.asarray(self.scene.ray_test(ray))
+        return ~computed(self.scene.ray_test(ray))
 
 
 def _ray(place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
