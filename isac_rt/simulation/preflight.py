@@ -49,6 +49,11 @@ def memory_needed(
     return PROGRAM_BYTES + at_work + frames * links * RECORD_BYTES
 
 
+def receivers_at_work() -> int:
+    """One more than the machine has cores, since now and then one waits for the interpreter."""
+    return (os.cpu_count() or 1) + 1
+
+
 def check_memory(antennas: Antennas, timetable: Timetable) -> None:
     """Refuse a run that does not fit.
 
@@ -56,8 +61,9 @@ def check_memory(antennas: Antennas, timetable: Timetable) -> None:
     ------
     ScenarioError  With the estimate and what is free.
     """
-    free, links, cores = available_memory(), len(timetable.all_links), os.cpu_count() or 1
-    needed = memory_needed(timetable.waveform, antennas, timetable.frames, links, cores)
+    free, links = available_memory(), len(timetable.all_links)
+    at_work = receivers_at_work()
+    needed = memory_needed(timetable.waveform, antennas, timetable.frames, links, at_work)
     if free is not None and needed > free:
         raise ScenarioError(
             f"the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are "

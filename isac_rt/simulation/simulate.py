@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +31,7 @@ from isac_rt.scenario.receivers import Receivers, ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.cooperation import AHEAD, Cooperation
 from isac_rt.simulation.plan import decisions, extent, mechanisms
+from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
@@ -349,8 +349,7 @@ def run(
     scenario : Scenario
     progress : called with the frames done and the frames in all
     setup : from `prepare`, if it is there already
-    threads : receivers at work at once; None: one more than the machine has cores, since now and
-        then one waits for the interpreter
+    threads : receivers at work at once; None: one more than the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path
         ledger are kept
     terminal : makes the receiver of a link: any object with `receive`, which is given what
@@ -583,7 +582,7 @@ class _Run:
         with (
             threadpool_limits(limits=1),
             tracing_in_one_thread(),
-            ThreadPoolExecutor(max_workers=threads or (os.cpu_count() or 1) + 1) as pool,
+            ThreadPoolExecutor(max_workers=threads or receivers_at_work()) as pool,
         ):
             _LOG.info("tracing and receiving the first frame")
             for number in range(self.restore(resume) if resume else 0, frames):

@@ -134,7 +134,7 @@ class Shadows:
     def _hidden(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(N,) of which points the triangle that hides them from the middle one of `places` surely
         hides them from all."""
-        out, box = np.zeros(len(points), bool), _box(places)
+        out = np.zeros(len(points), bool)
         for first in range(0, len(points) if len(places) > 1 else 0, CHUNK):
             part = slice(first, first + CHUNK)
             view = np.broadcast_to(places[len(places) // 2], points[part].shape)
@@ -142,7 +142,7 @@ class Shadows:
             hit = self.scene.ray_intersect_preliminary(ray)
             dr.eval(hit)
             row = self.triangles.rows(hit)
-            out[part] = _hides(self.triangles.sides, row, box, places, points[part])
+            out[part] = _hides(self.triangles.sides, row, _box(places), places, points[part])
         return out
 
     def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
