@@ -129,7 +129,7 @@ def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at,
     lines = samples.reshape(num_rx * num_chirps, 2 * size)
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
-        fill(factor, first, 1, count, factors)
+        _fill(factor, 0, first, count, factors)
         for i in range(turns.size // ROW):
             for lane in range(count):
                 turns[i * ROW + lane], turns[i * ROW + LANES + lane] = (
@@ -138,7 +138,7 @@ def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at,
                 )
         added[:], tapered[:] = 0.0, 0.0
         for r in range(num_rx):
-            fill(lines, r * num_chirps + first, 1, count, table)
+            _fill(lines, r * num_chirps, first, count, table)
             _multiply(table, factors)
             lanefft.transform(table, 0, size, radices, twiddles)
             if added.size:
@@ -151,14 +151,14 @@ def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at,
 
 
 @jit
-def fill(lines, first, step, count, table):
-    """Row n of the table: sample n of so many `lines`, real and imaginary parts in turn, of which
-    every `step` counts from the `first` on; 16 numbers of 16 lines are turned over at a time."""
-    length = lines.shape[1]
+def _fill(lines, offset, first, count, table):
+    """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
+    chirps are turned over at a time."""
+    lanes = lines.shape[1]
     flat = lines.reshape(-1)
-    for n in range(0, length, LANES):
+    for n in range(0, lanes, LANES):
         for lane in range(count):
-            store(table, (n + lane) * LANES, load(flat, (first + lane * step) * length + n))
+            store(table, (n + lane) * LANES, load(flat, (offset + first + lane) * lanes + n))
         for lane in range(count, LANES):
             table[(n + lane) * LANES : (n + lane + 1) * LANES] = 0.0
         transpose(table, n * LANES)

@@ -659,9 +659,9 @@ def test_moments_are_the_sums_over_the_samples(size: int):
 
 @pytest.mark.parametrize(("receivers", "length"), [(18, 40), (3, 30)])
 def test_the_spectrum_of_any_number_of_receivers(receivers: int, length: int):
-    """Two blocks of sixteen side by side, and a length for which there is only scipy; float64's
-    transform is the truth. Planted bugs: the second block's receivers in the first one's place; the
-    chirps of a receiver not N apart."""
+    """Two blocks of sixteen side by side, and a part of one; lengths that are a multiple of 8 and
+    not; float64's transform is the truth. Planted bugs: counted from the first sample; receivers
+    without weights."""
     rng = np.random.default_rng(length)
     shape = 2, receivers, 3, length
     samples_ = (rng.standard_normal((*shape, 2)) @ [1, 1j]).astype(np.complex64)

@@ -25,23 +25,11 @@ import scipy.fft
 from numpy.polynomial import Chebyshev
 from scipy.special import i0
 
-from isac_rt.kernels import fourier as lanefft
-from isac_rt.kernels.fourier import ROW
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import (
-    LANES,
-    aligned,
-    lent_memory,
-    load,
-    splat,
-    store,
-    stream,
-    zip_high,
-    zip_low,
-)
+from isac_rt.kernels.vector import LANES, lent_memory
 from isac_rt.receive.joint.tones import Tones, Weights
 from isac_rt.receive.known import Known
-from isac_rt.receive.transform import fill
+from isac_rt.receive.transform import transform
 
 OVERSAMPLING, TAPS = 1.5, 8
 """Frequencies per cell, and those that a tone reads: an error of 1e-6 of the largest tone."""
@@ -79,23 +67,18 @@ class Moments:
         """(M, P, G, lanes) transform of the weighted samples, counted from sample N // 2; lanes
         beyond the receivers are zero."""
         num_groups, num_rx, num_chirps, length = self._samples.shape
-        size = scipy.fft.next_fast_len(int(np.ceil(OVERSAMPLING * length)), real=True)
-        weight, lanes = _weights(length, size), num_rx + -num_rx % LANES
-        out = lent_memory((num_groups, num_chirps, size, lanes))
-        if length % 8:
-            return spectrum_plain(self._samples, weight, out)
-        radices, twiddles, order = lanefft.plan(size)
+        # a multiple of 8 and of nothing but 2, 3 and 5, for the reception's own transform
+        size = 8 * scipy.fft.next_fast_len(int(np.ceil(OVERSAMPLING * length / 8)), real=True)
+        lanes = num_rx + -num_rx % LANES
+        factor = np.zeros((lanes, size), np.complex64)
+        factor[:, :length] = _weights(length, size)
         turn = np.exp(2j * np.pi * (np.arange(size) * (length // 2) % size) / size)
-        _fill_spectrum(
-            np.ascontiguousarray(self._samples, np.complex64).view(np.float32),
-            weight,
-            turn.astype(np.complex64),
-            radices,
-            twiddles,
-            order[-np.arange(size) % size] * ROW,  # the lane transform turns the other way
-            aligned(size * ROW),
-            out.view(np.float32),
-        )
+        turns = np.repeat(turn.astype(np.complex64)[:, None], lanes, axis=1)
+        padded = np.zeros((num_chirps, lanes, size), np.complex64)
+        out = lent_memory((num_groups, num_chirps, size, lanes))
+        for group, made in zip(self._samples, out, strict=True):  # receivers in the place of chirps
+            padded[:, :num_rx, :length] = group.swapaxes(0, 1)
+            transform(padded, factor, np.arange(size), made, turn=turns)
         return out
 
     @cached_property
@@ -117,45 +100,6 @@ class Moments:
         turned = weights._replace(factors=factors)
         _interpolate(self.spectrum.view(np.float32), tones, turned, late, _kernel(), out)
         return out
-
-
-def spectrum_plain(samples: np.ndarray, weight: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """`Moments.spectrum` into `out` with `scipy.fft`, for any N."""
-    num_rx, (length, size) = samples.shape[1], (samples.shape[-1], out.shape[2])
-    middle, out[:] = length // 2, 0.0
-    for group, lines in zip(samples, out, strict=True):
-        for p, line in enumerate(lines):
-            part = np.zeros((num_rx, size), np.complex64)
-            part[:, :length] = group[:, p] * weight
-            part = scipy.fft.fft(np.roll(part, -middle, axis=1), axis=1, workers=1)
-            line[:, :num_rx] = part.T
-    return out
-
-
-@jit
-def _fill_spectrum(samples, weight, turn, radices, twiddles, place, table, out):
-    """`Moments.spectrum`, receivers side by side in the `table`; complex arrays as floats."""
-    num_groups, num_rx, num_chirps, _ = samples.shape
-    lines, flat, width = samples.reshape(-1, samples.shape[3]), out.reshape(-1), out.shape[3]
-    size, to = place.size, 0
-    for m in range(num_groups):
-        for p in range(num_chirps):
-            for rx in range(0, num_rx, LANES):
-                first, count = (m * num_rx + rx) * num_chirps + p, min(LANES, num_rx - rx)
-                fill(lines, first, num_chirps, count, table)
-                for n in range(weight.size):
-                    w = splat(weight[n])
-                    store(table, n * ROW, w * load(table, n * ROW))
-                    store(table, n * ROW + LANES, w * load(table, n * ROW + LANES))
-                table[weight.size * ROW :] = 0.0
-                lanefft.transform(table, 0, size, radices, twiddles)
-                for g in range(size):
-                    a, b = load(table, place[g]), load(table, place[g] + LANES)
-                    c, d = splat(turn[g].real), splat(turn[g].imag)
-                    a, b = a * c - b * d, a * d + b * c
-                    stream(flat, to + g * width + 2 * rx, zip_low(a, b))
-                    stream(flat, to + g * width + 2 * rx + LANES, zip_high(a, b))
-            to += size * width
 
 
 @lru_cache(maxsize=8)
