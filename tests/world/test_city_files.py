@@ -686,22 +686,29 @@ def test_a_run_in_a_hostile_city_ends_with_2_and_one_line(source, file, traps, c
 
 
 def test_plain_binary_meshes_are_read_as_trimesh_reads_them(tmp_path):
-    """Corners and faces to the last bit, and what is not plain goes the old way: a face of four
-    corners, bytes at the end, other names, a comment. Planted bugs: faces begin a byte late;
-    the count of corners is not looked at."""
+    """Corners and faces to the last bit, with and without more numbers of a corner, and what is not
+    plain goes the old way: a face of four corners, bytes at the end, other names, a comment.
+    Planted bugs: faces begin a byte late; the count of corners is not looked at; the numbers after
+    z are taken for places."""
     rng = np.random.default_rng(5)
     points = rng.normal(size=(9, 3)).astype("<f4")
     faces = np.zeros(5, [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, rng.integers(0, 9, (5, 3))
     body = points.tobytes() + faces.tobytes()
     plain = ply("9", "5", body)
-    assert meshfiles._plain_triangles(plain) is not None
-    (tmp_path / "m.ply").write_bytes(plain)
-    (piece,) = meshfiles.pieces(tmp_path / "m.ply")
-    found = load_ply(BytesIO(plain))
-    assert np.array_equal(piece.vertices, np.asarray(found["vertices"], float))
-    assert np.array_equal(piece.faces, found["faces"])
-    assert (piece.vertices.dtype, piece.faces.dtype) == (np.float64, np.int64)
+    z = b"property float z\n"
+    textured = ply("9", "5", np.hstack([points, points[:, ::-1]]).tobytes() + faces.tobytes())
+    textured = textured.replace(
+        z, z + b"property float s\nproperty float t\nproperty float Col_0\n"
+    )
+    for one in (plain, textured):
+        assert meshfiles._plain_triangles(one) is not None
+        (tmp_path / "m.ply").write_bytes(one)
+        (piece,) = meshfiles.pieces(tmp_path / "m.ply")
+        found = load_ply(BytesIO(one))  # puts vertices with textures in another order
+        corners = np.asarray(found["vertices"], float)[found["faces"]]
+        assert np.array_equal(piece.vertices[piece.faces], corners)
+        assert (piece.vertices.dtype, piece.faces.dtype) == (np.float64, np.int64)
     quads = np.zeros(5, [("count", "u1"), ("corners", "<i4", 3)])
     quads["count"] = 4
     for other in (
@@ -710,6 +717,9 @@ def test_plain_binary_meshes_are_read_as_trimesh_reads_them(tmp_path):
         ply("9", "5", points.tobytes() + quads.tobytes()),
         ply("9", "0", body),
         plain.replace(b"float z", b"float w"),
+        plain.replace(z, z + b"property float s\n"),
+        textured.replace(b"float s", b"float x"),
+        textured.replace(b"float s", b"int s"),
         plain.replace(b"list uchar int", b"list uchar uint"),
         plain.replace(b"little", b"big"),
         plain.replace(b"element vertex", b"comment a\nelement vertex"),

@@ -28,11 +28,11 @@ _MAX_PROPERTIES = 200
 """Of a PLY file: trimesh takes a time that grows with their square."""
 _PLAIN_PLY = re.compile(
     rb"ply\nformat binary_little_endian 1.0\nelement vertex ([1-9]\d{0,8})\n"
-    rb"property float x\nproperty float y\nproperty float z\nelement face ([1-9]\d{0,8})\n"
-    rb"property list uchar int vertex_ind(?:ices|ex)\nend_header\n"
+    rb"property float x\nproperty float y\nproperty float z\n((?:property float (?![xyz]\n)\w+\n)*)"
+    rb"element face ([1-9]\d{0,8})\nproperty list uchar int vertex_ind(?:ices|ex)\nend_header\n"
 )
-"""The header of a mesh with nothing but places and faces, as of Sionna's thousands of
-buildings."""
+"""The header of a mesh of places, with more numbers of each at most (of textures, colours), and
+faces, as of Sionna's thousands of buildings."""
 _PLAIN_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _NAMED = 20
 """Most names that a message lists."""
@@ -65,16 +65,19 @@ def _used(
 
 
 def _plain_triangles(data: bytes) -> tuple[NDArray, NDArray] | None:
-    """Vertices and faces of a binary PLY file that holds triangles and nothing else; None of any
-    other, however near to it."""
+    """Vertices and faces of a binary PLY file that holds places and triangles; None of any other,
+    however near to it."""
     header = _PLAIN_PLY.match(data)
     if header is None:
         return None
-    points, count = int(header[1]), int(header[2])
-    if len(data) != header.end() + 12 * points + _PLAIN_FACE.itemsize * count:
+    points, count, numbers = int(header[1]), int(header[3]), 3 + header[2].count(b"\n")
+    first = header.end() + 4 * numbers * points
+    if len(data) != first + _PLAIN_FACE.itemsize * count:
         return None
-    vertices = np.frombuffer(data, "<f4", 3 * points, header.end()).reshape(-1, 3)
-    faces = np.frombuffer(data, _PLAIN_FACE, count, header.end() + 12 * points)
+    vertices = np.frombuffer(data, "<f4", numbers * points, header.end()).reshape(-1, numbers)[
+        :, :3
+    ]
+    faces = np.frombuffer(data, _PLAIN_FACE, count, first)
     return (vertices, faces["corners"]) if (faces["count"] == 3).all() else None
 
 
