@@ -25,7 +25,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.propagation.clutter.cells import Density, error_for
-from isac_rt.propagation.clutter.merging import resolution_cell
+from isac_rt.propagation.clutter.merging import apart_db, resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -540,7 +540,7 @@ def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np
         np.bincount(part, power, count)
         for part, power in zip(np.split(number, [len(cells[0])]), powers, strict=True)
     )
-    return float(np.quantile(np.abs(10 * np.log10((1 + b) / (1 + a))), 0.9))
+    return float(np.quantile(apart_db(a, b), 0.9))
 
 
 def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:

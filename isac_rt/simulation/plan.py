@@ -63,7 +63,7 @@ MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
 beyond, `Auto`."""
 
-MOST_SPREAD = 24
+MOST_SPREAD = 12
 """Instants of a run at which its clutter is held against its noise."""
 REACH_MARGIN_M = 1.0
 """What the mesh reaches farther, for accelerations within a frame."""

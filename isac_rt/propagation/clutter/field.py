@@ -44,7 +44,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
-from isac_rt.propagation.clutter.merging import NoiseFloor, allowed_area, merge, resolution_cell
+from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
 from isac_rt.propagation.clutter.penumbra import Facets
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight
 from isac_rt.propagation.legs.bodies import Bodies
@@ -241,31 +241,39 @@ class ClutterField:
         instants of `floor`, local."""
         cells, sight = self.cells, self.sight
         finest = density.finest(cKDTree(places).query(cells.points)[0])
-        error = 10 ** (error_for(density.per_metre) / 10) - 1
+        error = error_for(density.per_metre)
         seen = {
             name: sight.from_places(np.array([pose.position for pose in of]))
             for name, of in poses.items()
         }
-        ever = {name: sight.ever(_kept_places([sight.flights[name]])) for name in poses}
+        ever = {
+            name: sight.ever(_kept_places([sight.flights[name]]), known=np.any(at, axis=0))
+            for name, at in seen.items()
+        }
         merged = {}
         for link, over_noise in floor.over_noise.items():
-            limit = np.full(len(cells), np.inf)
+            both = np.flatnonzero(ever[link.tx] & ever[link.rx])
+            some, heard = cells.select(both), []
             for k in np.flatnonzero(over_noise):
                 state = LinkState(link, floor.times[k], poses[link.tx][k], poses[link.rx][k])
-                share = (seen[link.tx][k] & seen[link.rx][k]).astype(np.float32)
-                ways = self._ways(cells, share, state)
-                power = over_noise[k] * (ways.magnitude * state.elements(floor.antennas, ways)) ** 2
-                delay = ways.length / SPEED_OF_LIGHT
-                cell = resolution_cell(floor.waveform, delay, ways.rate / SPEED_OF_LIGHT)
-                some = (power > 0) & (delay < floor.longest_delay)
-                index = ways.index[some]
-                area = allowed_area(
-                    power[some], cell[some], cells.area[index], finest[index], error
-                )
-                limit[index] = np.minimum(limit[index], area)
-            some = np.flatnonzero(ever[link.tx] & ever[link.rx])
-            merged[str(link)] = vars(merge(cells.select(some), limit[some]))
+                share = (seen[link.tx][k] & seen[link.rx][k])[both].astype(np.float32)
+                heard.append(self._heard(floor, some, share, state, over_noise[k]))
+            merged[str(link)] = vars(covered(some, heard, finest[both], error))
         return merged
+
+    def _heard(
+        self, floor: NoiseFloor, cells: Cells, share: np.ndarray, state: LinkState, level: float
+    ) -> Heard:
+        """What a link hears of cells of which both ends see shares (N,); `level` is the power of a
+        path over the noise, per power gain."""
+        ways = self._ways(cells, share, state)
+        power = level * (ways.magnitude * state.elements(floor.antennas, ways)) ** 2
+        delay = ways.length / SPEED_OF_LIGHT
+        some = (power > 0) & (delay < floor.longest_delay)
+        rate = ways.rate[some] / SPEED_OF_LIGHT
+        return Heard(
+            ways.index[some], power[some], resolution_cell(floor.waveform, delay[some], rate)
+        )
 
     @property
     def nbytes(self) -> int:

@@ -10,9 +10,11 @@ stays what `clutter.max_error_db` allows as long as
 A_0 the area that the surface is cut to. That says how the clutter is spread over cells on average;
 a cell with n scatterers at random errs by the share 1/sqrt(n) of C, so that none may hold more
 than s(1 + C)^2/C of the noise, nor more than q(1 + C), since a faint cell with one scatterer
-instead of many shows all of it or nothing; s and q go with the square of the error allowed. Nor
-does one hold more than a sixth of a cell's clutter where that is over the noise: fewer would fix
-the cell's level by a single draw.
+instead of many shows all of it or nothing; s and q go with the square of the error allowed. They
+are set for a street whose clutter lies about the noise, the worst there is: a link takes up to six
+times of both where nine of ten of its range-Doppler cells keep the error all the same, and nine of
+ten of those whose clutter is over the noise. Nor does one scatterer hold more than a sixth of a
+cell's clutter where that is over the noise: fewer would fix the cell's level by a single draw.
 
 The two halves of a cell merge while their joint area keeps the least of these limits over all
 scatterers that they hold and all instants of the run. What is merged has the coherent sum of the
@@ -24,8 +26,9 @@ link has one such cut for the whole run, so that nothing jumps.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +46,8 @@ ALL_ERR = 4.0
 the same cell."""
 ONE_ERRS = 42.0
 """q over the square of the error: most cells are faint."""
+EASED = (6.0, 3.0, 2.0, 1.0)
+"""Times of s and q that are tried in turn; the last is taken unseen."""
 
 
 @dataclass(frozen=True)
@@ -80,36 +85,97 @@ def resolution_cell(waveform: Waveform, delay: np.ndarray, rate: np.ndarray) -> 
     return beat * w.num_chirps + turns % w.num_chirps
 
 
+class Heard(NamedTuple):
+    """What a link hears of some scatterers at one instant.
+
+    Attributes
+    ----------
+    which : (K,) of those that are heard
+    power : (K,) mean power over the noise of a range-Doppler cell
+    cell : (K,) int from 0 in which each is seen
+    """
+
+    which: np.ndarray
+    power: np.ndarray
+    cell: np.ndarray
+
+
+def covered(cells: Cells, heard: Sequence[Heard], finest: np.ndarray, error_db: float) -> Cells:
+    """What is left of a link's scatterers.
+
+    Parameters
+    ----------
+    heard : at the instants that show how the run changes
+    finest : (N,) area to which the surface is cut at each of the N cells [m^2]
+    error_db : of noise plus clutter that nine of ten range-Doppler cells keep to
+    """
+    for eased in EASED:
+        limit = np.full(len(cells), np.inf)
+        for some in heard:
+            area = allowed_area(some, cells.area, finest, 10 ** (error_db / 10) - 1, eased)
+            limit[some.which] = np.minimum(limit[some.which], area)
+        place, left = merge(cells, limit)
+        times = np.zeros(len(cells))
+        times[place] = left.area / cells.area[place]
+        if eased == EASED[-1] or _within(error_db, times, heard):
+            break
+    return left
+
+
+def _within(error_db: float, times: np.ndarray, heard: Sequence[Heard]) -> bool:
+    """Whether nine of ten range-Doppler cells keep an error, of all and of those whose clutter is
+    over the noise, if scatterers (N,) stand for so many times their power."""
+    errors, loud = [np.zeros(1)], [np.zeros(1)]
+    for which, power, cell in heard:
+        every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
+        held = np.flatnonzero(every)
+        error = apart_db(every[held], left[held])
+        errors.append(error)
+        loud.append(error[every[held] > 1])
+    return all(np.quantile(np.concatenate(some), 0.9) <= error_db for some in (errors, loud))
+
+
+def apart_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """How far noise and clutter together are from each other, of two clutters over the noise
+    [dB]."""
+    return np.abs(10 * np.log10((1 + other) / (1 + one)))
+
+
 def allowed_area(
-    power: np.ndarray, cell: np.ndarray, area: np.ndarray, finest: np.ndarray, error: float
+    heard: Heard, area: np.ndarray, finest: np.ndarray, error: float, eased: float
 ) -> np.ndarray:
     """Largest areas that scatterers may stand for at one instant.
 
     Parameters
     ----------
-    power : (K,) mean power over the noise of a range-Doppler cell
-    cell : (K,) int from 0 in which each is seen
-    area : (K,) that each stands for [m^2]
-    finest : (K,) to which the surface is cut there [m^2]
+    area : (N,) that each stands for [m^2]
+    finest : (N,) to which the surface is cut there [m^2]
     error : of noise plus clutter that is allowed, as a share
+    eased : times that s and q are taken
 
     Returns
     -------
-    area : (K,) [m^2]
+    area : (K,) of those that are heard [m^2]
     """
+    which, power, cell = heard
     clutter = np.bincount(cell, power)[cell]
     over = (1 + clutter) / clutter
-    most = error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)
+    most = eased * error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)
     most = np.where(clutter > 1, np.minimum(most, clutter / FEWEST), most)
-    return np.minimum(finest * over ** (4 / 3), area * most / power)
+    return np.minimum(finest[which] * over ** (4 / 3), area[which] * most / power)
 
 
-def merge(cells: Cells, limit: np.ndarray) -> Cells:
+def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
     """Cells whose halves are merged, again and again, while their area keeps to a limit.
 
     Parameters
     ----------
     limit : (N,) area that what holds each of the N cells may have [m^2]
+
+    Returns
+    -------
+    place : (M,) which of the N cells each that is left stands in the place of
+    cells : M that are left
     """
     halvings = np.frexp(cells.code.astype(float))[1] - 1
     along = cells.code << (62 - halvings).astype(np.uint64)
@@ -120,7 +186,9 @@ def merge(cells: Cells, limit: np.ndarray) -> Cells:
     )
     place, area, amplitude = found
     out = some.select(place)
-    return replace(out, area=area.astype(np.float32), amplitude=amplitude.astype(np.complex64))
+    return order[place], replace(
+        out, area=area.astype(np.float32), amplitude=amplitude.astype(np.complex64)
+    )
 
 
 @jit

@@ -170,9 +170,12 @@ class Sight:
         """(K, N) bool what is seen from places (K, 3), by rays alone."""
         return self.shadows.all_seen(places, self._facets.points, self._facets.normals)
 
-    def ever(self, places: np.ndarray) -> np.ndarray:
-        """(N,) bool what is seen from any of places (K, 3), by rays alone."""
-        return self.shadows.ever_sees(places, self._facets.points, self._facets.normals)
+    def ever(self, places: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """(N,) bool what is seen from any of places (K, 3), by rays alone, or `known` to be."""
+        out, left = known.copy(), np.flatnonzero(~known)
+        points, normals = self._facets.points[left], self._facets.normals[left]
+        out[left] = self.shadows.ever_sees(places, points, normals)
+        return out
 
     def _near(self, name: str, knot: int) -> _Nearby:
         """The crossings that matter about a knot, as one list."""
