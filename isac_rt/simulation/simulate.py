@@ -8,11 +8,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -50,6 +51,7 @@ _LOG = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
+Carried = dict[Link, Future[list[dict[str, Any]]]]
 
 
 MOST_EARLY = 16
@@ -192,10 +194,11 @@ class _Observer:
             if answer.cells:
                 self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
 
-    def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+    def memory(self, carried: dict[str, Any] | None) -> dict[str, Any]:
+        """What is carried over to the next frame as plain numbers and arrays, for `restore`;
+        `carried` is the terminal's part of it where that is at work on a later frame."""
         return {
-            "terminal": self.terminal.memory(),
+            "terminal": self.terminal.memory() if carried is None else carried,
             "scorer": self.scorer.memory(),
             "feedback": self.feedback,
             "seconds": self.seconds,
@@ -313,14 +316,14 @@ class _Listeners:
         """Processor seconds of reception and tracking by link."""
         return {str(link): o.seconds for link, o in self.observers.items()}
 
-    def memory(self, first: int) -> dict[str, Any]:
+    def memory(self, first: int, carried: Mapping[Link, dict[str, Any]]) -> dict[str, Any]:
         """The rows from a frame on, earlier ones that have changed, and what every terminal carries
         over."""
-        recorder = self.recorder
+        recorder, observers = self.recorder, self.observers.items()
         return {
             "rows": [recorder.row(i) for i in range(first, len(recorder))],
             "amended": [[i, recorder.row(i)] for i in sorted(recorder.amended) if i < first],
-            "observers": {str(link): o.memory() for link, o in self.observers.items()},
+            "observers": {str(link): o.memory(carried.get(link)) for link, o in observers},
             "swarm": None if self.swarm is None else self.swarm.memory(),
         }
 
@@ -505,6 +508,15 @@ def _standard(setup: Setup) -> list[_Listeners]:
     ]
 
 
+class _AtWork(NamedTuple):
+    """A frame whose receivers are at work, and if it is to be kept what each carries over right
+    after it; what is not there is what it carries once all are done."""
+
+    frame: Frame
+    jobs: Jobs
+    carried: Carried | None
+
+
 @dataclass
 class _Run:
     """The frames of a run so far, recorded and scored."""
@@ -555,29 +567,31 @@ class _Run:
         """Of the scenario's own receivers."""
         return self.own.recorder
 
+    @property
+    def sets(self) -> list[_Listeners]:
+        """The scenario's own receivers, then those compared."""
+        return [self.own, *self.compared.values()]
+
     def fly(self, progress: Progress | None, threads: int | None, resume: Resume | None) -> None:
         """Frame after frame; while the receivers work the next ones are traced.
 
-        A link's frames are heard one after the other. Where what is sent depends on what was
+        A link's jobs are done one after the other. Where what is sent depends on what was
         received, a frame waits for all receivers of the one before.
         """
         setup, frames = self.setup, self.setup.timetable.frames
         dependent = setup.scenario.access.feedback or setup.scenario.array.fall_back
-        at_work: deque[tuple[Frame, Jobs]] = deque()
-        last: Jobs = {}
+        at_work: deque[_AtWork] = deque()
+        last: dict[Link, Future[Any]] = {}
 
-        def settle(left: int, keep: Resume | None = None) -> None:
-            """Collect all but so many frames at work, keep them, and say so."""
-            if len(at_work) <= left:
-                return
+        def settle(left: int) -> None:
+            """Collect all but so many frames at work, and say so."""
             while len(at_work) > left:
-                self.collect(*at_work.popleft())
-            if keep is not None and keep.append(self.memory()):
-                self.kept = len(self.recorder)
-                for one in (self.own, *self.compared.values()):
-                    one.recorder.amended.clear()
-            if progress:
-                progress(len(self.recorder), frames)
+                one = at_work.popleft()
+                self.collect(one.frame, one.jobs)
+                if resume and one.carried is not None:
+                    self.keep(resume, one.carried)
+                if progress:
+                    progress(len(self.recorder), frames)
 
         with (
             threadpool_limits(limits=1),
@@ -588,18 +602,21 @@ class _Run:
             for number in range(self.restore(resume) if resume else 0, frames):
                 with self.stopwatch.stage("trace"):
                     frame = setup.frame(number)
-                keep = resume if resume and at_work and resume.due() else None
-                settle(0 if keep or dependent else AHEAD - 1, keep)
+                settle(0 if dependent else AHEAD - 1)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
-                sets = (self.own, *self.compared.values())
-                jobs = {
-                    link: pool.submit(
-                        self.hear, frame, link, [s.told(link, number) for s in sets], last.get(link)
-                    )
-                    for link in setup.timetable.links(number)
-                }
+                jobs = {}
+                for link in setup.timetable.links(number):
+                    told = [one.told(link, number) for one in self.sets]
+                    jobs[link] = pool.submit(self.hear, frame, link, told, last.get(link))
                 last |= jobs
-                at_work.append((frame, jobs))
+                carried: Carried | None = None
+                if resume and resume.due() and number + 1 < frames:
+                    links = [] if dependent else setup.timetable.all_links
+                    carried = {
+                        link: pool.submit(self.carried, link, last.get(link)) for link in links
+                    }
+                    last |= carried
+                at_work.append(_AtWork(frame, jobs, carried))
             settle(0)
 
     def hear(
@@ -607,12 +624,13 @@ class _Run:
         frame: Frame,
         link: Link,
         told: Sequence[Sequence[KnownBody]],
-        before: Future[list[Heard]] | None,
+        before: Future[Any] | None,
     ) -> list[Heard]:
         """What a link's receivers make of a frame, those of the scenario first; all are given the
         same samples, and each what it was told.
 
-        The frame `before` is one that the pool began earlier, so that waiting for it ends.
+        What was `before` at this link is a job that the pool began earlier, so that waiting for it
+        ends.
         """
         with self.stopwatch.stage("synthesis"):
             cube = _shared(frame.heard(link))
@@ -623,6 +641,23 @@ class _Run:
             heard = self.own.observers[link].hear(frame, cube, maps, told[0])
             others = zip(self.compared.values(), told[1:], strict=True)
             return [heard, *(s.observers[link].hear(frame, cube, False, k) for s, k in others)]
+
+    def carried(self, link: Link, before: Future[Any] | None) -> list[dict[str, Any]]:
+        """What the terminals of a link, those of the scenario first, carry over from their jobs
+        `before` this one, which the pool began earlier."""
+        if before is not None:
+            before.result()
+        return deepcopy([one.observers[link].terminal.memory() for one in self.sets])
+
+    def keep(self, resume: Resume, carried: Carried) -> None:
+        """Keep the frames collected so far, for a later call of the same run."""
+        by_set = [
+            {link: job.result()[i] for link, job in carried.items()} for i in range(len(self.sets))
+        ]
+        if resume.append(self.memory(by_set)):
+            self.kept = len(self.recorder)
+            for one in self.sets:
+                one.recorder.amended.clear()
 
     def collect(self, frame: Frame, jobs: Jobs) -> None:
         """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
@@ -641,17 +676,19 @@ class _Run:
                 one.record(frame, {link: by_set[i] for link, by_set in results.items()}, False)
             self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
-    def memory(self) -> dict[str, Any]:
+    def memory(self, carried: Sequence[Mapping[Link, dict[str, Any]]]) -> dict[str, Any]:
         """What a later call needs to go on after the frames so far: those since the last entry,
-        and all that receivers carry over.
+        and all that receivers carry over, of each set of them that which is `carried` already.
 
-        Only while no receiver is at work. Paths and samples are functions of the frame alone and
-        are made anew.
+        Paths and samples are functions of the frame alone and are made anew.
         """
+        own, *others = (
+            one.memory(self.kept, by_link) for one, by_link in zip(self.sets, carried, strict=True)
+        )
         return {
             "first": self.kept,
-            **self.own.memory(self.kept),
-            "compared": {name: one.memory(self.kept) for name, one in self.compared.items()},
+            **own,
+            "compared": dict(zip(self.compared, others, strict=True)),
             "advice": self.schedules.memory(),
             "seconds": self.stopwatch.so_far(),
         }

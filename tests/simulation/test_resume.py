@@ -100,6 +100,34 @@ def test_a_stopped_run_goes_on_to_the_same_bits(name, tmp_path):
     assert len(entries) == scenario.frames - 1
 
 
+@pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
+def test_frames_are_kept_while_receivers_are_at_work_on_later_ones(tmp_path, monkeypatch):
+    """Two terminals that hear every frame and one that hears every second; each frame is kept only
+    once the receivers are done with the next. Stopped after a frame of either kind, the run goes on
+    to the same bits. Planted bugs: what a terminal carries after the later frame is kept; that of
+    a terminal which the frame passes over is."""
+    every_second = ["receivers.active_every_frames=2", "modulation.acquisition_frames=2"]
+    scenario = load(SCENES / "paper_swarm_consistent.yaml", every_second, frames=6)
+    assert len(prepare(scenario).timetable.links(1)) < len(prepare(scenario).timetable.all_links)
+    whole = simulate.run(scenario, snapshots=1)
+    collect = simulate._Run.collect
+
+    def late(self, frame, jobs):
+        collect(self, frame, jobs)
+        time.sleep(0.4)
+
+    monkeypatch.setattr(simulate._Run, "collect", late)
+    for stop in (2, 3):
+        resume = Resume(tmp_path / str(stop), run_content(scenario, 1), every=0.0)
+        resume.file.parent.mkdir()
+        with pytest.raises(Stopped):
+            simulate.run(scenario, snapshots=1, resume=resume, progress=stopping_at(stop))
+        assert len(list(resume.entries())) == stop
+        with monkeypatch.context() as quick:
+            quick.setattr(simulate._Run, "collect", collect)
+            assert_equal_results(simulate.run(scenario, snapshots=1, resume=resume), whole)
+
+
 def differences(a, b, at=""):
     """Places at which two objects differ, whatever they are made of."""
     if a is b or callable(a):
@@ -161,7 +189,7 @@ def test_everything_that_is_carried_over_is_taken_up(tmp_path):
             counted(observer.terminal.tracker)
             observer.scorer._labels |= {70: [1, 2], 71: [0]}
             observer.scorer._followed |= {5: 70}
-    assert resume.append(first.memory())
+    assert resume.append(first.memory([{}, {}]))
     assert second.restore(resume) == 4
     first.kept = second.kept
     second.stopwatch = first.stopwatch  # the seconds of two runs differ
