@@ -8,7 +8,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -62,18 +62,12 @@ class _Reader:
     path: Path
     root: ET.Element
     defaults: dict[str, str]
+    beside: dict[str, Path]
+    """Mesh files that were found already, by their names."""
 
     @classmethod
     def of(cls, path: Path) -> _Reader:
-        parser = ET.XMLParser(target=_Tree())
-        try:
-            root = ET.fromstring(read_bytes(path), parser)
-        except (ET.ParseError, LookupError, ValueError) as error:
-            raise CityError(
-                f"{path.name}: not readable as XML ({error}); export it again"
-            ) from None
-        defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
-        return cls(path, root, defaults)
+        return _reader(path, read_bytes(path))
 
     def text(self, element: ET.Element, key: str, otherwise: str | None = None) -> str | None:
         """An attribute with `$name` replaced."""
@@ -196,13 +190,28 @@ def _material(reader: _Reader, city: scenario.City, bsdf: ET.Element) -> Materia
     return MaterialUse(canonical_name(wanted) or wanted, thickness)
 
 
+@lru_cache(maxsize=1)
+def _reader(path: Path, content: bytes) -> _Reader:
+    """Of a file with some content, the same again: its digest is made before it is read."""
+    parser = ET.XMLParser(target=_Tree())
+    try:
+        root = ET.fromstring(content, parser)
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise CityError(f"{path.name}: not readable as XML ({error}); export it again") from None
+    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
+    return _Reader(path, root, defaults, {})
+
+
 def _mesh_path(reader: _Reader, shape: ET.Element) -> Path:
     """The mesh file that a shape names."""
     what = f"shape {shape.get('id')!r}"
     node = shape.find("string[@name='filename']")
     if node is None:
         raise CityError(f"{reader.path.name}: {what} has no filename; give it one")
-    return beside(reader.path, reader.text(node, "value") or "", what)
+    name = reader.text(node, "value") or ""
+    if name not in reader.beside:
+        reader.beside[name] = beside(reader.path, name, what)
+    return reader.beside[name]
 
 
 def mitsuba_files(path: Path) -> list[Path]:
