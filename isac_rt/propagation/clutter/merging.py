@@ -12,9 +12,10 @@ a cell with n scatterers at random errs by the share 1/sqrt(n) of C, so that non
 than s(1 + C)^2/C of the noise, nor more than q(1 + C), since a faint cell with one scatterer
 instead of many shows all of it or nothing; s and q go with the square of the error allowed. They
 are set for a street whose clutter lies about the noise, the worst there is: a link takes up to six
-times of both where nine of ten of its range-Doppler cells keep the error all the same, and nine of
-ten of those whose clutter is over the noise. Nor does one scatterer hold more than a sixth of a
-cell's clutter where that is over the noise: fewer would fix the cell's level by a single draw.
+times of both where nine of ten of its range-Doppler cells keep the error all the same at every
+instant, and nine of ten of those whose clutter is over the noise. Nor does one scatterer hold more
+than a sixth of a cell's clutter where that is over the noise: fewer would fix the cell's level by a
+single draw.
 
 The two halves of a cell merge while their joint area keeps the least of these limits over all
 scatterers that they hold and all instants of the run. What is merged has the coherent sum of the
@@ -123,16 +124,15 @@ def covered(cells: Cells, heard: Sequence[Heard], finest: np.ndarray, error_db: 
 
 
 def _within(error_db: float, times: np.ndarray, heard: Sequence[Heard]) -> bool:
-    """Whether nine of ten range-Doppler cells keep an error, of all and of those whose clutter is
-    over the noise, if scatterers (N,) stand for so many times their power."""
-    errors, loud = [np.zeros(1)], [np.zeros(1)]
+    """Whether nine of ten range-Doppler cells keep an error at every instant, of all and of those
+    whose clutter is over the noise, if scatterers (N,) stand for so many times their power."""
     for which, power, cell in heard:
         every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
         held = np.flatnonzero(every)
-        error = apart_db(every[held], left[held])
-        errors.append(error)
-        loud.append(error[every[held] > 1])
-    return all(np.quantile(np.concatenate(some), 0.9) <= error_db for some in (errors, loud))
+        error, loud = apart_db(every[held], left[held]), every[held] > 1
+        if any(np.quantile(e, 0.9) > error_db for e in (error, error[loud]) if e.size):
+            return False
+    return True
 
 
 def apart_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
