@@ -16,7 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import AutoLocator
+from matplotlib.ticker import AutoLocator, LogLocator
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.dataset import MEASURES, errors_of
@@ -112,15 +112,23 @@ def _moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
 
 
 def _labelled(ax: Axes, x: str, y: str, columns: int = 0, **legend: Any) -> Axes:
-    """Labels, and a legend if there is something to name.
+    """Labels, and a legend if there is something to name that no axis before names alike.
 
-    With `columns` it stands in so many above the data, for which the axis grows.
+    With `columns` it stands above the data, for which the axis grows, in so many columns or as
+    many as its names leave room for.
     """
     ax.set(xlabel=x, ylabel=y)
-    named = len(ax.get_legend_handles_labels()[0])
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    names = ax.get_legend_handles_labels()[1]
+    legends = [other.get_legend() for other in figure.axes]
+    shown = [[text.get_text() for text in old.get_texts()] for old in legends if old]
+    named = 0 if names in shown else len(names)
     if named and columns:
-        figure = ax.get_figure(root=True)
-        height = ax.get_position().height * (figure.get_figheight() if figure else 1.0)
+        width, height = ax.get_position().size * figure.get_size_inches()
+        letters = 10 + len("".join(names)) / named  # with the line before and the gap behind
+        letter = 0.45 * matplotlib.rcParams["font.size"] / 72
+        columns = max(1, min(columns, int(width / (letter * letters))))
         share = min(0.6, (math.ceil(named / columns) * _LEGEND_ROW + 0.1) / height)
         low, high = ax.get_ylim()
         ax.set_ylim(low, low + (high - low) / (1 - share))
@@ -401,7 +409,8 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
                     color=colour_of(o),
                     label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})",
                 )
-    ax.set(xscale="log", ylim=(0, 1.02), yticks=np.linspace(0, 1, 6))
+    ax.set(xscale="log", ylim=(0, None), yticks=np.linspace(0, 1, 6))
+    ax.xaxis.set_major_locator(LogLocator(numticks=_STEPS))
     ax.minorticks_off()  # they take longer to draw than the curves
     ax.xaxis.set_major_formatter("{x:g}")  # powers of ten are set as formulas
     return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", columns=2)
@@ -473,7 +482,7 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     )
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
     _shade(ax, t, dataset.shadowed.values[:, observer, sender], "#303030")
-    ax.set_ylim(-0.04, 1.14)
+    ax.set(ylim=(-0.04, 1.14), yticks=(0, 0.5, 1))
     hidden = dataset.transmitter.values[observer]
     ax.set_title(f"{dataset.observer.values[observer]} (shaded: the city hides {hidden})")
     return _labelled(ax, "time [s]", "symbol error rate", columns=3)
@@ -553,13 +562,14 @@ FORMS = ("png", "svg", "pdf")
 
 
 class Drawing(NamedTuple):
-    """A figure to be: its name, what draws each axis, the height of a row [inch], and how many
-    axes stand beside each other."""
+    """A figure to be: its name, what draws each axis, the height of a row [inch], how many axes
+    stand beside each other, and whether all have one x axis, written below the last."""
 
     name: str
     axes: Sequence[Callable[[Axes], Any]]
     height: float
     columns: int = 1
+    one_x: bool = False
 
 
 def _figure(drawing: Drawing, style: Style) -> Figure:
@@ -572,8 +582,10 @@ def _figure(drawing: Drawing, style: Style) -> Figure:
     rows = len(drawing.axes) // columns
     width, height = style.width, drawing.height * style.height * rows
     figure = Figure(figsize=(width, height))
-    axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=drawing.one_x, sharey="row")
     left, right, bottom, top, across, down = np.multiply(_MARGINS, style.height**0.5)
+    if drawing.one_x:
+        down = top
     figure.subplots_adjust(
         left=left / width,
         right=1 - right / width,
@@ -588,6 +600,11 @@ def _figure(drawing: Drawing, style: Style) -> Figure:
             locator = axis.get_major_locator()
             if isinstance(locator, AutoLocator):
                 locator.set_params(nbins=_STEPS)
+    for (row, column), ax in np.ndenumerate(axes):
+        if row < rows - 1 and drawing.one_x:
+            ax.set_xlabel("")
+        if column:
+            ax.set_ylabel("")
     return figure
 
 
@@ -615,7 +632,10 @@ def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]
         of = ("range", "velocity", "azimuth")
         label = str(d.observer.values[o]).replace("->", "_to_")
         yield Drawing(
-            f"tracks_{label}", [partial(over_time, dataset=d, observer=o, name=m) for m in of], 2.53
+            f"tracks_{label}",
+            [partial(over_time, dataset=d, observer=o, name=m) for m in of],
+            2.53,
+            one_x=True,
         )
     yield Drawing("errors", [partial(error_cdf, dataset=d, name=m) for m in MEASURES], 3.5, 2)
     if d.sizes["path"]:
@@ -627,9 +647,10 @@ def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]
         yield Drawing("paths", draw, 3.3, 2)
     decoders = [o for o in observers if (d.symbol_total.values[:, o] > 0).any()]
     if decoders:
-        yield Drawing("decoding", [partial(decoding, dataset=d, observer=o) for o in decoders], 2.8)
+        draw = [partial(decoding, dataset=d, observer=o) for o in decoders]
+        yield Drawing("decoding", draw, 2.8, one_x=True)
     counts = [partial(path_counts, dataset=d, observer=o) for o in observers]
-    yield Drawing("link", [partial(reference_snr, dataset=d), *counts], 2.7)
+    yield Drawing("link", [partial(reference_snr, dataset=d), *counts], 2.7, one_x=True)
 
 
 def _written(

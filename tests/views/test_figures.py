@@ -63,6 +63,15 @@ def test_all_figures_are_there_and_hold_ink(written):
         assert min(pixels.shape[:2]) > 200
 
 
+def test_axes_of_one_figure_name_alike_once_and_write_one_time_axis(run):
+    """Planted bugs: a legend on every axis; a time axis that none shares."""
+    drawing = next(d for d in figures._all(run.dataset, None, False) if d.name == "tracks_AT")
+    axes = figures._figure(drawing, figures.STYLES["screen"]).axes
+    assert [ax.get_legend() is not None for ax in axes] == [True, False, False]
+    assert [ax.get_xlabel() for ax in axes] == ["", "", "time [s]"]
+    assert axes[0].get_shared_x_axes().joined(axes[0], axes[2])
+
+
 def test_a_run_draws_the_middle_maps_and_figures_those_of_every_snapshot(run):
     """Maps take longest to draw. Seen failing with the first snapshot's, and with all of them."""
     d = run.dataset.isel(snapshot=[0, 0, 0]).assign(snapshot_frame=("snapshot", [0, 1, 2]))
