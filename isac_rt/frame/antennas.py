@@ -200,6 +200,11 @@ class Antennas:
             & (np.abs(direction[..., 2]) <= limit)
         )
 
+    @property
+    def look_back(self) -> bool:
+        """Whether elements send and hear anything behind the plane across their boresight."""
+        return self.pattern == "isotropic" or (self.pattern != "sector" and self.table is not None)
+
     def element_gain(self, direction: np.ndarray) -> np.ndarray:
         """Power gain of an element towards body-frame unit vectors (..., 3) (linear)."""
         if self.pattern == "isotropic":

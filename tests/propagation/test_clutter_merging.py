@@ -18,6 +18,7 @@ from isac_rt import prepare, scenario
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Cells, Density, cut
+from isac_rt.propagation.clutter.field import in_local
 from isac_rt.propagation.clutter.merging import (
     EASED,
     Heard,
@@ -26,9 +27,10 @@ from isac_rt.propagation.clutter.merging import (
     merge,
     resolution_cell,
 )
+from isac_rt.propagation.clutter.sight import Flight, ever_ahead
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.audit import check
-from isac_rt.simulation.setup import Setup
+from isac_rt.simulation.setup import Setup, swarm_of
 from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.swarm import Pose
 
@@ -318,3 +320,73 @@ def test_the_budget_check_measures_what_merging_does():
                 assert 0.001 < row["clutter_db"] < row["clutter_bound_db"]
             else:
                 assert row["clutter_db"] == 0
+
+
+def turning_tree() -> dict:
+    """Both ends turn while they fly through the street, the transmitter by 100 degrees."""
+    ways = {
+        "A": (((2.4, -22.7, 9.3), -40), ((1.3, -8.1, 10.2), 5), ((-1.9, 6.3, 9.8), 60)),
+        "P": (((-1.3, 17.9, 11.1), 170), ((0.2, 12.4, 10.9), 200), ((1.1, 8.3, 12.2), 215)),
+    }
+    roles = {"A": "active", "P": "passive"}
+    swarm = {
+        name: {
+            "role": roles[name],
+            "waypoints": [
+                {"time_s": 0.6 * k, "position_m": place, "attitude_deg": [yaw, -8, 3]}
+                for k, (place, yaw) in enumerate(way)
+            ],
+        }
+        for name, way in ways.items()
+    }
+    return swarm_tree() | {"swarm": swarm}
+
+
+def test_what_no_element_sends_or_hears_is_left_out_and_nothing_else():
+    """Two terminals that turn: every scatterer that a link hears in a frame of a field with nothing
+    left out is there, and with the same power, before merging; a fifth of all are not. Planted
+    bugs: the boresight of another axis; the receiver's planes for what is sent."""
+    every = prepare(
+        scenario.Scenario.model_validate(turning_tree() | {"accuracy": {"preset": "everything"}})
+    )
+    some = prepare(scenario.Scenario.model_validate(turning_tree()))
+    fields = every.propagation.field, some.propagation.field.whole()
+    assert len(fields[1].cells) < 0.8 * len(fields[0].cells)
+    for frame in range(0, 60, 7):
+        poses = some.swarm.poses(some.timetable.epoch(frame))
+        local = [in_local(poses[name], some.city.origin) for name in ("A", "P")]
+        for rx, end in zip("AP", local, strict=True):
+            state = LinkState(Link("A", rx), some.timetable.epoch(frame), local[0], end)
+            heard = []
+            for field in fields:
+                seen = field.seen(state)
+                power = (seen.magnitude * state.elements(some.antennas, seen)) ** 2
+                lit = np.flatnonzero(power)
+                order = np.lexsort(field.cells.points[seen.index[lit]].T)
+                heard.append((field.cells.points[seen.index[lit]][order], power[lit][order]))
+            assert len(heard[0][0]) > 100
+            assert np.array_equal(*(points for points, _ in heard))
+            assert np.array_equal(*(power for _, power in heard))
+
+
+def test_nothing_that_is_ahead_at_any_time_is_taken_to_be_behind():
+    """40,000 places about a flight that turns and one that draws back from what it looks at, at
+    1,500 instants. Planted bug: planes through the foremost place of a boresight."""
+    tree = turning_tree()
+    tree["swarm"]["B"] = {
+        "role": "passive",
+        "position_m": (7.1, 3.2, 14.9),
+        "velocity_mps": (-0.9, -13.7, 0.4),
+        "boresight": (0.1, 1.0, 0.2),
+    }
+    swarm = swarm_of(scenario.Scenario.model_validate(tree))
+    points = np.random.default_rng(7).uniform(-150, 150, (40_000, 3))
+    for name in "AB":
+        trajectory = swarm.trajectories[name]
+        ahead = np.zeros(len(points), bool)
+        for time in np.linspace(0, swarm.duration, 1500):
+            pose = trajectory.pose(time)
+            ahead |= points @ pose.rotation[:, 1] > pose.position @ pose.rotation[:, 1]
+        found = ever_ahead(Flight(trajectory, swarm.duration, np.zeros(3)).fronts, points)
+        assert not (ahead & ~found).any()
+        assert (found & ~ahead).sum() < 0.2 * (~ahead).sum()

@@ -111,7 +111,7 @@ def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, mo
     is made anew. Planted bug: the file's name and size in the key instead of its bytes."""
     first = prepared(place, {})
     calls = []
-    for room, name in ((clutter_field, "cut"), (clutter_field, "merge"), (sight, "crossings")):
+    for room, name in ((clutter_field, "cut"), (clutter_field, "covered"), (sight, "crossings")):
         old = getattr(room, name)
         monkeypatch.setattr(
             room, name, lambda *a, old=old, name=name: calls.append(name) or old(*a)
@@ -124,7 +124,7 @@ def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, mo
     digit = next(i for i in range(at, len(text)) if text[i].isdigit() and text[i] not in "09")
     file.write_text(text[:digit] + str(int(text[digit]) + 1) + text[digit + 1 :])
     assert prepared(place, {}) != first
-    assert {*calls} == {"cut", "merge", "crossings"}
+    assert {*calls} == {"cut", "covered", "crossings"}
 
 
 def test_a_bent_file_is_made_again(place):
@@ -132,7 +132,7 @@ def test_a_bent_file_is_made_again(place):
     the checksum."""
     first = prepared(place, {})
     files = sorted((place / "kept").glob("*/*.data"))
-    assert len(files) == 7
+    assert len(files) == 9
     rng = np.random.default_rng(2)
     for file in files:
         good = file.read_bytes()

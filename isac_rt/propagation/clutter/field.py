@@ -46,7 +46,7 @@ from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
 from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
 from isac_rt.propagation.clutter.penumbra import Facets
-from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight
+from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight, ever_ahead
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
@@ -166,7 +166,8 @@ class ClutterField:
         floor: NoiseFloor | None = None,
     ) -> ClutterField:
         """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
-        place of its flight; merge what the noise of each link covers, if `floor` says."""
+        place of its flight. Where there is a `floor`, leave out what no element sends or hears, and
+        merge what the noise of each link covers."""
         flights = {
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin)
             for name in swarm.terminals
@@ -176,7 +177,9 @@ class ClutterField:
             city.face_material
         ]
         shadows = Shadows(scene)
-        lookouts = _kept_places([flights[name] for name in swarm.transmitters])
+        senders = [flights[name] for name in swarm.transmitters]
+        lookouts, behind = _kept_places(senders), floor is None or floor.antennas.look_back
+        fronts = [] if behind else [flight.fronts for flight in senders]
 
         def found() -> dict[str, Any]:
             of = 0
@@ -184,12 +187,14 @@ class ClutterField:
             def in_sight(points: np.ndarray, face: np.ndarray) -> np.ndarray:
                 nonlocal of
                 of = len(face)
-                return shadows.ever_sees(lookouts, points, city.normals[face])
+                out = ever_ahead(np.concatenate(fronts), points) if fronts else np.full(of, True)
+                out[out] = shadows.ever_sees(lookouts, points[out], city.normals[face[out]])
+                return out
 
             cells = cut(city, scatters, places, density, seed, in_sight)
             return {"cells": vars(cells), "of": of}
 
-        depends_on = [city.plain(), places, lookouts, asdict(density), seed, MOST_CELLS]
+        depends_on = [city.plain(), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
         sight = Sight(shadows, flights, facets_of(cells, city), wavelength, city)
@@ -252,7 +257,10 @@ class ClutterField:
         }
         merged = {}
         for link, over_noise in floor.over_noise.items():
-            both = np.flatnonzero(ever[link.tx] & ever[link.rx])
+            held = ever[link.tx] & ever[link.rx]
+            if not floor.antennas.look_back:
+                held &= ever_ahead(sight.flights[link.rx].fronts, cells.points)
+            both = np.flatnonzero(held)
             some, heard = cells.select(both), []
             for k in np.flatnonzero(over_noise):
                 state = LinkState(link, floor.times[k], poses[link.tx][k], poses[link.rx][k])

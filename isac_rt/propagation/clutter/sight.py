@@ -10,12 +10,14 @@ frames before it were computed or not. Import only after `isac_rt.runtime.activa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
 from scipy.interpolate import BSpline
 
+from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
 from isac_rt.propagation.legs.rays import Shadows
@@ -32,8 +34,10 @@ REACH = 3
 goes."""
 AROUND = 8
 """Knots on each side whose crossings are known."""
-TOGETHER = 8
+TOGETHER = 4
 """Knots that are tested, and kept for later runs, at once."""
+LOOKS = 81
+"""Instants of a run at which it is asked what lies before a terminal."""
 WIDEST = (AROUND - 1) / PENUMBRA
 """Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is
 forgotten."""
@@ -70,6 +74,22 @@ class Flight:
         self.knots = trajectory.positions(times) - origin
         """(K, 3) local [m]"""
 
+    @cached_property
+    def fronts(self) -> np.ndarray:
+        """(S, 5) planes across the boresights that the terminal has in the run: a unit vector, how
+        far along it begins what lies before such a plane [m], and how far a boresight turns from
+        one of the `LOOKS` to the next [rad]."""
+        poses = [self._trajectory.pose(time) for time in self._times[:: 2000 // (LOOKS - 1)]]
+        places = np.array([pose.position for pose in poses]) - self._origin
+        boresights = np.array([pose.rotation[:, 1] for pose in poses])
+        step, turn = (
+            np.linalg.norm(np.diff(a, axis=0), axis=1).max() for a in (places, boresights)
+        )
+        each, row = np.unique(boresights, axis=0, return_inverse=True)
+        begins = np.full(len(each), np.inf)
+        np.minimum.at(begins, row.ravel(), (places * boresights).sum(axis=1) - step)
+        return np.column_stack([each, begins, np.full(len(each), turn)])
+
     def holds(self, pose: Pose, time: float) -> bool:
         """Whether a pose, local, is the planned one."""
         return bool(
@@ -94,6 +114,27 @@ class Flight:
         ):
             out[knot] = out.get(knot, 0.0) + weight
         return out
+
+
+def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N,) whether points (N, 3), local, lie before any of some `Flight.fronts` (S, 5), or so near
+    to one that they might between two `LOOKS`."""
+    normals, begins, turn = np.split(fronts, [3, 4], axis=1)
+    farthest = np.linalg.norm(points, axis=1).max(initial=0.0)
+    return _beyond(np.column_stack([normals, begins - turn * farthest]), points)
+
+
+@jit
+def _beyond(planes, points):
+    """(N,) whether points (N, 3) lie beyond any of planes (S, 4)."""
+    out = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        for a, b, c, begins in planes:
+            if x * a + y * b + z * c > begins:
+                out[i] = True
+                break
+    return out
 
 
 class _Stretch(NamedTuple):
