@@ -231,8 +231,8 @@ OF_CASES = {
     ),
     "noise and merged clutter": Bug(
         "propagation/clutter/merging.py",
-        "most = error**2 * (1 + clutter)",
-        "most = error * (1 + clutter)",
+        "most = eased * error**2 * (1 + clutter)",
+        "most = eased * error * (1 + clutter)",
     ),
     "mean power of a street": Bug(
         "propagation/clutter/field.py",
