@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import load, splat, store
+from isac_rt.kernels.vector import LANES, PART, load_part, store
 
 ROW = 32  # float32 numbers in a row
 NEAR = 256
@@ -63,18 +63,18 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @jit(inline=True)
 def _put(table, at, re, im, twiddles, t):
     """Store re + j im times a twiddle factor."""
-    c, s = splat(twiddles[t]), splat(twiddles[t + 1])
-    store(table, at, re * c - im * s)
-    store(table, at + 16, re * s + im * c)
+    c, s = twiddles[t], twiddles[t + 1]
+    store(table, at, c * re - s * im)
+    store(table, at + 16, s * re + c * im)
 
 
 @jit(inline=True)
 def _two(table, at, step, twiddles, t):
     ar, ai, br, bi = (
-        load(table, at),
-        load(table, at + 16),
-        load(table, at + step),
-        load(table, at + step + 16),
+        load_part(table, at),
+        load_part(table, at + 16),
+        load_part(table, at + step),
+        load_part(table, at + step + 16),
     )
     store(table, at, ar + br)
     store(table, at + 16, ai + bi)
@@ -83,11 +83,11 @@ def _two(table, at, step, twiddles, t):
 
 @jit(inline=True)
 def _three(table, at, step, twiddles, t):
-    ar, ai = load(table, at), load(table, at + 16)
-    br, bi = load(table, at + step), load(table, at + step + 16)
-    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
-    sr, si, dr, di = br + cr, bi + ci, splat(_S3) * (br - cr), splat(_S3) * (bi - ci)
-    mr, mi = ar + splat(_C3) * sr, ai + splat(_C3) * si
+    ar, ai = load_part(table, at), load_part(table, at + 16)
+    br, bi = load_part(table, at + step), load_part(table, at + step + 16)
+    cr, ci = load_part(table, at + 2 * step), load_part(table, at + 2 * step + 16)
+    sr, si, dr, di = br + cr, bi + ci, _S3 * (br - cr), _S3 * (bi - ci)
+    mr, mi = ar + _C3 * sr, ai + _C3 * si
     store(table, at, ar + sr)
     store(table, at + 16, ai + si)
     _put(table, at + step, mr - di, mi + dr, twiddles, t)
@@ -104,10 +104,10 @@ def _quarters(ar, ai, br, bi, cr, ci, dr, di):
 
 @jit(inline=True)
 def _four(table, at, step, twiddles, t):
-    ar, ai = load(table, at), load(table, at + 16)
-    br, bi = load(table, at + step), load(table, at + step + 16)
-    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
-    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
+    ar, ai = load_part(table, at), load_part(table, at + 16)
+    br, bi = load_part(table, at + step), load_part(table, at + step + 16)
+    cr, ci = load_part(table, at + 2 * step), load_part(table, at + 2 * step + 16)
+    dr, di = load_part(table, at + 3 * step), load_part(table, at + 3 * step + 16)
     ar, ai, cr, ci, br, bi, dr, di = _quarters(ar, ai, br, bi, cr, ci, dr, di)
     store(table, at, ar)
     store(table, at + 16, ai)
@@ -118,14 +118,14 @@ def _four(table, at, step, twiddles, t):
 
 @jit(inline=True)
 def _eight(table, at, step, twiddles, t):
-    ar, ai = load(table, at), load(table, at + 16)
-    br, bi = load(table, at + step), load(table, at + step + 16)
-    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
-    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
-    er, ei = load(table, at + 4 * step), load(table, at + 4 * step + 16)
-    fr, fi = load(table, at + 5 * step), load(table, at + 5 * step + 16)
-    gr, gi = load(table, at + 6 * step), load(table, at + 6 * step + 16)
-    hr, hi = load(table, at + 7 * step), load(table, at + 7 * step + 16)
+    ar, ai = load_part(table, at), load_part(table, at + 16)
+    br, bi = load_part(table, at + step), load_part(table, at + step + 16)
+    cr, ci = load_part(table, at + 2 * step), load_part(table, at + 2 * step + 16)
+    dr, di = load_part(table, at + 3 * step), load_part(table, at + 3 * step + 16)
+    er, ei = load_part(table, at + 4 * step), load_part(table, at + 4 * step + 16)
+    fr, fi = load_part(table, at + 5 * step), load_part(table, at + 5 * step + 16)
+    gr, gi = load_part(table, at + 6 * step), load_part(table, at + 6 * step + 16)
+    hr, hi = load_part(table, at + 7 * step), load_part(table, at + 7 * step + 16)
     ar, ai, er, ei = ar + er, ai + ei, ar - er, ai - ei
     br, bi, fr, fi = br + fr, bi + fi, br - fr, bi - fi
     cr, ci, gr, gi = cr + gr, ci + gi, cr - gr, ci - gi
@@ -136,10 +136,9 @@ def _eight(table, at, step, twiddles, t):
     _put(table, at + 2 * step, br, bi, twiddles, t + 2)
     _put(table, at + 4 * step, cr, ci, twiddles, t + 6)
     _put(table, at + 6 * step, dr, di, twiddles, t + 10)
-    half, zero = splat(_C8), splat(np.float32(0))
-    fr, fi = half * (fr - fi), half * (fr + fi)  # an eighth of a turn
-    gr, gi = zero - gi, gr
-    hr, hi = zero - half * (hr + hi), half * (hr - hi)
+    fr, fi = _C8 * (fr - fi), _C8 * (fr + fi)  # an eighth of a turn
+    gr, gi = np.float32(-1) * gi, gr
+    hr, hi = -_C8 * (hr + hi), _C8 * (hr - hi)
     er, ei, gr, gi, fr, fi, hr, hi = _quarters(er, ei, fr, fi, gr, gi, hr, hi)
     _put(table, at + step, er, ei, twiddles, t)
     _put(table, at + 3 * step, fr, fi, twiddles, t + 4)
@@ -149,16 +148,16 @@ def _eight(table, at, step, twiddles, t):
 
 @jit(inline=True)
 def _five(table, at, step, twiddles, t):
-    ar, ai = load(table, at), load(table, at + 16)
-    br, bi = load(table, at + step), load(table, at + step + 16)
-    cr, ci = load(table, at + 2 * step), load(table, at + 2 * step + 16)
-    dr, di = load(table, at + 3 * step), load(table, at + 3 * step + 16)
-    er, ei = load(table, at + 4 * step), load(table, at + 4 * step + 16)
+    ar, ai = load_part(table, at), load_part(table, at + 16)
+    br, bi = load_part(table, at + step), load_part(table, at + step + 16)
+    cr, ci = load_part(table, at + 2 * step), load_part(table, at + 2 * step + 16)
+    dr, di = load_part(table, at + 3 * step), load_part(table, at + 3 * step + 16)
+    er, ei = load_part(table, at + 4 * step), load_part(table, at + 4 * step + 16)
     pr, pi, mr, mi = br + er, bi + ei, br - er, bi - ei
     qr, qi, nr, ni = cr + dr, ci + di, cr - dr, ci - di
     store(table, at, ar + pr + qr)
     store(table, at + 16, ai + pi + qi)
-    c, d, s, u = splat(_C5), splat(_D5), splat(_S5), splat(_T5)
+    c, d, s, u = _C5, _D5, _S5, _T5
     xr, xi, yr, yi = ar + c * pr + d * qr, ai + c * pi + d * qi, s * mr + u * nr, s * mi + u * ni
     _put(table, at + step, xr - yi, xi + yr, twiddles, t)
     _put(table, at + 4 * step, xr + yi, xi - yr, twiddles, t + 6)
@@ -173,23 +172,28 @@ def _stage(table, first, length, radix, twiddles, t):
     step = length // radix * ROW
     if radix == 8:
         for at in range(first, first + step, ROW):
-            _eight(table, at, step, twiddles, t)
+            for lane in range(0, LANES, PART):
+                _eight(table, at + lane, step, twiddles, t)
             t += 14
     elif radix == 4:
         for at in range(first, first + step, ROW):
-            _four(table, at, step, twiddles, t)
+            for lane in range(0, LANES, PART):
+                _four(table, at + lane, step, twiddles, t)
             t += 6
     elif radix == 2:
         for at in range(first, first + step, ROW):
-            _two(table, at, step, twiddles, t)
+            for lane in range(0, LANES, PART):
+                _two(table, at + lane, step, twiddles, t)
             t += 2
     elif radix == 5:
         for at in range(first, first + step, ROW):
-            _five(table, at, step, twiddles, t)
+            for lane in range(0, LANES, PART):
+                _five(table, at + lane, step, twiddles, t)
             t += 8
     else:
         for at in range(first, first + step, ROW):
-            _three(table, at, step, twiddles, t)
+            for lane in range(0, LANES, PART):
+                _three(table, at + lane, step, twiddles, t)
             t += 4
 
 

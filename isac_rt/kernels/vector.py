@@ -1,9 +1,10 @@
 """Sixteen numbers as one value inside numba kernels.
 
 LLVM does not make vector code of loops over small slices (it cannot know that arrays do not
-overlap), so the kernels say it: `load`, `splat`, + - *, `store`, for float32 and float64. On
-AVX-512 sixteen float32 are one register; elsewhere LLVM splits them, so the kernels run, slower, on
-any processor. A product that feeds a sum becomes one fused instruction where there is one.
+overlap), so the kernels say it: `load`, `splat`, + - * (also with a number), `store`, for float32
+and float64. On AVX-512 sixteen float32 are one register; elsewhere LLVM splits them, so the kernels
+run, slower, on any processor. A product that feeds a sum becomes one fused instruction where there
+is one.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from contextlib import suppress
 from math import factorial
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
@@ -22,17 +23,21 @@ from numba.np.arrayobj import make_array
 from isac_rt.kernels.jit import FAST, jit
 
 LANES = 16
+PART = LANES if binding.get_host_cpu_features().get("avx512f") else LANES // 2
+"""Lanes that kernels with many values take at once (`load_part`): half of them where sixteen
+registers hold eight float32 each, for what does not fit there goes to memory and back. Which it is
+changes no bit: lanes know nothing of each other."""
 
 
 class _Vector(types.Type):
-    """Sixteen of `element`."""
+    """Some of `element`."""
 
-    def __init__(self, element: types.Float) -> None:
+    def __init__(self, element: types.Float, lanes: int = LANES) -> None:
         self.element = element
         self.form = ir.VectorType(
-            {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}[element], LANES
+            {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}[element], lanes
         )
-        super().__init__(name=f"{element}x{LANES}")
+        super().__init__(name=f"{element}x{lanes}")
 
 
 FLOATS, DOUBLES = _Vector(types.float32), _Vector(types.float64)
@@ -44,13 +49,9 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.form)
 
 
-def _of(element) -> _Vector:
-    return FLOATS if element == types.float32 else DOUBLES
-
-
-def _address(context, builder, kind, array, index):
+def _address(context, builder, kind, array, index, form):
     data = make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _of(kind.dtype).form.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), form.as_pointer())
 
 
 def _size(kind) -> int:
@@ -58,32 +59,39 @@ def _size(kind) -> int:
 
 
 def _mask(indices):
-    return ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(indices))
+    indices = list(indices)
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices)
 
 
-@intrinsic
-def load(typingctx, array, index):
-    """The 16 elements of a flat array from `index`."""
+def _loading(lanes):
+    """Intrinsic of a flat array and an index: so many elements from there."""
 
-    def codegen(context, builder, signature, args):
-        kind = signature.args[0]
-        return builder.load(_address(context, builder, kind, args[0], args[1]), align=_size(kind))
+    @intrinsic
+    def loaded(typingctx, array, index):
+        def codegen(context, builder, signature, args):
+            kind, form = signature.args[0], signature.return_type.form
+            at = _address(context, builder, kind, *args, form)
+            return builder.load(at, align=_size(kind))
 
-    return _of(array.dtype)(array, types.intp), codegen
+        return _Vector(array.dtype, lanes)(array, types.intp), codegen
+
+    return loaded
+
+
+load, load_part = _loading(LANES), _loading(PART)
 
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write 16 elements to a flat array from `index`."""
+    """Write a vector to a flat array from `index`."""
 
     def codegen(context, builder, signature, args):
         kind = signature.args[0]
-        builder.store(
-            args[2], _address(context, builder, kind, args[0], args[1]), align=_size(kind)
-        )
+        at = _address(context, builder, kind, *args[:2], args[2].type)
+        builder.store(args[2], at, align=_size(kind))
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, _of(array.dtype)), codegen
+    return types.void(array, types.intp, value), codegen
 
 
 @intrinsic
@@ -92,14 +100,16 @@ def stream(typingctx, array, index, value):
 
     def codegen(context, builder, signature, args):
         written = builder.store(
-            args[2], _address(context, builder, signature.args[0], args[0], args[1]), align=64
+            args[2],
+            _address(context, builder, signature.args[0], *args[:2], args[2].type),
+            align=64,
         )
         written.set_metadata(
             "nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)])
         )
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, _of(array.dtype)), codegen
+    return types.void(array, types.intp, value), codegen
 
 
 @intrinsic
@@ -111,7 +121,7 @@ def splat(typingctx, value):
         first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
         return builder.shuffle_vector(first, nothing, _mask([0] * LANES))
 
-    return _of(value)(value), codegen
+    return _Vector(value)(value), codegen
 
 
 @intrinsic
@@ -153,9 +163,6 @@ def _two(method):
     return both
 
 
-_add = _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST))
-_sub = _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST))
-_mul = _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST))
 larger = _two(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 # 1 in lanes that are not above the other's, else 0
 not_above = _two(
@@ -213,48 +220,75 @@ def odd_twice(typingctx, value):
     return value(value), codegen
 
 
-@overload(operator.add)
-def _plus(a, b):
-    if isinstance(a, _Vector) and a == b:
-        return lambda a, b: _add(a, b)
-    return None
+@intrinsic
+def _all(typingctx, value, like):
+    """The same number in all lanes of a vector like another."""
+
+    def codegen(context, builder, signature, args):
+        form = signature.return_type.form
+        nothing = ir.Constant(form, ir.Undefined)
+        first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
+        return builder.shuffle_vector(first, nothing, _mask([0] * form.count))
+
+    return like(value, like), codegen
 
 
-@overload(operator.sub)
-def _minus(a, b):
-    if isinstance(a, _Vector) and a == b:
-        return lambda a, b: _sub(a, b)
-    return None
+def _let(sign, of_two):
+    """Let kernels write `sign` between two vectors, or a vector and a number."""
+
+    @overload(sign)
+    def made(a, b):
+        if isinstance(a, _Vector) and a == b:
+            return lambda a, b: of_two(a, b)
+        if isinstance(a, _Vector) and b == a.element:
+            return lambda a, b: of_two(a, _all(b, a))
+        if isinstance(b, _Vector) and a == b.element:
+            return lambda a, b: of_two(_all(a, b), b)
+        return None
 
 
-@overload(operator.mul)
-def _times(a, b):
-    if isinstance(a, _Vector) and a == b:
-        return lambda a, b: _mul(a, b)
-    return None
+_let(operator.add, _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST)))
+_let(operator.sub, _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST)))
+_let(operator.mul, _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST)))
+
+
+def _transposed(builder, rows):
+    """As many vectors as each has lanes: rounds of exchanges between rows i and i + s."""
+    rows, size = list(rows), len(rows)
+    for s in (2**k for k in range(size.bit_length() - 1)):
+        upper = _mask(lane if not lane & s else lane - s + size for lane in range(size))
+        lower = _mask(lane + s if not lane & s else lane + size for lane in range(size))
+        for i in range(size):
+            if not i & s:
+                a, b = rows[i], rows[i + s]
+                rows[i] = builder.shuffle_vector(a, b, upper)
+                rows[i + s] = builder.shuffle_vector(a, b, lower)
+    return rows
 
 
 @intrinsic
 def transpose(typingctx, array, index):
-    """Transpose in place the 16 x 16 float32 that lie from `index`: four rounds of exchanges
-    between rows i and i + s."""
+    """Transpose in place the 16 x 16 float32 that lie from `index`, square by square of `PART` rows
+    and columns."""
 
     def codegen(context, builder, signature, args):
-        places = [builder.add(args[1], ir.Constant(args[1].type, LANES * i)) for i in range(LANES)]
-        places = [_address(context, builder, signature.args[0], args[0], at) for at in places]
-        rows = [builder.load(at, align=4) for at in places]
-        for s in (1, 2, 4, 8):
-            upper = _mask(lane if not lane & s else lane - s + LANES for lane in range(LANES))
-            lower = _mask(lane + s if not lane & s else lane + LANES for lane in range(LANES))
-            for i in range(LANES):
-                if not i & s:
-                    a, b = rows[i], rows[i + s]
-                    rows[i], rows[i + s] = (
-                        builder.shuffle_vector(a, b, upper),
-                        builder.shuffle_vector(a, b, lower),
-                    )
-        for at, row in zip(places, rows, strict=True):
-            builder.store(row, at, align=4)
+        kind, form = signature.args[0], _Vector(types.float32, PART).form
+
+        def square(row, column):
+            starts = [LANES * (row + i) + column for i in range(PART)]
+            places = [builder.add(args[1], ir.Constant(args[1].type, start)) for start in starts]
+            return [_address(context, builder, kind, args[0], at, form) for at in places]
+
+        for row in range(0, LANES, PART):
+            for column in range(0, row + 1, PART):
+                below, above = square(row, column), square(column, row)
+                turned = [
+                    _transposed(builder, [builder.load(at, align=4) for at in places])
+                    for places in ([below, above] if row > column else [below])
+                ]
+                for places, rows in zip([above, below], turned, strict=False):
+                    for at, value in zip(places, rows, strict=True):
+                        builder.store(value, at, align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.intp), codegen
@@ -273,21 +307,21 @@ _COS = tuple(
 def cos_sin(cycles):
     """Cosine and sine of 2 pi `cycles` (float32, within [-0.55, 0.55]) by the series of half the
     angle; errors below 1.3e-6."""
-    h = cycles * splat(_HALF_TURN)
+    h = cycles * _HALF_TURN
     q = h * h
-    s = splat(_SIN[4]) + q * splat(_SIN[5])
-    s = splat(_SIN[3]) + q * s
-    s = splat(_SIN[2]) + q * s
-    s = splat(_SIN[1]) + q * s
-    s = h * (splat(_SIN[0]) + q * s)
-    c = splat(_COS[5]) + q * splat(_COS[6])
-    c = splat(_COS[4]) + q * c
-    c = splat(_COS[3]) + q * c
-    c = splat(_COS[2]) + q * c
-    c = splat(_COS[1]) + q * c
-    c = splat(_COS[0]) + q * c
-    twice = splat(_TWO) * s
-    return splat(_COS[0]) - twice * s, twice * c
+    s = _SIN[4] + q * _SIN[5]
+    s = _SIN[3] + q * s
+    s = _SIN[2] + q * s
+    s = _SIN[1] + q * s
+    s = h * (_SIN[0] + q * s)
+    c = _COS[5] + q * _COS[6]
+    c = _COS[4] + q * c
+    c = _COS[3] + q * c
+    c = _COS[2] + q * c
+    c = _COS[1] + q * c
+    c = _COS[0] + q * c
+    twice = _TWO * s
+    return _COS[0] - twice * s, twice * c
 
 
 # The same for float64, up to a quarter turn: what is cut after eight terms is below 7e-11
@@ -298,53 +332,53 @@ _COSINE = tuple((-1.0) ** i / factorial(2 * i) for i in range(11))
 @jit(inline=True)
 def cos_sin_exact(cycles):
     """Cosine and sine of 2 pi `cycles` (float64, within [-0.5, 0.5]) to 1e-10, as float32."""
-    h = cycles * splat(np.pi)
+    h = cycles * np.pi
     q = h * h
-    s = splat(_SINE[6]) + q * splat(_SINE[7])
-    s = splat(_SINE[5]) + q * s
-    s = splat(_SINE[4]) + q * s
-    s = splat(_SINE[3]) + q * s
-    s = splat(_SINE[2]) + q * s
-    s = splat(_SINE[1]) + q * s
-    s = h * (splat(_SINE[0]) + q * s)
-    c = splat(_COSINE[6]) + q * splat(_COSINE[7])
-    c = splat(_COSINE[5]) + q * c
-    c = splat(_COSINE[4]) + q * c
-    c = splat(_COSINE[3]) + q * c
-    c = splat(_COSINE[2]) + q * c
-    c = splat(_COSINE[1]) + q * c
-    c = splat(_COSINE[0]) + q * c
-    twice = splat(2.0) * s
-    return narrow(splat(1.0) - twice * s), narrow(twice * c)
+    s = _SINE[6] + q * _SINE[7]
+    s = _SINE[5] + q * s
+    s = _SINE[4] + q * s
+    s = _SINE[3] + q * s
+    s = _SINE[2] + q * s
+    s = _SINE[1] + q * s
+    s = h * (_SINE[0] + q * s)
+    c = _COSINE[6] + q * _COSINE[7]
+    c = _COSINE[5] + q * c
+    c = _COSINE[4] + q * c
+    c = _COSINE[3] + q * c
+    c = _COSINE[2] + q * c
+    c = _COSINE[1] + q * c
+    c = _COSINE[0] + q * c
+    twice = 2.0 * s
+    return narrow(1.0 - twice * s), narrow(twice * c)
 
 
 @jit(inline=True)
 def cos_sin_double(cycles):
     """Cosine and sine of 2 pi `cycles` (float64, within [-0.5, 0.5]) to some 1e-16."""
-    h = cycles * splat(np.pi)
+    h = cycles * np.pi
     q = h * h
-    s = splat(_SINE[9]) + q * splat(_SINE[10])
-    s = splat(_SINE[8]) + q * s
-    s = splat(_SINE[7]) + q * s
-    s = splat(_SINE[6]) + q * s
-    s = splat(_SINE[5]) + q * s
-    s = splat(_SINE[4]) + q * s
-    s = splat(_SINE[3]) + q * s
-    s = splat(_SINE[2]) + q * s
-    s = splat(_SINE[1]) + q * s
-    s = h * (splat(_SINE[0]) + q * s)
-    c = splat(_COSINE[9]) + q * splat(_COSINE[10])
-    c = splat(_COSINE[8]) + q * c
-    c = splat(_COSINE[7]) + q * c
-    c = splat(_COSINE[6]) + q * c
-    c = splat(_COSINE[5]) + q * c
-    c = splat(_COSINE[4]) + q * c
-    c = splat(_COSINE[3]) + q * c
-    c = splat(_COSINE[2]) + q * c
-    c = splat(_COSINE[1]) + q * c
-    c = splat(_COSINE[0]) + q * c
-    twice = splat(2.0) * s
-    return splat(1.0) - twice * s, twice * c
+    s = _SINE[9] + q * _SINE[10]
+    s = _SINE[8] + q * s
+    s = _SINE[7] + q * s
+    s = _SINE[6] + q * s
+    s = _SINE[5] + q * s
+    s = _SINE[4] + q * s
+    s = _SINE[3] + q * s
+    s = _SINE[2] + q * s
+    s = _SINE[1] + q * s
+    s = h * (_SINE[0] + q * s)
+    c = _COSINE[9] + q * _COSINE[10]
+    c = _COSINE[8] + q * c
+    c = _COSINE[7] + q * c
+    c = _COSINE[6] + q * c
+    c = _COSINE[5] + q * c
+    c = _COSINE[4] + q * c
+    c = _COSINE[3] + q * c
+    c = _COSINE[2] + q * c
+    c = _COSINE[1] + q * c
+    c = _COSINE[0] + q * c
+    twice = 2.0 * s
+    return 1.0 - twice * s, twice * c
 
 
 def aligned(size: int) -> np.ndarray:

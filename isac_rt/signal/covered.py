@@ -23,7 +23,18 @@ import numpy as np
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.fourier import ROW
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, aligned, cos_sin, floor, load, narrow, splat, store
+from isac_rt.kernels.vector import (
+    LANES,
+    PART,
+    aligned,
+    cos_sin,
+    floor,
+    load,
+    load_part,
+    narrow,
+    splat,
+    store,
+)
 from isac_rt.signal.direct import passed
 from isac_rt.signal.tones import Tones
 
@@ -43,8 +54,9 @@ EXTRA = 2
 _ACROSS = 3  # chirps whose sums stay in registers, with the same shares
 _Z = 2 * LANES * TOGETHER  # float32 of 16 paths' amplitudes in these chirps
 _SUM = 2 * LANES  # float32 of a line's sums in a chirp
-_BLOCK = 64  # lines whose sums in a few chirps stay in the first-level cache
-_ONE, _HALF = np.float32(1), np.float32(0.5)
+_LINE = _SUM * TOGETHER  # and in these chirps
+_BLOCK = 32  # lines whose sums stay in the nearest caches
+_NONE, _ONE = np.float32(0), np.float32(1)
 
 
 class Covered(NamedTuple):
@@ -115,7 +127,7 @@ class Desk(NamedTuple):
     Attributes
     ----------
     z, share : of each path the amplitudes in the chirps of a batch, and the upper line's share
-    sums, rest : of each line in a few chirps, and of the line after the last in every chirp
+    sums : of each line, and of the one after the last, in every chirp
     place, weights, shift : within a grid step, of the `LINES` lines in one; in every chirp the
         weights of these, and the whole lines that its data move all lines by
     factor : of each line in every chirp
@@ -127,7 +139,6 @@ class Desk(NamedTuple):
     z: np.ndarray
     share: np.ndarray
     sums: np.ndarray
-    rest: np.ndarray
     place: np.ndarray
     weights: np.ndarray
     shift: np.ndarray
@@ -170,8 +181,7 @@ def desk(paths: Covered) -> Desk:
     return Desk(
         aligned(blocks * _Z),
         aligned(blocks * LANES * (TOGETHER // _ACROSS)),
-        aligned(_BLOCK * _ACROSS * _SUM),
-        aligned(TOGETHER * _SUM),
+        aligned((_BLOCK + 1) * _LINE),
         np.arange(LANES) / LINES - 0.5,
         aligned(TOGETHER * TAPS * LANES),
         np.zeros(TOGETHER, np.int64),
@@ -314,8 +324,7 @@ def covered_paths(
     bow = (sent * accel * ts * ts / 2 + w.slope * step * (ts - step / 2)) * half**2
     extra = np.ascontiguousarray(t.tx_delay[path].T)
     element = delay + extra
-    factor = np.empty(element.shape, complex)
-    factor[:] = t.factor[path] * t.tx_gain[path].T if t.tx_gain.size else t.factor[path]
+    factor = t.factor[path] * t.tx_gain[path].T if t.tx_gain.size else t.factor[path]
     cycles = element * (carrier - w.slope / 2 * element) + bow * centre
     place = (w.slope * delay + rate * sent) * ts * size
     drift = w.slope * rate * ts * size
@@ -323,22 +332,24 @@ def covered_paths(
     first_slots = np.arange(0, w.num_chirps, slots)
     after = np.minimum(first_slots + slots, w.num_chirps)
     middle = (first_slots + after - w.num_chirps) / 2 * w.slot_duration
-    below = np.floor((place + drift * middle[:, None]) * LINES)
+    below = np.multiply.outer(middle, drift * LINES)
+    below += place * LINES
+    np.floor(below, out=below)
     shown = [
-        first + np.argsort(below[:, first:last], axis=1, kind="stable")
+        np.argsort(below[:, first:last], axis=1, kind="stable") + first
         for first, last in groups[:, 2:]
     ]
     return Covered(
         groups,
-        (cycles + np.angle(factor) / (2 * np.pi)) % 1.0,
+        cycles + np.angle(factor) / (2 * np.pi),
         sent * rate,
         (sent * accel - w.slope * rate**2) / 2,
-        (np.abs(factor) * real).astype(np.float32),
+        np.full(element.shape, np.abs(factor) * real, np.float32),
         place,
         drift,
         (extra / spacing).astype(np.float32),
         steering(path, delay / (ts * half)),
-        np.concatenate(shown, axis=1),
+        shown[0] if len(shown) == 1 else np.concatenate(shown, axis=1),
         below,
     )
 
@@ -396,7 +407,7 @@ def _amplitudes(desk, paths, first, last, antenna):
 @jit(inline=True)
 def _one(z, j, sr, si, ar, ai):
     """Add a path's amplitude in a chirp times its elements' phasors."""
-    x, y = splat(z[j]), splat(z[j + LANES])
+    x, y = z[j], z[j + LANES]
     return ar + x * sr - y * si, ai + x * si + y * sr
 
 
@@ -441,35 +452,39 @@ def _factors(desk, count, antenna, w, sheet):
 
 
 @jit(fast=True)
-def _sum(desk, count, sheet, paths, order, first):
-    """Sum the paths beside each of `count` lines in a few chirps from `first` on. What the last
-    paths leave to the next line stays in `desk.rest`."""
-    steer, z, sums, rest, zero = paths.steer, desk.z, desk.sums, desk.rest, splat(np.float32(0))
-    own, to = first // _ACROSS * paths.turn.shape[0], _SUM * first
-    ar, ai = load(rest, to), load(rest, to + 16)
-    cr, ci = load(rest, to + 32), load(rest, to + 48)
-    er, ei = load(rest, to + 64), load(rest, to + 80)
+def _sum(desk, count, sheet, paths, order, chirps):
+    """Sum the paths beside each of `count` lines in the `chirps` of a batch. What paths leave to
+    the line after theirs is there when its turn comes."""
+    steer, z, sums, size = paths.steer, desk.z, desk.sums, paths.turn.shape[0]
     for b in range(count):
-        br, bi, dr, di, fr, fi = zero, zero, zero, zero, zero, zero
-        for i in range(desk.begin[b], desk.end[b]):
-            n = order[i]
-            k, j = 48 * n, n // LANES * _Z + n % LANES + 2 * LANES * first
-            share = load(steer, k + 32) + splat(desk.share[own + n])
-            under = splat(_ONE) - share
-            more = splat(_ONE) + share * under * splat(np.float32(sheet.more))
-            share, under = share * more, under * more
-            sr, si = load(steer, k), load(steer, k + 16)
-            tr, ti = sr * share, si * share
-            sr, si = sr * under, si * under
-            ar, ai = _one(z, j, sr, si, ar, ai)
-            br, bi = _one(z, j, tr, ti, br, bi)
-            cr, ci = _one(z, j + 32, sr, si, cr, ci)
-            dr, di = _one(z, j + 32, tr, ti, dr, di)
-            er, ei = _one(z, j + 64, sr, si, er, ei)
-            fr, fi = _one(z, j + 64, tr, ti, fr, fi)
-        _keep(sums, _ACROSS * _SUM * b, ar, ai, cr, ci, er, ei)
-        ar, ai, cr, ci, er, ei = br, bi, dr, di, fr, fi
-    _keep(rest, to, ar, ai, cr, ci, er, ei)
+        begin, end, line = desk.begin[b], desk.end[b], _LINE * b
+        for first in range(0, chirps, _ACROSS):  # as often as before, which processors foresee
+            own, to_z = first // _ACROSS * size, 2 * LANES * first
+            for lane in range(0, LANES, PART):
+                at = line + _SUM * first + lane
+                ar, ai = load_part(sums, at), load_part(sums, at + 16)
+                cr, ci = load_part(sums, at + 32), load_part(sums, at + 48)
+                er, ei = load_part(sums, at + 64), load_part(sums, at + 80)
+                zero = _NONE * ar
+                br, bi, dr, di, fr, fi = zero, zero, zero, zero, zero, zero
+                for i in range(begin, end):
+                    n = order[i]
+                    k, j = 48 * n + lane, n // LANES * _Z + n % LANES + to_z
+                    share = load_part(steer, k + 32) + desk.share[own + n]
+                    under = _ONE - share
+                    more = _ONE + share * under * np.float32(sheet.more)
+                    share, under = share * more, under * more
+                    sr, si = load_part(steer, k), load_part(steer, k + 16)
+                    tr, ti = sr * share, si * share
+                    sr, si = sr * under, si * under
+                    ar, ai = _one(z, j, sr, si, ar, ai)
+                    br, bi = _one(z, j, tr, ti, br, bi)
+                    cr, ci = _one(z, j + 32, sr, si, cr, ci)
+                    dr, di = _one(z, j + 32, tr, ti, dr, di)
+                    er, ei = _one(z, j + 64, sr, si, er, ei)
+                    fr, fi = _one(z, j + 64, tr, ti, fr, fi)
+                _keep(sums, at, ar, ai, cr, ci, er, ei)
+                _keep(sums, at + _LINE, br, bi, dr, di, fr, fi)
 
 
 @jit(inline=True)
@@ -486,8 +501,8 @@ def _keep(sums, at, ar, ai, cr, ci, er, ei):
 @jit(inline=True)
 def _add(grids, to, re, im):
     """Add to a row of the grids."""
-    store(grids, to, load(grids, to) + re)
-    store(grids, to + 16, load(grids, to + 16) + im)
+    store(grids, to, load_part(grids, to) + re)
+    store(grids, to + 16, load_part(grids, to + 16) + im)
 
 
 @jit(inline=True)
@@ -500,13 +515,14 @@ def _add_four(grids, to, ar, ai, br, bi, cr, ci, dr, di):
 
 
 @jit(fast=True)
-def _spread(grids, desk, count, c, sheet):
-    """Spread the sums of `count` lines in chirp c. Lines of one grid step are added together in
-    registers before the grid is written."""
-    zero, shift, size, weights = splat(np.float32(0)), desk.shift[c], sheet.size, desk.weights
-    base, at, k = c * sheet.stride + sheet.inner, c % _ACROSS * _SUM, c * 2 * _BLOCK
+def _spread(grids, desk, count, c, sheet, lane):
+    """Spread the sums of `count` lines in chirp c at the elements from `lane` on. Lines of one grid
+    step are added together in registers before the grid is written."""
+    shift, size, weights = desk.shift[c], sheet.size, desk.weights
+    base, at, k = c * sheet.stride + sheet.inner + lane, c * _SUM + lane, c * 2 * _BLOCK
     last = (int(desk.lines[0]) + shift) // LINES
     row = last % size
+    zero = _NONE * load_part(desk.sums, at)
     ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
     for b in range(count):
         place = int(desk.lines[b]) + shift
@@ -521,15 +537,15 @@ def _spread(grids, desk, count, c, sheet):
                 ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
             last += steps
             row = last % size
-        x, y = splat(desk.factor[k + b]), splat(desk.factor[k + _BLOCK + b])
-        sr, si = load(desk.sums, at), load(desk.sums, at + 16)
+        x, y = desk.factor[k + b], desk.factor[k + _BLOCK + b]
+        sr, si = load_part(desk.sums, at), load_part(desk.sums, at + 16)
         sr, si = x * sr - y * si, x * si + y * sr
         j = c * TAPS * LANES + place % LINES
-        u, v = splat(weights[j]), splat(weights[j + LANES])
-        p, q = splat(weights[j + 2 * LANES]), splat(weights[j + 3 * LANES])
+        u, v = weights[j], weights[j + LANES]
+        p, q = weights[j + 2 * LANES], weights[j + 3 * LANES]
         ar, ai, br, bi = ar + u * sr, ai + u * si, br + v * sr, bi + v * si
         cr, ci, dr, di = cr + p * sr, ci + p * si, dr + q * sr, di + q * si
-        at += _ACROSS * _SUM
+        at += _LINE
     _add_four(grids, base + row * ROW, ar, ai, br, bi, cr, ci, dr, di)
 
 
@@ -589,14 +605,14 @@ def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
             _shares(desk, paths, first, last, antenna, segment)
             _amplitudes(desk, paths, first, last, antenna)
             _weigh(desk, antenna, w, sheet)
-            desk.rest[:] = np.float32(0)
+            desk.sums[:_LINE] = np.float32(0)
             i, line, pending = begin, 0.0, False
             while pending or i < stop:
                 count, i, line, pending = _gather(desk, order, below, i, stop, line, pending)
                 _factors(desk, count, antenna, w, sheet)
-                for few in range(0, chirps.shape[0], _ACROSS):
-                    _sum(desk, count, sheet, paths, order, few)
-                    for c in range(few, few + _ACROSS):
-                        if desk.antenna[c] == antenna:
-                            _spread(grids, desk, count, c, sheet)
+                _sum(desk, count, sheet, paths, order, chirps.shape[0])
+                for c in range(TOGETHER):
+                    for lane in range(0, LANES if desk.antenna[c] == antenna else 0, PART):
+                        _spread(grids, desk, count, c, sheet, lane)
+                desk.sums[:_LINE] = desk.sums[count * _LINE : (count + 1) * _LINE]
         begin = stop
