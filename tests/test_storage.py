@@ -255,6 +255,20 @@ def test_a_store_keeps_to_its_limit_and_lets_the_oldest_go(tmp_path):
     assert store.get(keys[5]) is None
 
 
+def test_a_store_that_has_room_is_not_counted_at_every_write(tmp_path, monkeypatch):
+    """A first set-up puts hundreds of things into a folder of thousands: it is looked at when half
+    of its room was used, four times for 200 entries that fill nine tenths of it. Planted bug: the
+    first look's room is taken for all there will be."""
+    looks, look = [], storage.Store._make_room
+    monkeypatch.setattr(storage.Store, "_make_room", lambda self: looks.append(1) or look(self))
+    store = storage.Store(tmp_path, ".data", 2_300_000)
+    for i in range(200):
+        store.put(f"{i:03d}" * 4, {"a": np.full(1250, i)})
+    size = sum(f.stat().st_size for f in tmp_path.glob("*/*.data"))
+    assert 0.85 * 2_300_000 < size < 2_300_000
+    assert 2 <= len(looks) <= 8
+
+
 def test_many_processes_keep_into_one_small_folder(tmp_path):
     """Four write and read the same twelve keys in a folder that holds five: whatever one finds is
     right, and none stumbles over what another took away. Planted bug: it must be there when it is
