@@ -38,8 +38,10 @@ _IMPORT = re.compile(rb"^from isac_rt\.([\w.]+) import (\([^)]*\)|.*)", re.MULTI
 _CONSTANT = re.compile(rb"\b_?[A-Z][A-Z0-9_]+\b")
 _WORD = re.compile(rb"\w+")
 
+AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
+"""Whether a register holds sixteen float32 here."""
 _CONFIG: Any = numba.config
-if _CONFIG.CPU_FEATURES is None and binding.get_host_cpu_features().get("avx512f"):
+if _CONFIG.CPU_FEATURES is None and AVX512:
     # loops take whole registers: LLVM takes half of one on Intel's processors, for the clock rates
     # of the first that had AVX-512
     _CONFIG.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"

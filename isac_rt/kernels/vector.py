@@ -14,16 +14,16 @@ from contextlib import suppress
 from math import factorial
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 from numba.np.arrayobj import make_array
 
-from isac_rt.kernels.jit import FAST, jit
+from isac_rt.kernels.jit import AVX512, FAST, jit
 
 LANES = 16
-PART = LANES if binding.get_host_cpu_features().get("avx512f") else LANES // 2
+PART = LANES if AVX512 else LANES // 2
 """Lanes that kernels with many values take at once (`load_part`): half of them where sixteen
 registers hold eight float32 each, for what does not fit there goes to memory and back. Which it is
 changes no bit: lanes know nothing of each other."""
@@ -281,12 +281,12 @@ def transpose(typingctx, array, index):
 
         for row in range(0, LANES, PART):
             for column in range(0, row + 1, PART):
-                below, above = square(row, column), square(column, row)
+                squares = [square(row, column), square(column, row)][: 1 + (row > column)]
                 turned = [
                     _transposed(builder, [builder.load(at, align=4) for at in places])
-                    for places in ([below, above] if row > column else [below])
+                    for places in squares
                 ]
-                for places, rows in zip([above, below], turned, strict=False):
+                for places, rows in zip(reversed(squares), turned, strict=True):
                     for at, value in zip(places, rows, strict=True):
                         builder.store(value, at, align=4)
         return context.get_dummy_value()
@@ -301,6 +301,20 @@ _SIN = tuple(np.float32(c) for c in (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, 
 _COS = tuple(
     np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
 )
+# The same for float64
+_SINE = tuple((-1.0) ** i / factorial(2 * i + 1) for i in range(11))
+_COSINE = tuple((-1.0) ** i / factorial(2 * i) for i in range(11))
+_SHORT_SINE, _SHORT_COSINE = _SINE[:8], _COSINE[:8]  # what is cut is below 7e-11
+
+
+@jit(inline=True)
+def _sum_of(series, q):
+    """sum_i series[i] q^i by Horner's rule."""
+    last = len(series) - 1
+    value = series[last - 1] + q * series[last]
+    for i in range(2, last + 1):
+        value = series[last - i] + q * value
+    return value
 
 
 @jit(inline=True)
@@ -309,24 +323,9 @@ def cos_sin(cycles):
     angle; errors below 1.3e-6."""
     h = cycles * _HALF_TURN
     q = h * h
-    s = _SIN[4] + q * _SIN[5]
-    s = _SIN[3] + q * s
-    s = _SIN[2] + q * s
-    s = _SIN[1] + q * s
-    s = h * (_SIN[0] + q * s)
-    c = _COS[5] + q * _COS[6]
-    c = _COS[4] + q * c
-    c = _COS[3] + q * c
-    c = _COS[2] + q * c
-    c = _COS[1] + q * c
-    c = _COS[0] + q * c
+    s, c = h * _sum_of(_SIN, q), _sum_of(_COS, q)
     twice = _TWO * s
     return _COS[0] - twice * s, twice * c
-
-
-# The same for float64, up to a quarter turn: what is cut after eight terms is below 7e-11
-_SINE = tuple((-1.0) ** i / factorial(2 * i + 1) for i in range(11))
-_COSINE = tuple((-1.0) ** i / factorial(2 * i) for i in range(11))
 
 
 @jit(inline=True)
@@ -334,20 +333,7 @@ def cos_sin_exact(cycles):
     """Cosine and sine of 2 pi `cycles` (float64, within [-0.5, 0.5]) to 1e-10, as float32."""
     h = cycles * np.pi
     q = h * h
-    s = _SINE[6] + q * _SINE[7]
-    s = _SINE[5] + q * s
-    s = _SINE[4] + q * s
-    s = _SINE[3] + q * s
-    s = _SINE[2] + q * s
-    s = _SINE[1] + q * s
-    s = h * (_SINE[0] + q * s)
-    c = _COSINE[6] + q * _COSINE[7]
-    c = _COSINE[5] + q * c
-    c = _COSINE[4] + q * c
-    c = _COSINE[3] + q * c
-    c = _COSINE[2] + q * c
-    c = _COSINE[1] + q * c
-    c = _COSINE[0] + q * c
+    s, c = h * _sum_of(_SHORT_SINE, q), _sum_of(_SHORT_COSINE, q)
     twice = 2.0 * s
     return narrow(1.0 - twice * s), narrow(twice * c)
 
@@ -357,26 +343,7 @@ def cos_sin_double(cycles):
     """Cosine and sine of 2 pi `cycles` (float64, within [-0.5, 0.5]) to some 1e-16."""
     h = cycles * np.pi
     q = h * h
-    s = _SINE[9] + q * _SINE[10]
-    s = _SINE[8] + q * s
-    s = _SINE[7] + q * s
-    s = _SINE[6] + q * s
-    s = _SINE[5] + q * s
-    s = _SINE[4] + q * s
-    s = _SINE[3] + q * s
-    s = _SINE[2] + q * s
-    s = _SINE[1] + q * s
-    s = h * (_SINE[0] + q * s)
-    c = _COSINE[9] + q * _COSINE[10]
-    c = _COSINE[8] + q * c
-    c = _COSINE[7] + q * c
-    c = _COSINE[6] + q * c
-    c = _COSINE[5] + q * c
-    c = _COSINE[4] + q * c
-    c = _COSINE[3] + q * c
-    c = _COSINE[2] + q * c
-    c = _COSINE[1] + q * c
-    c = _COSINE[0] + q * c
+    s, c = h * _sum_of(_SINE, q), _sum_of(_COSINE, q)
     twice = 2.0 * s
     return 1.0 - twice * s, twice * c
 
