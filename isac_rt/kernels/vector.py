@@ -1,7 +1,7 @@
 """Sixteen numbers as one value inside numba kernels.
 
 LLVM does not make vector code of loops over small slices (it cannot know that arrays do not
-overlap), so the kernels say it: `load`, `splat`, + - * (also with a number), `store`, for float32
+overlap), so the kernels say it: `load`, `splat`, + - * / (also with a number), `store`, for float32
 and float64. On AVX-512 sixteen float32 are one register; elsewhere LLVM splits them, so the kernels
 run, slower, on any processor. A product that feeds a sum becomes one fused instruction where there
 is one.
@@ -250,6 +250,7 @@ def _let(sign, of_two):
 _let(operator.add, _two(lambda builder, a, b: builder.fadd(a, b, flags=FAST)))
 _let(operator.sub, _two(lambda builder, a, b: builder.fsub(a, b, flags=FAST)))
 _let(operator.mul, _two(lambda builder, a, b: builder.fmul(a, b, flags=FAST)))
+_let(operator.truediv, _two(lambda builder, a, b: builder.fdiv(a, b, flags=FAST)))
 
 
 def _transposed(builder, rows):

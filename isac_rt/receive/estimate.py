@@ -24,7 +24,19 @@ import numpy as np
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, cos_sin_double, floor, load, splat, store
+from isac_rt.kernels.vector import (
+    LANES,
+    aligned,
+    cos_sin_double,
+    cos_sin_exact,
+    floor,
+    load,
+    narrow,
+    not_above,
+    splat,
+    store,
+    transpose,
+)
 from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
@@ -39,6 +51,7 @@ _STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1]
 """Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
+_NONE = np.float32(0)
 TIE = 1e-9
 """Share by which a direction must be stronger: both ends of the axis may be the same one."""
 T = TypeVar("T", float, np.ndarray)
@@ -91,17 +104,17 @@ class LocalSpectra:
         self._beam, self._in_phase = _NO_BEAM if beam is None else beam, in_phase
         low, count = _rows_about(row, spectra.shape[2])
         self._axis = _axis(known.waveform)._replace(first=float(low))
-        self._num_rx, blocks = spectra.shape[1], -(-spectra.shape[1] // LANES)
-        data = np.zeros(self._sent.tx.size * count * blocks * 2 * LANES, np.float32)
-        _gather(spectra, low, count, self._axis.share, data)
-        self._chirps = _Chirps(data, count, blocks, *self._sent[:3])
+        self._num_rx = spectra.shape[1]
+        self._chirps = _room(self._sent, self._num_rx, count)
+        _gather(np.ascontiguousarray(spectra), low, self._axis.share, self._chirps)
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
         amplitude; of separate groups the mean, each antenna turned into the phase that it has in
         the first one."""
-        out, energy = _match(self._chirps, self._axis, delay, delay_rate, self._sent.antennas)
-        return _responses(out[None], energy[None], self._num_rx, self.waveform.num_tx)[0]
+        path = np.array([delay]), np.array([delay_rate])
+        out, energy = _matched(self._chirps, self._axis, *path, self._sent.antennas)
+        return _responses(out, energy, self._num_rx, self.waveform.num_tx)[0]
 
     def modes(self, delay: float, delay_rate: float) -> np.ndarray:
         """(MODES, L_tx, L_rx) amplitudes of a path by polynomials over the chirp: the least squares
@@ -177,7 +190,7 @@ def _rows_about(row: int, rows: int) -> tuple[int, int]:
 class _Chirps(NamedTuple):
     """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
     `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
-    two filled up to a multiple of sixteen."""
+    two filled up to a multiple of sixteen. `tile`: room for sixteen times sixteen."""
 
     data: np.ndarray
     rows: int
@@ -185,6 +198,15 @@ class _Chirps(NamedTuple):
     weight: np.ndarray
     time: np.ndarray
     tx: np.ndarray
+    tile: np.ndarray
+
+
+def _room(sent: _Sent, num_rx: int, rows: int) -> _Chirps:
+    """Without samples yet."""
+    weight, time, tx, _ = sent
+    blocks = -(-num_rx // LANES)
+    data = aligned(tx.size * rows * blocks * 2 * LANES)
+    return _Chirps(data, rows, blocks, weight, time, tx, aligned(LANES * LANES))
 
 
 class _Axis(NamedTuple):
@@ -208,87 +230,105 @@ def _axis(waveform: Waveform) -> _Axis:
     return _Axis(w.carrier_frequency, w.slope, *window, 0.0)
 
 
-@jit
-def _gather(spectra, low, count, share, out):
-    """Fill the `data` of `_Chirps` with `count` rows from `low`. The window begins at sample 0 and
-    its transform is real about its middle: the turn from row to row is taken out here. Eight chirps
-    of all receivers at a time, which the nearest cache holds."""
-    groups, num_rx, _, num_chirps = spectra.shape
-    line, turns = 2 * LANES * (-(-num_rx // LANES)), np.empty(count, np.complex128)
-    for i in range(count):
-        turns[i] = np.exp(2j * np.pi * (low + i) * (share / 2))
-    for m in range(groups):
-        for begin in range(0, num_chirps, 8):
-            for i in range(count):
-                for r in range(num_rx):
-                    at = ((m * num_chirps + begin) * count + i) * line
-                    at += r // LANES * 2 * LANES + r % LANES
-                    for p in range(begin, min(begin + 8, num_chirps)):
-                        value = spectra[m, r, low + i, p] * turns[i]
-                        out[at], out[at + LANES] = value.real, value.imag
-                        at += count * line
+@jit(fast=True)
+def _gather(spectra, low, share, chirps):
+    """Fill `chirps.data` with rows from `low`. The window begins at sample 0 and its transform is
+    real about its middle: the turn from row to row is taken out here. Eight chirps of sixteen
+    receivers at a time."""
+    groups, num_rx, num_rows, num_chirps = spectra.shape
+    flat, tile, out = spectra.reshape(-1).view(np.float32), chirps.tile, chirps.data
+    rows, blocks, to_next = chirps.rows, chirps.blocks, 2 * num_rows * num_chirps
+    for i in range(rows):
+        angle = np.pi * (low + i) * share
+        c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        for m in range(groups):
+            for b in range(blocks):
+                lanes = min(LANES, num_rx - LANES * b)
+                start = (m * num_rx + LANES * b) * to_next + 2 * (low + i) * num_chirps
+                for p in range(0, num_chirps, LANES // 2):
+                    count = min(LANES // 2, num_chirps - p)
+                    if lanes < LANES or count < LANES // 2:
+                        tile[:] = np.float32(0)
+                    for r in range(lanes):
+                        at = start + r * to_next + 2 * p
+                        if count == LANES // 2:
+                            store(tile, LANES * r, load(flat, at))
+                        else:
+                            tile[LANES * r : LANES * r + 2 * count] = flat[at : at + 2 * count]
+                    transpose(tile, 0)
+                    for q in range(count):
+                        re, im = load(tile, 2 * LANES * q), load(tile, 2 * LANES * q + LANES)
+                        to = (((m * num_chirps + p + q) * rows + i) * blocks + b) * 2 * LANES
+                        store(out, to, c * re - s * im)
+                        store(out, to + LANES, s * re + c * im)
 
 
-@jit
-def _template(chirps, axis, delay, delay_rate):
-    """Of a path every chirp's weighted cosine and sine (P,) and its rows' real factors (rows, P):
-    beat, phase and `hann_response`, which a test holds against them."""
-    carrier, slope, middle, duration, length, share, first = axis
-    size = chirps.time.size
-    near, cycles, cosines = np.empty(size), np.empty((2, size)), np.empty((2, size))
-    for i in range(size):
-        tau = delay + delay_rate * chirps.time[i]
-        beat = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
-        turns, chirp = carrier * tau, slope * tau * (middle - tau / 2)
-        near[i] = (beat - first) * share
-        cycles[0, i] = turns - np.floor(turns) + chirp - np.floor(chirp)
-        cycles[1, i] = near[i] / 2
-    sines, shape = np.empty((2, size)), np.empty((chirps.rows, size))
-    for i in range(0, 2 * size, LANES):
-        angle = load(cycles.reshape(-1), i)
-        c, s = cos_sin_double(angle - floor(angle + splat(0.5)))
-        store(cosines.reshape(-1), i, c)
-        store(sines.reshape(-1), i, s)
+@jit(fast=True)
+def _template(chirps, axis, first, delay, delay_rate, steps, out):
+    """Of a path in the sixteen chirps from `first` on, sixteen float32 each: weighted cosine and
+    sine, weight times the sum of the rows' squared factors, and the rows' real factors. Beat, phase
+    and `hann_response`; a test holds them against these. `steps` : cosine and sine from the first
+    row to each."""
+    carrier, slope, middle, duration, length, share, low = axis
+    weight, tau = narrow(load(chirps.weight, first)), delay + delay_rate * load(chirps.time, first)
+    near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
+    near = (near - low) * share
+    turns, chirp, half = carrier * tau, slope * tau * (middle - 0.5 * tau), 0.5 * near
+    cycles = turns - floor(turns) + chirp - floor(chirp)
+    c, s = cos_sin_exact(cycles - floor(cycles + 0.5))
+    store(out, 0, weight * c)
+    store(out, LANES, weight * s)
+    c, s = cos_sin_double(half - floor(half + 0.5))
+    energy = _NONE * weight
     for k in range(chirps.rows):
-        step_cos, step_sin = np.cos(np.pi * share * k), np.sin(np.pi * share * k)
-        for i in range(size):
-            d = near[i] - k * share
-            value = sines[1, i] * step_cos - cosines[1, i] * step_sin
-            under = np.pi * d * (1.0 - d * d)
-            regular = abs(under) > 1e-8
-            edge = 0.5 if abs(d) > 0.5 else 1.0
-            shape[k, i] = length / 2 * (value / under if regular else edge)
-    for i in range(size):
-        cosines[0, i] *= chirps.weight[i]
-        sines[0, i] *= chirps.weight[i]
-    return cosines[0], sines[0], shape
+        d = near - k * share
+        value, under = s * steps[0, k] - c * steps[1, k], np.pi * d * (1.0 - d * d)
+        # at its middle and at the ends of its lobe the quotient is 1 and 1/2
+        at_hole, inside = not_above(under * under, splat(1e-16)), not_above(d * d, splat(0.25))
+        value = value + at_hole * (0.5 + 0.5 * inside - value)
+        under = under + at_hole * (1.0 - under)
+        factor = np.float32(length / 2) * (narrow(value) / narrow(under))
+        store(out, (3 + k) * LANES, factor)
+        energy = energy + factor * factor
+    store(out, 2 * LANES, weight * energy)
+
+
+@jit(fast=True)
+def _match(chirps, axis, delays, delay_rates, out, energy):
+    """Add to `out` (K, antennas * line), of every path and transmit antenna, the sum of
+    conj(template) times data, flat blocks of sixteen real and imaginary parts; and to `energy` (K,
+    antennas) that of the template."""
+    rows, blocks, data, flat = chirps.rows, chirps.blocks, chirps.data, out.reshape(-1)
+    line, template = 2 * LANES * blocks, chirps.tile
+    angle = np.pi * axis.share * np.arange(rows)
+    steps = np.stack((np.cos(angle), np.sin(angle)))
+    for first in range(0, chirps.tx.size, LANES):
+        for j in range(delays.size):
+            _template(chirps, axis, first, delays[j], delay_rates[j], steps, template)
+            for i in range(min(LANES, chirps.tx.size - first)):
+                tx = chirps.tx[first + i]
+                energy[j, tx] += template[2 * LANES + i]
+                c, s = template[i], template[LANES + i]
+                for b in range(blocks):
+                    at = (first + i) * rows * line + 2 * LANES * b
+                    re, im = _NONE * load(data, at), _NONE * load(data, at)
+                    for k in range(rows):
+                        factor = template[(3 + k) * LANES + i]
+                        re = re + factor * load(data, at)
+                        im = im + factor * load(data, at + LANES)
+                        at += line
+                    to = j * out.shape[1] + tx * line + 2 * LANES * b
+                    store(flat, to, load(flat, to) + c * re + s * im)
+                    store(flat, to + LANES, load(flat, to + LANES) + c * im - s * re)
 
 
 @jit
-def _match(chirps, axis, delay, delay_rate, antennas):
-    """Of every transmit antenna the sum of conj(template) times data, as flat blocks of sixteen
-    real and imaginary parts, and the energy of the template."""
-    cosine, sine, shape = _template(chirps, axis, delay, delay_rate)
-    rows, blocks, flat = chirps.rows, chirps.blocks, chirps.data
-    line = 2 * LANES * blocks
-    out, energy = np.zeros(antennas * line, np.float32), np.zeros(antennas)
-    for i in range(chirps.tx.size):
-        square = 0.0
-        for k in range(rows):
-            square += shape[k, i] * shape[k, i]
-        energy[chirps.tx[i]] += chirps.weight[i] * square
-        c, s = splat(np.float32(cosine[i])), splat(np.float32(sine[i]))
-        for b in range(blocks):
-            at = i * rows * line + 2 * LANES * b
-            re, im = splat(np.float32(0)), splat(np.float32(0))
-            for k in range(rows):
-                factor = splat(np.float32(shape[k, i]))
-                re = re + factor * load(flat, at)
-                im = im + factor * load(flat, at + LANES)
-                at += line
-            to = chirps.tx[i] * line + 2 * LANES * b
-            store(out, to, load(out, to) + c * re + s * im)
-            store(out, to + LANES, load(out, to + LANES) + c * im - s * re)
+def _matched(chirps, axis, delays, delay_rates, antennas):
+    """`_match` in new arrays."""
+    line = 2 * LANES * chirps.blocks
+    out = np.zeros((delays.size, antennas * line), np.float32)
+    energy = np.zeros((delays.size, antennas))
+    _match(chirps, axis, delays, delay_rates, out, energy)
     return out, energy
 
 
@@ -296,9 +336,10 @@ def _match(chirps, axis, delay, delay_rate, antennas):
 def _powers(chirps, axis, delays, delay_rates, antennas, beam, in_phase):
     """`LocalSpectra.powers`; `beam` (0, 0): there is none."""
     total, added = np.zeros(delays.size), np.empty(beam.shape[0], np.complex128)
+    every, energies = _matched(chirps, axis, delays, delay_rates, antennas)
+    line = every.shape[1] // antennas
     for j in range(delays.size):
-        out, energy = _match(chirps, axis, delays[j], delay_rates[j], antennas)
-        line = out.size // antennas
+        out, energy = every[j], energies[j]
         if not beam.size:
             for t in range(antennas):
                 square = 0.0
@@ -414,20 +455,19 @@ def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float
 
 
 @jit
-def _estimated(spectra, sent, axis, rows, delays, delay_rates, steps, units, out, energy):
+def _estimated(spectra, antennas, axis, rows, delays, delay_rates, steps, units, room, out, energy):
     """`LocalSpectra` about each of Q rows, its `climb` from delays and rates, in place, and
-    `_match` there, (Q, ...) floats and energies."""
-    weight, time, tx, antennas = sent
-    blocks = -(-spectra.shape[1] // LANES)
-    data = np.zeros(tx.size * (2 * HALF_WIDTH + 1) * blocks * 2 * LANES, np.float32)
+    `_match` there, (Q, ...) floats and energies, which are 0 before."""
+    data, _, blocks, weight, time, tx, tile = room
     for q in range(rows.size):
         low, count = _rows_about(rows[q], spectra.shape[2])
-        _gather(spectra, low, count, axis.share, data)
-        chirps = _Chirps(data, count, blocks, weight, time, tx)
+        chirps = _Chirps(data, count, blocks, weight, time, tx, tile)
+        _gather(spectra, low, axis.share, chirps)
         here = _Axis(*axis[:-1], np.float64(low))
         way = delays[q], delay_rates[q], steps, units, antennas, np.zeros((0, 0), np.complex128)
         delays[q], delay_rates[q] = _climb(chirps, here, *way, False)
-        out[q], energy[q] = _match(chirps, here, delays[q], delay_rates[q], antennas)
+        one = slice(q, q + 1)
+        _match(chirps, here, delays[one], delay_rates[one], out[one], energy[one])
 
 
 @dataclass(frozen=True)
@@ -455,11 +495,10 @@ class Estimator:
         """Those of all peaks (Q,) in spectra; `separate` as in `LocalSpectra`."""
         w, sent, num_rx = known.waveform, _sent(known, separate), spectra.shape[1]
         (delays, rates), steps = self._begun(power, rows, columns, w)
-        energy = np.empty((len(rows), sent.antennas))
-        line = 2 * LANES * -(-num_rx // LANES)
-        out = np.empty((len(rows), sent.antennas * line), np.float32)
-        args = rows, delays, rates, np.array(steps), _units(w), out, energy
-        _estimated(spectra, sent, _axis(w), *args)
+        energy, room = np.zeros((len(rows), sent.antennas)), _room(sent, num_rx, 2 * HALF_WIDTH + 1)
+        out = np.zeros((len(rows), sent.antennas * 2 * LANES * room.blocks), np.float32)
+        args = rows, delays, rates, np.array(steps), _units(w), room, out, energy
+        _estimated(np.ascontiguousarray(spectra), sent.antennas, _axis(w), *args)
         channels = _responses(out, energy, num_rx, w.num_tx)
         return [
             Estimate(*one) for one in zip(delays.tolist(), rates.tolist(), channels, strict=True)

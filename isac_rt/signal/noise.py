@@ -34,6 +34,8 @@ class WhiteNoise(NamedTuple):
     seed_words: np.ndarray
 
 
+_BLOCK = 512
+"""Samples whose words stay in the nearest cache."""
 _PARITY = np.uint32(0x1BD11BDA)  # Threefish key-schedule constant, 32-bit variant
 _LN2 = np.float32(np.log(2.0))
 _TURN = np.float32(2 * np.pi)
@@ -47,11 +49,38 @@ _COS = tuple(np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
 
 
 @jit(inline=True)
+def _same(k):
+    """Four times the same word."""
+    return k, k, k, k
+
+
+@jit(inline=True)
+def _plus(a, b):
+    """Sums of four words and four others, modulo 2^32 as all below."""
+    return (
+        uint32(a[0] + b[0]),
+        uint32(a[1] + b[1]),
+        uint32(a[2] + b[2]),
+        uint32(a[3] + b[3]),
+    )
+
+
+@jit(inline=True)
+def _rotated(b, r):
+    """The bits of a word moved up by r places, around the end."""
+    return uint32(uint32(b << uint32(r)) | uint32(b >> uint32(32 - r)))
+
+
+@jit(inline=True)
 def _mix(a, b, r):
-    """One Threefry round: add, rotate, exclusive or (all modulo 2^32)."""
-    a = uint32(a + b)
-    b = uint32(uint32(b << uint32(r)) | uint32(b >> uint32(32 - r)))
-    return a, uint32(b ^ a)
+    """One Threefry round: add, rotate, exclusive or."""
+    a = _plus(a, b)
+    return a, (
+        uint32(_rotated(b[0], r) ^ a[0]),
+        uint32(_rotated(b[1], r) ^ a[1]),
+        uint32(_rotated(b[2], r) ^ a[2]),
+        uint32(_rotated(b[3], r) ^ a[3]),
+    )
 
 
 @jit(inline=True)
@@ -70,20 +99,40 @@ def _four_rounds(a, b, even):
 
 
 @jit(inline=True)
-def _threefry(counter0, counter1, key0, key1):
-    """Two random words of a two-word counter under a two-word key (20 rounds)."""
+def _threefry(a, b, key0, key1):
+    """Two random words of each of four two-word counters under a two-word key (20 rounds). Every
+    operation waits for the one before; those of four counters do not wait for each other."""
     key2 = uint32(uint32(key0 ^ key1) ^ _PARITY)
-    a, b = uint32(counter0 + key0), uint32(counter1 + key1)
+    a, b = _plus(a, _same(key0)), _plus(b, _same(key1))
     a, b = _four_rounds(a, b, True)
-    a, b = uint32(a + key1), uint32(b + uint32(key2 + uint32(1)))
+    a, b = _plus(a, _same(key1)), _plus(b, _same(uint32(key2 + uint32(1))))
     a, b = _four_rounds(a, b, False)
-    a, b = uint32(a + key2), uint32(b + uint32(key0 + uint32(2)))
+    a, b = _plus(a, _same(key2)), _plus(b, _same(uint32(key0 + uint32(2))))
     a, b = _four_rounds(a, b, True)
-    a, b = uint32(a + key0), uint32(b + uint32(key1 + uint32(3)))
+    a, b = _plus(a, _same(key0)), _plus(b, _same(uint32(key1 + uint32(3))))
     a, b = _four_rounds(a, b, False)
-    a, b = uint32(a + key1), uint32(b + uint32(key2 + uint32(4)))
+    a, b = _plus(a, _same(key1)), _plus(b, _same(uint32(key2 + uint32(4))))
     a, b = _four_rounds(a, b, True)
-    return uint32(a + key2), uint32(b + uint32(key0 + uint32(5)))
+    return _plus(a, _same(key2)), _plus(b, _same(uint32(key0 + uint32(5))))
+
+
+@jit(fast=True)
+def random_words(first_words, second_words, first, key0, key1):
+    """The two words of sample `first` of the stream and of those after it, a multiple of four."""
+    n, low, high = first_words.shape[0] // 4, uint32(first), uint32(first >> np.uint64(32))
+    for i in range(n):
+        a = _plus(_same(uint32(low + uint32(i))), (0, uint32(n), uint32(2 * n), uint32(3 * n)))
+        b = (
+            uint32(high + uint32(a[0] < low)),
+            uint32(high + uint32(a[1] < low)),
+            uint32(high + uint32(a[2] < low)),
+            uint32(high + uint32(a[3] < low)),
+        )
+        a, b = _threefry(a, b, key0, key1)
+        first_words[i], second_words[i] = a[0], b[0]
+        first_words[i + n], second_words[i + n] = a[1], b[1]
+        first_words[i + 2 * n], second_words[i + 2 * n] = a[2], b[2]
+        first_words[i + 3 * n], second_words[i + 3 * n] = a[3], b[3]
 
 
 @jit(inline=True)
@@ -119,42 +168,23 @@ def _cos_sin(word):
     return cosine, sine
 
 
-@jit(inline=True)
-def _gaussian(low, high, i, power, key0, key1):
-    """Real and imaginary part of sample i from the one with counter (low, high) on."""
-    counter = uint32(low + uint32(i))
-    carry = uint32(1) if counter < low else uint32(0)
-    a, b = _threefry(counter, uint32(high + carry), key0, key1)
-    r = np.sqrt(power * _minus_log(a))
-    c, s = _cos_sin(b)
-    return r * c, r * s
+@jit(fast=True)
+def _add_gaussians(out, power, first_words, second_words):
+    """Add a complex Gaussian of each two words to (out[2 i], out[2 i + 1])."""
+    for i in range(out.shape[0] // 2):
+        r = np.sqrt(power * _minus_log(first_words[i]))
+        c, s = _cos_sin(second_words[i])
+        out[2 * i] += r * c
+        out[2 * i + 1] += r * s
 
 
 @jit(fast=True)
 def add_stream(out, power, key0, key1, first):
-    """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1]), fewer than 2^32."""
-    half, low, high = out.shape[0] // 4, uint32(first), uint32(first >> np.uint64(32))
-    for i in range(half):  # two samples at once, for the operations of one wait for each other
-        j = i + half
-        x, y = _gaussian(low, high, i, power, key0, key1)
-        u, v = _gaussian(low, high, j, power, key0, key1)
-        out[2 * i] += x
-        out[2 * i + 1] += y
-        out[2 * j] += u
-        out[2 * j + 1] += v
-    for i in range(2 * half, out.shape[0] // 2):
-        x, y = _gaussian(low, high, i, power, key0, key1)
-        out[2 * i] += x
-        out[2 * i + 1] += y
-
-
-@jit
-def _words(counters, keys):
-    """Threefry-2x32-20 of (n, 2) counters and (n, 2) keys, for the known-answer test."""
-    out = np.empty_like(counters)
-    for i in range(counters.shape[0]):
-        out[i, 0], out[i, 1] = _threefry(counters[i, 0], counters[i, 1], keys[i, 0], keys[i, 1])
-    return out
+    """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1])."""
+    a, b = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
+    for start in range(0, out.shape[0] // 2, _BLOCK):
+        random_words(a, b, np.uint64(first + np.uint64(start)), key0, key1)
+        _add_gaussians(out[2 * start : 2 * (start + _BLOCK)], power, a, b)
 
 
 def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: int = 0) -> None:

@@ -384,9 +384,13 @@ def test_peaks_that_lobes_explain_are_those_of_plain_numpy():
     assert without_sidelobes(rows, bins, power, 120, 1e-5).tolist() == keep.tolist()
 
 
-def test_compiled_match_is_the_template():
-    """Planted bugs: Doppler without the data delay, phase at the first sample, window's transform
-    about its start."""
+@pytest.mark.parametrize(
+    "place", [14.37, 14.0, 14.0 - Waveform().num_samples / Waveform().window_length]
+)
+def test_compiled_match_is_the_template(place: float):
+    """In general, and in the middle of a row and at the end of its lobe, where the window's
+    transform is 0/0. Planted bugs: Doppler without the data delay, phase at the first sample,
+    window's transform about its start; 1 or 0/0 at the end of a lobe."""
     w, schedule, _ = frame()
     spectra = (
         np.random.default_rng(2)
@@ -394,7 +398,7 @@ def test_compiled_match_is_the_template():
         .astype(np.float32)
         .view(np.complex64)[..., 0]
     )
-    tau, rate, row = 14.37 * w.delay_step, 3.1e-8, 14
+    tau, rate, row = place * w.delay_step, 3.1e-8 * (place == 14.37), 14
     got = LocalSpectra(spectra, known(w, schedule, unmodulated(w)), row).respond(tau, rate)
     rows = np.arange(row - 3, row + 4)
     shape = hann_response(w, w.beat_cells(tau, rate)[..., None] - rows)

@@ -12,7 +12,7 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import seed_sequence
 from isac_rt.signal.if_signal import add_noise
-from isac_rt.signal.noise import _words, add_white_noise
+from isac_rt.signal.noise import add_white_noise, random_words
 
 COUNT = 1 << 20
 SIGMAS = 5  # statistical: a false failure in 1.7 million
@@ -24,16 +24,25 @@ def draw(*purpose, count=COUNT, power=1.0):
     return out
 
 
+def words(first, key, count):
+    """(2, count) words of the samples from `first` on."""
+    out = np.zeros((2, count), np.uint32)
+    random_words(*out, np.uint64(first), *np.array(key, np.uint32))
+    return out
+
+
 def test_known_answers_of_threefry():
-    """Published with the Random123 library for Threefry-2x32, 20 rounds. Planted bug: rotation 16
-    for 15."""
-    ones = 0xFFFFFFFF
-    counters = np.array([[0, 0], [ones, ones], [0x243F6A88, 0x85A308D3]], np.uint32)
-    keys = np.array([[0, 0], [ones, ones], [0x13198A2E, 0x03707344]], np.uint32)
-    answers = [[0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]]
-    np.testing.assert_array_equal(
-        _words(counters, keys), np.array(answers, np.uint32)
-    )  # published, exact
+    """Published with the Random123 library for Threefry-2x32, 20 rounds: of counters alone, and in
+    each of the four places of a block. Planted bugs: rotation 16 for 15; the third place's counter
+    one too large; no carry."""
+    counters = 0, 2**64 - 1, 0x85A308D3_243F6A88
+    keys = [0, 0], [0xFFFFFFFF] * 2, [0x13198A2E, 0x03707344]
+    answers = [0x6B200159, 0x99BA4EFE], [0x1CB996FC, 0xBB002BE7], [0xC4923A9C, 0x483DF7A0]
+    for counter, key, answer in zip(counters, keys, answers, strict=True):
+        for size in (4, 512):
+            for place in range(0, size, size // 4):
+                first = (counter - place) % 2**64
+                assert words(first, key, size)[:, place].tolist() == answer  # published, exact
 
 
 def test_each_sample_is_box_and_mullers():
@@ -43,12 +52,8 @@ def test_each_sample_is_box_and_mullers():
     key, power, count = np.array([0x13198A2E, 0x03707344], np.uint32), 1.0, 300_000
     z = np.zeros(count, np.complex64)
     add_white_noise(z, power, key)
-    counters = np.stack([np.arange(count, dtype=np.uint32), np.zeros(count, np.uint32)], axis=1)
-    words = _words(counters, np.tile(key, (count, 1))).astype(float)
-    square, turn = (
-        -power * np.log((words[:, 0] + 0.5) / 2**32),
-        np.exp(2j * np.pi * words[:, 1] / 2**32),
-    )
+    first, second = words(0, key, count).astype(float)
+    square, turn = -power * np.log((first + 0.5) / 2**32), np.exp(2j * np.pi * second / 2**32)
     off = np.abs(np.abs(z.astype(complex)) ** 2 - square)
     assert (
         off[square < np.log(2) / 2].max() < 2.4e-7
