@@ -44,10 +44,11 @@ _INSTALL_LLVM = (
     "install LLVM 19 (Debian 12 and later, Ubuntu 24.04 and later: apt install libllvm19)"
 )
 
-COLLECT = 20_000
+COLLECT = 100_000
 """Objects made until garbage is looked for among them: what commands import stays, and looking
-through it after each 700 takes over a second. Older ones are looked through as often as ever: what
-runs leave, figures above all, would pile up in a command of many runs."""
+through it after each 700 takes over a second, after each 20,000 twice as long as after so many.
+Older ones are looked through as often as ever: what runs leave, figures above all, would pile up in
+a command of many runs."""
 LINEAR_ALGEBRA = "OPENBLAS_NUM_THREADS", "1"
 """Frames work in threads of their own. Those of numpy's library have nothing to do, but look for
 work at first, both of the two copies that come with numpy and scipy: 0.2 s, more on a busy machine;
