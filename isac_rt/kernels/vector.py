@@ -349,12 +349,19 @@ def cos_sin_double(cycles):
     return 1.0 - twice * s, twice * c
 
 
-def aligned(size: int) -> np.ndarray:
-    """Zeros (size,) float32 from an address that is a multiple of 64: a vector that crosses a cache
-    line costs twice."""
-    room = np.zeros(4 * size + 64, np.uint8)
+def unset(size: int) -> np.ndarray:
+    """Float32 (size,) of any values from an address that is a multiple of 64: a vector that crosses
+    a cache line costs twice."""
+    room = np.empty(4 * size + 64, np.uint8)
     start = -room.ctypes.data % 64
     return room[start : start + 4 * size].view(np.float32)
+
+
+def aligned(size: int) -> np.ndarray:
+    """`unset`, all zeros."""
+    out = unset(size)
+    out[:] = 0
+    return out
 
 
 _SPARE: list[np.ndarray] = []
@@ -387,7 +394,4 @@ def lent_memory(shape: tuple[int, ...]) -> np.ndarray:
 
 def new_memory(shape: tuple[int, ...]) -> np.ndarray:
     """Complex64 of any values from an address that is a multiple of 64."""
-    size = 8 * int(np.prod(shape))
-    room = np.empty(size + 64, np.uint8)
-    start = -room.ctypes.data % 64
-    return room[start : start + size].view(np.complex64).reshape(shape)
+    return unset(2 * int(np.prod(shape))).view(np.complex64).reshape(shape)

@@ -36,6 +36,7 @@ from isac_rt.kernels.vector import (
     splat,
     store,
     transpose,
+    unset,
 )
 from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
@@ -205,7 +206,7 @@ def _room(sent: _Sent, num_rx: int, rows: int) -> _Chirps:
     """Without samples yet."""
     weight, time, tx, _ = sent
     blocks = -(-num_rx // LANES)
-    data = aligned(tx.size * rows * blocks * 2 * LANES)
+    data = unset(tx.size * rows * blocks * 2 * LANES)
     return _Chirps(data, rows, blocks, weight, time, tx, aligned(LANES * LANES))
 
 

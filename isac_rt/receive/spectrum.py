@@ -29,7 +29,6 @@ from isac_rt.kernels.vector import (
     load,
     narrow,
     new_memory,
-    splat,
     store,
     zip_high,
     zip_low,
@@ -43,52 +42,70 @@ def _factors(
 ) -> np.ndarray:
     """Hann's window at sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D
     to k: (P, N) complex64."""
-    out = np.empty((len(starts), num_samples), np.complex64)
-    symbols = np.asarray(delay_symbols, np.int64) % num_samples
-    _fill_factors(symbols, starts.astype(np.float64), length, *_phasors(num_samples, length), out)
-    return out
-
-
-@lru_cache(maxsize=8)
-def _phasors(num_samples: int, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of the window and of the transform, at every sample."""
-    n = np.arange(num_samples)
-    return np.exp(2j * np.pi / length * n), np.exp(-2j * np.pi / num_samples * n)
-
-
-@jit
-def _fill_factors(symbols, starts, length, places, roots, out):
-    """Sines of sums made of few sines: `places` are those of the window, `roots` those of the
-    transform."""
-    for p in range(out.shape[0]):
-        begin = np.exp(-2j * np.pi * starts[p] / length)
-        at = 0
-        for n in range(out.shape[1]):
-            inside = starts[p] <= n <= starts[p] + length
-            out[p, n] = (0.5 - 0.5 * (begin * places[n]).real) * roots[at] if inside else 0.0
-            at += symbols[p]
-            if at >= out.shape[1]:
-                at -= out.shape[1]
-
-
-def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
-    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, with phases
-    in float64."""
-    places = np.arange(num_samples + -num_samples % LANES, dtype=float)
-    out = np.empty((len(frequency), places.size), np.complex64)
-    _fill_tones(np.asarray(frequency, float), places, out.view(np.float32).reshape(-1))
+    out = _padded_tones(-np.asarray(delay_symbols) / num_samples, num_samples)
+    window = _window_phases(out.shape[1], length)
+    _weigh(starts.astype(np.float64), length, *window, out.view(np.float32))
     return np.ascontiguousarray(out[:, :num_samples])
 
 
+@lru_cache(maxsize=8)
+def _window_phases(num_samples: int, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine and sine of the window that begins at sample 0, at every sample."""
+    angle = 2 * np.pi / length * np.arange(num_samples)
+    return np.cos(angle), np.sin(angle)
+
+
 @jit
-def _fill_tones(frequency, places, out):
+def _weigh(starts, length, cosine, sine, out):
+    """Multiply rows by Hann's window from each start on, 0 outside."""
+    flat, at = out.reshape(-1), 0
+    for p in range(out.shape[0]):
+        angle = 2 * np.pi * starts[p] / length
+        c, s = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
+        for n in range(0, cosine.size, LANES):
+            window = narrow(0.5 - (c * load(cosine, n) + s * load(sine, n)))
+            store(flat, at, zip_low(window, window) * load(flat, at))
+            store(flat, at + LANES, zip_high(window, window) * load(flat, at + LANES))
+            at += 2 * LANES
+        out[p, : 2 * int(np.ceil(starts[p]))] = 0
+        out[p, 2 * int(np.floor(starts[p] + length)) + 2 :] = 0
+
+
+def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
+    """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, to 2e-7."""
+    return np.ascontiguousarray(_padded_tones(frequency, num_samples)[:, :num_samples])
+
+
+def _padded_tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
+    """`tones` of the next multiple of sixteen samples."""
+    blocks = -(-num_samples // LANES)
+    places = np.arange(blocks + -blocks % LANES, dtype=float)
+    out = np.empty((len(frequency), blocks * LANES), np.complex64)
+    starts = np.empty(2 * places.size, np.float32)
+    flat = out.view(np.float32).reshape(-1)
+    _fill_tones(np.asarray(frequency, float), blocks, places, starts, flat)
+    return out
+
+
+@jit
+def _fill_tones(frequency, blocks, places, starts, out):
+    """Of each sixteen samples the first one's phase, reduced in float64, times those of sixteen
+    from 0."""
     at = 0
     for p in range(frequency.size):
-        for n in range(0, places.size, LANES):
-            cycles = splat(frequency[p]) * load(places, n)
-            c, s = cos_sin_double(cycles - floor(cycles + splat(0.5)))
-            store(out, at, zip_low(narrow(c), narrow(s)))
-            store(out, at + LANES, zip_high(narrow(c), narrow(s)))
+        for b in range(0, places.size, LANES):
+            cycles = LANES * frequency[p] * load(places, b)
+            c, s = cos_sin_double(cycles - floor(cycles + 0.5))
+            store(starts, b, narrow(c))
+            store(starts, places.size + b, narrow(s))
+        cycles = frequency[p] * load(places, 0)
+        c, s = cos_sin_double(cycles - floor(cycles + 0.5))
+        lr, li = narrow(c), narrow(s)
+        for b in range(blocks):
+            c, s = starts[b], starts[places.size + b]
+            re, im = c * lr - s * li, c * li + s * lr
+            store(out, at, zip_low(re, im))
+            store(out, at + LANES, zip_high(re, im))
             at += 2 * LANES
 
 

@@ -34,6 +34,7 @@ from isac_rt.kernels.vector import (
     narrow,
     splat,
     store,
+    unset,
 )
 from isac_rt.signal.direct import passed
 from isac_rt.signal.tones import Tones
@@ -179,8 +180,8 @@ def desk(paths: Covered) -> Desk:
     """Room for the sums of these paths."""
     blocks = paths.turn.size // LANES
     return Desk(
-        aligned(blocks * _Z),
-        aligned(blocks * LANES * (TOGETHER // _ACROSS)),
+        unset(blocks * _Z),
+        unset(blocks * LANES * (TOGETHER // _ACROSS)),
         aligned((_BLOCK + 1) * _LINE),
         np.arange(LANES) / LINES - 0.5,
         aligned(TOGETHER * TAPS * LANES),

@@ -44,6 +44,7 @@ from isac_rt.kernels.vector import (
     store,
     stream,
     transpose,
+    unset,
     zip_high,
     zip_low,
 )
@@ -655,7 +656,7 @@ def _steering(
     mid-window (real, imaginary) and, `wideband`, their turn over half a chirp [rad]: (32 or 48 n,)
     float32."""
     w, planes = waveform, 3 if wideband else 2
-    out = aligned(len(path) * planes * LANES)
+    out = unset(len(path) * planes * LANES)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
     turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
     _steer(out, planes, path, rx, first, middle, w.slope, turn, np.zeros(LANES))
@@ -839,7 +840,7 @@ def _synthesise(
         (setting.width - taps) // 2 * ROW,
         kernel.faint.ravel(),
     )
-    grids = aligned(int(order.parts[:, 1].max()) * stride)
+    grids = unset(int(order.parts[:, 1].max()) * stride)
     tile = aligned(_TILE + LANES * (2 * num_samples + ROW))
     room = _Room(grids, aligned(80), aligned(_STEP * setting.width), tile)
     flat, rx, shared = out.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)

@@ -506,14 +506,16 @@ def _distances(
     a: np.ndarray, b: np.ndarray, of_a: np.ndarray, of_b: np.ndarray, most: float
 ) -> tuple[np.ndarray, np.ndarray]:
     d2, log_det = np.full((len(a), len(b)), np.inf), np.full((len(a), len(b)), np.inf)
-    work = np.empty((SIZE + 1, SIZE))
+    work, traces = np.empty((SIZE + 1, SIZE)), np.array([np.trace(P) for P in of_b])
     for i in range(len(a)):
+        trace = np.trace(of_a[i])
         for j in range(len(b)):
-            y = a[i] - b[j]
-            trace = np.trace(of_a[i]) + np.trace(of_b[j])
-            if np.sum(y * y) > most * trace:  # no variance is larger
+            square = 0.0
+            for k in range(SIZE):
+                square += (a[i, k] - b[j, k]) ** 2
+            if square > most * (trace + traces[j]):  # no variance is larger
                 continue
-            here = distance(y, of_a[i] + of_b[j], work)
+            here = distance(a[i] - b[j], of_a[i] + of_b[j], work)
             if here[0] <= most:
                 d2[i, j], log_det[i, j] = here
     return d2, log_det
