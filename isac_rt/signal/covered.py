@@ -57,6 +57,7 @@ _Z = 2 * LANES * TOGETHER  # float32 of 16 paths' amplitudes in these chirps
 _SUM = 2 * LANES  # float32 of a line's sums in a chirp
 _LINE = _SUM * TOGETHER  # and in these chirps
 _BLOCK = 32  # lines whose sums stay in the nearest caches
+_BITS = LANES.bit_length() - 1  # n >> _BITS is n // LANES, which would mind the sign of n
 _NONE, _ONE = np.float32(0), np.float32(1)
 
 
@@ -408,7 +409,7 @@ def _amplitudes(desk, paths, first, last, antenna):
 @jit(inline=True)
 def _one(z, j, sr, si, ar, ai):
     """Add a path's amplitude in a chirp times its elements' phasors."""
-    x, y = z[j], z[j + LANES]
+    x, y = z[np.uint64(j)], z[np.uint64(j + LANES)]
     return ar + x * sr - y * si, ai + x * si + y * sr
 
 
@@ -455,8 +456,10 @@ def _factors(desk, count, antenna, w, sheet):
 @jit(fast=True)
 def _sum(desk, count, sheet, paths, order, chirps):
     """Sum the paths beside each of `count` lines in the `chirps` of a batch. What paths leave to
-    the line after theirs is there when its turn comes."""
-    steer, z, sums, size = paths.steer, desk.z, desk.sums, paths.turn.shape[0]
+    the line after theirs is there when its turn comes. Unsigned indices are not checked for their
+    sign."""
+    steer, z, sums, shares = paths.steer, desk.z, desk.sums, desk.share
+    size = paths.turn.shape[0]
     for b in range(count):
         begin, end, line = desk.begin[b], desk.end[b], _LINE * b
         for first in range(0, chirps, _ACROSS):  # as often as before, which processors foresee
@@ -469,9 +472,9 @@ def _sum(desk, count, sheet, paths, order, chirps):
                 zero = _NONE * ar
                 br, bi, dr, di, fr, fi = zero, zero, zero, zero, zero, zero
                 for i in range(begin, end):
-                    n = order[i]
-                    k, j = 48 * n + lane, n // LANES * _Z + n % LANES + to_z
-                    share = load_part(steer, k + 32) + desk.share[own + n]
+                    n = order[np.uint64(i)]
+                    k, j = 48 * n + lane, (n >> _BITS) * _Z + (n & LANES - 1) + to_z
+                    share = load_part(steer, k + 32) + shares[np.uint64(own + n)]
                     under = _ONE - share
                     more = _ONE + share * under * np.float32(sheet.more)
                     share, under = share * more, under * more

@@ -129,7 +129,7 @@ def _tone(room, half, amplitude, phase, frequency, quadratic):
 
 
 @jit(fast=True)
-def _flush(out, to, num_samples, sums, fresh):
+def flush(out, to, num_samples, sums, fresh):
     """Write the sums of one chirp to its samples, from out[to] on, or add them, and clear them."""
     zero = splat(np.float32(0))
     for at in range(0, 2 * num_samples, 32):
@@ -169,43 +169,69 @@ class _Room(NamedTuple):
     places: np.ndarray
 
 
+class OneByOne(NamedTuple):
+    """Paths and group offsets (K,) of tones, and the memory of their sums."""
+
+    path: np.ndarray
+    offset: np.ndarray
+    tones: Tones
+    room: _Room
+
+
+def one_by_one(waveform: Waveform, tones: Tones) -> OneByOne:
+    """All that is heard of some tones, for the kernels."""
+    lanes = np.arange(LANES)
+    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
+        [-1.0, 1.0], LANES
+    )
+    blocks = -(-waveform.num_samples // LANES)
+    room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
+    return OneByOne(*sources(waveform, tones), tones, room)
+
+
 @jit(fast=True)
-def _direct(out, shape, w, path, offset, t, fresh, room, turn):
-    """Add the listed (path, group offset) of the tones to the samples of `shape`, or write them."""
+def sum_paths(alone, w, half, m, r, p):
+    """Add the paths to the sums of chirp p of group m at element r; how many it has."""
+    path, offset, t, room = alone
+    groups, time, count = t.send.shape[1], w.first + p * w.slot + m * w.spacing, 0
+    for i in range(path.shape[0]):
+        k, source = path[i], m - offset[i]
+        if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
+            continue
+        q = t.link[k]
+        tau = (
+            t.symbol_delay[q, source, p]
+            + t.delay[k]
+            + (t.rate[k] + t.accel[k] * time / 2) * time
+            - offset[i] * w.spacing
+        )
+        amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
+        if amplitude == 0:
+            continue
+        a = t.antenna[q, source, p]
+        if t.tx_gain.shape[0]:
+            amplitude *= t.tx_gain[k, a]
+        if t.rx_gain.shape[0]:
+            amplitude *= t.rx_gain[k, r]
+        element = tau + t.tx_delay[k, a] + t.rx_delay[k, r] + t.cross[t.cross_row[k], a, r]
+        terms = chirp_terms(w, element, t.rate[k] + t.accel[k] * time, t.accel[k])
+        _tone(room, half, amplitude, *terms)
+        count += 1
+    return count
+
+
+@jit(fast=True)
+def _direct(out, shape, w, alone, fresh, turn):
+    """Add the paths to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
-    half = float(num_samples // 2)
+    half, sums = float(num_samples // 2), alone.room.sums
     for line in range(groups * num_rx * chirps):  # as they lie in memory
         m, r, p = line // (num_rx * chirps), line // chirps % num_rx, line % chirps
-        time = w.first + p * w.slot + m * w.spacing
-        count = 0
-        for i in range(path.shape[0]):
-            k, source = path[i], m - offset[i]
-            if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
-                continue
-            q = t.link[k]
-            tau = (
-                t.symbol_delay[q, source, p]
-                + t.delay[k]
-                + (t.rate[k] + t.accel[k] * time / 2) * time
-                - offset[i] * w.spacing
-            )
-            amplitude = t.factor[k] * t.send[q, source, p] * passed(w, tau)
-            if amplitude == 0:
-                continue
-            a = t.antenna[q, source, p]
-            if t.tx_gain.shape[0]:
-                amplitude *= t.tx_gain[k, a]
-            if t.rx_gain.shape[0]:
-                amplitude *= t.rx_gain[k, r]
-            element = tau + t.tx_delay[k, a] + t.rx_delay[k, r] + t.cross[t.cross_row[k], a, r]
-            terms = chirp_terms(w, element, t.rate[k] + t.accel[k] * time, t.accel[k])
-            _tone(room, half, amplitude, *terms)
-            count += 1
-        if count == 0 and not fresh:
+        if sum_paths(alone, w, half, m, r, p) == 0 and not fresh:
             continue
         if turn.shape[0]:
-            _turned(room.sums, turn[m * chirps + p])
-        _flush(out, 2 * num_samples * line, num_samples, room.sums, fresh)
+            _turned(sums, turn[m * chirps + p])
+        flush(out, 2 * num_samples * line, num_samples, sums, fresh)
 
 
 def add_direct(
@@ -228,19 +254,13 @@ def add_direct(
     fresh : write instead of adding, whatever `samples` held
     turn : (M, P, N) complex64 by which the paths' samples are multiplied; None: not
     """
-    path, offset = sources(waveform, tones)
-    if path.size == 0:
+    alone = one_by_one(waveform, tones)
+    if alone.path.size == 0:
         if fresh:
             samples[:] = 0
         return
-    lanes = np.arange(LANES)
-    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
-        [-1.0, 1.0], LANES
-    )
-    blocks = -(-samples.shape[3] // LANES)
-    room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
     flat = samples.reshape(-1).view(np.float32)
     rows = np.zeros((0, 0), np.float32)
     if turn is not None:
         rows = turn.reshape(-1, turn.shape[2]).view(np.float32)
-    _direct(flat, samples.shape, numbers(waveform), path, offset, tones, fresh, room, rows)
+    _direct(flat, samples.shape, numbers(waveform), alone, fresh, rows)

@@ -65,7 +65,15 @@ from isac_rt.signal.covered import (
     plain_batches,
     turn_elements,
 )
-from isac_rt.signal.direct import numbers, passed
+from isac_rt.signal.direct import (
+    OneByOne,
+    add_direct,
+    flush,
+    numbers,
+    one_by_one,
+    passed,
+    sum_paths,
+)
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
 from isac_rt.signal.tones import Tones, sources
@@ -301,11 +309,13 @@ class _Faint(NamedTuple):
 
 
 class _Heard(NamedTuple):
-    """What is heard: blocks of paths, the `_steering` of these, and what noise covers."""
+    """What is heard: blocks of paths, the `_steering` of these, what noise covers, and what is
+    added past the grid."""
 
     blocks: _Blocks
     steer: np.ndarray
     faint: _Faint
+    alone: OneByOne
 
 
 class _Room(NamedTuple):
@@ -494,15 +504,14 @@ def _fold(grid, size, low, width):
 
 
 @jit(fast=True)
-def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fresh):
-    """Write the rows of the samples, divided by the kernel's response: channel r of sample n to
-    out[at + r stride + 2 n]. Fresh ones are put together channel by channel in the tile first, for
-    the channels lie in memory where they would drive each other out of the cache."""
+def _divide(deconvolution, channels, grid, low, order, tile):
+    """Divide the rows of the samples by the kernel's response and put them together channel by
+    channel in the tile: in memory the channels lie where they would drive each other out of the
+    cache."""
     num_samples, size = deconvolution.shape[0], order.shape[0]
     half, line = num_samples // 2, 2 * num_samples + ROW
     for start in range(0, num_samples, 16):
-        count = min(16, num_samples - start)
-        for i in range(count):
+        for i in range(min(16, num_samples - start)):
             mode = start + i - half
             row = (low + order[mode if mode >= 0 else mode + size]) * ROW
             d = splat(deconvolution[start + i])
@@ -511,28 +520,26 @@ def _emit(out, at, stride, channels, deconvolution, grid, low, order, tile, fres
         transpose(tile, 0)
         transpose(tile, 256)
         for r in range(channels):
-            to = at + r * stride + 2 * start
             re, im = load(tile, 16 * r), load(tile, 256 + 16 * r)
-            if count == 16 and fresh:
-                here = _TILE + r * line + 2 * start
-                store(tile, here, zip_low(re, im))
-                store(tile, here + 16, zip_high(re, im))
-            elif count == 16:
-                store(out, to, load(out, to) + zip_low(re, im))
-                store(out, to + 16, load(out, to + 16) + zip_high(re, im))
-            else:
-                for i in range(count):
-                    re_i, im_i = tile[16 * r + i], tile[256 + 16 * r + i]
-                    out[to + 2 * i] = re_i if fresh else out[to + 2 * i] + re_i
-                    out[to + 2 * i + 1] = im_i if fresh else out[to + 2 * i + 1] + im_i
+            here = _TILE + r * line + 2 * start
+            store(tile, here, zip_low(re, im))
+            store(tile, here + 16, zip_high(re, im))
+
+
+@jit(fast=True)
+def _emit(out, at, stride, channels, num_samples, tile):
+    """Write the tile: sample n of channel r to out[at + r stride + 2 n]."""
+    line, blocks = 2 * num_samples + ROW, num_samples // 16 * 32
     whole = (out.ctypes.data + 4 * at) % 64 == 0 and stride % 16 == 0
-    for r in range(channels if fresh else 0):
+    for r in range(channels):
         to, here = at + r * stride, _TILE + r * line
-        for i in range(0, num_samples // 16 * 32, 16):
+        for i in range(0, blocks, 16):
             if whole:
                 stream(out, to + i, load(tile, here + i))
             else:
                 store(out, to + i, load(tile, here + i))
+        for i in range(blocks, 2 * num_samples):
+            out[to + i] = tile[here + i]
 
 
 @jit(fast=True)
@@ -549,11 +556,11 @@ def _in_band(work, places, count, limit):
 
 
 @jit(fast=True)
-def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room, fresh):
-    """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, emit,
-    one batch of chirps after the other."""
+def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room):
+    """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, divide
+    and add paths one by one, emit, one batch of chirps after the other."""
     grid, work, scratch, tile = room
-    b, steer, faint = heard
+    b, steer, faint, alone = heard
     groups, num_rx, num_chirps, num_samples = shape
     size, width, cells = g.rows.shape[0], len(g.taps), band.turn.shape[0]
     low, centre, channels = width // 2 - 1, np.float32(g.centre), min(16, num_rx - first_channel)
@@ -613,8 +620,12 @@ def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room, fresh)
             line = m * num_rx + first_channel
             if cells == 0:
                 to, step = 2 * num_samples * (line * num_chirps + p), 2 * num_samples * num_chirps
-                samples = g.deconvolution
-                _emit(out, to, step, channels, samples, table, low, g.rows, tile, fresh)
+                _divide(g.deconvolution, channels, table, low, g.rows, tile)
+                for r in range(channels):
+                    if sum_paths(alone, w, g.half, m, first_channel + r, p):
+                        here = _TILE + r * (2 * num_samples + ROW)
+                        flush(tile, here, num_samples, alone.room.sums, False)
+                _emit(out, to, step, channels, num_samples, tile)
                 continue
             draw = ((first_channel // 16 * groups + m) * num_chirps + p) * g.deconvolution.shape[0]
             to_cells(table, low, g.rows, g.deconvolution, band, draw * LANES, p % CHIRPS)
@@ -697,17 +708,17 @@ def _blocks(waveform: Waveform, t: Tones, path: np.ndarray, offset: np.ndarray) 
     )
 
 
-def add_gridded(
+def make_gridded(
     samples: np.ndarray,
     waveform: Waveform,
     tones: Tones,
     setting: Setting = DEFAULT,
     *,
-    fresh: bool = False,
     faint: np.ndarray | None = None,
+    alone: Tones | None = None,
 ) -> None:
-    """Add many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30 m/s and
-    15 elements of the L).
+    """Samples of many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30
+    m/s and 15 elements of the L).
 
     Left out: the joint curvature `Tones.cross`; with `DEFAULT` the third order of the wideband
     term. A path lives in whole chirps. Runs in one thread without the interpreter's lock; the
@@ -715,17 +726,16 @@ def add_gridded(
 
     Parameters
     ----------
-    samples : (M, L_rx, P, N) complex64, contiguous, added to
-    fresh : write instead of adding, whatever `samples` held
+    samples : (M, L_rx, P, N) complex64, contiguous, which is written
     faint : (K,) bool, paths that noise covers, of a setting that has a way for them
+    alone : paths that are added one by one, as `isac_rt.signal.direct.add_direct` does
     """
     count = waveform.num_groups * waveform.num_chirps
     none, one = np.zeros(count), np.ones(count)
     views = _View(none, none, one, none, one, one.astype(complex))
-    job = _Job(waveform, tones, setting, faint)
-    heard = _synthesise(samples, samples.shape, job, fresh, no_band(), views)
-    if fresh and not heard:
-        samples[:] = 0
+    job = _Job(waveform, tones, setting, faint, alone)
+    if not _synthesise(samples, samples.shape, job, no_band(), views):
+        add_direct(samples, waveform, job.one_by_one, fresh=True)
 
 
 def range_cells(
@@ -780,30 +790,35 @@ def range_cells(
         limit=limit * one,
         turn=np.ravel(phases).conj() * np.exp(-2j * np.pi * (cycles % 1.0)),
     )
-    _synthesise(out, shape, _Job(w, tones, setting), True, band, views)
+    _synthesise(out, shape, _Job(w, tones, setting), band, views)
     return out
 
 
 class _Job(NamedTuple):
-    """What is synthesised and how; `faint` as of `add_gridded`."""
+    """What is synthesised and how; `faint` and `alone` as of `make_gridded`."""
 
     waveform: Waveform
     tones: Tones
     setting: Setting
     faint: np.ndarray | None = None
+    alone: Tones | None = None
+
+    @property
+    def one_by_one(self) -> Tones:
+        """What is added past the grid."""
+        return self.tones.select(np.zeros(0, int)) if self.alone is None else self.alone
 
 
 def _synthesise(
     out: np.ndarray,
     shape: tuple[int, ...],
     job: _Job,
-    fresh: bool,
     band: Band,
     views: _View,
 ) -> bool:
     """Run the kernel over all elements; False, and nothing done, where no path can be heard and
     there is no band."""
-    w, t, setting, faint = job
+    w, t, setting, faint, _ = job
     path, offset = sources(w, t)
     apart = np.zeros(path.size, bool)
     if faint is not None and setting.faint:
@@ -843,6 +858,7 @@ def _synthesise(
     grids = unset(int(order.parts[:, 1].max()) * stride)
     tile = aligned(_TILE + LANES * (2 * num_samples + ROW))
     room = _Room(grids, aligned(80), aligned(_STEP * setting.width), tile)
+    alone = one_by_one(w, job.one_by_one)
     flat, rx, shared = out.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     for first in range(0, shape[1], LANES):
         steer = _steering(w, rx, b.path, first, setting.wideband)
@@ -851,8 +867,8 @@ def _synthesise(
             steering = partial(_turned_steering, w, rx, first, kernel.grid)
             paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
         weakest = _Faint(paths, sheet, desk(paths))
-        heard = _Heard(b, steer, weakest)
-        _chirps(flat, shape, first, shared, views, g, heard, t, band, room, fresh)
+        heard = _Heard(b, steer, weakest, alone)
+        _chirps(flat, shape, first, shared, views, g, heard, t, band, room)
     return True
 
 

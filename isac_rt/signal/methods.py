@@ -19,8 +19,8 @@ from isac_rt.signal.gridded import (
     DEFAULT,
     GRIDDED_ERROR,
     Setting,
-    add_gridded,
     grid_size,
+    make_gridded,
 )
 from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
@@ -210,8 +210,10 @@ def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:
     """Samples with some paths made one by one, the others through a grid."""
     samples = lent_memory(_shape(waveform, tones))
     setting, alone, faint = choice
-    if not alone.all():
+    strong = tones.select(alone)
+    if alone.all():
+        add_direct(samples, waveform, strong, fresh=True)
+    else:
         rest = tones.select(~alone)
-        add_gridded(samples, waveform, rest, setting, fresh=True, faint=faint[~alone])
-    add_direct(samples, waveform, tones.select(alone), fresh=bool(alone.all()))
+        make_gridded(samples, waveform, rest, setting, faint=faint[~alone], alone=strong)
     return samples
