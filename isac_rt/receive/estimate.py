@@ -280,7 +280,7 @@ def _template(chirps, axis, first, delay, delay_rate, steps, out):
     store(out, 0, weight * c)
     store(out, LANES, weight * s)
     c, s = cos_sin_double(half - floor(half + 0.5))
-    energy = _NONE * weight
+    energy = splat(_NONE)
     for k in range(chirps.rows):
         d = near - k * share
         value, under = s * steps[0, k] - c * steps[1, k], np.pi * d * (1.0 - d * d)
@@ -312,7 +312,7 @@ def _match(chirps, axis, delays, delay_rates, out, energy):
                 c, s = template[i], template[LANES + i]
                 for b in range(blocks):
                     at = (first + i) * rows * line + 2 * LANES * b
-                    re, im = _NONE * load(data, at), _NONE * load(data, at)
+                    re, im = splat(_NONE), splat(_NONE)
                     for k in range(rows):
                         factor = template[(3 + k) * LANES + i]
                         re = re + factor * load(data, at)

@@ -67,7 +67,7 @@ def _weigh(starts, length, cosine, sine, out):
             store(flat, at, zip_low(window, window) * load(flat, at))
             store(flat, at + LANES, zip_high(window, window) * load(flat, at + LANES))
             at += 2 * LANES
-        out[p, : 2 * int(np.ceil(starts[p]))] = 0
+        out[p, : 2 * max(int(np.ceil(starts[p])), 0)] = 0
         out[p, 2 * int(np.floor(starts[p] + length)) + 2 :] = 0
 
 

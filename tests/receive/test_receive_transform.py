@@ -12,7 +12,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.cfar import peaks
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import power_map, slow_window
-from isac_rt.receive.spectrum import tones
+from isac_rt.receive.spectrum import _factors, tones
 from isac_rt.receive.transform import transform, transform_plain
 
 ROUNDING = 1e-6
@@ -66,6 +66,19 @@ def test_tones_are_exponentials():
     expected = np.exp(2j * np.pi * np.outer(frequency, np.arange(75)))
     # rounding of complex64, and of a float64 phase of 75e6 cycles in `expected`
     assert np.abs(tones(frequency, 75) - expected).max() < 2e-7
+
+
+def test_window_and_derotation_are_their_formulas():
+    """Windows that begin before the first sample, end after the last, or lie between two samples.
+    Planted bugs: what is before a window's start counted from the end; one sample of a window left
+    out at its end."""
+    size, length, n = 75, 61.3, np.arange(75)
+    symbols, starts = np.array([0, 3, -4, 71, 9]), np.array([0.0, 2.71, -3.2, 20.4, 8.0])
+    x = n - starts[:, None]
+    window = np.where((x >= 0) & (x <= length), 0.5 - 0.5 * np.cos(2 * np.pi * x / length), 0)
+    expected = window * np.exp(-2j * np.pi * symbols[:, None] * n / size)
+    found = _factors(size, symbols, starts, length)
+    assert np.abs(found - expected).max() < 3e-7  # roundings of tones and window
 
 
 @pytest.mark.parametrize(("groups", "chirps"), [(3, 36), (3, 33), (2, 36)])
