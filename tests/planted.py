@@ -277,8 +277,8 @@ OF_CASES = {
     ),
     "automatic choice": Bug(
         "signal/methods.py",
-        "add_direct(samples, waveform, tones.select(alone), fresh",
-        "add_direct(samples, waveform, tones.select(alone[::-1]), fresh",
+        "strong = tones.select(alone)",
+        "strong = tones.select(alone[::-1])",
     ),
     "mesh to if at rest": Bug(
         "propagation/ways.py",
@@ -331,7 +331,7 @@ OF_CASES = {
         "signal/noise.py", "c = _COS[0] + q * (", "c = _COS[0] + np.float32(0.9) * q * ("
     ),
     "noise does not know the order of work": Bug(
-        "signal/noise.py", "counter = uint32(low + uint32(i))", "counter = uint32(i)"
+        "signal/noise.py", "_same(uint32(low + uint32(i)))", "_same(uint32(i))"
     ),
     "dpsk symbol errors": Bug(
         "receive/symbols/powers.py",
@@ -382,8 +382,8 @@ OF_CASES = {
     ),
     "bias of an echo": Bug(
         "receive/estimate.py",
-        "beat = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration",
-        "beat = (slope * tau - delay_rate * (carrier + slope * (middle - tau))) * duration",
+        "near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration",
+        "near = (slope * tau - delay_rate * (carrier + slope * (middle - tau))) * duration",
     ),
     "scatter of range and velocity": Bug(
         "receive/estimate.py",
