@@ -52,9 +52,9 @@ _STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1]
 """Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
-_NONE = np.float32(0)
 TIE = 1e-9
 """Share by which a direction must be stronger: both ends of the axis may be the same one."""
+_NONE = np.float32(0)
 T = TypeVar("T", float, np.ndarray)
 
 
@@ -232,6 +232,21 @@ def _axis(waveform: Waveform) -> _Axis:
 
 
 @jit(fast=True)
+def _square(flat, start, to_next, lanes, count, tile):
+    """Fill the tile with `count` complex values of each of `lanes` receivers, `to_next` apart from
+    `start` on, and turn it over: real and imaginary parts of one value of all receivers."""
+    if lanes < LANES or count < LANES // 2:
+        tile[:] = _NONE
+    for r in range(lanes):
+        at = start + r * to_next
+        if count == LANES // 2:
+            store(tile, LANES * r, load(flat, at))
+        else:
+            tile[LANES * r : LANES * r + 2 * count] = flat[at : at + 2 * count]
+    transpose(tile, 0)
+
+
+@jit(fast=True)
 def _gather(spectra, low, share, chirps):
     """Fill `chirps.data` with rows from `low`. The window begins at sample 0 and its transform is
     real about its middle: the turn from row to row is taken out here. Eight chirps of sixteen
@@ -248,15 +263,7 @@ def _gather(spectra, low, share, chirps):
                 start = (m * num_rx + LANES * b) * to_next + 2 * (low + i) * num_chirps
                 for p in range(0, num_chirps, LANES // 2):
                     count = min(LANES // 2, num_chirps - p)
-                    if lanes < LANES or count < LANES // 2:
-                        tile[:] = np.float32(0)
-                    for r in range(lanes):
-                        at = start + r * to_next + 2 * p
-                        if count == LANES // 2:
-                            store(tile, LANES * r, load(flat, at))
-                        else:
-                            tile[LANES * r : LANES * r + 2 * count] = flat[at : at + 2 * count]
-                    transpose(tile, 0)
+                    _square(flat, start + 2 * p, to_next, lanes, count, tile)
                     for q in range(count):
                         re, im = load(tile, 2 * LANES * q), load(tile, 2 * LANES * q + LANES)
                         to = (((m * num_chirps + p + q) * rows + i) * blocks + b) * 2 * LANES
@@ -294,14 +301,32 @@ def _template(chirps, axis, first, delay, delay_rate, steps, out):
     store(out, 2 * LANES, weight * energy)
 
 
+@jit(inline=True)
+def _add_chirp(chirps, chirp, template, lane, out, to):
+    """Add to out[to:] conj(template) times the data of a chirp, which has that lane of the
+    template."""
+    rows, data = chirps.rows, chirps.data
+    line = 2 * LANES * chirps.blocks
+    c, s = template[lane], template[LANES + lane]
+    for start in range(0, line, 2 * LANES):
+        at = chirp * rows * line + start
+        re, im = splat(_NONE), splat(_NONE)
+        for k in range(rows):
+            factor = template[(3 + k) * LANES + lane]
+            re = re + factor * load(data, at)
+            im = im + factor * load(data, at + LANES)
+            at += line
+        store(out, to + start, load(out, to + start) + c * re + s * im)
+        store(out, to + start + LANES, load(out, to + start + LANES) + c * im - s * re)
+
+
 @jit(fast=True)
 def _match(chirps, axis, delays, delay_rates, out, energy):
     """Add to `out` (K, antennas * line), of every path and transmit antenna, the sum of
     conj(template) times data, flat blocks of sixteen real and imaginary parts; and to `energy` (K,
     antennas) that of the template."""
-    rows, blocks, data, flat = chirps.rows, chirps.blocks, chirps.data, out.reshape(-1)
-    line, template = 2 * LANES * blocks, chirps.tile
-    angle = np.pi * axis.share * np.arange(rows)
+    flat, line, template = out.reshape(-1), 2 * LANES * chirps.blocks, chirps.tile
+    angle = np.pi * axis.share * np.arange(chirps.rows)
     steps = np.stack((np.cos(angle), np.sin(angle)))
     for first in range(0, chirps.tx.size, LANES):
         for j in range(delays.size):
@@ -309,18 +334,8 @@ def _match(chirps, axis, delays, delay_rates, out, energy):
             for i in range(min(LANES, chirps.tx.size - first)):
                 tx = chirps.tx[first + i]
                 energy[j, tx] += template[2 * LANES + i]
-                c, s = template[i], template[LANES + i]
-                for b in range(blocks):
-                    at = (first + i) * rows * line + 2 * LANES * b
-                    re, im = splat(_NONE), splat(_NONE)
-                    for k in range(rows):
-                        factor = template[(3 + k) * LANES + i]
-                        re = re + factor * load(data, at)
-                        im = im + factor * load(data, at + LANES)
-                        at += line
-                    to = j * out.shape[1] + tx * line + 2 * LANES * b
-                    store(flat, to, load(flat, to) + c * re + s * im)
-                    store(flat, to + LANES, load(flat, to + LANES) + c * im - s * re)
+                to = j * out.shape[1] + tx * line
+                _add_chirp(chirps, first + i, template, i, flat, to)
 
 
 @jit
