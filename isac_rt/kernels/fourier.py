@@ -166,7 +166,7 @@ def _five(table, at, step, twiddles, t):
     _put(table, at + 3 * step, xr + yi, xi - yr, twiddles, t + 4)
 
 
-@jit
+@jit(borrows=True)
 def _stage(table, first, length, radix, twiddles, t):
     """One stage of the transform of `length` rows from float `first`."""
     step = length // radix * ROW
@@ -197,7 +197,7 @@ def _stage(table, first, length, radix, twiddles, t):
             t += 4
 
 
-@jit
+@jit(borrows=True)
 def transform(table, first, size, radices, twiddles):
     """sum_g x_g exp(+j 2 pi g k/size) of the rows from float `first` of the flat `table`, in place,
     in the order of `plan`.

@@ -47,21 +47,32 @@ if _CONFIG.CPU_FEATURES is None and AVX512:
     _CONFIG.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"
 
 
-def jit(function: Callable | None = None, *, fast: bool = False, inline: bool = False) -> Any:
+def jit(
+    function: Callable | None = None,
+    *,
+    fast: bool = False,
+    inline: bool = False,
+    borrows: bool = False,
+) -> Any:
     """Compile a function: it runs without the interpreter's lock and divides by zero as numpy does.
 
     Parameters
     ----------
     fast : products and sums are fused; NaN, infinities and the sign of zero are not minded
     inline : a part of the functions that call it, whose freedom it shares
+    borrows : all its arrays are its caller's or parts of them: it makes none and returns none. Then
+        nobody counts who refers to them, which else every part of an array and every array of a
+        tuple does, twice, with an atomic addition that all threads wait for
     """
     if function is None:
-        return partial(jit, fast=fast, inline=inline)
-    made: Any = numba.njit(
+        return partial(jit, fast=fast, inline=inline, borrows=borrows)
+    compiled: Any = numba.njit  # whose stubs do not know `_nrt`
+    made = compiled(
         nogil=True,
         error_model="numpy",
         fastmath=set(FAST) if fast else False,
         inline="always" if inline else "never",
+        _nrt=not borrows,
     )(function)
     if not inline and cache_folder(function.__module__) is not None:
         made._cache = _Cache(function)

@@ -46,7 +46,7 @@ def _medians(lines, out):
         out[i] = (least + following) / np.float32(2)
 
 
-@jit
+@jit(borrows=True)
 def _not_above(line, most, lanes):
     """How many numbers of a line are not above one; `lanes` is work space."""
     value, zero = splat(most), splat(np.float32(0))

@@ -231,7 +231,7 @@ def _axis(waveform: Waveform) -> _Axis:
     return _Axis(w.carrier_frequency, w.slope, *window, 0.0)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _square(flat, start, to_next, lanes, count, tile):
     """Fill the tile with `count` complex values of each of `lanes` receivers, `to_next` apart from
     `start` on, and turn it over: real and imaginary parts of one value of all receivers."""
@@ -242,11 +242,12 @@ def _square(flat, start, to_next, lanes, count, tile):
         if count == LANES // 2:
             store(tile, LANES * r, load(flat, at))
         else:
-            tile[LANES * r : LANES * r + 2 * count] = flat[at : at + 2 * count]
+            for i in range(2 * count):
+                tile[LANES * r + i] = flat[at + i]
     transpose(tile, 0)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _gather(spectra, low, share, chirps):
     """Fill `chirps.data` with rows from `low`. The window begins at sample 0 and its transform is
     real about its middle: the turn from row to row is taken out here. Eight chirps of sixteen
@@ -271,7 +272,7 @@ def _gather(spectra, low, share, chirps):
                         store(out, to + LANES, s * re + c * im)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _template(chirps, axis, first, delay, delay_rate, steps, out):
     """Of a path in the sixteen chirps from `first` on, sixteen float32 each: weighted cosine and
     sine, weight times the sum of the rows' squared factors, and the rows' real factors. Beat, phase
@@ -325,9 +326,15 @@ def _match(chirps, axis, delays, delay_rates, out, energy):
     """Add to `out` (K, antennas * line), of every path and transmit antenna, the sum of
     conj(template) times data, flat blocks of sixteen real and imaginary parts; and to `energy` (K,
     antennas) that of the template."""
-    flat, line, template = out.reshape(-1), 2 * LANES * chirps.blocks, chirps.tile
     angle = np.pi * axis.share * np.arange(chirps.rows)
     steps = np.stack((np.cos(angle), np.sin(angle)))
+    _add_matches(chirps, axis, delays, delay_rates, steps, out, energy)
+
+
+@jit(fast=True, borrows=True)
+def _add_matches(chirps, axis, delays, delay_rates, steps, out, energy):
+    """`_match`, with the `steps` of `_template`."""
+    flat, line, template = out.reshape(-1), 2 * LANES * chirps.blocks, chirps.tile
     for first in range(0, chirps.tx.size, LANES):
         for j in range(delays.size):
             _template(chirps, axis, first, delays[j], delay_rates[j], steps, template)
@@ -596,7 +603,7 @@ def _strongest(values, apart, limit, count, fine):
     return best
 
 
-@jit
+@jit(borrows=True)
 def _beam(values, turn):
     """Power of the rows of `values` (T, L), each turned by `turn` and added in phase."""
     power = 0.0

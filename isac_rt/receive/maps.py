@@ -9,7 +9,6 @@ the output is -P/2. Receding is positive.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,6 +22,8 @@ from isac_rt.receive.known import Known
 UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler
 bin; reached within 2 % of the unambiguous velocity."""
+_ROWS = 128
+"""Range cells of an antenna, all groups' chirps, that stay in the second-level cache."""
 
 
 def slow_window(waveform: Waveform) -> np.ndarray:
@@ -50,62 +51,46 @@ def channel_maps(spectra: np.ndarray, known: Known) -> np.ndarray:
         L_tx) these are the correlations with the Doppler atoms, with the sampling's sidelobes in
         them.
     """
-    num_rx, num_rows, num_chirps = spectra.shape[1:]
-    out = np.empty((known.waveform.num_tx, num_rx, num_rows, num_chirps), np.complex64)
-    channels = out.reshape(-1, num_rows, num_chirps)
-    for channel, made in zip(channels, _parts(spectra, known), strict=True):
-        _join_both_bins(made, channel)
-    return out
+    return maps_with_power(spectra, known)[0]
+
+
+def maps_with_power(spectra: np.ndarray, known: Known) -> tuple[np.ndarray, np.ndarray]:
+    """`channel_maps`, and `accumulate` of them, added while they are in the cache."""
+    maps = np.empty((known.waveform.num_tx, *spectra.shape[1:]), np.complex64)
+    return maps, _mapped(spectra, known, maps)
 
 
 def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
     """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, centred."""
+    return _mapped(spectra, known, np.empty((0, *spectra.shape[1:]), np.complex64))
+
+
+def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
+    """`power_map`; fills (L_tx, L_rx, rows, P) `channel_maps`, or none."""
     power = np.zeros(spectra.shape[2:], np.float32)
-    for made in _parts(spectra, known):
-        _add_both_bins(made, power)
+    ends, places, parts = _operators(known)
+    places = places[0] * np.uint64(spectra[0].size) + places[1]
+    _make_maps(np.ascontiguousarray(spectra), ends, places, parts, maps, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
-def _parts(spectra: np.ndarray, known: Known) -> Iterator[np.ndarray]:
-    """Of each virtual channel a x, b x, a y and b y (x or y, rows, a or b, P/2 + 1), the same array
-    every time.
-
-    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
-    With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
-    half of the multiplications.
-    """
-    _, num_rx, num_rows, num_chirps = spectra.shape
-    half = num_chirps // 2 + 1
-    for groups, chirps, parts in _operators(known):
-        places = (groups * (num_rx * num_rows * num_chirps) + chirps).astype(np.uint64)
-        united = np.empty((2, num_rows, places.size), np.float32)
-        made = np.empty((2 * num_rows, 2 * half), np.float32)
-        for rx in range(num_rx):
-            _unite(
-                spectra.reshape(-1),
-                places + np.uint64(rx * num_rows * num_chirps),
-                num_chirps,
-                united,
-            )
-            np.matmul(united.reshape(2 * num_rows, -1), parts, out=made)
-            yield made.reshape(2, num_rows, 2, half)
-
-
 @lru_cache(maxsize=8)
-def _operators(known: Known) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each transmit antenna the groups and numbers of its chirps (S,), and the real and
-    imaginary parts of the operator on them for the bins from 0 to P/2 (S, P + 2)."""
+def _operators(known: Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the chirps of each transmit antenna begin and end (L_tx + 1,), the groups and numbers
+    of all these chirps (2, S), and the real and imaginary parts of the operators on them for the
+    bins from 0 to P/2 (S, P + 2)."""
     w, half = known.waveform, known.waveform.num_chirps // 2 + 1
-    out = []
+    places, parts = [], []
     for sent in known.sent_by:
-        groups, chirps = np.nonzero(sent)
         operator = (union_operator if known.full else correlation_operator)(w, known.slots[sent])
         rows = operator[:half].copy()
         if w.num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
             rows[-1] = rows[-1].conj()
-        parts = np.ascontiguousarray(np.concatenate([rows.real, rows.imag]).T)
-        out.append((groups, chirps, parts))
-    return out
+        places.append(np.nonzero(sent))
+        parts.append(np.concatenate([rows.real, rows.imag]).T)
+    ends = np.cumsum([0, *map(len, parts)])
+    every = np.ascontiguousarray(np.concatenate(parts))
+    return ends, np.concatenate(places, axis=1).astype(np.uint64), every
 
 
 class Levels(NamedTuple):
@@ -178,19 +163,49 @@ class Banded(LatinUnion):
 
 
 @jit
-def _unite(flat, places, num_chirps, out):
-    """out[0, i, s] + j out[1, i, s] = flat[i P + places[s]]; unsigned, so that no index is checked
-    for its sign."""
-    for i in range(out.shape[1]):
-        first = np.uint64(i * num_chirps)
-        for s in range(out.shape[2]):
+def _make_maps(spectra, ends, places, parts, maps, power):
+    """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
+    L_rx, rows, P) if there is room for them; `places` of chirps in the samples of all groups.
+
+    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
+    With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
+    half of the multiplications. All antennas' chirps of some range cells are taken while they are
+    in the cache.
+    """
+    num_rx, num_rows, num_chirps = spectra.shape[1:]
+    flat, half = spectra.reshape(-1), parts.shape[1] // 2
+    room = np.empty(2 * _ROWS * places.size, np.float32)
+    made = np.empty((2 * _ROWS, 2 * half), np.float32)
+    for first in range(0, num_rows, _ROWS):
+        count = min(_ROWS, num_rows - first)
+        for rx in range(num_rx):
+            start = np.uint64((rx * num_rows + first) * num_chirps)
+            for tx in range(ends.size - 1):
+                begin, end = ends[tx], ends[tx + 1]
+                united = room[: 2 * count * (end - begin)].reshape(2 * count, end - begin)
+                _unite(flat, start, places[begin:end], num_chirps, united)
+                np.dot(united, parts[begin:end], made[: 2 * count])
+                both = made[: 2 * count].reshape(2, count, 2, half)
+                _add_both_bins(both, power[first : first + count])
+                if maps.shape[0]:
+                    _join_both_bins(both, maps[tx, rx, first : first + count])
+
+
+@jit(borrows=True)
+def _unite(flat, start, places, num_chirps, out):
+    """out[i, s] and out[rows + i, s] = real and imaginary part of flat[start + i P + places[s]];
+    unsigned, so that no index is checked for its sign."""
+    rows = out.shape[0] // 2
+    for i in range(rows):
+        first, real, imag = start + np.uint64(i * num_chirps), out[i], out[rows + i]
+        for s in range(places.size):
             value = flat[first + places[s]]
-            out[0, i, s], out[1, i, s] = value.real, value.imag
+            real[s], imag[s] = value.real, value.imag
 
 
 # no fused products: which of two is fused the compiler may decide anew, and bits would differ
 # between processes
-@jit
+@jit(borrows=True)
 def _add_both_bins(made, power):
     """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
     num_chirps = power.shape[1]
@@ -203,7 +218,7 @@ def _add_both_bins(made, power):
             line[num_chirps - k] += (ax[k] + by[k]) ** 2 + (ay[k] - bx[k]) ** 2
 
 
-@jit
+@jit(borrows=True)
 def _join_both_bins(made, out):
     """out[i, k] and out[i, -k] from made[x or y, i, a or b, k]."""
     num_chirps = out.shape[1]
@@ -253,7 +268,7 @@ def _sincs(a, b):
     return out
 
 
-@jit
+@jit(borrows=True)
 def add_power(power, values):
     """power += |values|^2 of two matrices, float32 and complex64."""
     for i in range(power.shape[0]):

@@ -168,36 +168,45 @@ def _pursue(first, gram_re, gram_im, support, amplitude):
     """Fill `support` and `amplitude` from the correlations `first` (V, P); `gram` is that of an
     atom and the one k bins on, for k in [0, 3 P). Atoms are chosen in float32."""
     num_chirps, sparsity = first.shape[1], support.shape[1]
-    width = num_chirps + -num_chirps % LANES
-    own_re, own_im, power = np.zeros((3, width), np.float32)
-    short_re, short_im = gram_re.astype(np.float32), gram_im.astype(np.float32)
+    own = np.zeros((3, num_chirps + -num_chirps % LANES), np.float32)
+    short = gram_re.astype(np.float32), gram_im.astype(np.float32)
     lower = np.empty((sparsity, sparsity), np.complex128)
-    forward, lanes = np.empty(sparsity, np.complex128), np.empty(LANES, np.float32)
+    room = np.empty(sparsity, np.complex128), np.empty(LANES, np.float32)
     for v in range(first.shape[0]):
-        chosen, x = support[v], amplitude[v]
-        for p in range(num_chirps):
-            own_re[p], own_im[p] = first[v, p].real, first[v, p].imag
-        for k in range(sparsity):
-            for p in range(0, width, LANES):
-                re, im = load(own_re, p), load(own_im, p)
-                for i in range(k):  # the correlation with bin p is the Gram's conjugate
-                    a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
-                    at = num_chirps - chosen[i] + p
-                    c, d = load(short_re, at), load(short_im, at)
-                    re, im = re - a * c - b * d, im - b * c + a * d
-                store(power, p, re * re + im * im)
-            power[chosen[:k]], power[num_chirps:] = -1.0, -1.0
-            most = load(power, 0)
-            for p in range(LANES, width, LANES):
-                most = larger(most, load(power, p))
-            store(lanes, 0, most)
-            chosen[k], highest = 0, lanes.max()
-            while power[chosen[k]] < highest:
-                chosen[k] += 1
-            _fit(first[v], chosen[: k + 1], gram_re, gram_im, lower, forward, x)
+        _pursue_one(first[v], short, gram_re, gram_im, support[v], amplitude[v], own, lower, *room)
 
 
-@jit
+@jit(borrows=True)
+def _pursue_one(first, short, gram_re, gram_im, chosen, x, own, lower, forward, lanes):
+    """`_pursue` of one vector, `short` the Gram in float32 and the rest room for its work."""
+    (own_re, own_im, power), (short_re, short_im), num_chirps = own, short, first.size
+    for p in range(num_chirps):
+        own_re[p], own_im[p] = first[p].real, first[p].imag
+    for k in range(chosen.size):
+        for p in range(0, power.size, LANES):
+            re, im = load(own_re, p), load(own_im, p)
+            for i in range(k):  # the correlation with bin p is the Gram's conjugate
+                a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
+                at = num_chirps - chosen[i] + p
+                c, d = load(short_re, at), load(short_im, at)
+                re, im = re - a * c - b * d, im - b * c + a * d
+            store(power, p, re * re + im * im)
+        power[num_chirps:] = -1.0
+        for i in range(k):
+            power[chosen[i]] = -1.0
+        most = load(power, 0)
+        for p in range(LANES, power.size, LANES):
+            most = larger(most, load(power, p))
+        store(lanes, 0, most)
+        chosen[k], highest = 0, lanes[0]
+        for value in lanes:
+            highest = max(highest, value)
+        while power[chosen[k]] < highest:
+            chosen[k] += 1
+        _fit(first, chosen[: k + 1], gram_re, gram_im, lower, forward, x)
+
+
+@jit(borrows=True)
 def _fit(first, chosen, gram_re, gram_im, lower, forward, x):
     """Least-squares amplitudes x of the atoms `chosen`; `lower` and `forward` are Cholesky's of all
     but the last atom, and become those of all."""

@@ -31,8 +31,7 @@ from isac_rt.receive.maps import (
     LATIN_UNION,
     UNION_FLOOR,
     LatinUnion,
-    accumulate,
-    channel_maps,
+    maps_with_power,
     power_map,
 )
 from isac_rt.receive.omp import Omp, sparse_enough
@@ -165,8 +164,8 @@ class Taken(NamedTuple):
 def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken:
     """Paths `STRONG_DB` over the noise and more; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
-    maps = channel_maps(left, known)
-    whole = known.mapped(spectra, lambda: accumulate(maps))
+    maps, power = maps_with_power(left, known)
+    whole = known.mapped(spectra, lambda: power)
     power = whole.copy()
     noise = max(median(power), 1e-30)
     taken, level = np.zeros(power.shape), np.full(power.shape, noise)
@@ -179,8 +178,7 @@ def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken
         if not rows.size:
             break
         changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
-        some = channel_maps(np.ascontiguousarray(left[:, :, changed]), known)
-        maps[:, :, changed], power[changed] = some, accumulate(some)
+        maps[:, :, changed], power[changed] = maps_with_power(left[:, :, changed], known)
     paths, snr = [f.estimate for f in found], np.array([f.snr for f in found])
     return Taken(paths, snr, whole, left, maps, power)
 
@@ -213,7 +211,7 @@ def _find(
 
 def _map_again(power: np.ndarray, left: np.ndarray, changed: np.ndarray, known: Known) -> None:
     """Make the rows of the map anew in which something was taken out, in place."""
-    power[changed] = power_map(np.ascontiguousarray(left[:, :, changed]), known)
+    power[changed] = power_map(left[:, :, changed], known)
 
 
 def sidelobe_floor(known: Known) -> float:

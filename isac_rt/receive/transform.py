@@ -121,7 +121,7 @@ def transform_plain(
             out[r] *= turn
 
 
-@jit
+@jit(borrows=True)
 def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at, work):
     """`transform`; complex arrays as `_floats`."""
     table, factors, turns, added, tapered = work
@@ -150,7 +150,7 @@ def _transform(samples, factor, turn, powers, out, radices, twiddles, place, at,
         _unload(tapered, first, count, powers[1])
 
 
-@jit
+@jit(borrows=True)
 def _fill(lines, offset, first, count, table):
     """Row n of the table: sample n of the chirps `first` to `first + count`; 16 numbers of 16
     chirps are turned over at a time."""
@@ -164,7 +164,7 @@ def _fill(lines, offset, first, count, table):
         transpose(table, n * LANES)
 
 
-@jit
+@jit(borrows=True)
 def _multiply(table, factors):
     for i in range(0, table.size, ROW):
         a, b, c, d = (
@@ -177,14 +177,14 @@ def _multiply(table, factors):
         store(table, i + LANES, a * d + b * c)
 
 
-@jit
+@jit(borrows=True)
 def _add_power(table, place, added):
     for k in range(place.size):
         a, b = load(table, place[k]), load(table, place[k] + LANES)
         store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
 
 
-@jit
+@jit(borrows=True)
 def _add_tapered(table, place, added):
     half, quarter, last = splat(np.float32(0.5)), splat(np.float32(0.25)), place[-1]
     before, before_im = load(table, last), load(table, last + LANES)
@@ -198,7 +198,7 @@ def _add_tapered(table, place, added):
         before, before_im, a, b = a, b, c, d
 
 
-@jit
+@jit(borrows=True)
 def _unload(added, first, count, power):
     """Add what chirps `first` to `first + count` have to their `power`."""
     for k in range(added.size // LANES):

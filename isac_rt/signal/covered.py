@@ -356,7 +356,7 @@ def covered_paths(
     )
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def turn_elements(steer, late, per_line):
     """Turn the elements' phasors (of `Covered.steer`, turns over half a chirp instead of lines) by
     what a path's delay `late`, in half chirps, does to the frequency that they see."""
@@ -369,7 +369,7 @@ def turn_elements(steer, late, per_line):
         store(steer, at + 32, turn * splat(np.float32(1 / per_line)))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _shares(desk, paths, first, last, antenna, segment):
     """The upper lines' shares of a group's paths, in the middle of each few chirps that an antenna
     sends."""
@@ -387,7 +387,7 @@ def _shares(desk, paths, first, last, antenna, segment):
             store(desk.share, half * size + n, share)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _amplitudes(desk, paths, first, last, antenna):
     """Amplitudes of a group's paths in the chirps that an antenna sends."""
     phase, amplitude = paths.phase[antenna], paths.amplitude[antenna]
@@ -413,7 +413,7 @@ def _one(z, j, sr, si, ar, ai):
     return ar + x * sr - y * si, ai + x * si + y * sr
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _weigh(desk, antenna, w, sheet):
     """Where the data of the chirps that an antenna sends move all lines: by whole lines, and the
     weights of the `LINES` places within a grid step that are left."""
@@ -430,7 +430,7 @@ def _weigh(desk, antenna, w, sheet):
             store(desk.weights, (c * TAPS + j) * LANES, v)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _factors(desk, count, antenna, w, sheet):
     """Factors of `count` lines in the chirps that an antenna sends."""
     to_beat = 1 / (LINES * w.step * sheet.size)
@@ -453,7 +453,7 @@ def _factors(desk, count, antenna, w, sheet):
                 desk.factor[own + _BLOCK + b] *= gain
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _sum(desk, count, sheet, paths, order, chirps):
     """Sum the paths beside each of `count` lines in the `chirps` of a batch. What paths leave to
     the line after theirs is there when its turn comes. Unsigned indices are not checked for their
@@ -518,7 +518,7 @@ def _add_four(grids, to, ar, ai, br, bi, cr, ci, dr, di):
     _add(grids, to + 3 * ROW, dr, di)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _spread(grids, desk, count, c, sheet, lane):
     """Spread the sums of `count` lines in chirp c at the elements from `lane` on. Lines of one grid
     step are added together in registers before the grid is written."""
@@ -553,7 +553,7 @@ def _spread(grids, desk, count, c, sheet, lane):
     _add_four(grids, base + row * ROW, ar, ai, br, bi, cr, ci, dr, di)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _send(desk, chirps, link, offset, t, w):
     """What reaches the chirps of a batch from a link's transmitter, so many groups apart."""
     groups, num_chirps = t.send.shape[1:]
@@ -572,7 +572,7 @@ def _send(desk, chirps, link, offset, t, w):
         desk.antenna[c] = t.antenna[link, source, p]
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _gather(desk, order, below, i, stop, line, pending):
     """The next lines, a block at most, and which paths lie above each, from place i of `order` on;
     `pending` : whether paths above `line` have a share in the next.
@@ -593,7 +593,7 @@ def _gather(desk, order, below, i, stop, line, pending):
     return count, i, line, pending
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
     """Add all paths to the grids of a batch of chirps."""
     order, below = paths.order[segment], paths.below[segment]
@@ -603,7 +603,10 @@ def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
         _send(desk, chirps, link, offset, t, w)
         stop = begin + end - first
         for antenna in range(paths.phase.shape[0]):
-            if not (desk.antenna == antenna).any():
+            sends = False
+            for c in range(TOGETHER):
+                sends |= desk.antenna[c] == antenna
+            if not sends:
                 continue
             last = first + (end - first + LANES - 1) // LANES * LANES
             _shares(desk, paths, first, last, antenna, segment)
@@ -618,5 +621,6 @@ def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
                 for c in range(TOGETHER):
                     for lane in range(0, LANES if desk.antenna[c] == antenna else 0, PART):
                         _spread(grids, desk, count, c, sheet, lane)
-                desk.sums[:_LINE] = desk.sums[count * _LINE : (count + 1) * _LINE]
+                for at in range(0, _LINE, LANES):
+                    store(desk.sums, at, load(desk.sums, count * _LINE + at))
         begin = stop

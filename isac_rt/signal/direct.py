@@ -85,7 +85,7 @@ def passed(w, tau):
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _turn(out, at, cycles, amplitude):
     """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at
     + 16:]."""
@@ -95,7 +95,7 @@ def _turn(out, at, cycles, amplitude):
     store(out, at + 16, re * s + im * c)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _tone(room, half, amplitude, phase, frequency, quadratic):
     """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to the sums: of
     each 16 samples real parts, then imaginary ones.
@@ -128,7 +128,7 @@ def _tone(room, half, amplitude, phase, frequency, quadratic):
             store(sums, at + 16, (load(sums, at + 16) + pr * li + pi * lr) + (qr * mi + qi * mr))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def flush(out, to, num_samples, sums, fresh):
     """Write the sums of one chirp to its samples, from out[to] on, or add them, and clear them."""
     zero = splat(np.float32(0))
@@ -150,7 +150,7 @@ def flush(out, to, num_samples, sums, fresh):
         store(sums, at + 16, zero)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _turned(sums, turn):
     """Multiply the sums of one chirp by as many complex factors, interleaved."""
     for n in range(turn.shape[0] // 2):
@@ -189,7 +189,7 @@ def one_by_one(waveform: Waveform, tones: Tones) -> OneByOne:
     return OneByOne(*sources(waveform, tones), tones, room)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def sum_paths(alone, w, half, m, r, p):
     """Add the paths to the sums of chirp p of group m at element r; how many it has."""
     path, offset, t, room = alone
@@ -220,7 +220,7 @@ def sum_paths(alone, w, half, m, r, p):
     return count
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _direct(out, shape, w, alone, fresh, turn):
     """Add the paths to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape

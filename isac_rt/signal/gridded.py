@@ -74,7 +74,7 @@ from isac_rt.signal.direct import (
     passed,
     sum_paths,
 )
-from isac_rt.signal.noise import WhiteNoise
+from isac_rt.signal.noise import SILENCE, WhiteNoise, add_stream_by, words_room
 from isac_rt.signal.profiles import CHIRPS, Band, make_band, no_band, to_cells, write_cells
 from isac_rt.signal.tones import Tones, sources
 from isac_rt.storage import kept
@@ -319,15 +319,18 @@ class _Heard(NamedTuple):
 
 
 class _Room(NamedTuple):
-    """Memory of the kernel: the grids, numbers of 16 paths, their weights, and what is emitted."""
+    """Memory of the kernel: the grids, numbers of 16 paths, their places and frequencies, their
+    weights, what is emitted, and random words of its noise."""
 
     grid: np.ndarray
     work: np.ndarray
+    places: np.ndarray
     scratch: np.ndarray
     tile: np.ndarray
+    words: np.ndarray
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _prepare(work, places, b, block, w, g, view, time, symbol, send, antenna):
     """Of 16 paths: place on the grid and frequency [cycles/sample] to `places`; distance from the
     middle of the cell, complex factor (less the filter's gain), quadratic term [rad] and lambda, 16
@@ -372,7 +375,7 @@ def _prepare(work, places, b, block, w, g, view, time, symbol, send, antenna):
     store(work, 64, narrow((tau - splat(view.origin * ts)) * splat(1 / (ts * half))))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _gate(work, b, block, w, time, symbol):
     """Multiply the factors of 16 paths by the filter's gain, and by 0 when they are not alive."""
     table, life, f = b.table, b.life, 32 * block
@@ -385,7 +388,7 @@ def _gate(work, b, block, w, time, symbol):
         work[32 + i] *= gain
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _weigh(work, scratch, poly, taps, wideband, cubic):
     """Weights of the grid points of 16 paths: times the complex factor (narrowband), or the sets as
     they are."""
@@ -414,7 +417,7 @@ def _weigh(work, scratch, poly, taps, wideband, cubic):
             store(scratch, _STEP * j + 48, v3)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _spread(grid, base, places, scratch, count, taps, steer, k):
     """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`."""
     for i in range(count):
@@ -441,7 +444,7 @@ def _centred(steer, work, i, k):
     return pr * cosine + pi * sine, pi * cosine - pr * sine, theta, splat(work[48 + i])
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same with every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
@@ -462,7 +465,7 @@ def _spread_wideband(grid, base, places, scratch, count, taps, steer, k, work, c
         k += 48
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, centre):
     """The same to the third order: strengths of 1, j x, x^2 - c and j (x^3 - 3/5 x)."""
     for i in range(count):
@@ -494,7 +497,7 @@ def _spread_cubic(grid, base, places, scratch, count, taps, steer, k, work, cent
         k += 48
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _fold(grid, size, low, width):
     """Wrap the margins: row g + low is frequency g, taken modulo the size of the grid."""
     for i in range(0, low * ROW, 16):
@@ -503,7 +506,7 @@ def _fold(grid, size, low, width):
         store(grid, i, load(grid, i) + load(grid, size * ROW + i))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _divide(deconvolution, channels, grid, low, order, tile):
     """Divide the rows of the samples by the kernel's response and put them together channel by
     channel in the tile: in memory the channels lie where they would drive each other out of the
@@ -526,7 +529,7 @@ def _divide(deconvolution, channels, grid, low, order, tile):
             store(tile, here + 16, zip_high(re, im))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _emit(out, at, stride, channels, num_samples, tile):
     """Write the tile: sample n of channel r to out[at + r stride + 2 n]."""
     line, blocks = 2 * num_samples + ROW, num_samples // 16 * 32
@@ -542,7 +545,7 @@ def _emit(out, at, stride, channels, num_samples, tile):
             out[to + i] = tile[here + i]
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _in_band(work, places, count, limit):
     """Strike out the paths from the frequency `limit` on; the number up to the last one that
     stays."""
@@ -555,18 +558,19 @@ def _in_band(work, places, count, limit):
     return last
 
 
-@jit(fast=True)
-def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room):
+@jit(fast=True, borrows=True)
+def _chirps(out, shape, first_channel, w, views, g, heard, t, band, noise, room):
     """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, divide
-    and add paths one by one, emit, one batch of chirps after the other."""
-    grid, work, scratch, tile = room
+    and add paths one by one and noise, emit, one batch of chirps after the other."""
+    grid, work, places, scratch, tile, words = room
+    power, key0, key1 = noise
     b, steer, faint, alone = heard
     groups, num_rx, num_chirps, num_samples = shape
     size, width, cells = g.rows.shape[0], len(g.taps), band.turn.shape[0]
     low, centre, channels = width // 2 - 1, np.float32(g.centre), min(16, num_rx - first_channel)
     top, skirt, per_delay = w.rate / w.slope, w.transition / w.slope, w.slope * w.step
     cut = top + skirt
-    stride, places = (size + _MARGIN) * ROW, np.zeros(32)
+    stride = (size + _MARGIN) * ROW
     for batch in range(g.order.parts.shape[0]):
         start, count, segment = g.order.parts[batch]
         chirps = g.order.chirp[start : start + count]
@@ -622,9 +626,13 @@ def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room):
                 to, step = 2 * num_samples * (line * num_chirps + p), 2 * num_samples * num_chirps
                 _divide(g.deconvolution, channels, table, low, g.rows, tile)
                 for r in range(channels):
+                    here = _TILE + r * (2 * num_samples + ROW)
                     if sum_paths(alone, w, g.half, m, first_channel + r, p):
-                        here = _TILE + r * (2 * num_samples + ROW)
                         flush(tile, here, num_samples, alone.room.sums, False)
+                    if power > 0:
+                        chirp = tile[here : here + 2 * num_samples]
+                        draw = ((line + r) * num_chirps + p) * num_samples
+                        add_stream_by(chirp, power, key0, key1, np.uint64(draw), words)
                 _emit(out, to, step, channels, num_samples, tile)
                 continue
             draw = ((first_channel // 16 * groups + m) * num_chirps + p) * g.deconvolution.shape[0]
@@ -635,7 +643,7 @@ def _chirps(out, shape, first_channel, w, views, g, heard, t, band, room):
                 write_cells(out, to, step, channels, done, num_chirps, cells, band.stage, tile)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _steer(out, planes, path, rx, first, frequency, slope, turn, delay):
     """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from
     the last element on."""
@@ -716,6 +724,7 @@ def make_gridded(
     *,
     faint: np.ndarray | None = None,
     alone: Tones | None = None,
+    noise: WhiteNoise = SILENCE,
 ) -> None:
     """Samples of many weak paths; relative RMS error of `DEFAULT` below `GRIDDED_ERROR` (up to 30
     m/s and 15 elements of the L).
@@ -729,13 +738,15 @@ def make_gridded(
     samples : (M, L_rx, P, N) complex64, contiguous, which is written
     faint : (K,) bool, paths that noise covers, of a setting that has a way for them
     alone : paths that are added one by one, as `isac_rt.signal.direct.add_direct` does
+    noise : is added, as `isac_rt.signal.noise.add_white_noise` does
     """
     count = waveform.num_groups * waveform.num_chirps
     none, one = np.zeros(count), np.ones(count)
     views = _View(none, none, one, none, one, one.astype(complex))
-    job = _Job(waveform, tones, setting, faint, alone)
+    job = _Job(waveform, tones, setting, faint, alone, noise)
     if not _synthesise(samples, samples.shape, job, no_band(), views):
         add_direct(samples, waveform, job.one_by_one, fresh=True)
+        noise.add_to(samples)
 
 
 def range_cells(
@@ -770,7 +781,7 @@ def range_cells(
         )
     length = w.window_length
     delay_symbols, phases = payload.delay_symbols, payload.phases
-    band = make_band(w.num_samples, num_cells, length, noise or WhiteNoise(0.0, np.zeros(2)))
+    band = make_band(w.num_samples, num_cells, length, noise or SILENCE)
     start = np.ravel(w.data_shift(delay_symbols))
     size = len(band.window)
     pad = (size - num_cells) // 2 / w.num_samples
@@ -795,13 +806,14 @@ def range_cells(
 
 
 class _Job(NamedTuple):
-    """What is synthesised and how; `faint` and `alone` as of `make_gridded`."""
+    """What is synthesised and how; `faint`, `alone` and `noise` as of `make_gridded`."""
 
     waveform: Waveform
     tones: Tones
     setting: Setting
     faint: np.ndarray | None = None
     alone: Tones | None = None
+    noise: WhiteNoise = SILENCE
 
     @property
     def one_by_one(self) -> Tones:
@@ -818,7 +830,7 @@ def _synthesise(
 ) -> bool:
     """Run the kernel over all elements; False, and nothing done, where no path can be heard and
     there is no band."""
-    w, t, setting, faint, _ = job
+    w, t, setting, faint, _, noise = job
     path, offset = sources(w, t)
     apart = np.zeros(path.size, bool)
     if faint is not None and setting.faint:
@@ -857,7 +869,8 @@ def _synthesise(
     )
     grids = unset(int(order.parts[:, 1].max()) * stride)
     tile = aligned(_TILE + LANES * (2 * num_samples + ROW))
-    room = _Room(grids, aligned(80), aligned(_STEP * setting.width), tile)
+    scratch = aligned(_STEP * setting.width)
+    room = _Room(grids, aligned(80), np.zeros(32), scratch, tile, words_room())
     alone = one_by_one(w, job.one_by_one)
     flat, rx, shared = out.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     for first in range(0, shape[1], LANES):
@@ -868,7 +881,7 @@ def _synthesise(
             paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
         weakest = _Faint(paths, sheet, desk(paths))
         heard = _Heard(b, steer, weakest, alone)
-        _chirps(flat, shape, first, shared, views, g, heard, t, band, room)
+        _chirps(flat, shape, first, shared, views, g, heard, t, band, noise.numbers, room)
     return True
 
 

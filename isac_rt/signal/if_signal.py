@@ -11,7 +11,7 @@ from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES, Setting, range_cells
 from isac_rt.signal.methods import Auto, Method
-from isac_rt.signal.noise import WhiteNoise, add_white_noise
+from isac_rt.signal.noise import SILENCE, WhiteNoise, add_white_noise
 from isac_rt.signal.tones import Links, Tones, tones_of
 
 _AUTO = Auto()
@@ -23,8 +23,10 @@ def if_signal(
     receiver: ReceiveArray,
     reference: Reference,
     method: Method = _AUTO,
+    *,
+    noise: WhiteNoise | None = None,
 ) -> IFCube:
-    r"""Dechirped IF samples of one receiver in one frame, without noise.
+    r"""Dechirped IF samples of one receiver in one frame.
 
     .. math::
 
@@ -46,6 +48,7 @@ def if_signal(
     reference : Reference
     method : how: `Auto` (the default), `Exact`, `Direct`, `Gridded` or `Separable`, of
         `isac_rt.signal.methods`
+    noise : what `add_noise` would add, to the bit, while samples are in the cache; None: none
 
     Returns
     -------
@@ -89,7 +92,7 @@ def if_signal(
     """
     schedule, tones = heard(waveform, links, receiver, reference)
     return IFCube(
-        samples=method.samples(waveform, tones),
+        samples=method.samples(waveform, tones, noise or SILENCE),
         waveform=waveform,
         schedule=schedule,
         start_time=reference.start_time,

@@ -1,4 +1,5 @@
-"""The methods of synthesis as values: each holds its own numbers and makes samples of tones."""
+"""The methods of synthesis as values: each holds its own numbers and makes samples of tones and
+noise."""
 
 from __future__ import annotations
 
@@ -22,6 +23,7 @@ from isac_rt.signal.gridded import (
     grid_size,
     make_gridded,
 )
+from isac_rt.signal.noise import SILENCE, WhiteNoise
 from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
 
@@ -49,9 +51,11 @@ class Exact:
 
     name: ClassVar[str] = "exact"
 
-    def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
+    def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return exact(waveform, tones).astype(np.complex64)
+        samples = exact(waveform, tones).astype(np.complex64)
+        noise.add_to(samples)
+        return samples
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,11 @@ class Separable:
 
     name: ClassVar[str] = "paper"
 
-    def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
+    def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        return separable(waveform, tones).astype(np.complex64)
+        samples = separable(waveform, tones).astype(np.complex64)
+        noise.add_to(samples)
+        return samples
 
 
 @dataclass(frozen=True)
@@ -71,10 +77,10 @@ class Direct:
 
     name: ClassVar[str] = "direct"
 
-    def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
+    def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         every = np.ones(tones.size, bool)
-        return _made(waveform, tones, Choice(DEFAULT, every, ~every))
+        return _made(waveform, tones, noise, Choice(DEFAULT, every, ~every))
 
 
 @dataclass(frozen=True)
@@ -86,10 +92,10 @@ class Gridded:
     setting: Setting = DEFAULT
     faint: bool = False
 
-    def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
+    def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         none, faint = np.zeros(tones.size, bool), np.full(tones.size, self.faint)
-        return _made(waveform, tones, Choice(self.setting, none, faint))
+        return _made(waveform, tones, noise, Choice(self.setting, none, faint))
 
 
 class Choice(NamedTuple):
@@ -131,12 +137,12 @@ class Auto:
     decide_for: int | None = None
     covered: float = 0.0
 
-    def samples(self, waveform: Waveform, tones: Tones) -> np.ndarray:
+    def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         shape, speed = _shape(waveform, tones), tones.speed(waveform.frame_duration)
         cover = _cover(waveform, tones) if self.covered and tones.size else None
         choice = self.choose(shape, tones.power, speed, tones.sight, cover)
-        return _made(waveform, tones, choice)
+        return _made(waveform, tones, noise, choice)
 
     def choose(
         self,
@@ -206,14 +212,16 @@ def _cover(waveform: Waveform, tones: Tones) -> Cover:
     return Cover(cell, covered_error(waveform, tones, size), dearer)
 
 
-def _made(waveform: Waveform, tones: Tones, choice: Choice) -> np.ndarray:
-    """Samples with some paths made one by one, the others through a grid."""
+def _made(waveform: Waveform, tones: Tones, noise: WhiteNoise, choice: Choice) -> np.ndarray:
+    """Samples with some paths made one by one, the others through a grid, and noise."""
     samples = lent_memory(_shape(waveform, tones))
     setting, alone, faint = choice
     strong = tones.select(alone)
     if alone.all():
         add_direct(samples, waveform, strong, fresh=True)
+        noise.add_to(samples)
     else:
         rest = tones.select(~alone)
-        make_gridded(samples, waveform, rest, setting, faint=faint[~alone], alone=strong)
+        parts = {"faint": faint[~alone], "alone": strong, "noise": noise}
+        make_gridded(samples, waveform, rest, setting, **parts)
     return samples

@@ -33,6 +33,20 @@ class WhiteNoise(NamedTuple):
     power: float
     seed_words: np.ndarray
 
+    @property
+    def numbers(self) -> tuple[np.float32, np.uint32, np.uint32]:
+        """Power and key for kernels."""
+        first, second = self.seed_words
+        return np.float32(self.power), np.uint32(first), np.uint32(second)
+
+    def add_to(self, samples: np.ndarray) -> None:
+        """Add it in place to samples, complex64 and contiguous, from the stream's first on."""
+        if self.power:
+            add_white_noise(samples, *self)
+
+
+SILENCE = WhiteNoise(0.0, np.zeros(2, np.uint32))
+"""No noise."""
 
 _BLOCK = 512
 """Samples whose words stay in the nearest cache."""
@@ -116,7 +130,7 @@ def _threefry(a, b, key0, key1):
     return _plus(a, _same(key2)), _plus(b, _same(uint32(key0 + uint32(5))))
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def random_words(first_words, second_words, first, key0, key1):
     """The two words of sample `first` of the stream and of those after it, a multiple of four."""
     n, low, high = first_words.shape[0] // 4, uint32(first), uint32(first >> np.uint64(32))
@@ -168,7 +182,7 @@ def _cos_sin(word):
     return cosine, sine
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _add_gaussians(out, power, first_words, second_words):
     """Add a complex Gaussian of each two words to (out[2 i], out[2 i + 1])."""
     for i in range(out.shape[0] // 2):
@@ -181,10 +195,21 @@ def _add_gaussians(out, power, first_words, second_words):
 @jit(fast=True)
 def add_stream(out, power, key0, key1, first):
     """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1])."""
-    a, b = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
+    words = np.empty((2, _BLOCK), np.uint32)
+    add_stream_by(out, power, key0, key1, first, words)
+
+
+@jit(fast=True, borrows=True)
+def add_stream_by(out, power, key0, key1, first, words):
+    """`add_stream` with room (2, _BLOCK) for `words`."""
     for start in range(0, out.shape[0] // 2, _BLOCK):
-        random_words(a, b, np.uint64(first + np.uint64(start)), key0, key1)
-        _add_gaussians(out[2 * start : 2 * (start + _BLOCK)], power, a, b)
+        random_words(words[0], words[1], np.uint64(first + np.uint64(start)), key0, key1)
+        _add_gaussians(out[2 * start : 2 * (start + _BLOCK)], power, words[0], words[1])
+
+
+def words_room() -> np.ndarray:
+    """For `add_stream_by`."""
+    return np.empty((2, _BLOCK), np.uint32)
 
 
 def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: int = 0) -> None:
@@ -198,5 +223,6 @@ def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: i
     key : (2,) uint32, the stream; streams of different keys are independent
     first : index of the first sample, so that parts of a cube can be filled one by one
     """
-    flat = samples.reshape(-1).view(np.float32)
-    add_stream(flat, np.float32(power), np.uint32(key[0]), np.uint32(key[1]), np.uint64(first))
+    add_stream(
+        samples.reshape(-1).view(np.float32), *WhiteNoise(power, key).numbers, np.uint64(first)
+    )

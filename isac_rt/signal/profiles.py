@@ -104,7 +104,7 @@ def no_band() -> Band:
     )
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def to_cells(grid, low, rows, deconvolution, band, first, slot):
     """Window, noise and transform of the chirp in `grid` (rows `rows` after `low`), to place `slot`
     of the stage.
@@ -138,7 +138,7 @@ def to_cells(grid, low, rows, deconvolution, band, first, slot):
         store(stage, to + 16, re * s + im * c)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def write_cells(out, at, stride, channels, count, num_chirps, cells, stage, tile):
     """Write `count` staged chirps: cell k of channel r to out[at + r stride + 2 k num_chirps];
     `out` begins at a multiple of 64 bytes."""

@@ -39,7 +39,7 @@ from isac_rt.scenario.environment import Belief
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
-from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
+from isac_rt.signal.if_signal import if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.received import noise_left_out, received
 from isac_rt.simulation.coverage import Coverage, coverage
@@ -143,8 +143,7 @@ class Frame:
         if not ends.ideal:
             heard = self._listening(link)
             return received(s.waveform, arriving, *heard, ends, method, noise)
-        cube = if_signal(s.waveform, arriving, *self._listening(link), method)
-        return add_noise(cube, noise.power, noise.seed_words)
+        return if_signal(s.waveform, arriving, *self._listening(link), method, noise=noise)
 
     def heard(self, link: tuple[str, str]) -> IFCube | RangeProfiles:
         """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at

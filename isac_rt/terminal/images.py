@@ -234,24 +234,32 @@ def _met(
     pairs, places, count = np.empty((64, 2), np.int64), np.empty((64, 3, 3)), 0
     once, at_j, A, B = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     before = np.array([_dot(planes.normals[j], end) - planes.offsets[j] for j in last])
+    x, y, z = planes.normals[last].T.copy()
+    offsets, beyond = planes.offsets[last], np.empty(last.size)
+    some = np.empty(last.size, np.int64)
     for i in first:
         n, d = planes.normals[i], planes.offsets[i]
-        s = _dot(n, start) - d
+        s, apart = _dot(n, start) - d, 0.0
         for c in range(3):
             once[c] = start[c] - 2 * s * n[c]
-        for j, e in zip(last, before):  # noqa: B905 - compiled
-            m = planes.normals[j]
-            beyond = _dot(m, once) - planes.offsets[j]
-            if i == j or not beyond * e > 0:
+            apart += (once[c] - end[c]) ** 2
+        for k in range(last.size):
+            beyond[k] = x[k] * once[0] + y[k] * once[1] + z[k] * once[2] - offsets[k]
+        # a mirror between two points makes the square of the way between them longer by four times
+        # the product of their distances from it
+        least = max((2 * LEAST_RANGE) ** 2 - apart, 0.0) / 4
+        most, chosen = (reach**2 - apart) / 4, 0
+        for k in range(last.size):  # without branches
+            some[chosen] = k
+            chosen += least < beyond[k] * before[k] < most
+        for k in some[:chosen]:
+            j = last[k]
+            if i == j:
                 continue
-            length = 0.0
             for c in range(3):
-                at_j[c] = once[c] - 2 * beyond * m[c]
-                length += (at_j[c] - end[c]) ** 2
-            if not 2 * LEAST_RANGE < np.sqrt(length) < reach:
-                continue
+                at_j[c] = once[c] - 2 * beyond[k] * planes.normals[j, c]
             # from the image behind j to the end before it
-            if not _within(at_j, end, beyond / (beyond + e), planes, j, B):
+            if not _within(at_j, end, beyond[k] / (beyond[k] + before[k]), planes, j, B):
                 continue
             height = _dot(n, B) - d
             if not height * s > -EDGE * abs(s):

@@ -63,7 +63,7 @@ class Air:
     def establish(self, monkeypatch: pytest.MonkeyPatch, n: Network):
         """The stages on samples that hold nothing but (listener, frame, first block, group)."""
 
-        def synthesis(waveform, links, receiver, reference, method):
+        def synthesis(waveform, links, receiver, reference, method, noise):
             name = NAMES[int(receiver.pose.position[0])]
             start = reference.start_time - reference.first_block * BLOCK
             number = (start - n.start) / W.frame_duration
@@ -73,12 +73,11 @@ class Air:
             samples[..., 2] = reference.first_block
             samples[..., 3] = np.arange(W.num_groups)[:, None, None]
             sent = [transmission for transmission, _ in links]
-            self.heard.append(Heard(name, round(number), reference.first_block, sent, 0.0, ()))
+            words = tuple(noise.seed_words.tolist())
+            self.heard.append(
+                Heard(name, round(number), reference.first_block, sent, noise.power, words)
+            )
             return IFCube(samples=samples, waveform=W, schedule=n.schedule, start_time=0.0)
-
-        def add_noise(cube, power, words):
-            self.heard[-1] = self.heard[-1]._replace(power=power, words=tuple(words.tolist()))
-            return cube
 
         def labels(samples):
             name, frame, first, group = samples[0, 0, 0].real.astype(int).tolist()
@@ -112,7 +111,6 @@ class Air:
 
         stand_ins = {
             "if_signal": synthesis,
-            "add_noise": add_noise,
             "hot_chirps": hot_chirps,
             "read": read,
             "receive_passive": receive_passive,

@@ -55,6 +55,26 @@ def run(folder: Path, code: str = RUN, **environment: str) -> list[str]:
     return done.stdout.split()
 
 
+BORROWS = """import numpy as np
+from isac_rt.kernels.jit import jit
+
+@jit(borrows=True)
+def total(x, out):
+    for i in range(len(x)):
+        line = x[i]
+        for k in range(i % 3, line.size):
+            out[0] += line[k]
+
+@jit(borrows=True)
+def part(x):
+    return x[1:]
+
+@jit(borrows=True)
+def copied(x):
+    return (x + 1).size
+"""
+
+
 def change(file: Path, old: str, new: str) -> None:
     """Another line of the same length at the same time: nothing but the text tells."""
     when = file.stat()
@@ -137,6 +157,25 @@ def test_every_kernel_that_is_called_counts(copy, module, file):
     with (copy / "isac_rt" / file).open("a") as source:
         source.write("\n")
     assert run(copy, code) != first
+
+
+def test_what_borrows_makes_no_array(copy):
+    """And returns none: it is not compiled. Planted bug: `_nrt` left at its default."""
+    (copy / "isac_rt/kernels/outer.py").write_text(BORROWS)
+    code = """
+import numpy as np
+from numba.core.errors import NumbaError
+from isac_rt.kernels import outer
+x, out = np.ones((4, 5)), np.zeros(1)
+outer.total(x, out)
+print(out[0])
+for wrong in outer.part, outer.copied:
+    try:
+        wrong(x)
+    except NumbaError:
+        print("no")
+"""
+    assert run(copy, code) == ["17.0", "no", "no"]
 
 
 def test_where_nothing_can_be_written_every_process_compiles(copy):

@@ -31,6 +31,8 @@ from isac_rt.signal.gridded import (
     grid_size,
     make_gridded,
 )
+from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Separable
+from isac_rt.signal.noise import WhiteNoise, add_white_noise
 from isac_rt.signal.tones import tones_of
 from isac_rt.world.swarm import Pose
 
@@ -243,6 +245,27 @@ def test_paths_past_the_grid_are_those_of_the_direct_method(samples):
     make_gridded(together, w, silent, DEFAULT, alone=alone)
     add_direct(apart, w, alone, fresh=True)
     assert np.array_equal(together, apart)
+
+
+@pytest.mark.parametrize("samples", [96, 90])
+def test_noise_is_that_of_its_own_pass(samples):
+    """To the bit, by a grid and past it, for chirps whose samples fill no block of words; and where
+    nothing is heard. Planted bugs: the draw of the chirp before; noise before the paths one by
+    one; none where nothing is heard."""
+    w, tones = scene(12, np.random.default_rng(4), num_samples=samples)
+    strong = np.arange(12) % 4 == 1
+    rest, alone = tones.select(~strong), tones.select(strong)
+    noise = WhiteNoise(0.03 * rest.power.mean(), np.array([3, 5], np.uint32))
+    for heard in (rest, rest._replace(delay=rest.delay + 1.0)):
+        apart, together = gridded(w, tones, DEFAULT), gridded(w, tones, DEFAULT)
+        make_gridded(apart, w, heard, DEFAULT, alone=alone)
+        add_white_noise(apart, *noise)
+        make_gridded(together, w, heard, DEFAULT, alone=alone, noise=noise)
+        assert np.array_equal(together, apart)
+    for method in (Exact(), Separable(), Direct(), Gridded(), Auto()):
+        apart = method.samples(w, tones)
+        add_white_noise(apart, *noise)
+        assert np.array_equal(method.samples(w, tones, noise), apart)
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,7 @@ def _hashed(state, word):
     return state ^ (state >> np.uint64(31))
 
 
-@jit
+@jit(borrows=True)
 def _place(corners, state, point):
     """A point, uniform in a triangle (3, 3)."""
     root = np.sqrt((np.float64(_hashed(state, np.uint64(0)) >> np.uint64(11)) + 0.5) / 2**53)
@@ -252,7 +252,7 @@ def _place(corners, state, point):
         point[axis] = (1 - root) * a + root * ((1 - share) * b + share * c)
 
 
-@jit
+@jit(borrows=True)
 def _near(corners, limit, places, boxes, span):
     """Whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a sphere
     about its centroid that holds it. Places are asked only where `span`, between which the distance
@@ -289,7 +289,7 @@ def _square(x, y, z):
     return x * x + y * y + z * z
 
 
-@jit
+@jit(borrows=True)
 def _halve(corners, one, other):
     """Cut a triangle (3, 3) from the middle of its longest edge into two; that edge's length."""
     edges = _edge(corners, 0), _edge(corners, 1), _edge(corners, 2)

@@ -114,7 +114,7 @@ def _sides(flat: np.ndarray) -> np.ndarray:
     return np.concatenate([across, -(across * flat).sum(2, keepdims=True)], axis=2)
 
 
-@jit
+@jit(borrows=True)
 def _face_at(mirrors, plane, x, y, z):
     """The face of a plane that holds a point of it, the first in the order of the faces; -1 where
     there is none."""

@@ -420,7 +420,7 @@ def _covariances(cells, scatterers, tables, shape, out):
             out[c, k, k] = 1.0 + sums[0, k, k] * shape[k, k]
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _add_products(re, im, count, size, sums):
     """sums[k, m] += x[q, k] x[q, m]^* over q < `count`, for m <= k, and some that no one reads."""
     width, flat = sums.shape[2], sums.reshape(-1)

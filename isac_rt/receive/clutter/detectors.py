@@ -23,7 +23,7 @@ from isac_rt.receive.clutter.neighbours import phases
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
 from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR, accumulate, channel_maps
+from isac_rt.receive.maps import UNION_FLOOR, maps_with_power
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import Correction, ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
@@ -107,8 +107,7 @@ class ClutterDetector:
         self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
     ) -> Sensed:
         """Detections in cleaned spectra of echoes."""
-        maps = channel_maps(spectra, known)
-        power, correction = accumulate(maps), None
+        (maps, power), correction = maps_with_power(spectra, known), None
         if clutter is not None and self.fitted:
             correction = correct(power, known, clutter)
             clutter = correction.apply(clutter)

@@ -129,7 +129,7 @@ class Response:
         return np.fft.fftshift(out, axes=2)
 
 
-@jit
+@jit(borrows=True)
 def _add_lines(lines, weights, rows):
     """Add to each row the weighted lines about it."""
     for r in range(rows.shape[0]):

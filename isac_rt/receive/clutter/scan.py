@@ -135,7 +135,7 @@ def search_by_power(along_x, along_z, scale, peak, place):
         peak[s], place[s, 0], place[s, 1] = power[best], best // size, best % size
 
 
-@jit
+@jit(borrows=True)
 def _apart(lines, out):
     """All real parts of the lines, then all imaginary ones."""
     count, size = lines.shape
@@ -244,7 +244,7 @@ def quadratic_forms(matrices, order, x, z, out):
                 store(flat, (first + s) * size * size + at, value)
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _sum(heard, count, n, lines, p, begin, g):
     """Sum over the channels m of line p of conj(a_m) Q_mn, real and imaginary part."""
     re, im = splat(np.float32(0)), splat(np.float32(0))
@@ -256,7 +256,7 @@ def _sum(heard, count, n, lines, p, begin, g):
     return re, im
 
 
-@jit(fast=True)
+@jit(fast=True, borrows=True)
 def _within(heard, count, begin, lines, total, step, other):
     """Add what an axis' own lines, whose channels begin at `begin`, have of `quadratic_forms`;
     `step` and `other` are those from one of their own directions to the next, and across."""

@@ -167,7 +167,7 @@ def own_sums(size: float, weights: Weights, powers: int = 3) -> np.ndarray:
     return over[:, None, None, None] * total.T[..., None]
 
 
-@jit
+@jit(borrows=True)
 def _nodes(reach):
     """Chebyshev nodes for sums over frequencies within `reach` cells of the middle one: they are
     band-limited to half a cycle a cell."""
