@@ -724,7 +724,8 @@ def test_what_a_triangle_hides_from_all_places_each_ray_meets():
     middle = points + rng.uniform(-0.1, 1.1, (900, 1)) * (places[6] - points)
     corners = (middle[:, None] + size * rng.normal(0, 1, (900, 3, 3))).astype(np.float32)
     triangles.corners = corners
-    hidden = rays._hides(triangles.sides, np.arange(900), rays._box(places), places, points)
+    hidden, box = np.zeros(900, bool), rays._box(places)
+    rays._hides(triangles.sides, np.arange(900), box, places, points, hidden)
     a, b, c = np.moveaxis(corners.astype(float), 1, 0)[:, :, None]
     side = np.sign(((places - points[:, None]) * normals[:, None]).sum(2, keepdims=True))
     start = points[:, None] + side * rays.LIFT * normals[:, None]

@@ -188,7 +188,6 @@ def _leaves(faces, places, boxes, density, most):
     then the row of the face, code, area, state and point, in the order of row and code. Ends early
     where there are more than `most`."""
     corners, area, face_states = faces
-    per_metre, smallest, near = density
     room = max(2 * area.size, 1024)
     rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
     areas, states, points = np.empty(room), np.empty(room, np.uint64), np.empty((room, 3))
@@ -203,34 +202,52 @@ def _leaves(faces, places, boxes, density, most):
         while first < last:
             if count + last - first > most:
                 return most + 1, rows, codes, areas, states, points
-            size = line_areas[first]
-            reach = size / per_metre if size > smallest else 0.0
-            if FINER * size > smallest:
-                reach = max(reach, min(FINER * size / per_metre, near))
-            if reach == 0 or not _near(line[first], reach, places, boxes, spans[first]):
-                if count == rows.size:
-                    rows, codes = np.append(rows, rows), np.append(codes, codes)
-                    areas, states = np.append(areas, areas), np.append(states, states)
-                    points = np.concatenate((points, points))
-                rows[count], codes[count], areas[count] = row, line_codes[first], size
-                states[count] = _hashed(face_states[row], line_codes[first])
-                _place(line[first], states[count], points[count])
-                count, first = count + 1, first + 1
-                continue
+            if count == rows.size:
+                rows, codes = np.append(rows, rows), np.append(codes, codes)
+                areas, states = np.append(areas, areas), np.append(states, states)
+                points = np.concatenate((points, points))
             if last + 2 > line_areas.size:
                 line_codes = np.append(line_codes[first:last], line_codes)
                 line_areas = np.append(line_areas[first:last], line_areas)
                 line = np.concatenate((line[first:last], line))
                 spans = np.concatenate((spans[first:last], spans))
                 first, last = 0, last - first
-            apart = _halve(line[first], line[last], line[last + 1]) / 6  # of a half's centroid
-            for half in range(2):
-                line_codes[last + half] = line_codes[first] * np.uint64(2) + np.uint64(half)
-                line_areas[last + half] = line_areas[first] / 2
-                spans[last + half, 0] = spans[first, 0] - apart
-                spans[last + half, 1] = spans[first, 1] + apart
-            first, last = first + 1, last + 2
+            leaves, waiting = (rows, codes, areas, states, points), (line_codes, line_areas)
+            at = row, face_states[row], count, first, last
+            around = line, spans, places, boxes, density, most
+            count, first, last = _cut_face(at, leaves, waiting, *around)
     return count, rows, codes, areas, states, points
+
+
+@jit(borrows=True)
+def _cut_face(at, leaves, waiting, line, spans, places, boxes, density, most):
+    """Cut the waiting cells of a face further, until none is left, there is no room, or there are
+    more than `most`; the new number of leaves, and the first and last of those that wait."""
+    row, state, count, first, last = at
+    rows, codes, areas, states, points = leaves
+    line_codes, line_areas = waiting
+    per_metre, smallest, near = density
+    while first < last and count < rows.size and last + 2 <= line_areas.size:
+        if count + last - first > most:
+            break
+        size = line_areas[first]
+        reach = size / per_metre if size > smallest else 0.0
+        if FINER * size > smallest:
+            reach = max(reach, min(FINER * size / per_metre, near))
+        if reach == 0 or not _near(line[first], reach, places, boxes, spans[first]):
+            rows[count], codes[count], areas[count] = row, line_codes[first], size
+            states[count] = _hashed(state, line_codes[first])
+            _place(line[first], states[count], points[count])
+            count, first = count + 1, first + 1
+            continue
+        apart = _halve(line[first], line[last], line[last + 1]) / 6  # of a half's centroid
+        for half in range(2):
+            line_codes[last + half] = line_codes[first] * np.uint64(2) + np.uint64(half)
+            line_areas[last + half] = line_areas[first] / 2
+            spans[last + half, 0] = spans[first, 0] - apart
+            spans[last + half, 1] = spans[first, 1] + apart
+        first, last = first + 1, last + 2
+    return count, first, last
 
 
 @jit(inline=True)

@@ -142,7 +142,7 @@ class Shadows:
             hit = self.scene.ray_intersect_preliminary(ray)
             dr.eval(hit)
             row = self.triangles.rows(hit)
-            out[part] = _hides(self.triangles.sides, row, _box(places), places, points[part])
+            _hides(self.triangles.sides, row, _box(places), places, points[part], out[part])
         return out
 
     def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -197,16 +197,15 @@ def _box(places: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
 
 
-@jit
-def _hides(sides, row, box, places, points):
-    """Whether the triangle of each point (N, 3), -1: none, surely hides it from all places: from
-    the corners of the box (8, 3) about them, and so from all within, or else from one by one."""
-    out = np.zeros(row.size, np.bool_)
+@jit(borrows=True)
+def _hides(sides, row, box, places, points, out):
+    """Note in `out` whether the triangle of each point (N, 3), -1: none, surely hides it from all
+    places: from the corners of the box (8, 3) about them, and so from all within, or else from one
+    by one."""
     for k in range(row.size):
         if row[k] >= 0:
             side = sides[row[k]]
             out[k] = _hidden_from(side, points[k], box) or _hidden_from(side, points[k], places)
-    return out
 
 
 @jit(inline=True)
