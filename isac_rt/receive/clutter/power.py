@@ -107,26 +107,42 @@ class Response:
         `slope` (K, A), Doppler centred."""
         across, along = _kernels(self.waveform, self.taper)
         turn = 2j * np.pi * np.arange(along.size) / self.waveform.num_chirps
-        lines = (self.rows + 2 * REACH) * FINE_BEAT
-        fine = self.waveform.num_chirps * FINE_DOPPLER
-        line = np.round((beat + REACH) * FINE_BEAT).astype(np.int64)
-        inside = (line >= 0) & (line < lines)
-        left = np.floor(doppler * FINE_DOPPLER)
-        share = (doppler * FINE_DOPPLER - left)[inside]
-        at = [(line * fine + (left.astype(np.int64) + side) % fine)[inside] for side in (0, 1)]
-        where, size = np.concatenate(at), self.waveform.num_chirps
+        size = self.waveform.num_chirps
         out = np.zeros((1 + slope.shape[1], self.rows, size))
+        grid = np.empty(((self.rows + 2 * REACH) * FINE_BEAT, size * FINE_DOPPLER))
+        folded = np.empty((len(grid), size // 2 + 1), complex)
         for number, made in enumerate(out):
-            weight = (power if number == 0 else power * slope[:, number - 1])[inside]
-            parts = np.concatenate([weight * (1 - share), weight * share])
-            grid = np.bincount(where, parts, lines * fine).reshape(lines, fine)
-            spectrum = scipy.fft.rfft(grid) * (along if number == 0 else -along * turn)
-            # every third place alone is wanted: the three parts of the spectrum fall together
-            half = size // 2 + 1
-            folded = spectrum[:, :half] + spectrum[:, size : size + half]
-            folded += spectrum[:, size : size - half : -1].conj()
+            weight = power if number == 0 else power * slope[:, number - 1]
+            _put(beat, doppler, np.asarray(weight, float), grid)
+            _fold(scipy.fft.rfft(grid), along if number == 0 else -along * turn, size, folded)
             _add_lines(scipy.fft.irfft(folded, size), across / FINE_DOPPLER, made)
         return np.fft.fftshift(out, axes=2)
+
+
+@jit(borrows=True)
+def _put(beat, doppler, weight, grid):
+    """Scatterers on the nearest line of the fine grid, shared by the two places about their
+    Doppler."""
+    grid[:] = 0.0
+    for k in range(weight.size):
+        line = int(np.rint((beat[k] + REACH) * FINE_BEAT))
+        if 0 <= line < grid.shape[0]:
+            at = doppler[k] * FINE_DOPPLER
+            left = np.floor(at)
+            place, share = int(left) % grid.shape[1], at - left
+            grid[line, place] += weight[k] * (1 - share)
+            grid[line, (place + 1) % grid.shape[1]] += weight[k] * share
+
+
+@jit(borrows=True)
+def _fold(spectra, response, size, out):
+    """The product of both, of which every third place alone is wanted: the three parts of the
+    spectrum fall together."""
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            up, down = size + k, size - k
+            value = spectra[i, k] * response[k] + spectra[i, up] * response[up]
+            out[i, k] = value + (spectra[i, down] * response[down]).conjugate()
 
 
 @jit(borrows=True)
