@@ -40,7 +40,7 @@ from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive import receive_passive
 from isac_rt.receive.types import Detections
 from isac_rt.scenario.receivers import Receivers
-from isac_rt.signal.if_signal import if_signal
+from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.world.swarm import Pose
@@ -235,13 +235,13 @@ class _Air:
             links.append((shifted, paths[Link(t.name, name)]))
         start = self.time - w.frame_duration / 2 + first_block * w.group_spacing
         words = seed_sequence(n.seed, "access", "noise", name, self.frame).generate_state(2)
-        return if_signal(
+        return noisy_if_signal(
             w,
             links,
             ReceiveArray(poses[name], n.antennas),
             Reference(start, first_block, n.schedule),
             Auto(n.noise_power[name]),
-            noise=WhiteNoise(n.noise_power[name], words),
+            WhiteNoise(n.noise_power[name], words),
         )
 
 

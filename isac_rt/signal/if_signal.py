@@ -23,10 +23,8 @@ def if_signal(
     receiver: ReceiveArray,
     reference: Reference,
     method: Method = _AUTO,
-    *,
-    noise: WhiteNoise | None = None,
 ) -> IFCube:
-    r"""Dechirped IF samples of one receiver in one frame.
+    r"""Dechirped IF samples of one receiver in one frame, without noise.
 
     .. math::
 
@@ -48,7 +46,6 @@ def if_signal(
     reference : Reference
     method : how: `Auto` (the default), `Exact`, `Direct`, `Gridded` or `Separable`, of
         `isac_rt.signal.methods`
-    noise : what `add_noise` would add, to the bit, while samples are in the cache; None: none
 
     Returns
     -------
@@ -90,9 +87,21 @@ def if_signal(
     >>> cube.samples.shape, int(np.abs(np.fft.fft(cube.samples[0, 0, 0])).argmax())
     ((1, 3, 6, 1024), 240)
     """
+    return noisy_if_signal(waveform, links, receiver, reference, method, SILENCE)
+
+
+def noisy_if_signal(
+    waveform: Waveform,
+    links: Links,
+    receiver: ReceiveArray,
+    reference: Reference,
+    method: Method,
+    noise: WhiteNoise,
+) -> IFCube:
+    """`if_signal` with what `add_noise` would add, to the bit, while samples are in the cache."""
     schedule, tones = heard(waveform, links, receiver, reference)
     return IFCube(
-        samples=method.samples(waveform, tones, noise or SILENCE),
+        samples=method.samples(waveform, tones, noise),
         waveform=waveform,
         schedule=schedule,
         start_time=reference.start_time,

@@ -39,7 +39,7 @@ from isac_rt.scenario.environment import Belief
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
-from isac_rt.signal.if_signal import if_signal, range_profiles
+from isac_rt.signal.if_signal import noisy_if_signal, range_profiles
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.received import noise_left_out, received
 from isac_rt.simulation.coverage import Coverage, coverage
@@ -143,7 +143,7 @@ class Frame:
         if not ends.ideal:
             heard = self._listening(link)
             return received(s.waveform, arriving, *heard, ends, method, noise)
-        return if_signal(s.waveform, arriving, *self._listening(link), method, noise=noise)
+        return noisy_if_signal(s.waveform, arriving, *self._listening(link), method, noise)
 
     def heard(self, link: tuple[str, str]) -> IFCube | RangeProfiles:
         """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at

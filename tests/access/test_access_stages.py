@@ -110,7 +110,7 @@ class Air:
             return Reception.undecoded(W, found)
 
         stand_ins = {
-            "if_signal": synthesis,
+            "noisy_if_signal": synthesis,
             "hot_chirps": hot_chirps,
             "read": read,
             "receive_passive": receive_passive,
