@@ -9,7 +9,7 @@ from receiver_cubes import ANTENNAS, frame, known
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter import correction
 from isac_rt.receive.clutter.correction import UNTAPERED, fit
-from isac_rt.receive.clutter.power import expected_power
+from isac_rt.receive.clutter.power import TAPER, Response, expected_power
 from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
@@ -184,3 +184,21 @@ def test_noise_alone_corrects_nothing():
     _, schedule, payload = frame(waveform=W)
     found = fit(np.ones((ROWS, W.num_chirps)), 1.0, guess, known(W, schedule, payload))
     assert found.level == 0 and not found.velocity.any()
+
+
+def test_a_whole_bin_more_moves_expected_power_by_a_bin():
+    """Power and its slopes, of scatterers between bins and across the ends of the Doppler axis: the
+    same grid, places of which come round. Planted bug: the place after the last one is the last."""
+    rng, count = np.random.default_rng(17), 40
+    response = Response(W, ROWS, TAPER)
+    beat, power = rng.uniform(2, ROWS - 3, count), rng.uniform(0.5, 2.0, count)
+    doppler, slope = rng.uniform(-0.5, 0.0, count) / 3, rng.normal(size=(count, 1))
+    here = response.of(beat, doppler, power, slope)
+    for bins in (1, 37, W.num_chirps // 2, -W.num_chirps // 2 - 1):
+        there = response.of(beat, doppler + bins, power, slope)
+        np.testing.assert_allclose(there, np.roll(here, bins, axis=2), atol=1e-12 * here.max())
+    each = sum(
+        response.of(beat[k : k + 1], doppler[k : k + 1], power[k : k + 1], slope[k : k + 1])
+        for k in range(count)
+    )
+    np.testing.assert_allclose(here, each, atol=1e-12 * here.max())

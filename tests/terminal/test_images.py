@@ -60,7 +60,8 @@ def test_walls_show_a_passive_terminal_its_transmitter():
     planes, where its images stand: lengths of straight ways from (20.9, -3.1, 4.2), (1.7, -3.1,
     -16.2) and (20.9, -3.1, -16.2), either order alike. Rates by the images' motion: components
     turned in the plane or planes. A receiver behind the wall is shown nothing over it. Planted
-    bugs: the receiver's motion left out; the image turned in the last plane alone."""
+    bugs: the receiver's motion left out; the image turned in the last plane alone; the reach of
+    ways over two planes half as far again."""
     sender = np.append(OWN.position, [1.3, -0.4, 2.2])
     own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
     images = [
@@ -75,6 +76,9 @@ def test_walls_show_a_passive_terminal_its_transmitter():
         expected.append([far, span @ (VELOCITY - motion) / far])
     found = unique(sender_images(sender, own, city(WALL, GROUND), 100.0))
     np.testing.assert_allclose(found, unique(np.array(expected)), rtol=0, atol=1e-8)
+    for beyond in (-1e-6, 1e-6):
+        some = unique(sender_images(sender, own, city(WALL, GROUND), found[-1, 0] + beyond))
+        assert len(some) == (2 if beyond < 0 else 3)
     behind = pose([14.0, 8.9, 2.2], [-1.0, 0.0, 0.0])
     assert not len(sender_images(sender, behind, city(WALL), 100.0))
 
