@@ -594,6 +594,7 @@ def dataset_of(
     shots : ``path`` and ``maps`` of the snapshots by frame
     states : names of the terminals' state codes
     """
+    import pandas as pd
     import xarray as xr  # as dear as a frame, and not needed before the last
 
     w, labels = timetable.waveform, list(timetable.labels.values())
@@ -601,9 +602,12 @@ def dataset_of(
     out: dict[str, xr.Variable] = {}
 
     def put(name: str, dims: Sequence[str], values: Any, units: str, meaning: str) -> None:
-        said = {"units": units, "long_name": meaning}
-        # fastpath: another look at the array would load dask, which takes as long as three figures
-        out[name] = xr.Variable(tuple(dims), np.asarray(values), said, fastpath=True)
+        said, values = {"units": units, "long_name": meaning}, np.asarray(values)
+        # another look at the array would load dask, which takes as long as three figures
+        if [name] == list(dims):
+            out[name] = xr.IndexVariable(name, pd.Index(values, dtype=values.dtype), said)
+        else:
+            out[name] = xr.Variable(tuple(dims), values, said, fastpath=True)
 
     for name, words, meaning in (
         ("observer", labels, "link, by its receiver where that is enough"),
