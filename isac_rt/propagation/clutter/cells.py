@@ -227,9 +227,8 @@ def _cut_face(at, leaves, waiting, line, spans, places, boxes, density, most):
     rows, codes, areas, states, points = leaves
     line_codes, line_areas = waiting
     per_metre, smallest, near = density
-    while first < last and count < rows.size and last + 2 <= line_areas.size:
-        if count + last - first > most:
-            break
+    end = line_areas.size
+    while first < last <= end - 2 and count < rows.size and count + last - first <= most:
         size = line_areas[first]
         reach = size / per_metre if size > smallest else 0.0
         if FINER * size > smallest:
