@@ -112,16 +112,22 @@ def stream(typingctx, array, index, value):
     return types.void(array, types.intp, value), codegen
 
 
-@intrinsic
-def splat(typingctx, value):
-    """The same number in all lanes."""
+def _splatting(lanes):
+    """Intrinsic: the same number in so many lanes."""
 
-    def codegen(context, builder, signature, args):
-        nothing = ir.Constant(signature.return_type.form, ir.Undefined)
-        first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(first, nothing, _mask([0] * LANES))
+    @intrinsic
+    def splatted(typingctx, value):
+        def codegen(context, builder, signature, args):
+            nothing = ir.Constant(signature.return_type.form, ir.Undefined)
+            first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
+            return builder.shuffle_vector(first, nothing, _mask([0] * lanes))
 
-    return _Vector(value)(value), codegen
+        return _Vector(value, lanes)(value), codegen
+
+    return splatted
+
+
+splat, splat_part = _splatting(LANES), _splatting(PART)
 
 
 @intrinsic
@@ -172,19 +178,36 @@ not_above = _two(
         ir.Constant(a.type, [0.0] * LANES),
     )
 )
-zip_low = _two(
-    lambda builder, a, b: builder.shuffle_vector(
-        a, b, _mask(i // 2 + LANES * (i % 2) for i in range(LANES))
-    )
-)
-zip_high = _two(
-    lambda builder, a, b: builder.shuffle_vector(
-        a, b, _mask(LANES // 2 + i // 2 + LANES * (i % 2) for i in range(LANES))
-    )
-)
+
+
+def _zipped(start):
+    """Intrinsic of two vectors: lanes in turn, from the share `start` of them on."""
+
+    def method(builder, a, b):
+        lanes = a.type.count
+        first = int(start * lanes)
+        return builder.shuffle_vector(
+            a, b, _mask(first + i // 2 + lanes * (i % 2) for i in range(lanes))
+        )
+
+    return _two(method)
+
+
+zip_low, zip_high = _zipped(0), _zipped(0.5)
 
 evens = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(range(0, 2 * LANES, 2))))
 odds = _two(lambda builder, a, b: builder.shuffle_vector(a, b, _mask(range(1, 2 * LANES, 2))))
+
+
+@intrinsic
+def backwards(typingctx, value):
+    """The last lane first."""
+
+    def codegen(context, builder, signature, args):
+        nothing = ir.Constant(args[0].type, ir.Undefined)
+        return builder.shuffle_vector(args[0], nothing, _mask(range(args[0].type.count)[::-1]))
+
+    return value(value), codegen
 
 
 @intrinsic

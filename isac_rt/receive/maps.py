@@ -17,12 +17,22 @@ from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform, hann
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import (
+    PART,
+    aligned,
+    backwards,
+    load_part,
+    splat_part,
+    store,
+    zip_high,
+    zip_low,
+)
 from isac_rt.receive.known import Known
 
 UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler
 bin; reached within 2 % of the unambiguous velocity."""
-_ROWS = 128
+_ROWS = 24
 """Range cells of an antenna, all groups' chirps, that stay in the second-level cache."""
 
 
@@ -68,9 +78,11 @@ def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
 def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
     """`power_map`; fills (L_tx, L_rx, rows, P) `channel_maps`, or none."""
     power = np.zeros(spectra.shape[2:], np.float32)
-    ends, places, parts = _operators(known)
-    places = places[0] * np.uint64(spectra[0].size) + places[1]
-    _make_maps(np.ascontiguousarray(spectra), ends, places, parts, maps, power)
+    ends, places, lines = _operators(known)
+    places = 2 * (places[0] * np.uint64(spectra[0].size) + places[1])
+    flat = np.ascontiguousarray(spectra).reshape(-1).view(np.float32)
+    room = aligned(4 * _ROWS * len(lines) * PART)
+    _make_maps(flat, spectra.shape, ends, places, lines, room, maps, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
@@ -78,19 +90,18 @@ def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
 def _operators(known: Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the chirps of each transmit antenna begin and end (L_tx + 1,), the groups and numbers
     of all these chirps (2, S), and the real and imaginary parts of the operators on them for the
-    bins from 0 to P/2 (S, P + 2)."""
+    bins from 0 to P/2, `PART` bins at a time: (blocks, S, 2, PART)."""
     w, half = known.waveform, known.waveform.num_chirps // 2 + 1
-    places, parts = [], []
-    for sent in known.sent_by:
-        operator = (union_operator if known.full else correlation_operator)(w, known.slots[sent])
-        rows = operator[:half].copy()
-        if w.num_chirps % 2 == 0:  # the lowest bin, -P/2, stands where P/2 would
-            rows[-1] = rows[-1].conj()
-        places.append(np.nonzero(sent))
-        parts.append(np.concatenate([rows.real, rows.imag]).T)
-    ends = np.cumsum([0, *map(len, parts)])
-    every = np.ascontiguousarray(np.concatenate(parts))
-    return ends, np.concatenate(places, axis=1).astype(np.uint64), every
+    make = union_operator if known.full else correlation_operator
+    places = [np.nonzero(sent) for sent in known.sent_by]
+    ends = np.cumsum([0, *(numbers.size for _, numbers in places)])
+    rows = np.concatenate([make(w, known.slots[sent])[:half] for sent in known.sent_by], axis=1)
+    blocks = -(-half // PART)
+    parts = np.zeros((2, blocks * PART, rows.shape[1]), np.float32)
+    parts[:, :half] = rows.real, rows.imag
+    lines = aligned(parts.size).reshape(blocks, -1, 2, PART)
+    lines[...] = parts.reshape(2, blocks, PART, -1).transpose(1, 3, 0, 2)
+    return ends, np.concatenate(places, axis=1).astype(np.uint64), lines
 
 
 class Levels(NamedTuple):
@@ -162,72 +173,102 @@ class Banded(LatinUnion):
         return above & (np.abs(doppler_bins(w) + 0.25) < share * w.num_chirps / 2)
 
 
-@jit
-def _make_maps(spectra, ends, places, parts, maps, power):
+@jit(borrows=True)
+def _make_maps(flat, shape, ends, places, lines, room, maps, power):
     """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
-    L_rx, rows, P) if there is room for them; `places` of chirps in the samples of all groups.
+    L_rx, rows, P) if there is room for them. `flat` are the real and imaginary parts of samples of
+    `shape`, `places` say where chirps stand in them; unsigned, so that no index is checked for its
+    sign.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
     With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
-    half of the multiplications. All antennas' chirps of some range cells are taken while they are
-    in the cache.
+    half of the multiplications. A block of bins stays in the first-level cache for some rows, and
+    what is made of these in `room`.
     """
-    num_rx, num_rows, num_chirps = spectra.shape[1:]
-    flat, half = spectra.reshape(-1), parts.shape[1] // 2
-    room = np.empty(2 * _ROWS * places.size, np.float32)
-    made = np.empty((2 * _ROWS, 2 * half), np.float32)
-    for first in range(0, num_rows, _ROWS):
-        count = min(_ROWS, num_rows - first)
-        for rx in range(num_rx):
-            start = np.uint64((rx * num_rows + first) * num_chirps)
+    num_rx, num_rows, num_chirps = shape[1:]
+    size, operators = lines.shape[0] * PART, lines.reshape(-1)
+    for rx in range(num_rx):
+        for first in range(0, num_rows, _ROWS):
+            last = min(first + _ROWS, num_rows)
             for tx in range(ends.size - 1):
-                begin, end = ends[tx], ends[tx + 1]
-                united = room[: 2 * count * (end - begin)].reshape(2 * count, end - begin)
-                _unite(flat, start, places[begin:end], num_chirps, united)
-                np.dot(united, parts[begin:end], made[: 2 * count])
-                both = made[: 2 * count].reshape(2, count, 2, half)
-                _add_both_bins(both, power[first : first + count])
-                if maps.shape[0]:
-                    _join_both_bins(both, maps[tx, rx, first : first + count])
+                sent = places[ends[tx] : ends[tx + 1]]
+                for block in range(lines.shape[0]):
+                    at = (block * lines.shape[1] + ends[tx]) * 2 * PART
+                    for i in range(first, last, 3):
+                        rows = i, min(i + 1, last - 1), min(i + 2, last - 1)
+                        samples = flat, rx * num_rows, 2 * num_chirps
+                        _three_rows(samples, rows, sent, operators, at, room, first, (size, block))
+                for i in range(first, last):
+                    made = room[4 * (i - first) * size : 4 * (i - first + 1) * size]
+                    _add_power(power[i], made)
+                    if maps.shape[0]:
+                        _set_bins(maps[tx, rx, i].view(np.float32), made)
 
 
 @jit(borrows=True)
-def _unite(flat, start, places, num_chirps, out):
-    """out[i, s] and out[rows + i, s] = real and imaginary part of flat[start + i P + places[s]];
-    unsigned, so that no index is checked for its sign."""
-    rows = out.shape[0] // 2
-    for i in range(rows):
-        first, real, imag = start + np.uint64(i * num_chirps), out[i], out[rows + i]
-        for s in range(places.size):
-            value = flat[first + places[s]]
-            real[s], imag[s] = value.real, value.imag
+def _three_rows(samples, rows, places, operators, at, room, first, part):
+    """Both bins of a block, of three rows: what is kept in registers, without fetching a factor
+    twice, is twelve sums."""
+    flat, before, step = samples
+    r0, r1, r2 = (
+        np.uint64((before + rows[0]) * step),
+        np.uint64((before + rows[1]) * step),
+        np.uint64((before + rows[2]) * step),
+    )
+    zero, imag = splat_part(np.float32(0)), np.uint64(1)
+    ax0, bx0, ay0, by0 = zero, zero, zero, zero
+    ax1, bx1, ay1, by1 = zero, zero, zero, zero
+    ax2, bx2, ay2, by2 = zero, zero, zero, zero
+    for s in range(places.size):
+        p, a, b = places[s], load_part(operators, at), load_part(operators, at + PART)
+        x, y = flat[r0 + p], flat[r0 + p + imag]
+        ax0, bx0, ay0, by0 = ax0 + a * x, bx0 + b * x, ay0 + a * y, by0 + b * y
+        x, y = flat[r1 + p], flat[r1 + p + imag]
+        ax1, bx1, ay1, by1 = ax1 + a * x, bx1 + b * x, ay1 + a * y, by1 + b * y
+        x, y = flat[r2 + p], flat[r2 + p + imag]
+        ax2, bx2, ay2, by2 = ax2 + a * x, bx2 + b * x, ay2 + a * y, by2 + b * y
+        at += 2 * PART
+    _keep_both(room, rows[0] - first, part, ax0, bx0, ay0, by0)
+    _keep_both(room, rows[1] - first, part, ax1, bx1, ay1, by1)
+    _keep_both(room, rows[2] - first, part, ax2, bx2, ay2, by2)
+
+
+@jit(inline=True)
+def _keep_both(room, row, part, ax, bx, ay, by):
+    """Write a block of bins to a row's part of `room`, and the opposite bins, in falling order, at
+    its end."""
+    size, block = part
+    begin = (4 * row * size) + 2 * block * PART
+    end = 4 * (row + 1) * size - 2 * (block + 1) * PART
+    re, im = ax - by, bx + ay
+    store(room, begin, zip_low(re, im))
+    store(room, begin + PART, zip_high(re, im))
+    re, im = backwards(ax + by), backwards(ay - bx)
+    store(room, end, zip_low(re, im))
+    store(room, end + PART, zip_high(re, im))
 
 
 # no fused products: which of two is fused the compiler may decide anew, and bits would differ
 # between processes
 @jit(borrows=True)
-def _add_both_bins(made, power):
-    """power[i, k] and power[i, -k] += |.|^2 from made[x or y, i, a or b, k]."""
-    num_chirps = power.shape[1]
-    for i in range(power.shape[0]):
-        ax, bx, ay, by = made[0, i, 0], made[0, i, 1], made[1, i, 0], made[1, i, 1]
-        line = power[i]
-        for k in range((num_chirps + 1) // 2):
-            line[k] += (ax[k] - by[k]) ** 2 + (bx[k] + ay[k]) ** 2
-        for k in range(1, num_chirps // 2 + 1):
-            line[num_chirps - k] += (ax[k] + by[k]) ** 2 + (ay[k] - bx[k]) ** 2
+def _add_power(line, made):
+    """Add to the bins of a line, FFT order, the power of what `_keep_both` wrote; its last bin is
+    0, again."""
+    half, before = line.size // 2 + 1, made.size // 2 - 1 - line.size
+    for k in range(half):
+        line[k] += made[2 * k] ** 2 + made[2 * k + 1] ** 2
+    for k in range(half, line.size):
+        line[k] += made[2 * (before + k)] ** 2 + made[2 * (before + k) + 1] ** 2
 
 
 @jit(borrows=True)
-def _join_both_bins(made, out):
-    """out[i, k] and out[i, -k] from made[x or y, i, a or b, k]."""
-    num_chirps = out.shape[1]
-    for i in range(out.shape[0]):
-        ax, bx, ay, by = made[0, i, 0], made[0, i, 1], made[1, i, 0], made[1, i, 1]
-        for k in range((num_chirps + 1) // 2):
-            out[i, k] = complex(ax[k] - by[k], bx[k] + ay[k])
-        for k in range(1, num_chirps // 2 + 1):
-            out[i, num_chirps - k] = complex(ax[k] + by[k], ay[k] - bx[k])
+def _set_bins(line, made):
+    """Real and imaginary parts of the bins themselves, likewise."""
+    half, before = 2 * (line.size // 4 + 1), made.size - 2 - line.size
+    for k in range(half):
+        line[k] = made[k]
+    for k in range(half, line.size):
+        line[k] = made[before + k]
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
@@ -248,10 +289,19 @@ def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
     unambiguous velocity: the normal equations of that band have the entries sinc(t - t'). What
     remains is below -60 dB, and below -50 dB within 2 % of the unambiguous velocity.
     """
+    return _united(waveform, np.asarray(times, float).tobytes())
+
+
+@lru_cache(maxsize=16)
+def _united(waveform: Waveform, stored: bytes) -> np.ndarray:
+    """`union_operator`, once for all receivers that read the same data."""
+    times = np.frombuffer(stored)
     p = np.arange(waveform.num_chirps)
     grid = p + (times - np.floor(times)).mean()
     resample = np.linalg.solve(_sincs(times, times), _sincs(times, grid)).T
-    return np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
+    out = np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
+    out.setflags(write=False)
+    return out
 
 
 @jit
