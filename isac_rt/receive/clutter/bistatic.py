@@ -232,10 +232,8 @@ def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: f
 
 
 def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
-    """Cells (flat numbers) whose T against noise alone can be `least` or more.
-
-    Of each arm the power in its best direction, summed over the transmit antennas, bounds what both
-    can hold together: T <= (sqrt(max A) + sqrt(max B))^2.
+    """The largest T of cells against noise alone; exact where it can be `least` or more, else a
+    bound, without a direction.
 
     Parameters
     ----------
@@ -243,19 +241,30 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     noise : mean power of a cell of one channel
     """
     looks, size = maps.shape[0], len(search.channels)
-    flat, scale = maps.reshape(looks, size, -1), 1 / (size * noise)
-    bound = np.zeros(flat.shape[2], np.float32)
-    for lines in (search.along_x, search.along_z):
-        channels = np.arange(looks)[:, None] * size + lines.members[0]
-        power = line_bounds(flat.reshape(looks * size, -1), channels, lines.spectra[0][::BOUNDED])
-        bound += np.sqrt(power) * np.float32(SCALLOPED)
-    cell = np.flatnonzero(bound**2 * scale >= least)
-    y = np.ascontiguousarray(flat[:, :, cell].transpose(2, 0, 1))
-    peak, cosines = _best(y, np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32), search)
+    x, scale = maps.reshape(looks * size, -1), 1 / (size * noise)
+    cell = np.flatnonzero(_bound(x, search, BOUNDED) * SCALLOPED**2 * scale >= least)
+    x = np.take(x, cell, axis=1)
+    peak, cosines = _bound(x, search, 1) * scale, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
+    y = np.ascontiguousarray(x[:, some].T).reshape(-1, looks, size)
+    whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)
+    peak[some], cosines[some] = _best(y, whole, search)
+    above = peak[some] >= least
+    some, y = some[above], y[above]
     norm = np.eye(size, dtype=np.complex64)[None] * np.float32(noise)
-    peak[some], cosines[some] = _climbed(y[some], norm, cosines[some], search)
+    peak[some], cosines[some] = _climbed(y, norm, cosines[some], search)
     return Found(cell, peak, cosines)
+
+
+def _bound(x: np.ndarray, search: Search, step: int) -> np.ndarray:
+    """(sqrt(max A) + sqrt(max B))^2 of channels (L_tx L_rx, S): of each arm the power in the best
+    of every so many directions, summed over the transmit antennas, bounds what both can hold
+    together in one of them."""
+    size = len(search.channels)
+    first, roots = np.arange(0, len(x), size)[:, None], np.zeros(x.shape[1], np.float32)
+    for lines in (search.along_x, search.along_z):
+        roots += np.sqrt(line_bounds(x, first + lines.members[0], lines.spectra[0][::step]))
+    return roots**2
 
 
 def search_white(
