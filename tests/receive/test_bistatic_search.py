@@ -66,6 +66,31 @@ def test_the_search_finds_the_largest_over_all_directions():
     np.testing.assert_array_less(found.peak, 1.02 * expected)
 
 
+def test_the_bounds_miss_nothing():
+    """Noise and paths of all directions beside a search of every cell: what reaches the threshold
+    has the same statistic, what does not a bound. The climb adds a tenth at most (`PRUNED`).
+
+    Planted bugs: either bound a fifth too low; the same transmit antenna for all of them, in both
+    bounds.
+    """
+    rng, least = np.random.default_rng(8), 30.0
+    u = rng.uniform(-0.6, 0.6, (900, 2))
+    x = white(rng, LOOKS, SIZE, 900, 1)
+    x += SEARCH.steering(u).T[:, :, None] * white(rng, LOOKS, 1, 900, 1)
+    every, found = search_plain(x, SEARCH, 1.0, 0.0), search_plain(x, SEARCH, 1.0, least)
+    assert every.cell.size == 900 > found.cell.size
+    peak, place = np.zeros(900), np.full((900, 2), np.nan)
+    peak[found.cell], place[found.cell] = found.peak, found.cosines
+    over = every.peak >= least / 0.9
+    assert 200 < over.sum() < 700
+    assert np.array_equal(place[over], every.cosines[over])
+    np.testing.assert_allclose(peak[over], every.peak[over], rtol=1e-5, atol=0)  # float32
+    bounded = np.setdiff1d(found.cell, np.flatnonzero(np.isfinite(place[:, 0])))
+    assert bounded.size > 20
+    assert (peak[bounded] < least).all()
+    assert (peak[bounded] > 0.9 * every.peak[bounded]).all()
+
+
 @pytest.mark.parametrize("together", [False, True])
 def test_false_alarms_in_clutter_are_no_more_than_those_designed(together: bool):
     """Clutter of eight directions, 3 to 20 dB, in every cell; heard alike by all transmit antennas,
