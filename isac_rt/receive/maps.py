@@ -207,8 +207,8 @@ def _make_maps(flat, shape, ends, places, lines, room, maps, power):
 
 @jit(borrows=True)
 def _three_rows(samples, rows, places, operators, at, room, first, part):
-    """Both bins of a block, of three rows: what is kept in registers, without fetching a factor
-    twice, is twelve sums."""
+    """A block of bins and the opposite ones, of three rows at once: their twelve sums, both factors
+    and a sample's two parts fill the registers of a processor that has sixteen."""
     flat, before, step = samples
     r0, r1, r2 = (
         np.uint64((before + rows[0]) * step),
@@ -235,10 +235,10 @@ def _three_rows(samples, rows, places, operators, at, room, first, part):
 
 @jit(inline=True)
 def _keep_both(room, row, part, ax, bx, ay, by):
-    """Write a block of bins to a row's part of `room`, and the opposite bins, in falling order, at
+    """Write a block of bins to a row's part of `room`, and the opposite bins, the lowest first, at
     its end."""
     size, block = part
-    begin = (4 * row * size) + 2 * block * PART
+    begin = 4 * row * size + 2 * block * PART
     end = 4 * (row + 1) * size - 2 * (block + 1) * PART
     re, im = ax - by, bx + ay
     store(room, begin, zip_low(re, im))
