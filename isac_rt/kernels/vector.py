@@ -112,15 +112,19 @@ def stream(typingctx, array, index, value):
     return types.void(array, types.intp, value), codegen
 
 
+def _repeated(builder, value, form):
+    nothing = ir.Constant(form, ir.Undefined)
+    first = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, nothing, _mask([0] * form.count))
+
+
 def _splatting(lanes):
     """Intrinsic: the same number in so many lanes."""
 
     @intrinsic
     def splatted(typingctx, value):
         def codegen(context, builder, signature, args):
-            nothing = ir.Constant(signature.return_type.form, ir.Undefined)
-            first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(first, nothing, _mask([0] * lanes))
+            return _repeated(builder, args[0], signature.return_type.form)
 
         return _Vector(value, lanes)(value), codegen
 
@@ -248,10 +252,7 @@ def _all(typingctx, value, like):
     """The same number in all lanes of a vector like another."""
 
     def codegen(context, builder, signature, args):
-        form = signature.return_type.form
-        nothing = ir.Constant(form, ir.Undefined)
-        first = builder.insert_element(nothing, args[0], ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(first, nothing, _mask([0] * form.count))
+        return _repeated(builder, args[0], signature.return_type.form)
 
     return like(value, like), codegen
 

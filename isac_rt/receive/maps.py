@@ -78,11 +78,12 @@ def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
 def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
     """`power_map`; fills (L_tx, L_rx, rows, P) `channel_maps`, or none."""
     power = np.zeros(spectra.shape[2:], np.float32)
-    ends, places, lines = _operators(known)
+    ends, places, factors = _operators(known)
     places = 2 * (places[0] * np.uint64(spectra[0].size) + places[1])
     flat = np.ascontiguousarray(spectra).reshape(-1).view(np.float32)
-    room = aligned(4 * _ROWS * len(lines) * PART)
-    _make_maps(flat, spectra.shape, ends, places, lines, room, maps, power)
+    room = aligned(4 * _ROWS * len(factors) * PART)
+    spare = np.empty((_ROWS, spectra.shape[3]), np.complex64)
+    _make_maps(flat, spectra.shape, ends, places, factors, room, maps, spare, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
@@ -99,9 +100,9 @@ def _operators(known: Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     blocks = -(-half // PART)
     parts = np.zeros((2, blocks * PART, rows.shape[1]), np.float32)
     parts[:, :half] = rows.real, rows.imag
-    lines = aligned(parts.size).reshape(blocks, -1, 2, PART)
-    lines[...] = parts.reshape(2, blocks, PART, -1).transpose(1, 3, 0, 2)
-    return ends, np.concatenate(places, axis=1).astype(np.uint64), lines
+    factors = aligned(parts.size).reshape(blocks, -1, 2, PART)
+    factors[...] = parts.reshape(2, blocks, PART, -1).transpose(1, 3, 0, 2)
+    return ends, np.concatenate(places, axis=1).astype(np.uint64), factors
 
 
 class Levels(NamedTuple):
@@ -174,11 +175,11 @@ class Banded(LatinUnion):
 
 
 @jit(borrows=True)
-def _make_maps(flat, shape, ends, places, lines, room, maps, power):
+def _make_maps(flat, shape, ends, places, factors, room, maps, spare, power):
     """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
-    L_rx, rows, P) if there is room for them. `flat` are the real and imaginary parts of samples of
-    `shape`, `places` say where chirps stand in them; unsigned, so that no index is checked for its
-    sign.
+    L_rx, rows, P), or parts of them to `spare` where they have no room. `flat` are the real and
+    imaginary parts of samples of `shape`, `places` say where chirps stand in them; unsigned, so
+    that no index is checked for its sign.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
     With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
@@ -186,23 +187,23 @@ def _make_maps(flat, shape, ends, places, lines, room, maps, power):
     what is made of these in `room`.
     """
     num_rx, num_rows, num_chirps = shape[1:]
-    size, operators = lines.shape[0] * PART, lines.reshape(-1)
+    size, operators = factors.shape[0] * PART, factors.reshape(-1)
     for rx in range(num_rx):
         for first in range(0, num_rows, _ROWS):
             last = min(first + _ROWS, num_rows)
             for tx in range(ends.size - 1):
                 sent = places[ends[tx] : ends[tx + 1]]
-                for block in range(lines.shape[0]):
-                    at = (block * lines.shape[1] + ends[tx]) * 2 * PART
+                for block in range(factors.shape[0]):
+                    at = (block * factors.shape[1] + ends[tx]) * 2 * PART
                     for i in range(first, last, 3):
                         rows = i, min(i + 1, last - 1), min(i + 2, last - 1)
                         samples = flat, rx * num_rows, 2 * num_chirps
                         _three_rows(samples, rows, sent, operators, at, room, first, (size, block))
-                for i in range(first, last):
-                    made = room[4 * (i - first) * size : 4 * (i - first + 1) * size]
-                    _add_power(power[i], made)
-                    if maps.shape[0]:
-                        _set_bins(maps[tx, rx, i].view(np.float32), made)
+                lines = maps[tx, rx, first:last] if maps.shape[0] else spare[: last - first]
+                for i in range(last - first):
+                    made = room[4 * i * size : 4 * (i + 1) * size]
+                    _join_bins(made.view(np.complex64), lines[i])
+                add_power(power[first:last], lines)
 
 
 @jit(borrows=True)
@@ -248,23 +249,10 @@ def _keep_both(room, row, part, ax, bx, ay, by):
     store(room, end + PART, zip_high(re, im))
 
 
-# no fused products: which of two is fused the compiler may decide anew, and bits would differ
-# between processes
 @jit(borrows=True)
-def _add_power(line, made):
-    """Add to the bins of a line, FFT order, the power of what `_keep_both` wrote; its last bin is
-    0, again."""
-    half, before = line.size // 2 + 1, made.size // 2 - 1 - line.size
-    for k in range(half):
-        line[k] += made[2 * k] ** 2 + made[2 * k + 1] ** 2
-    for k in range(half, line.size):
-        line[k] += made[2 * (before + k)] ** 2 + made[2 * (before + k) + 1] ** 2
-
-
-@jit(borrows=True)
-def _set_bins(line, made):
-    """Real and imaginary parts of the bins themselves, likewise."""
-    half, before = 2 * (line.size // 4 + 1), made.size - 2 - line.size
+def _join_bins(made, line):
+    """Bins in FFT order from what `_keep_both` wrote, the last of which is bin 0 again."""
+    half, before = line.size // 2 + 1, made.size - 1 - line.size
     for k in range(half):
         line[k] = made[k]
     for k in range(half, line.size):
@@ -318,6 +306,8 @@ def _sincs(a, b):
     return out
 
 
+# no fused products: which of two is fused the compiler may decide anew, and bits would differ
+# between processes
 @jit(borrows=True)
 def add_power(power, values):
     """power += |values|^2 of two matrices, float32 and complex64."""
