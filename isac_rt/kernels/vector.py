@@ -144,20 +144,25 @@ def narrow(typingctx, value):
     return FLOATS(DOUBLES), codegen
 
 
-@intrinsic
-def floor(typingctx, value):
-    """The largest whole number not above each lane."""
+def _each(name):
+    """Intrinsic of LLVM's own function of every lane."""
 
-    def codegen(context, builder, signature, args):
-        kind = signature.args[0]
-        name = f"llvm.floor.v{LANES}f{kind.element.bitwidth}"
-        module = builder.module
-        function = module.globals.get(name) or ir.Function(
-            module, ir.FunctionType(kind.form, [kind.form]), name
-        )
-        return builder.call(function, args)
+    @intrinsic
+    def made(typingctx, value):
+        def codegen(context, builder, signature, args):
+            kind, module = signature.args[0], builder.module
+            whole = f"llvm.{name}.v{LANES}f{kind.element.bitwidth}"
+            function = module.globals.get(whole) or ir.Function(
+                module, ir.FunctionType(kind.form, [kind.form]), whole
+            )
+            return builder.call(function, args)
 
-    return value(value), codegen
+        return value(value), codegen
+
+    return made
+
+
+floor, root = _each("floor"), _each("sqrt")
 
 
 def _two(method):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, larger, load, splat, store
+from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import LatinUnion, Levels
 
@@ -156,77 +156,89 @@ def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: 
 
 @lru_cache(maxsize=32)
 def _dictionary(chosen: tuple[int, ...], num_chirps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The atoms' conjugates (S, P) complex64, and real and imaginary part of the products of an
-    atom and the one k bins on (2, 3 P): three times, so that no stretch of P ends at the edge."""
+    """The atoms' conjugates (S, P) complex64, no atoms after them up to a multiple of `LANES`, and
+    real and imaginary part of the products of an atom and the one k bins on (2, 3 P): three times,
+    so that no stretch of P ends at the edge."""
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
     gram = np.tile(atoms.sum(axis=0), 3)
-    return atoms.conj().astype(np.complex64), np.stack([gram.real, gram.imag])
+    analysis = np.pad(atoms.conj().astype(np.complex64), ((0, 0), (0, -num_chirps % LANES)))
+    return analysis, np.stack([gram.real, gram.imag])
 
 
-@jit
+@jit(fast=True)
 def _pursue(first, gram_re, gram_im, support, amplitude):
-    """Fill `support` and `amplitude` from the correlations `first` (V, P); `gram` is that of an
-    atom and the one k bins on, for k in [0, 3 P). Atoms are chosen in float32."""
-    num_chirps, sparsity = first.shape[1], support.shape[1]
-    own = np.zeros((3, num_chirps + -num_chirps % LANES), np.float32)
+    """Fill `support` and `amplitude` from the correlations `first` (V, P and what fills vectors);
+    `gram` is that of an atom and the one k bins on, for k in [0, 3 P). Atoms are chosen in
+    float32."""
+    sparsity, power = support.shape[1], np.empty(first.shape[1], np.float32)
+    lanes = np.empty(LANES, np.float32)
     short = gram_re.astype(np.float32), gram_im.astype(np.float32)
     lower = np.empty((sparsity, sparsity), np.complex128)
-    room = np.empty(sparsity, np.complex128), np.empty(LANES, np.float32)
+    forward, parts = np.empty(sparsity, np.complex128), first.view(np.float32)
     for v in range(first.shape[0]):
-        _pursue_one(first[v], short, gram_re, gram_im, support[v], amplitude[v], own, lower, *room)
+        chosen, x = support[v], amplitude[v]
+        for k in range(sparsity):
+            _powers(parts[v], short, chosen[:k], x, power)
+            chosen[k] = _largest(power, lanes)
+            _fit(first[v], chosen[: k + 1], gram_re, gram_im, lower, forward, x)
 
 
-@jit(borrows=True)
-def _pursue_one(first, short, gram_re, gram_im, chosen, x, own, lower, forward, lanes):
-    """`_pursue` of one vector, `short` the Gram in float32 and the rest room for its work."""
-    (own_re, own_im, power), (short_re, short_im), num_chirps = own, short, first.size
-    for p in range(num_chirps):
-        own_re[p], own_im[p] = first[p].real, first[p].imag
-    for k in range(chosen.size):
-        for p in range(0, power.size, LANES):
-            re, im = load(own_re, p), load(own_im, p)
-            for i in range(k):  # the correlation with bin p is the Gram's conjugate
-                a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
-                at = num_chirps - chosen[i] + p
-                c, d = load(short_re, at), load(short_im, at)
-                re, im = re - a * c - b * d, im - b * c + a * d
-            store(power, p, re * re + im * im)
-        power[num_chirps:] = -1.0
-        for i in range(k):
-            power[chosen[i]] = -1.0
-        most = load(power, 0)
-        for p in range(LANES, power.size, LANES):
-            most = larger(most, load(power, p))
-        store(lanes, 0, most)
-        chosen[k], highest = 0, lanes[0]
-        for value in lanes:
-            highest = max(highest, value)
-        while power[chosen[k]] < highest:
-            chosen[k] += 1
-        _fit(first, chosen[: k + 1], gram_re, gram_im, lower, forward, x)
+@jit(fast=True, borrows=True)
+def _powers(first, short, chosen, x, power):
+    """Of all bins the correlation's square once the atoms `chosen`, of amplitudes x, are out;
+    below all others where they lie and where there is none. `short` is the Gram in float32."""
+    (gram_re, gram_im), num_chirps = short, short[0].size // 3
+    for p in range(0, power.size, LANES):
+        a, b = load(first, 2 * p), load(first, 2 * p + LANES)
+        re, im = evens(a, b), odds(a, b)
+        for i in range(chosen.size):  # the correlation with bin p is the Gram's conjugate
+            a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
+            at = num_chirps - chosen[i] + p
+            c, d = load(gram_re, at), load(gram_im, at)
+            re, im = re - a * c - b * d, im - b * c + a * d
+        store(power, p, re * re + im * im)
+    power[num_chirps:] = -1.0
+    for bin in chosen:
+        power[bin] = -1.0
 
 
-@jit(borrows=True)
+@jit(fast=True, borrows=True)
+def _largest(power, lanes):
+    """The first number of the largest."""
+    most = load(power, 0)
+    for p in range(LANES, power.size, LANES):
+        most = larger(most, load(power, p))
+    store(lanes, 0, most)
+    highest, found = lanes[0], 0
+    for value in lanes:
+        highest = max(highest, value)
+    while power[found] < highest:
+        found += 1
+    return found
+
+
+@jit(fast=True, borrows=True)
 def _fit(first, chosen, gram_re, gram_im, lower, forward, x):
     """Least-squares amplitudes x of the atoms `chosen`; `lower` and `forward` are Cholesky's of all
-    but the last atom, and become those of all."""
-    k, num_chirps = chosen.size - 1, first.size
+    but the last atom, and become those of all. The diagonal of `lower` has the reciprocals: a
+    division costs as much as ten products."""
+    k, num_chirps = chosen.size - 1, gram_re.size // 3
     left, value = gram_re[0] * (1.0 + RIDGE), first[chosen[k]]
     for i in range(k):
         at = chosen[i] - chosen[k] + num_chirps
         inner = complex(gram_re[at], gram_im[at])
         for j in range(i):
             inner -= lower[k, j] * lower[i, j].conjugate()
-        lower[k, i] = inner / lower[i, i].real
+        lower[k, i] = inner * lower[i, i].real
         left -= lower[k, i].real ** 2 + lower[k, i].imag ** 2
         value -= lower[k, i] * forward[i]
-    lower[k, k] = np.sqrt(max(left, gram_re[0] * RIDGE))
-    forward[k] = value / lower[k, k].real
+    lower[k, k] = 1 / np.sqrt(max(left, gram_re[0] * RIDGE))
+    forward[k] = value * lower[k, k].real
     for i in range(k, -1, -1):
         value = forward[i]
         for j in range(i + 1, k + 1):
             value -= lower[j, i].conjugate() * x[j]
-        x[i] = value / lower[i, i].real
+        x[i] = value * lower[i, i].real
 
 
 class Omp(LatinUnion):

@@ -11,8 +11,13 @@ from receiver_cubes import ANTENNAS
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.arms import all_channels
 from isac_rt.receive.clutter import bistatic
-from isac_rt.receive.clutter.coherent import Search, denominators
-from isac_rt.receive.clutter.scan import line_bounds, search_by_power, search_coherent
+from isac_rt.receive.clutter.coherent import Search, denominators, search_plain
+from isac_rt.receive.clutter.scan import (
+    axis_bounds,
+    line_bounds,
+    search_by_power,
+    search_coherent,
+)
 from isac_rt.receive.known import Known
 
 GRID = 32
@@ -33,6 +38,54 @@ def test_bounds_are_the_largest_power_over_a_lines_directions(cells: int):
     power = (np.abs(np.einsum("gn,tns->tgs", spectra, maps[channels])) ** 2).sum(axis=0)
     found = line_bounds(maps, channels, spectra)
     np.testing.assert_allclose(found, power.max(axis=0), rtol=ROUNDING)
+
+
+def coherent_search(antennas) -> Search:
+    known = Known.unmodulated(Waveform(), np.zeros((1, 120), int), antennas, 2)
+    return Search.of(all_channels(antennas), known.wavenumber, antennas.view_limit)
+
+
+@pytest.mark.parametrize("cells", [5, 64, 83])
+def test_bounds_of_an_axis_are_the_largest_sum_over_its_lines(cells: int):
+    """Both axes of an L. Planted bugs: powers of the lines added; each line in its own best
+    direction; channels in another order; the last cells left out."""
+    search, rng = coherent_search(ANTENNAS), np.random.default_rng(6)
+    x = noise(rng, len(search.channels), cells)
+    order, *axes = search.axes
+    parts = np.split(order, [axes[0].ends[-1]])
+    for lines, axis, part in zip((search.along_x, search.along_z), axes, parts, strict=True):
+        each = [np.abs(s @ x[m]) for m, s in zip(lines.members, lines.spectra, strict=True)]
+        assert len(each) == 2
+        expected = sum(each).max(axis=0)
+        np.testing.assert_allclose(axis_bounds(x, part, axis), expected, rtol=ROUNDING)
+
+
+def test_the_bounds_of_the_coherent_search_miss_nothing():
+    """Noise and paths of all directions beside a search of every cell: what reaches the threshold
+    has the same statistic, what does not has none or a bound. Peaks between the grid's directions
+    are a tenth higher at most (`PRUNED`).
+
+    Planted bugs: either bound a fifth too low; channels in another order in the second one; the
+    lines along X alone.
+    """
+    search, rng, least, count = coherent_search(ANTENNAS), np.random.default_rng(7), 16.0, 900
+    c = search.channels
+    maps = noise(rng, ANTENNAS.num_tx, ANTENNAS.num_rx, count) / np.float32(np.sqrt(2))
+    paths = search.steering(rng.uniform(-0.6, 0.6, (count, 2))).T * noise(rng, 1, count)
+    maps[c.tx, c.rx] += np.float32(0.5) * paths
+    maps = maps.reshape(*maps.shape[:2], 30, 30)
+    every, found = search_plain(maps, search, 1.0, 0.0), search_plain(maps, search, 1.0, least)
+    assert every.cell.size == count > found.cell.size
+    peak, place = np.zeros(count), np.full((count, 2), np.nan)
+    peak[found.cell], place[found.cell] = found.peak, found.cosines
+    over = every.peak >= least / 0.9
+    assert 200 < over.sum() < 700
+    assert np.array_equal(place[over], every.cosines[over])
+    np.testing.assert_allclose(peak[over], every.peak[over], rtol=ROUNDING)
+    bounded = np.setdiff1d(found.cell, np.flatnonzero(np.isfinite(place[:, 0])))
+    assert bounded.size > 20
+    assert (peak[bounded] < least).all()
+    assert (peak[bounded] > 0.9 * every.peak[bounded]).all()
 
 
 @pytest.mark.parametrize("scales", [1, 9])
@@ -75,10 +128,7 @@ def test_denominators_are_the_quadratic_forms_of_the_steering_vectors(antennas, 
     """Every direction of the grid, 18 matrices. Planted bugs: what couples both axes once and not
     twice; turns of two lines not conjugated; channels in another order; the last matrices left
     out."""
-    known = Known.unmodulated(Waveform(), np.zeros((1, 120), int), antennas, 2)
-    limit = antennas.view_limit
-    search = bistatic.search_of(antennas, 30.0) if one_way else None
-    search = search or Search.of(all_channels(antennas), known.wavenumber, limit)
+    search = bistatic.search_of(antennas, 30.0) if one_way else coherent_search(antennas)
     rng, size = np.random.default_rng(4), len(search.channels)
     mixed = noise(rng, 18, size, size)
     Q = np.eye(size) + mixed @ mixed.conj().transpose(0, 2, 1)

@@ -21,6 +21,7 @@ import scipy.fft
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -107,21 +108,25 @@ class Response:
         `slope` (K, A), Doppler centred."""
         across, along = _kernels(self.waveform, self.taper)
         turn = 2j * np.pi * np.arange(along.size) / self.waveform.num_chirps
-        size = self.waveform.num_chirps
-        out = np.zeros((1 + slope.shape[1], self.rows, size))
-        grid = np.empty(((self.rows + 2 * REACH) * FINE_BEAT, size * FINE_DOPPLER))
-        folded = np.empty((len(grid), size // 2 + 1), complex)
+        size, places = self.waveform.num_chirps, self.waveform.num_chirps * FINE_DOPPLER
+        out = np.empty((1 + slope.shape[1], self.rows, size))
+        width = places + -places % LANES
+        grid = np.empty(((self.rows + 2 * REACH) * FINE_BEAT, width))
+        heard = np.empty((self.rows, width))
+        folded = np.empty((self.rows, size // 2 + 1), complex)
         for number, made in enumerate(out):
             weight = power if number == 0 else power * slope[:, number - 1]
-            _put(beat, doppler, np.asarray(weight, float), grid)
-            _fold(scipy.fft.rfft(grid), along if number == 0 else -along * turn, size, folded)
-            _add_lines(scipy.fft.irfft(folded, size), across / FINE_DOPPLER, made)
+            _put(beat, doppler, np.asarray(weight, float), places, grid)
+            _weigh_lines(grid, across / FINE_DOPPLER, heard)
+            spectra = scipy.fft.rfft(heard[:, :places])
+            _fold(spectra, along if number == 0 else -along * turn, size, folded)
+            made[:] = scipy.fft.irfft(folded, size)
         return np.fft.fftshift(out, axes=2)
 
 
 @jit(borrows=True)
-def _put(beat, doppler, weight, grid):
-    """Scatterers on the nearest line of the fine grid, shared by the two places about their
+def _put(beat, doppler, weight, places, grid):
+    """Scatterers on the nearest line of the fine grid, shared by the two of its places about their
     Doppler."""
     grid[:] = 0.0
     for k in range(weight.size):
@@ -129,9 +134,9 @@ def _put(beat, doppler, weight, grid):
         if 0 <= line < grid.shape[0]:
             at = doppler[k] * FINE_DOPPLER
             left = np.floor(at)
-            place, share = int(left) % grid.shape[1], at - left
+            place, share = int(left) % places, at - left
             grid[line, place] += weight[k] * (1 - share)
-            grid[line, (place + 1) % grid.shape[1]] += weight[k] * share
+            grid[line, (place + 1) % places] += weight[k] * share
 
 
 @jit(borrows=True)
@@ -146,12 +151,15 @@ def _fold(spectra, response, size, out):
 
 
 @jit(borrows=True)
-def _add_lines(lines, weights, rows):
-    """Add to each row the weighted lines about it."""
-    for r in range(rows.shape[0]):
-        for k in range(weights.size):
-            for p in range(rows.shape[1]):
-                rows[r, p] += weights[k] * lines[FINE_BEAT * r + k, p]
+def _weigh_lines(lines, weights, out):
+    """Each row of `out` is the weighted sum of the lines about it."""
+    flat, width, to = lines.reshape(-1), lines.shape[1], out.reshape(-1)
+    for first in range(0, width, LANES):
+        for r in range(out.shape[0]):
+            total, at = splat(0.0), FINE_BEAT * r * width + first
+            for k in range(weights.size):
+                total = total + weights[k] * load(flat, at + k * width)
+            store(to, r * width + first, total)
 
 
 def expected_power(
