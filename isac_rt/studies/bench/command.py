@@ -177,7 +177,10 @@ def markdown(found: list[dict[str, Any]]) -> list[str]:
             said = [f"{one['predicted'][stage]:.2f}" for one in found]
             cells = [f"{was} ({plan})" for was, plan in zip(cells, said, strict=True)]
         lines.append(f"| {stage}, all frames (by the plan) [s] | {' | '.join(cells)} |")
-    for key, title in (("peak_memory_mib", "peak memory [MiB]"), ("paths_per_frame", "paths")):
+    for key, title in (
+        ("peak_memory_mib", "peak memory [MiB]"),
+        ("paths_per_frame", "paths a frame"),
+    ):
         cells = [f"{one[key]:,.0f}" for one in found]
         lines.append(f"| {title} | {' | '.join(cells)} |")
     return lines
