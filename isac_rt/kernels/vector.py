@@ -151,7 +151,7 @@ def _each(name):
     def made(typingctx, value):
         def codegen(context, builder, signature, args):
             kind, module = signature.args[0], builder.module
-            whole = f"llvm.{name}.v{LANES}f{kind.element.bitwidth}"
+            whole = f"llvm.{name}.v{kind.form.count}f{kind.element.bitwidth}"
             function = module.globals.get(whole) or ir.Function(
                 module, ir.FunctionType(kind.form, [kind.form]), whole
             )

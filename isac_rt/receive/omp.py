@@ -156,7 +156,7 @@ def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: 
 
 @lru_cache(maxsize=32)
 def _dictionary(chosen: tuple[int, ...], num_chirps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The atoms' conjugates (S, P) complex64, no atoms after them up to a multiple of `LANES`, and
+    """The atoms' conjugates (S, P) complex64 with zeros after them up to a multiple of `LANES`, and
     real and imaginary part of the products of an atom and the one k bins on (2, 3 P): three times,
     so that no stretch of P ends at the edge."""
     atoms = np.exp(2j * np.pi * np.outer(chosen, np.arange(num_chirps)) / num_chirps)
@@ -185,8 +185,8 @@ def _pursue(first, gram_re, gram_im, support, amplitude):
 
 @jit(fast=True, borrows=True)
 def _powers(first, short, chosen, x, power):
-    """Of all bins the correlation's square once the atoms `chosen`, of amplitudes x, are out;
-    below all others where they lie and where there is none. `short` is the Gram in float32."""
+    """Of all bins the correlation's square once the atoms `chosen`, of amplitudes x, are out; -1
+    where they lie and after the last bin. `short` is the Gram in float32."""
     (gram_re, gram_im), num_chirps = short, short[0].size // 3
     for p in range(0, power.size, LANES):
         a, b = load(first, 2 * p), load(first, 2 * p + LANES)
@@ -202,7 +202,7 @@ def _powers(first, short, chosen, x, power):
         power[bin] = -1.0
 
 
-@jit(fast=True, borrows=True)
+@jit(borrows=True)
 def _largest(power, lanes):
     """The first number of the largest."""
     most = load(power, 0)

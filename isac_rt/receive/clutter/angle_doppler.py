@@ -13,6 +13,7 @@ from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.clutter.adaptive import scanned, threshold_of
 from isac_rt.receive.clutter.coherent import (
+    PRUNED,
     Bucketed,
     Found,
     Search,
@@ -29,9 +30,6 @@ from isac_rt.receive.types import ExpectedClutter, Gates
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
 alone."""
-PRUNED = 0.9
-"""Share of the lower threshold below which a cell is not looked at further: the grid of directions
-misses a tenth of a peak at most."""
 
 
 @dataclass(frozen=True)

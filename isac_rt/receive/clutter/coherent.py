@@ -44,9 +44,9 @@ from isac_rt.receive.types import ExpectedClutter
 
 DIRECTIONS = 32
 """Values of each direction cosine that are searched; the peak between them is sought from there."""
-SCALLOPED = 1.05
-"""By this factor in amplitude the bound of a cell is raised: half a step off the grid on both axes
-lines of 16 half wavelengths hold 0.82 of a peak's power, of which thresholds allow for a tenth."""
+PRUNED = 0.9
+"""Share of the lower threshold below which a cell is not looked at further: between directions of
+the grid a parabola misses a tenth of a peak at most."""
 CLIMBED = 0.3, 0.12
 """Steps, in those of the grid, by which the peak between them is climbed."""
 TOGETHER = 8
@@ -135,6 +135,18 @@ class Search:
         order = np.concatenate([*self.along_x.members, *self.along_z.members])
         return order, axes[0], axes[1]
 
+    @cached_property
+    def scalloping(self) -> float:
+        """By how much a wave half a step off the grid on both axes exceeds, in amplitude, the sum
+        of what the lines have of it on the grid."""
+        half = self.wavenumber * (self.cosines[1] - self.cosines[0]) / 2
+        kept = [
+            abs(np.exp(1j * half * self.channels.places[members, axis]).sum())
+            for axis, lines in ((0, self.along_x), (2, self.along_z))
+            for members in lines.members
+        ]
+        return len(self.channels) / float(sum(kept))
+
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
         places = self.channels.places
@@ -182,7 +194,7 @@ class Found:
     ----------
     cell : (S,) flat numbers of the cells
     peak : (S,) T over the directions
-    cosines : (S, 2) its direction
+    cosines : (S, 2) its direction, NaN where the peak is a bound
     """
 
     cell: np.ndarray
@@ -191,8 +203,8 @@ class Found:
 
 
 def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
-    """The largest T of cells against noise alone; exact where it can be `least` or more, else a
-    bound, without a direction.
+    """The largest T of cells against noise alone; exact where it is `least` / `PRUNED` or more.
+    Below it is that of the grid, or a bound without a direction.
 
     Parameters
     ----------
@@ -203,16 +215,18 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     x = maps.reshape(-1, maps.shape[2] * maps.shape[3])
     channel = c.tx * maps.shape[1] + c.rx
     scale = 1 / (len(c) * noise)
+    # what a wave has between the grid's directions, as far as `PRUNED` does not allow for it
+    raised = scale * max(PRUNED * search.scalloping**2, 1)
     bound = np.zeros(x.shape[1], np.float32)
     for lines in (search.along_x, search.along_z):
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
             bound += np.sqrt(line_bounds(x, channel[members][None], spectra))
-    cell = np.flatnonzero(bound**2 * scale >= least)
+    cell = np.flatnonzero(bound**2 * raised >= least)
     x = np.take(x, cell, axis=1)[channel]
     # of each line the best direction, then of all lines along an axis one
     on_x, on_z = np.split(order, [along_x.ends[-1]])
     bound = axis_bounds(x, on_x, along_x) + axis_bounds(x, on_z, along_z)
-    peak, cosines = (SCALLOPED * bound) ** 2 * scale, np.full((cell.size, 2), np.nan)
+    peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
     y = np.ascontiguousarray(x[:, some].T)
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale)

@@ -63,10 +63,10 @@ def _line_bounds(maps, channels, cosines, sines, out):
 
 def axis_bounds(maps: np.ndarray, order: np.ndarray, axis: Axis) -> np.ndarray:
     """(S,) largest sum of the amplitudes that lines along an axis have in one of its directions,
-    of cells with channels `maps` (C, S); `order` says which the lines' are."""
+    of cells with channels `maps` (C, S); `order`: which of them are the lines', one by one."""
     out = np.empty(maps.shape[1] + -maps.shape[1] % LANES, np.float32)
     heard = np.zeros((order.size, out.size), np.complex64)
-    np.take(maps, order, axis=0, out=heard[:, : maps.shape[1]])
+    np.take(maps, order, axis=0, out=heard[:, : maps.shape[1]], mode="clip")  # "raise" buffers
     _axis_bounds(heard.view(np.float32), axis.ends, axis.cosines, axis.sines, out)
     return out[: maps.shape[1]]
 
