@@ -31,6 +31,7 @@ from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobe
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.coherent import (
     DIRECTIONS,
+    PRUNED,
     Bucketed,
     Found,
     Search,
@@ -50,8 +51,6 @@ from isac_rt.receive.types import Detections, ExpectedClutter
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
 alone."""
-PRUNED = 0.9
-"""Share of the lower threshold below which a cell is not looked at further."""
 BESIDE = (3, 1)
 """Rows and bins about a path that was taken out which may hold its remainder, `LEFT_OVER_DB` below
 it."""
@@ -232,8 +231,8 @@ def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: f
 
 
 def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
-    """The largest T of cells against noise alone; exact where it can be `least` or more, else a
-    bound, without a direction.
+    """The largest T of cells against noise alone; exact where that of the grid is `least` or more.
+    Below it is that of the grid, or a bound without a direction.
 
     Parameters
     ----------

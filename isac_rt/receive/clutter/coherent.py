@@ -222,13 +222,13 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
             bound += np.sqrt(line_bounds(x, channel[members][None], spectra))
     cell = np.flatnonzero(bound**2 * raised >= least)
-    x = np.take(x, cell, axis=1)[channel]
+    x = np.take(x, cell, axis=1)
     # of each line the best direction, then of all lines along an axis one
-    on_x, on_z = np.split(order, [along_x.ends[-1]])
+    on_x, on_z = np.split(channel[order], [along_x.ends[-1]])
     bound = axis_bounds(x, on_x, along_x) + axis_bounds(x, on_z, along_z)
     peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
-    y = np.ascontiguousarray(x[:, some].T)
+    y = np.ascontiguousarray(x[channel[:, None], some].T)
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale)
     peak[some], cosines[some] = _whitened(y, whole, search)
     above = peak[some] >= least

@@ -19,14 +19,28 @@ def line_bounds(maps: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> 
     channels : (looks, n) numbers of the line's channels
     spectra : (G, n) complex64 of the line in its directions, an even number
     """
-    maps = np.ascontiguousarray(maps)
+    floats = _whole_vectors(maps)
+    out = np.empty(floats.shape[1] // 2, np.float32)
+    parts = np.ascontiguousarray(spectra.real), np.ascontiguousarray(spectra.imag)
+    _line_bounds(floats, channels, *parts, out)
+    return out[: maps.shape[1]]
+
+
+def _whole_vectors(maps: np.ndarray) -> np.ndarray:
+    """Complex maps (C, S) as real and imaginary parts in turn, with zeros after the last cell where
+    it fills no vector."""
     short = -maps.shape[1] % LANES
     if short:
         maps = np.pad(maps, ((0, 0), (0, short)))
-    out = np.empty(maps.shape[1], np.float32)
-    parts = np.ascontiguousarray(spectra.real), np.ascontiguousarray(spectra.imag)
-    _line_bounds(maps.view(np.float32), channels, *parts, out)
-    return out[: out.size - short]
+    return np.ascontiguousarray(maps).view(np.float32)
+
+
+@jit(borrows=True)
+def _hear(flat, at, to, heard):
+    """Sixteen cells of a channel from `at`: their real parts, then the imaginary ones."""
+    a, b = load(flat, at), load(flat, at + LANES)
+    store(heard, to, evens(a, b))
+    store(heard, to + LANES, odds(a, b))
 
 
 @jit
@@ -39,10 +53,8 @@ def _line_bounds(maps, channels, cosines, sines, out):
     for first in range(0, out.size, LANES):
         for t in range(looks):
             for e in range(count):
-                at, to = channels[t, e] * width + 2 * first, t * line + 2 * LANES * e
-                a, b = load(flat, at), load(flat, at + LANES)
-                store(heard, to, evens(a, b))
-                store(heard, to + LANES, odds(a, b))
+                at = channels[t, e] * width + 2 * first
+                _hear(flat, at, t * line + 2 * LANES * e, heard)
         largest = zero
         for g in range(0, len(cosines), 2):
             one, other = zero, zero
@@ -61,27 +73,24 @@ def _line_bounds(maps, channels, cosines, sines, out):
         store(out, first, largest)
 
 
-def axis_bounds(maps: np.ndarray, order: np.ndarray, axis: Axis) -> np.ndarray:
-    """(S,) largest sum of the amplitudes that lines along an axis have in one of its directions,
-    of cells with channels `maps` (C, S); `order`: which of them are the lines', one by one."""
-    out = np.empty(maps.shape[1] + -maps.shape[1] % LANES, np.float32)
-    heard = np.zeros((order.size, out.size), np.complex64)
-    np.take(maps, order, axis=0, out=heard[:, : maps.shape[1]], mode="clip")  # "raise" buffers
-    _axis_bounds(heard.view(np.float32), axis.ends, axis.cosines, axis.sines, out)
+def axis_bounds(maps: np.ndarray, channels: np.ndarray, axis: Axis) -> np.ndarray:
+    """(S,) largest sum of the amplitudes that the lines along an axis have in one of its
+    directions, of each cell of `maps` (C, S) complex64; `channels` (n,) are numbers of the lines'
+    channels, line by line."""
+    floats = _whole_vectors(maps)
+    out = np.empty(floats.shape[1] // 2, np.float32)
+    _axis_bounds(floats, channels, axis.ends, axis.cosines, axis.sines, out)
     return out[: maps.shape[1]]
 
 
 @jit
-def _axis_bounds(maps, ends, cosines, sines, out):
+def _axis_bounds(maps, channels, ends, cosines, sines, out):
     """`axis_bounds`; complex maps as real and imaginary parts in turn."""
-    (count, width), flat, zero = maps.shape, maps.reshape(-1), splat(np.float32(0))
-    heard = np.empty(2 * LANES * count, np.float32)
+    width, flat, zero = maps.shape[1], maps.reshape(-1), splat(np.float32(0))
+    heard = np.empty(2 * LANES * channels.size, np.float32)
     for first in range(0, out.size, LANES):
-        for e in range(count):
-            at, to = e * width + 2 * first, 2 * LANES * e
-            a, b = load(flat, at), load(flat, at + LANES)
-            store(heard, to, evens(a, b))
-            store(heard, to + LANES, odds(a, b))
+        for e in range(channels.size):
+            _hear(flat, channels[e] * width + 2 * first, 2 * LANES * e, heard)
         largest = zero
         for g in range(len(cosines)):
             total = zero
