@@ -353,6 +353,9 @@ class Document:
 def _said(root: type[Node], key: Key, found: Any) -> str:
     """What pydantic found, in words for people."""
     kind = found["type"]
+    instead = _instead_of_removed(root, key, found["input"])
+    if instead is not None:
+        return f"removed in this version; {instead}"
     if kind == "extra_forbidden":
         allowed = _names_allowed(root, key[:-1])
         near = difflib.get_close_matches(str(key[-1]), allowed, n=1, cutoff=0.6)
@@ -420,10 +423,25 @@ def _models_in(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
 
 def _names_allowed(root: type[BaseModel], key: Iterable[str | int]) -> list[str]:
     """Keys that a tree of class `root` knows in the mapping at `key`."""
+    model = _model_at(root, key)
+    return list(model.model_fields) if model else []
+
+
+def _instead_of_removed(root: type[BaseModel], key: Key, value: Any) -> str | None:
+    """What to write instead of a key or a value that earlier versions had."""
+    model = _model_at(root, key[:-1]) if key else None
+    if model is None or not issubclass(model, Node):
+        return None
+    return model.REMOVED.get(str(key[-1]), model.REMOVED.get(f"{key[-1]}: {value}"))
+
+
+def _model_at(root: type[BaseModel], key: Iterable[str | int]) -> type[BaseModel] | None:
+    """The class of the mapping at `key` in a tree of class `root`."""
     model, parts = root, iter(key)
     for part in parts:
-        inner, keyed = _models_in(model.model_fields[str(part)].annotation)
+        field = model.model_fields.get(str(part))
+        inner, keyed = _models_in(field.annotation) if field else (None, False)
         if inner is None or (keyed and next(parts, None) is None):
-            return []
+            return None
         model = inner
-    return list(model.model_fields)
+    return model

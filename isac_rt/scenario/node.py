@@ -4,7 +4,7 @@ complains."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
@@ -54,6 +54,9 @@ class Node(BaseModel):
     """One mapping of the tree."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    REMOVED: ClassVar[dict[str, str]] = {}
+    """What to write instead of keys ("rays") and values ("model: diffuse") of earlier versions."""
 
     @field_validator("*", mode="before")
     @classmethod

@@ -11,14 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.scenario.document import MAX_MESSAGES, ScenarioError
+from isac_rt.scenario.document import MAX_MESSAGES, ScenarioError, _models_in
 from isac_rt.scenario.environment import CITY_KEYS, City
 from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
+from isac_rt.scenario.node import Node
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario, json_schema
 
@@ -638,3 +640,34 @@ def test_a_uav_named_like_a_validator_is_named_in_its_complaint(complaint):
     bug: whatever begins with "function-" is left out."""
     text = BASE + "  function-1: {role: target, position_m: [0, 9, 1], rolle: 3}\n"
     assert "swarm.function-1" in complaint(text)
+
+
+def nodes_with_removals() -> dict[str, tuple[type[Node], str]]:
+    """Dotted place of every removed key or value, with its class and what to write instead."""
+
+    def below(model: type[Node], place: str):
+        for name, instead in model.REMOVED.items():
+            yield f"{place}{name}", (model, instead)
+        for name, field in model.model_fields.items():
+            inner, keyed = _models_in(field.annotation)
+            if inner is not None and issubclass(inner, Node):
+                yield from below(inner, f"{place}{name}.{'*.' if keyed else ''}")
+
+    return dict(below(Scenario, ""))
+
+
+@pytest.mark.parametrize("place", nodes_with_removals() or ["none"])
+def test_removed_keys_and_values_say_what_to_write_instead(place, complaint):
+    """Planted bug: `_said` looks a removed value up as a key."""
+    if place == "none":
+        pytest.skip("nothing has been removed")
+    *above, last = place.split(".")
+    key, _, value = last.partition(": ")
+    tree: dict = {key: value or 1}
+    for i, part in reversed(list(enumerate(above))):
+        in_list = part == "*" and above[i - 1] in ("role_changes", "waypoints")
+        tree = [tree] if in_list else {"AT" if part == "*" else part: tree}
+    scenario = yaml.safe_load(BASE)
+    scenario["swarm"]["AT"] |= tree.pop("swarm", {}).get("AT", {})
+    said = complaint(yaml.safe_dump(scenario | tree))
+    assert f"removed in this version; {nodes_with_removals()[place][1]}" in said
