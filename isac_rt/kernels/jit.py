@@ -79,6 +79,37 @@ def jit(
     return made
 
 
+TWINS_ONLY = os.environ.get("ISAC_RT_KERNELS") == "0"
+"""Run the numpy twins instead of the kernels."""
+TWINS: dict[str, tuple[Callable, Callable]] = {}
+"""Kernel and numpy twin by the twin's full name, for the test that holds both together."""
+
+
+def twin_of(kernel: Callable) -> Callable[[Callable], Callable]:
+    """Mark a numpy function as the readable twin of a kernel with the same arguments.
+
+    The function's name then stands for the kernel, or with `ISAC_RT_KERNELS=0` for the twin.
+
+    Examples
+    --------
+    >>> @jit
+    ... def _total(values):
+    ...     out = 0.0
+    ...     for value in values:
+    ...         out += value
+    ...     return out
+    >>> @twin_of(_total)
+    ... def total(values):
+    ...     return values.sum()
+    """
+
+    def chosen(twin: Callable) -> Callable:
+        TWINS[f"{twin.__module__}.{twin.__qualname__}"] = kernel, twin
+        return twin if TWINS_ONLY else kernel
+
+    return chosen
+
+
 @lru_cache
 def digest(module: str) -> str:
     """Of the source of all that a module's machine code depends on; it and what it calls."""
