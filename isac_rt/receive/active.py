@@ -89,8 +89,7 @@ def receive_active(
     payload : what the terminal has sent
     antennas : of both ends
     settings : Receivers
-    clutter : what the city is expected to return, for the detectors that need it
-        (`isac_rt.receive.clutter.detectors`)
+    clutter : what the city is expected to return, for `clutter_detector: angle_doppler`
     maps : also return pictures
 
     Returns

@@ -12,10 +12,7 @@ import numpy as np
 
 from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.bistatic import BeamSearch
-from isac_rt.receive.clutter.detectors import ClutterDetector
 from isac_rt.receive.clutter.filter import ClutterFilter
-from isac_rt.receive.clutter.sample_matrix import SampleMatrix
-from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import refine_jointly
@@ -44,11 +41,6 @@ CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
     "omp": partial(Cfar, doppler=Omp()),
     "pursuit": Pursuit,
 }
-DETECTORS: dict[str, type[ClutterDetector]] = {
-    "map": ThresholdMap,
-    "angle_doppler": AngleDoppler,
-    "sample_matrix": SampleMatrix,
-}
 ESTIMATORS = {"grid": Estimator(on_grid=True), "local": Estimator(), "joint": Estimator()}
 REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": refine_jointly}
 READERS = {"powers": ByPowers, "profile": ByProfile, "beams": ByBeams}
@@ -73,9 +65,9 @@ def passive_detector_of(settings: Receivers) -> Cfar:
 
 def detector_of(settings: Receivers) -> Detector:
     """The active terminal's detector."""
-    if settings.clutter_detector not in DETECTORS:
-        return cfar_of(settings)
-    return DETECTORS[settings.clutter_detector](settings, ESTIMATORS[settings.refinement])
+    if settings.clutter_detector == "angle_doppler":
+        return AngleDoppler(settings, ESTIMATORS[settings.refinement])
+    return cfar_of(settings)
 
 
 def refiner_of(settings: Receivers) -> Refiner | None:

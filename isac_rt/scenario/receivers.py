@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -11,7 +11,6 @@ from isac_rt.scenario.node import Node, Positive, Problem
 
 COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
-    "clutter_channels": ("clutter_detector", ("sample_matrix",)),
     "update_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "gate_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "clutter_run_cells": ("clutter_filter", ("runs",)),
@@ -22,6 +21,12 @@ COUNTS_WITH = {
 
 class Receivers(Node):
     """How terminals detect targets and decode data."""
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        "clutter_channels": "leave it out; clutter_detector: angle_doppler filters all antennas",
+        "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
+        "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
+    }
 
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
     """How velocities are found. `latin_union`: all groups as one uniform sampling, where there are
@@ -89,22 +94,17 @@ class Receivers(Node):
     clutter_run_cells: Annotated[int, Field(ge=2)] = 15
     """Consecutive occupied range cells from which on a run counts as clutter, for `clutter_filter:
     runs`. The default lies below the 40 cells that the paper's clutter has at least."""
-    clutter_detector: Literal["cfar", "map", "angle_doppler", "sample_matrix"] = "cfar"
+    clutter_detector: Literal["cfar", "angle_doppler"] = "cfar"
     """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
-    `map`: the clutter power that the city's mesh predicts. `angle_doppler`: all antennas are added
-    in phase towards every direction, and filtered with the clutter's covariance where mesh and own
-    velocity predict clutter. `sample_matrix`: the antennas are filtered with the covariance of the
-    cells around. `map` and `angle_doppler` first correct the own velocity and the clutter's level
-    by the frame."""
+    `angle_doppler`: all antennas are added in phase towards every direction, and filtered with the
+    clutter's covariance where mesh and own velocity predict clutter; own velocity and clutter level
+    are corrected by the frame first."""
     passive_detector: Literal["cfar", "beams"] = "cfar"
     """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out
     of those around. `beams`: strong paths are taken out, then the antennas are added in phase
     towards every direction, and filtered with the clutter's covariance where the city's mesh and
     the transmitter as it is tracked predict clutter. With fewer groups than transmit antennas it
     is as `cfar`."""
-    clutter_channels: Literal["arms", "joint"] = "arms"
-    """Antennas that are filtered together, for `sample_matrix`: each arm of the virtual L by itself
-    (`arms`, the default), or both at once (`joint`, several times slower)."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """An active terminal processes one frame in so many; the others only carry data. By default it
     processes all."""
@@ -167,7 +167,7 @@ class Receivers(Node):
     @property
     def needs_mesh(self) -> bool:
         """Whether the detector predicts clutter from a city's mesh."""
-        return self.clutter_detector in ("map", "angle_doppler")
+        return self.clutter_detector == "angle_doppler"
 
     def looks_by_beam(self, own: bool) -> bool:
         """Whether the antennas are added in phase at an active terminal (`own`) or at a passive
@@ -175,7 +175,7 @@ class Receivers(Node):
         if self.refinement == "joint":
             return True
         if own:
-            return self.clutter_detector in ("angle_doppler", "sample_matrix")
+            return self.clutter_detector == "angle_doppler"
         return "beams" in (self.symbol_decision, self.passive_detector)
 
 

@@ -561,7 +561,7 @@ class Scenario(Node):
                     (detector, ("propagation", "model"), ("city",)),
                     f"{one.receivers.clutter_detector} predicts clutter from a city's mesh: it "
                     "needs propagation.model ray_traced and a city; "
-                    f"add them or set {dotted(detector)} to cfar or sample_matrix",
+                    f"add them or set {dotted(detector)} to cfar",
                 )
             if one.tracking.needs_mesh and self.city is None:
                 births = (*above, "tracking", "births")

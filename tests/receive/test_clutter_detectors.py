@@ -16,13 +16,10 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import receive_active
 from isac_rt.receive.arms import all_channels, arm, both_arms
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.clutter.adaptive import Matched, beams_of, expected_count, scan_threshold
-from isac_rt.receive.clutter.angle_doppler import AngleDoppler
+from isac_rt.receive.clutter.adaptive import expected_count, scanned
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler, beam_weights, near_beam, noise_level
 from isac_rt.receive.clutter.coherent import Bucketed, Search, search_plain, search_white, searches
-from isac_rt.receive.clutter.detectors import beam_weights, near_beam, noise_level
 from isac_rt.receive.clutter.power import Taper, expected_power
-from isac_rt.receive.clutter.sample_matrix import SampleMatrix, like_exponential, sampled
-from isac_rt.receive.clutter.threshold_map import map_factor
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -85,6 +82,12 @@ def maps_of(
     one = cube(w, schedule, payload, paths, antennas, noise, seed)
     sent = known(w, schedule, payload, antennas)
     return channel_maps(clean_spectrum(one, sent, rows), sent)
+
+
+def draw(R: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, L) circular Gaussian vectors of covariance R."""
+    white = rng.standard_normal((count, len(R), 2)) @ np.array([1, 1j]) / np.sqrt(2)
+    return white @ np.linalg.cholesky(R).T
 
 
 def test_covariance_is_the_sum_over_single_scatterers():
@@ -216,171 +219,22 @@ def test_power_map_is_the_mean_power_of_random_clutter():
     assert np.median(ratio) == pytest.approx(1, abs=0.12)
 
 
-@pytest.mark.parametrize(
-    ("joint", "rate"), [(False, 0.02), (True, 0.02), (False, 1e-3), (True, 1e-3)]
-)
-def test_scan_threshold_holds_the_rate_in_white_noise(joint: bool, rate: float):
-    """Largest beam of white snapshots. Beams half a lobe apart miss a fifth to a half of the
-    continuous scan's crossings, so the rate is below the design's and above 0.4 of it, 0.2 with
-    both axes. Planted bug: e^-t alone as the tail (43 times the rate)."""
-    w, rng, draws = Waveform(), np.random.default_rng(6), 60000
-    if joint:
-        sets = [(both_arms(ANTENNAS), (0, 2))]
-    else:
-        sets = [(arm(ANTENNAS, axis), (axis,)) for axis in (0, 2)]
-    beams = [beams_of(c, silent(w, ANTENNAS), axes) for c, axes in sets]
-    limit = scan_threshold(tuple(beams), rate)
-    hits = 0
-    for _ in range(10):
-        total = np.zeros(draws // 10)
-        for b in beams:
-            x = (
-                rng.standard_normal((draws // 10, b.steer.shape[1], 2))
-                @ np.array([1, 1j])
-                / np.sqrt(2)
-            ).astype(np.complex64)
-            total += (np.abs(x @ b.steer.conj().T) ** 2).max(axis=1) / b.steer.shape[1]
-        hits += int((total > limit).sum())
-    low, high = (
-        stats.binom.ppf(FALSE_FAILURE, draws, (0.2 if joint else 0.4) * rate),
-        stats.binom.isf(FALSE_FAILURE, draws, rate),
-    )
-    assert low <= hits <= high
-
-
 def test_expected_count_is_that_of_a_fine_scan():
     """One arm scanned 16 times as finely: crossings of t = 7 against the Euler characteristic.
     Planted bug: sqrt(t/pi) without pi."""
     w, rng, draws = Waveform(), np.random.default_rng(4), 40000
     channels = arm(ANTENNAS, 0)
-    beams = beams_of(channels, silent(w, ANTENNAS), (0,))
     u = np.zeros((513, 3))
     u[:, 0] = np.linspace(-1, 1, 513) * np.sin(ANTENNAS.half_view)
+    k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
+    length = 2 * np.sin(ANTENNAS.half_view) * k * channels.places[:, 0].std()
     fine = channels.steering(u, silent(w, ANTENNAS))
     x = rng.standard_normal((draws, 16, 2)) @ np.array([1, 1j]) / np.sqrt(2)
     above = np.concatenate(
         [(np.abs(part @ fine.conj().T) ** 2).max(axis=1) / 16 > 7 for part in np.array_split(x, 20)]
     )
-    p = float(expected_count(7.0, beams.lengths, beams.area))
+    p = float(expected_count(7.0, (length,), 0.0))
     assert above.mean() == pytest.approx(p, abs=5 * np.sqrt(p / draws) + 0.05 * p)
-
-
-def interference(size: int, rng: np.random.Generator) -> np.ndarray:
-    """Noise and two strong directions, 40 dB over it."""
-    a = np.exp(1j * np.outer(np.arange(size), [0.7, 2.1]))
-    return np.eye(size) + 1e4 * a @ a.conj().T * rng.uniform(0.5, 1)
-
-
-def draw(R: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    white = rng.standard_normal((count, len(R), 2)) @ np.array([1, 1j]) / np.sqrt(2)
-    return white @ np.linalg.cholesky(R).T
-
-
-def one_beam(a: np.ndarray):
-    """A beam set of one direction."""
-    from isac_rt.receive.clutter.adaptive import Beams
-
-    return Beams(np.zeros((1, 3)), a[None].astype(np.complex64), (0.0,), 0.0)
-
-
-def test_matched_filter_is_exponential_and_has_the_optimal_sinr():
-    """Clutter 40 dB over the noise with its own covariance: T is exponential (Kolmogorov-Smirnov),
-    and a target of amplitude s gives E T = 1 + s^2 a^H R^-1 a, Brennan and Reed's optimum. Planted
-    bug: R transposed (mean of T without a target 4e3)."""
-    from isac_rt.receive.clutter.adaptive import Scan
-
-    rng, size, draws = np.random.default_rng(11), 12, 20000
-    R, a = interference(size, rng), np.exp(1j * 1.3 * np.arange(size))
-    beams = one_beam(a)
-    matched = Matched.of(R[None].astype(complex).repeat(1, axis=0), beams)
-    for s in (0.0, 1.7):
-        scan = Scan(*(np.zeros((1, draws)) for _ in range(3)))
-        x = draw(R, draws, rng) + s * a
-        whole = Matched(
-            matched.inverse.repeat(draws, 0), matched.norm.repeat(draws, 0), matched.against
-        )
-        whole.fill(scan, 0, np.arange(draws), x)
-        gain = float((a.conj() @ np.linalg.solve(R, a)).real)
-        mean = 1 + s**2 * gain
-        spread = np.sqrt(1 + 2 * s**2 * gain)
-        assert scan.peak.mean() == pytest.approx(mean, abs=5 * spread / np.sqrt(draws))
-        if s == 0:
-            assert stats.kstest(scan.peak[0], "expon").pvalue > FALSE_FAILURE
-            assert scan.energy.mean() == pytest.approx(1, abs=5 / np.sqrt(draws * size))
-
-
-def test_sample_matrix_tail_and_loss_are_the_known_ones():
-    """36 independent snapshots for 12 channels. Robey's tail at p = 0.01, binomial; and Reed,
-    Mallett and Brennan's mean loss (N - L + 2)/(N + 1) of the SINR. Planted bug: rho ~ Beta(L - 1,
-    N - L + 2)."""
-    rng, size, count, draws = np.random.default_rng(5), 12, 36, 20000
-    a = np.exp(1j * 1.3 * np.arange(size))
-    x = (rng.standard_normal((draws, size, 2)) @ np.array([1, 1j])) / np.sqrt(2)
-    z = (rng.standard_normal((draws, count, size, 2)) @ np.array([1, 1j])) / np.sqrt(2)
-    inverse = np.linalg.inv(np.einsum("dki,dkj->dij", z, z.conj()) / count)
-    w = inverse @ a
-    norm = (w @ a.conj()).real
-    statistic = np.abs((w.conj() * x).sum(axis=1)) ** 2 / norm
-    grid = np.geomspace(0.1, 200, 400)
-    limit = float(np.interp(-np.log(0.01), like_exponential(grid, count, size), grid))
-    hits = int((statistic > limit).sum())
-    assert (
-        stats.binom.ppf(FALSE_FAILURE, draws, 0.01)
-        <= hits
-        <= stats.binom.isf(FALSE_FAILURE, draws, 0.01)
-    )
-    loss = np.abs(w @ a.conj()) ** 2 / (np.abs(w) ** 2).sum(axis=1) / size
-    assert loss.mean() == pytest.approx(
-        (count - size + 2) / (count + 1), abs=5 * loss.std() / np.sqrt(draws)
-    )
-
-
-@pytest.mark.parametrize("row", [40, 2])
-def test_sampled_scan_is_the_filter_of_the_cells_around(row: int):
-    """One cell by the definition: the mean of x x^H over L rows on each side outside the guard and
-    a bin on each side (at the end of the range axis those there are), loaded, inverted. Planted
-    bugs: a row of the guard among them, one neighbouring bin twice."""
-    w, rng, column, guard = Waveform(), np.random.default_rng(9), 0, 3
-    antennas = replace(ANTENNAS, rx_x=3, rx_z=3)
-    maps = (rng.standard_normal((3, 5, 90, 120, 2)) @ np.array([1, 1j]) / np.sqrt(2)).astype(
-        np.complex64
-    )
-    channels = arm(antennas, 0)
-    beams = beams_of(channels, silent(w, antennas), (0,))
-    scan = sampled(maps, channels, beams, 1.3, guard)
-    x, size = maps[channels.tx, channels.rx].astype(complex), len(channels)
-    rows = [r for r in range(90) if guard < abs(r - row) <= guard + size]
-    cells = np.concatenate(
-        [x[:, rows][:, :, c % 120] for c in (column - 1, column, column + 1)], axis=1
-    )
-    R = cells @ cells.conj().T / cells.shape[1] + 0.1 * 1.3 * np.eye(size)
-    weights = np.linalg.inv(R)
-    a = beams.steer.astype(complex)
-    peak = (
-        np.abs(a.conj() @ weights @ x[:, row, column]) ** 2
-        / np.einsum("bi,ij,bj->b", a.conj(), weights, a).real
-    ).max()
-    assert scan.peak[row, column] == pytest.approx(
-        float(like_exponential(np.array([peak]), 18, size)[0]), rel=2e-3, abs=0
-    )
-
-
-def test_guard_of_the_sample_matrix_is_that_of_the_range():
-    """Its cells lie along the range: the guard of the Doppler axis plays no part, that of the range
-    keeps a second echo three rows off out of the covariance that would cancel the first. Planted
-    bug: the other axis's guard."""
-    w, schedule, payload = frame(waveform=SHORT)
-    near = 20 * w.range_cell(2)
-    echoes = [Path(2 * (near + k * w.range_cell(2)), 3.7, 2.0) for k in (0, 3)]
-    maps = maps_of(w, schedule, payload, echoes, FEW, 60, noise=0.5, seed=4)
-    ratio = {}
-    for guard in ((4, 1), (4, 6), (1, 4)):
-        settings = Receivers(clutter_detector="sample_matrix", guard_cells=guard)
-        ratio[guard] = (
-            SampleMatrix(settings).judge([maps], known(w, schedule, payload, FEW))[0].ratio
-        )
-    assert np.array_equal(ratio[4, 1], ratio[4, 6])
-    assert ratio[4, 1][20].max() > 3 * ratio[1, 4][20].max()
 
 
 def test_noise_level_from_the_quietest_cells():
@@ -423,8 +277,8 @@ def test_ratio_of_the_cfar_is_its_decision():
 
 def test_size_of_the_scanned_directions():
     """Sides and area in correlation lengths, k sin(half view) apart, from the places' variances
-    written out; beams half a lobe apart at most. Planted bugs: the variance for the deviation; the
-    area without the covariance of the two arms; no limit to the view."""
+    written out. Planted bugs: the variance for the deviation; the area without the covariance of
+    the two arms."""
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
     channels = both_arms(antennas)
     x, z = (
@@ -432,27 +286,12 @@ def test_size_of_the_scanned_directions():
         channels.places[:, 2] - channels.places[:, 2].mean(),
     )
     k, side = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT, 2 * np.sin(antennas.half_view)
-    beams = beams_of(channels, silent(w, antennas), (0, 2))
-    assert beams.lengths == pytest.approx(
+    lengths, area = scanned(channels, k, antennas.view_limit)
+    assert lengths == pytest.approx(
         (side * k * np.sqrt((x * x).mean()), side * k * np.sqrt((z * z).mean())), rel=1e-9, abs=0
     )
     determinant = (x * x).mean() * (z * z).mean() - (x * z).mean() ** 2
-    assert beams.area == pytest.approx(side**2 * k**2 * np.sqrt(determinant), rel=1e-9, abs=0)
-    assert (
-        np.abs(beams.cosines[:, 0]).max() == pytest.approx(np.sin(antennas.half_view))
-        and not beams.cosines[:, 1].any()
-    )
-    for axis in (0, 2):
-        lobe = w.wavelength / (np.ptp(channels.places[:, axis]) + antennas.spacing)
-        apart = np.diff(np.unique(np.round(beams.cosines[:, axis], 12)))
-        assert apart.max() <= lobe / 2 and apart.min() > 0.8 * lobe / 2
-    wide, half = (
-        beams_of(channels, silent(w, replace(antennas, half_view=h)), (0, 2))
-        for h in (2.1, np.pi / 2)
-    )  # an arm tells no more apart
-    assert wide.lengths == half.lengths and wide.lengths[0] == pytest.approx(
-        beams.lengths[0] / np.sin(antennas.half_view)
-    )
+    assert area == pytest.approx(side**2 * k**2 * np.sqrt(determinant), rel=1e-9, abs=0)
 
 
 def test_direction_within_a_filters_beam():
@@ -473,17 +312,6 @@ def test_direction_within_a_filters_beam():
     assert abs((weights.conj() * np.outer(*wave)).sum()) == pytest.approx(
         size, rel=2e-3
     )  # the window's middle is 9 samples off
-
-
-def test_map_factor_at_its_ends():
-    """Without clutter the noise's own law, with much of it an exponential: -ln(rate) of the
-    clutter's mean."""
-    assert map_factor(np.array(0.0), 45, 1e-3) == pytest.approx(
-        stats.gamma.isf(1e-3, 45, scale=1 / 45), rel=1e-9, abs=0
-    )
-    assert map_factor(np.array(1e5), 45, 1e-3) / 1e5 == pytest.approx(
-        -np.log(1e-3), rel=1e-3, abs=0
-    )
 
 
 def test_receiver_finds_what_clutter_hides():
@@ -540,7 +368,7 @@ def test_snr_of_a_detection_in_clutter_is_power_over_background():
     guess = replace(guess, power=1e-9 * guess.power)
     echo = [Path(2 * 17.3, 2 * 3.3, 2.0, (0.2, 0.1), (0.2, 0.1))]
     received = cube(w, schedule, payload, echo, FEW, 20.0, 1)
-    settings = Receivers(clutter_detector="map")
+    settings = Receivers(clutter_detector="angle_doppler")
     d = receive_active(received, payload, FEW, settings, clutter=guess).detections
     powers = [
         (np.abs(maps_of(w, schedule, payload, p, FEW, 110, noise=20.0, seed=1)) ** 2).mean(
@@ -560,7 +388,7 @@ def test_a_mesh_detector_without_a_mesh_says_so():
             cube(w, schedule, payload, [], FEW, 1.0),
             payload,
             FEW,
-            Receivers(clutter_detector="map"),
+            Receivers(clutter_detector="angle_doppler"),
         )
 
 

@@ -8,9 +8,9 @@ from receiver_cubes import ANTENNAS, frame, known
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter import correction
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.correction import UNTAPERED, fit
 from isac_rt.receive.clutter.power import TAPER, Response, expected_power
-from isac_rt.receive.clutter.threshold_map import ThresholdMap
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.receivers import Receivers
 
@@ -150,7 +150,7 @@ def test_a_level_expected_far_too_low_is_found(too_low_db: float):
 
 def test_detectors_judge_with_the_corrected_clutter():
     """Circular Gaussian cells of the clutter's own mean; the terminal believes in a third of the
-    power and 0.15 m/s too much. The level that its threshold map rests on is the true one: 15 % at
+    power and 0.15 m/s too much. The level that its detector rests on is the true one: 15 % at
     the median over cells with clutter, 5 % in all. Planted bugs: the map not made anew; the
     correction left out."""
     towards, ranges, powers = surroundings(COUNT, np.random.default_rng(4))
@@ -168,7 +168,7 @@ def test_detectors_judge_with_the_corrected_clutter():
         / np.sqrt(2)
     )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
-    detector = ThresholdMap(Receivers(clutter_detector="map"))
+    detector = AngleDoppler(Receivers(clutter_detector="angle_doppler"))
     (judged,) = detector.judge([maps], known(W, schedule, payload), wrong)
     strong = mean > 3 * noise
     off = judged.level[strong] / mean[strong] - 1

@@ -105,8 +105,8 @@ def test_what_is_no_file_is_one_message(tmp_path):
         (["array.rx={shape: planar, columns: 64, rows: 64}"], "more than 1024"),
         (["array.rx.shape=ti_cascade", "receivers.refinement=joint"], "needs an L"),
         (
-            ["array.rx.shape=linear", "receivers.clutter_detector=sample_matrix"],
-            "sample_matrix needs an L with two receive arms",
+            ["array.rx.shape=linear", "receivers.clutter_detector=angle_doppler"],
+            "angle_doppler needs an L with two receive arms",
         ),
         (
             ["array.rx.shape=linear", "receivers={refinement: joint, passive_detector: beams}"],

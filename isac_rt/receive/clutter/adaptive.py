@@ -13,9 +13,7 @@ chi-squared field of two degrees of freedom):
 .. math:: e^{-t}\,(1 + \mu_1\sqrt{t/\pi} + \mu_2 (2t - 1)/(2\pi)),
 
 mu the length and area of the scanned directions in units of the correlation length, which follows
-from the variances of the channels' places. Beams are half a lobe apart. R comes from the mesh
-(`angle_doppler`), or from the cells around (`sample_matrix`), whose finite number makes the tail
-heavier.
+from the variances of the channels' places.
 
 References
 ----------
@@ -28,64 +26,24 @@ chi-squared, F and t fields", Adv. Appl.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.arms import Channels
-from isac_rt.receive.known import Known
-
-
-@dataclass(frozen=True)
-class Beams:
-    """Directions in which a set of channels is scanned.
-
-    Attributes
-    ----------
-    cosines : (B, 3) body-frame vectors; only the components that the channels measure matter
-    steer : (B, L) complex64
-    lengths : sides of the scanned interval or rectangle over the correlation length
-    area : product of the sides over the correlation area; 0 for one axis
-    """
-
-    cosines: np.ndarray
-    steer: np.ndarray
-    lengths: tuple[float, ...]
-    area: float
-
-
-def beams_of(channels: Channels, known: Known, axes: tuple[int, ...]) -> Beams:
-    """Beams half a lobe apart over the field of view, along the axes (0 is X, 2 is Z) that the
-    channels span."""
-    k = 2 * np.pi * known.waveform.effective_carrier / SPEED_OF_LIGHT
-    limit = known.antennas.view_limit
-    lines = []
-    for axis in axes:
-        aperture = np.ptp(channels.places[:, axis]) + known.antennas.spacing
-        count = int(np.ceil(2 * limit * k * aperture / np.pi)) + 1
-        lines.append(np.linspace(-limit, limit, count))
-    grid = np.meshgrid(*lines, indexing="ij")
-    cosines = np.zeros((grid[0].size, 3))
-    for axis, values in zip(axes, grid, strict=True):
-        cosines[:, axis] = values.ravel()
-    cosines = cosines[(cosines**2).sum(axis=1) <= 1]
-    steer = channels.steering(cosines, known).astype(np.complex64)
-    return Beams(cosines, steer, *scanned(channels, k, limit, axes))
 
 
 def scanned(
-    channels: Channels, wavenumber: float, limit: float, axes: tuple[int, ...] = (0, 2)
-) -> tuple[tuple[float, ...], float]:
-    """Sides of the scanned directions over the correlation length, and their area over the
-    correlation area; see `Beams`."""
-    covariance = wavenumber**2 * np.cov(channels.places[:, list(axes)].T, bias=True).reshape(
-        len(axes), len(axes)
-    )
-    sides = tuple(2 * limit * float(np.sqrt(covariance[i, i])) for i in range(len(axes)))
-    area = float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance))) if len(axes) == 2 else 0.0
-    return sides, area
+    channels: Channels, wavenumber: float, limit: float
+) -> tuple[tuple[float, float], float]:
+    """Sides of the directions within `limit` on both axes over the correlation length, and their
+    area over the correlation area.
+
+    The correlation length along an axis is 1 / (k s), s the deviation of the channels' places.
+    """
+    covariance = wavenumber**2 * np.cov(channels.places[:, [0, 2]].T, bias=True)
+    x, z = 2 * limit * np.sqrt(np.diag(covariance))
+    return (float(x), float(z)), float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance)))
 
 
 def scanned_within(
@@ -105,17 +63,13 @@ def expected_count(t: np.ndarray | float, lengths: tuple[float, ...], area: floa
     return np.exp(-t) * (1 + more)
 
 
-def scan_threshold(beams: tuple[Beams, ...], false_alarm_rate: float) -> float:
-    """What the sum over several scans' maxima exceeds at this rate, the scans taken as independent.
+@lru_cache(maxsize=64)
+def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
+    """What the sum over several scans' maxima exceeds at this rate, the scans of such lengths and
+    areas (`scanned`) taken as independent.
 
     The largest of one scan is below t with probability exp(-`expected_count`).
     """
-    return threshold_of(tuple((b.lengths, b.area) for b in beams), false_alarm_rate)
-
-
-@lru_cache(maxsize=64)
-def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
-    """`scan_threshold` of scans of such lengths and areas (`scanned`)."""
     grid = np.arange(0, 200, 0.01)
     density = np.zeros_like(grid)
     density[0] = 1.0
@@ -133,71 +87,3 @@ def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float
     if rate >= tail[trusted]:
         return float(np.interp(-np.log(rate), -np.log(tail[: trusted + 1]), grid[: trusted + 1]))
     return float(grid[trusted] + np.log(tail[trusted] / rate))
-
-
-@dataclass(frozen=True)
-class Scan:
-    """What a scan found in every cell of a map, Doppler in FFT order.
-
-    Attributes
-    ----------
-    peak : (rows, P) largest T over the beams
-    beam : (rows, P) its beam
-    energy : (rows, P) x^H R^-1 x / L, of mean one without a target if R is right
-    """
-
-    peak: np.ndarray
-    beam: np.ndarray
-    energy: np.ndarray
-
-
-def white_scan(snapshots: np.ndarray, beams: Beams, noise: float) -> Scan:
-    """The scan where there is noise alone."""
-    rows, columns, size = snapshots.shape
-    scan = Scan(
-        np.empty((rows, columns), np.float32),
-        np.empty((rows, columns), np.int32),
-        np.empty((rows, columns), np.float32),
-    )
-    against = beams.steer.conj().T
-    for row, x in enumerate(snapshots):
-        power = np.abs(x @ against) ** 2
-        scan.beam[row] = power.argmax(axis=1)
-        scan.peak[row] = power.max(axis=1) / (size * noise)
-        scan.energy[row] = (x.real**2 + x.imag**2).sum(axis=1) / (size * noise)
-    return scan
-
-
-@dataclass(frozen=True)
-class Matched:
-    """The filters of S cells.
-
-    Attributes
-    ----------
-    inverse : (S, L, L) of the covariances, in units of the noise
-    norm : (S, B) a^H R^-1 a
-    against : (L, B) conjugate steering vectors
-    """
-
-    inverse: np.ndarray
-    norm: np.ndarray
-    against: np.ndarray
-
-    @classmethod
-    def of(cls, R: np.ndarray, beams: Beams) -> Matched:
-        inverse = np.linalg.inv(R)
-        against = beams.steer.conj().T
-        return cls(
-            inverse,
-            np.maximum((against * np.matmul(inverse, beams.steer.T)).sum(axis=1).real, 1e-12),
-            against,
-        )
-
-    def fill(self, scan: Scan, row: int, bins: np.ndarray, x: np.ndarray) -> None:
-        """Set the cells of a scan from their snapshots (S, L), in units of the noise's
-        amplitude."""
-        y = np.einsum("sij,sj->si", self.inverse, x)
-        power = np.abs(y @ self.against) ** 2 / self.norm
-        scan.beam[row, bins] = power.argmax(axis=1)
-        scan.peak[row, bins] = power.max(axis=1)
-        scan.energy[row, bins] = np.maximum((x.conj() * y).sum(axis=1).real / x.shape[1], 0)

@@ -29,6 +29,7 @@ from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
 from isac_rt.receive.clutter.adaptive import scanned
+from isac_rt.receive.clutter.angle_doppler import FINE, noise_level
 from isac_rt.receive.clutter.coherent import (
     DIRECTIONS,
     PRUNED,
@@ -38,7 +39,6 @@ from isac_rt.receive.clutter.coherent import (
     climbed,
     denominators,
 )
-from isac_rt.receive.clutter.detectors import FINE, noise_level
 from isac_rt.receive.clutter.power import TAPER, expected_power
 from isac_rt.receive.clutter.scan import line_bounds, search_by_power
 from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations

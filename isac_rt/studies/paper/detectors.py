@@ -25,9 +25,8 @@ from isac_rt.frame.payload import Payload
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.chain import DETECTORS as CHAINED
 from isac_rt.receive.chain import filter_of
-from isac_rt.receive.clutter.detectors import ClutterDetector, Judged, noise_level
+from isac_rt.receive.clutter.angle_doppler import AngleDoppler, noise_level
 from isac_rt.receive.clutter.power import cells_of, expected_power
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -96,17 +95,13 @@ DETECTORS = {
     "cfar": Detector("CFAR", {}),
     "runs": Detector("CFAR after the paper's filter (runs)", {"clutter_filter": "runs"}),
     "notch": Detector("CFAR after a zero-Doppler notch", {"clutter_filter": "zero_doppler"}),
-    "sample": Detector("sample matrix, per arm", {"clutter_detector": "sample_matrix"}),
-    "map": Detector("threshold map from the mesh", {"clutter_detector": "map"}),
     "filter": Detector("mesh and velocity", FILTER),
     "velocity_wrong": Detector("mesh and velocity, velocity 0.1 m/s off", FILTER, VELOCITY_WRONG),
     "level_wrong": Detector("mesh and velocity, level 3 dB off", FILTER, LEVEL_WRONG),
     "mesh_wrong": Detector("mesh and velocity, mesh 0.1 m off", FILTER, MESH_WRONG),
     "filter_wrong": Detector("mesh and velocity, all three off", FILTER, ALL_WRONG),
     "unfitted": Detector("all three off, not corrected", FILTER, ALL_WRONG, fitted=False),
-    "map_wrong": Detector("threshold map, all three off", {"clutter_detector": "map"}, ALL_WRONG),
 }
-LEFT_OUT_QUICK = "sample", "map_wrong"
 BOUNDS = {"bound": "filter"}
 """Detectors without any clutter."""
 
@@ -228,14 +223,19 @@ def _known(scenes: Scenes, payload: Payload) -> Known:
     return Known(s.waveform, s.schedule, payload.delay_symbols, payload.phases, s.antennas, 2)
 
 
-class CfarStatistic(ClutterDetector):
-    """The CFAR as a statistic over its threshold."""
-
-    def judge(
-        self, frames: Sequence[np.ndarray], known: Known, clutter: ExpectedClutter | None = None
-    ) -> list[Judged]:
-        rule = CfarRule.of(self.settings, known.channels)
-        return [Judged.everywhere(*rule.ratio(accumulate(maps))) for maps in frames]
+def _ratios(
+    settings: Receivers,
+    fitted: bool,
+    frames: Sequence[np.ndarray],
+    known: Known,
+    expected: ExpectedClutter,
+) -> list[np.ndarray]:
+    """Statistic over its threshold in every cell of each frame (rows, P)."""
+    if settings.clutter_detector == "cfar":
+        rule = CfarRule.of(settings, known.channels)
+        return [rule.ratio(accumulate(maps))[0] for maps in frames]
+    judged = AngleDoppler(settings, fitted=fitted).judge(frames, known, expected)
+    return [one.ratio for one in judged]
 
 
 def _expected(
@@ -268,31 +268,28 @@ def score(
     expected = NOTHING if quiet else _expected(scenes, case.place, case.speed, detector.mistakes)
     # the first one corrects the terminal, and what is in the air must not hinder that
     frames = [*frames[2:], *frames[:2]]
-    kind = CHAINED.get(settings.clutter_detector, CfarStatistic)
-    judged = kind(settings, fitted=detector.fitted).judge(frames, known, expected)
+    ratios = _ratios(settings, detector.fitted, frames, known, expected)
     rows = slice(*(round(r / known.waveform.range_cell(2)) for r in SPAN_M))
-    tally.tuning.append(judged[-2].ratio[rows].ravel())
-    tally.free.append(judged[-1].ratio[rows].ravel())
-    for one, cells in zip(judged[:-2], case.cells, strict=True):
-        best = ndimage.maximum_filter(one.ratio, size=3, mode=("nearest", "wrap"))
+    tally.tuning.append(ratios[-2][rows].ravel())
+    tally.free.append(ratios[-1][rows].ravel())
+    for ratio, cells in zip(ratios[:-2], case.cells, strict=True):
+        best = ndimage.maximum_filter(ratio, size=3, mode=("nearest", "wrap"))
         tally.hits.append(best[tuple(cells.T)])
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:
-    """Every detector on every place; `quick`: coarser scatterers, fewer UAVs, without the slowest
-    detectors."""
+    """Every detector on every place; `quick`: coarser scatterers, fewer UAVs."""
     places = COMPARED
     target_frames, count = (1, 60) if quick else (3, 60)
     scenes = Scenes(scenario(places, seed, 0.03 if quick else 0.015, POWER_DBM))
-    chosen = {k: d for k, d in DETECTORS.items() if not (quick and k in LEFT_OUT_QUICK)}
-    bounds = {k: DETECTORS[of] for k, of in BOUNDS.items() if of in chosen}
-    tallies = {name: Tally() for name in [*chosen, *bounds]}
+    bounds = {name: DETECTORS[of] for name, of in BOUNDS.items()}
+    tallies = {name: Tally() for name in [*DETECTORS, *bounds]}
     about: list[tuple] = []
     done, steps = 0, 2 * len(places)
     for place in places:
         for speed in (0.0, SPEED):
             case = make_case(scenes, place, speed, target_frames, count)
-            for name, detector in chosen.items():
+            for name, detector in DETECTORS.items():
                 score(scenes, case, detector, tallies[name])
             for name, detector in bounds.items():
                 score(scenes, case, detector, tallies[name], quiet=True)
@@ -360,9 +357,6 @@ strong: In strong-clutter cells the filter finds at least 0.95
   {best} {strong}; bound {strong_limit}; hovering {top.pd_strong_hovering:.3f}, at {speed:g} m/s
   {top.pd_strong_moving:.3f}; {top.n_strong} UAVs in cells with clutter over {level:g} dB
 
-map: There the filter is at least 0.1 above the threshold map
-  {best} {top.pd_strong:.3f}, threshold map {map.pd_strong:.3f}
-
 wrong: The filter holds this with 0.1 m/s of velocity error, 3 dB of level error and
 0.1 m of mesh error
   all three at once, {wrong.detector}: {wrong.pd:.4f} over all, {strong} in strong clutter, false
@@ -375,7 +369,7 @@ others: What the others reach (no claim; stated beside the filter)
 
 def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
     """What is demanded of the filter, by name."""
-    top, limit, threshold_map = found.loc["filter"], found.loc["bound"], found.loc["map"]
+    top, limit = found.loc["filter"], found.loc["bound"]
     wrong, raw = found.loc["filter_wrong"], found.loc["unfitted"]
     alone = [found.loc[n] for n in ("velocity_wrong", "level_wrong", "mesh_wrong")]
 
@@ -389,7 +383,7 @@ def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
     losers = ", ".join(
         f"{DETECTORS[n].text} {found.pd[n]:.3f} ({found.pd_strong[n]:.3f} in strong clutter)"
         for n in found.index
-        if n in ("cfar", "runs", "notch", "sample", "map")
+        if n in ("cfar", "runs", "notch")
     )
     rates = {"worst_rate": rate_text(worst), "rate": rate_text(top)}
     both = {"strong": strong(top), "strong_limit": strong(limit)}
@@ -400,13 +394,12 @@ def _verdicts(found: pd.DataFrame) -> tuple[Verdict, ...]:
         say("false alarms", quiet, best="filter", worst=worst, **rates),
         say("bound", top.pd >= limit.pd - 0.03, **told, limit=limit, uavs=uavs),
         say("strong", top.pd_strong >= 0.95, **told, **both, **cells),
-        say("map", top.pd_strong >= threshold_map.pd_strong + 0.1, **told, map=threshold_map),
         say("wrong", kept, wrong=wrong, raw=raw, **failed),
         say("others", True, losers=losers),
     )
 
 
-DRAWN = "cfar", "notch", "sample", "map", "filter", "filter_wrong", "bound"
+DRAWN = "cfar", "notch", "filter", "filter_wrong", "bound"
 
 
 def _figure(found: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame) -> Figure:
@@ -429,7 +422,7 @@ def _figure(found: pd.DataFrame, targets: pd.DataFrame, hits: pd.DataFrame) -> F
         bins = np.digitize(targets.clutter_db, edges)
         inside = [w for b in range(1, edges.size) if (w := bins == b).sum() > 4]
         at = [float(np.clip(targets.clutter_db[w].mean(), -10, 60)) for w in inside]
-        for n, mark in zip(DRAWN, "v<xsoD+", strict=True):
+        for n, mark in zip(DRAWN, "v<oD+", strict=True):
             if n in names:
                 curve.plot(at, [hits[n][w].mean() for w in inside], mark + "-", label=text[n])
         curve.set(xlabel="clutter over noise in the UAV's cell [dB]")
